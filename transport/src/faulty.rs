@@ -1,0 +1,218 @@
+//! A transport that fails on purpose.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use fipa_acl::Letter;
+use parking_lot::Mutex;
+
+use crate::transport::LoanedContent;
+use crate::{
+    Answer, Arrival, AttemptId, Conclusion, Kind, ListenError, Location, Parcel, Sink, Ticket,
+    Transport, Verdict, WayError, WayFault,
+};
+
+/// A way of failing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum Fault {
+    /// Dispatching fails at once: nothing leaves.
+    Unreachable,
+    /// The parcel is dropped on the way; the attempt concludes as unconfirmed.
+    Lost,
+    /// The parcel arrives, but its answer is lost; the attempt concludes as unconfirmed.
+    AnswerLost,
+    /// Nothing is ever heard of the attempt: the parcel is dropped and no conclusion comes.
+    Silence,
+}
+
+/// Wraps a transport and makes some of its attempts fail, for testing what stands above it.
+///
+/// Faults are drawn with a seed, so that a run can be repeated, or forced for everything with
+/// [`force`](Self::force). [`Fault::Silence`] breaks the rule of one conclusion on purpose: the
+/// delivery core must have a time-out of its own.
+pub struct Faulty {
+    inner: Arc<dyn Transport>,
+    shared: Arc<Shared>,
+}
+
+struct Shared {
+    plan: Mutex<Plan>,
+    /// Attempts whose real conclusion is replaced.
+    pending: Mutex<HashMap<AttemptId, Fault>>,
+    /// Conclusions of attempts that never reached the inner transport.
+    invented: Mutex<Vec<(AttemptId, Conclusion)>>,
+    sink: Mutex<Option<Arc<dyn Sink>>>,
+    injected: AtomicU64,
+}
+
+struct Plan {
+    random: fastrand::Rng,
+    rates: Vec<(Fault, f64)>,
+    forced: Option<Fault>,
+}
+
+impl Faulty {
+    /// Wraps `inner`. Each dispatch suffers one of the faults with its rate (0 to 1), drawn with
+    /// `seed`.
+    pub fn new(inner: Arc<dyn Transport>, seed: u64, rates: &[(Fault, f64)]) -> Self {
+        let random = fastrand::Rng::with_seed(seed);
+        Self {
+            inner,
+            shared: Arc::new(Shared {
+                plan: Mutex::new(Plan {
+                    random,
+                    rates: rates.to_vec(),
+                    forced: None,
+                }),
+                pending: Mutex::default(),
+                invented: Mutex::default(),
+                sink: Mutex::default(),
+                injected: AtomicU64::new(0),
+            }),
+        }
+    }
+
+    /// From now on every dispatch suffers this fault, or, with `None`, those drawn by rate.
+    pub fn force(&self, fault: Option<Fault>) {
+        self.shared.plan.lock().forced = fault;
+    }
+
+    /// How many faults were injected so far.
+    #[must_use]
+    pub fn injected(&self) -> u64 {
+        self.shared.injected.load(Ordering::Relaxed)
+    }
+
+    fn draw(&self) -> Option<Fault> {
+        let mut plan = self.shared.plan.lock();
+        if plan.forced.is_some() {
+            return plan.forced;
+        }
+        let mut left = plan.random.f64();
+        for (fault, rate) in plan.rates.clone() {
+            if left < rate {
+                return Some(fault);
+            }
+            left -= rate;
+        }
+        None
+    }
+}
+
+fn lost() -> Conclusion {
+    Conclusion::Unconfirmed(WayError::new(WayFault::Broken, "injected fault"))
+}
+
+impl Transport for Faulty {
+    fn kind(&self) -> Kind {
+        self.inner.kind()
+    }
+
+    fn max_letter(&self) -> usize {
+        self.inner.max_letter()
+    }
+
+    fn answers_at_once(&self) -> bool {
+        self.inner.answers_at_once()
+    }
+
+    fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
+        *self.shared.sink.lock() = Some(Arc::clone(&sink));
+        self.inner.listen(Arc::new(Filter {
+            sink,
+            shared: Arc::clone(&self.shared),
+        }))
+    }
+
+    fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
+        let fault = self.draw();
+        if fault.is_some() {
+            self.shared.injected.fetch_add(1, Ordering::Relaxed);
+        }
+        match fault {
+            Some(Fault::Unreachable) => Err(WayError::new(WayFault::Unreachable, "injected fault")),
+            Some(Fault::Lost) => {
+                self.shared.invented.lock().push((attempt, lost()));
+                Ok(())
+            }
+            Some(Fault::Silence) => Ok(()),
+            Some(Fault::AnswerLost) => {
+                self.shared
+                    .pending
+                    .lock()
+                    .insert(attempt, Fault::AnswerLost);
+                let sent = self.inner.dispatch(attempt, to, parcel);
+                if sent.is_err() {
+                    self.shared.pending.lock().remove(&attempt);
+                }
+                sent
+            }
+            None => self.inner.dispatch(attempt, to, parcel),
+        }
+    }
+
+    fn abandon(&self, attempt: AttemptId) {
+        self.shared.pending.lock().remove(&attempt);
+        self.shared
+            .invented
+            .lock()
+            .retain(|(other, _)| *other != attempt);
+        self.inner.abandon(attempt);
+    }
+
+    fn answer(&self, ticket: Ticket, answer: Answer) {
+        self.inner.answer(ticket, answer);
+    }
+
+    fn drive(&self) -> bool {
+        let invented = std::mem::take(&mut *self.shared.invented.lock());
+        let sink = self.shared.sink.lock().clone();
+        let mut did_something = false;
+        if let Some(sink) = sink {
+            for (attempt, conclusion) in invented {
+                did_something = true;
+                sink.concluded(attempt, conclusion);
+            }
+        }
+        self.inner.drive() || did_something
+    }
+
+    fn loan(
+        &self,
+        to: &Location,
+        head_room: usize,
+        len: usize,
+        tail_room: usize,
+    ) -> Result<Option<Box<dyn LoanedContent>>, WayError> {
+        self.inner.loan(to, head_room, len, tail_room)
+    }
+
+    fn close(&self) {
+        self.inner.close();
+        self.drive();
+    }
+}
+
+/// The sink that the inner transport sees.
+struct Filter {
+    sink: Arc<dyn Sink>,
+    shared: Arc<Shared>,
+}
+
+impl Sink for Filter {
+    fn arrived(&self, arrival: Arrival) -> Verdict {
+        self.sink.arrived(arrival)
+    }
+
+    fn arrived_unframed(&self, letter: Letter, via: Kind) {
+        self.sink.arrived_unframed(letter, via);
+    }
+
+    fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {
+        let fault = self.shared.pending.lock().remove(&attempt);
+        let conclusion = if fault.is_some() { lost() } else { conclusion };
+        self.sink.concluded(attempt, conclusion);
+    }
+}

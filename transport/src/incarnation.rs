@@ -1,0 +1,118 @@
+//! Incarnations: what tells two lives of the same name apart.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+/// One life of an agent or of a message transport service.
+///
+/// Drawn at random for every registration. A name may be registered again, here or on another
+/// host, after a crash or a move; the incarnation says whether it is still the same one, which is
+/// what order and deduplication hang on. Zero is [`Incarnation::UNKNOWN`]: a peer that has none
+/// (fipa_services, JADE).
+///
+/// Written as 16 lower-case hexadecimal digits.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default)]
+pub struct Incarnation(u64);
+
+impl Incarnation {
+    /// The incarnation of somebody who does not know of incarnations.
+    pub const UNKNOWN: Self = Self(0);
+
+    /// A new incarnation from the operating system's random numbers.
+    ///
+    /// # Panics
+    /// When the operating system has no random numbers to give, which Linux rules out after boot.
+    #[must_use]
+    pub fn random() -> Self {
+        loop {
+            let drawn = getrandom::u64().expect("the operating system gives random numbers");
+            if drawn != 0 {
+                return Self(drawn);
+            }
+        }
+    }
+
+    /// The incarnation with this number; zero is [`Incarnation::UNKNOWN`].
+    #[must_use]
+    pub const fn from_u64(number: u64) -> Self {
+        Self(number)
+    }
+
+    /// The number of this incarnation.
+    #[must_use]
+    pub const fn as_u64(self) -> u64 {
+        self.0
+    }
+
+    /// Whether this is a real incarnation.
+    #[must_use]
+    pub const fn is_known(self) -> bool {
+        self.0 != 0
+    }
+}
+
+impl fmt::Display for Incarnation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:016x}", self.0)
+    }
+}
+
+impl fmt::Debug for Incarnation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{self}")
+    }
+}
+
+/// Text that is not an incarnation.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("not an incarnation (16 hexadecimal digits expected): {0:?}")]
+pub struct IncarnationError(String);
+
+impl FromStr for Incarnation {
+    type Err = IncarnationError;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let digits_only = text.len() == 16 && text.bytes().all(|b| b.is_ascii_hexdigit());
+        match u64::from_str_radix(text, 16) {
+            Ok(number) if digits_only => Ok(Self(number)),
+            _ => Err(IncarnationError(text.chars().take(40).collect())),
+        }
+    }
+}
+
+impl Serialize for Incarnation {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+impl<'de> Deserialize<'de> for Incarnation {
+    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        String::deserialize(deserializer)?
+            .parse()
+            .map_err(serde::de::Error::custom)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn text_round_trips_and_nonsense_is_refused() {
+        let incarnation = Incarnation::from_u64(0x00ab_cdef_0123_4567);
+        assert_eq!(incarnation.to_string(), "00abcdef01234567");
+        assert_eq!("00abcdef01234567".parse(), Ok(incarnation));
+        for wrong in [
+            "",
+            "12",
+            "+0abcdef01234567",
+            "00abcdef0123456g",
+            "00abcdef012345678",
+        ] {
+            assert!(wrong.parse::<Incarnation>().is_err(), "{wrong:?}");
+        }
+    }
+}

@@ -1,0 +1,305 @@
+//! The trait that every way of moving a letter implements, and the one it reports to.
+
+use std::fmt;
+use std::sync::Arc;
+
+use fipa_acl::Letter;
+use serde::Serialize;
+
+use crate::{FailureReason, Kind, Location, Parcel};
+
+/// One way of moving letters.
+///
+/// A transport tries once and reports. It keeps these rules, which [`crate::conformance`] checks:
+///
+/// 1. **One conclusion.** Every [`dispatch`](Self::dispatch) that returned `Ok` is followed by
+///    exactly one [`Sink::concluded`] with its attempt, unless the attempt was
+///    [abandoned](Self::abandon) before.
+/// 2. **Honest conclusions.** [`Conclusion::NotSent`] only when the other side cannot have got
+///    the letter, and never will. If in doubt, [`Conclusion::Unconfirmed`].
+/// 3. **An answer is the other sink's answer.** `Accepted` is reported only after the receiving
+///    sink said so; nothing is acknowledged on its behalf.
+/// 4. **Order.** Parcels dispatched to one location arrive in the order of the calls, or do not
+///    arrive.
+/// 5. **No call-back from a call.** A sink is never called from within `dispatch`, `abandon` or
+///    `answer`: the caller may hold its own lock. It may be called from within
+///    [`drive`](Self::drive) and `listen`.
+/// 6. **Bounded.** A parcel that there is no room for is returned as an error, not queued without
+///    limit. No length that came from outside makes memory be taken unchecked.
+/// 7. **Lazy.** Nothing is opened to a location before a parcel needs it.
+///
+/// No method blocks. Methods may be called from any thread.
+pub trait Transport: Send + Sync + 'static {
+    /// What kind of transport this is: locations of this kind are dispatched here.
+    fn kind(&self) -> Kind;
+
+    /// Largest letter, in bytes, that can be carried. A larger one fails with
+    /// [`WayFault::TooLarge`].
+    fn max_letter(&self) -> usize;
+
+    /// Whether arrivals must be answered at once. A delivery core that cannot tell the outcome
+    /// yet then answers [`Answer::Custody`] and sends a report later, so that a slow way behind
+    /// it holds no slots of this transport.
+    fn answers_at_once(&self) -> bool;
+
+    /// Begins to listen and hands everything that arrives to `sink`. Called once, before anything
+    /// else. Returns the locations at which this endpoint can be reached, best first.
+    ///
+    /// # Errors
+    /// When the endpoint cannot be opened; nothing is left open then.
+    fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError>;
+
+    /// Sends a parcel to a location. See the rules above for what follows.
+    ///
+    /// # Errors
+    /// When it is known at once that the parcel does not go; no conclusion follows then.
+    fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError>;
+
+    /// The caller is no longer interested in this attempt: its resources are freed, its
+    /// conclusion is not reported. Unknown attempts are ignored.
+    fn abandon(&self, attempt: AttemptId);
+
+    /// Answers an arrival for which the sink had said [`Verdict::Later`]. Unknown tickets are
+    /// ignored: the peer may be gone.
+    fn answer(&self, ticket: Ticket, answer: Answer);
+
+    /// Does what can be done now without blocking, on the calling thread, and says whether there
+    /// was anything. Whoever waits for a letter or an outcome may call this in a short loop
+    /// before going to sleep; nobody has to.
+    fn drive(&self) -> bool {
+        false
+    }
+
+    /// Loans `len` bytes in which the content of a letter to `to` can be written in place, when
+    /// this transport can later carry those very bytes without a copy. `head_room` is the length
+    /// of everything that will stand in front of the content and `tail_room` what will follow it.
+    ///
+    /// # Errors
+    /// When there is no room or the letter is too large.
+    fn loan(
+        &self,
+        to: &Location,
+        head_room: usize,
+        len: usize,
+        tail_room: usize,
+    ) -> Result<Option<Box<dyn LoanedContent>>, WayError> {
+        let _ = (to, head_room, len, tail_room);
+        Ok(None)
+    }
+
+    /// Stops listening, gives every outstanding attempt its conclusion and frees everything.
+    /// Later dispatches fail. Calling it twice is allowed.
+    fn close(&self);
+}
+
+/// Memory for the content of one letter, to be filled in place.
+pub trait LoanedContent: Send {
+    /// The bytes, to be written. They start out as zeros or as anything else.
+    fn content_mut(&mut self) -> &mut [u8];
+
+    /// The bytes as content of a letter. The transport that loaned them recognises them when the
+    /// letter is dispatched to the location they were loaned for, and copies nothing.
+    fn freeze(self: Box<Self>) -> bytes::Bytes;
+}
+
+/// Who is told what arrives and what became of attempts: the delivery core.
+pub trait Sink: Send + Sync {
+    /// A parcel arrived. The verdict is what the sender is told.
+    fn arrived(&self, arrival: Arrival) -> Verdict;
+
+    /// An old peer's letter arrived, which has no header and gets no answer. Its envelope has
+    /// been brought into the standard dialect; whom it is for stands in there.
+    fn arrived_unframed(&self, letter: Letter, via: Kind);
+
+    /// An attempt came to its end.
+    fn concluded(&self, attempt: AttemptId, conclusion: Conclusion);
+}
+
+/// A parcel that arrived.
+#[derive(Debug)]
+pub struct Arrival {
+    /// What arrived.
+    pub parcel: Parcel,
+    /// Who handed it over.
+    pub from: Hop,
+    /// For [`Transport::answer`], when the verdict is [`Verdict::Later`].
+    pub ticket: Ticket,
+}
+
+/// The message transport service that handed a parcel over.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Hop {
+    /// Where to send reports and credits about the parcel, with the incarnation of the service
+    /// that is there.
+    pub location: Location,
+    /// Whether the parcel came from another host.
+    pub remote: bool,
+}
+
+/// What a sink says about an arrival.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Verdict {
+    /// This is the answer.
+    Now(Answer),
+    /// The answer follows through [`Transport::answer`]. Not allowed towards a transport that
+    /// [answers at once](Transport::answers_at_once).
+    Later,
+}
+
+/// What the other side says about a parcel.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Answer {
+    /// Accepted into the named agent's queue, now or when an earlier copy arrived. Reports and
+    /// credits are accepted too.
+    Accepted,
+    /// Taken for forwarding; a report follows.
+    Custody,
+    /// There is no room; a credit follows when there is.
+    Busy,
+    /// The letter that this one comes after has not been taken yet.
+    OutOfOrder {
+        /// The last letter of the stream that was taken.
+        last: u64,
+    },
+    /// Not accepted, finally.
+    Failed {
+        /// Why.
+        reason: FailureReason,
+        /// More about it, for people; at most [`Answer::MAX_DETAIL`] bytes are carried.
+        detail: String,
+    },
+}
+
+impl Answer {
+    /// How much of a failure's detail is carried, in bytes.
+    pub const MAX_DETAIL: usize = 160;
+
+    /// A final refusal.
+    pub fn failed(reason: FailureReason, detail: impl Into<String>) -> Self {
+        Self::Failed {
+            reason,
+            detail: detail.into(),
+        }
+    }
+}
+
+/// How an attempt ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Conclusion {
+    /// The other side answered.
+    Answered(Answer),
+    /// Handed to a peer that cannot answer.
+    Handed,
+    /// The other side did not get it and never will.
+    NotSent(WayError),
+    /// The other side may have got it.
+    Unconfirmed(WayError),
+}
+
+/// Why a way did not work.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error, Serialize)]
+#[error("{}{}{detail}", fault.description(), if detail.is_empty() { "" } else { ": " })]
+pub struct WayError {
+    /// What kind of fault it was.
+    pub fault: WayFault,
+    /// More about it, for people: what the operating system said, and what to do.
+    pub detail: String,
+}
+
+impl WayError {
+    /// An error with a detail for people.
+    pub fn new(fault: WayFault, detail: impl fmt::Display) -> Self {
+        Self {
+            fault,
+            detail: detail.to_string(),
+        }
+    }
+}
+
+/// The kinds of faults of a way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
+#[serde(rename_all = "snake_case")]
+#[non_exhaustive]
+pub enum WayFault {
+    /// Nobody is there, or nothing leads there.
+    Unreachable,
+    /// Somebody is there, but of another incarnation than expected.
+    WrongIncarnation,
+    /// The letter is larger than this way takes.
+    TooLarge,
+    /// The window towards that location is full; what is under way makes room.
+    Congested,
+    /// The connection broke, or the other process ended, before an answer came.
+    Broken,
+    /// No answer came in time.
+    TimedOut,
+    /// The other side speaks another version, or nonsense.
+    Incompatible,
+    /// The other side does not take it.
+    Refused,
+    /// This transport has been closed or cannot be used on this machine.
+    Closed,
+    /// This end has run out of memory, descriptors or disk for this way.
+    Exhausted,
+}
+
+impl WayFault {
+    /// Every fault, for encoding: the position is the code on the wire, so new ones go last.
+    pub(crate) const CODES: [Self; 10] = [
+        Self::Unreachable,
+        Self::WrongIncarnation,
+        Self::TooLarge,
+        Self::Congested,
+        Self::Broken,
+        Self::TimedOut,
+        Self::Incompatible,
+        Self::Refused,
+        Self::Closed,
+        Self::Exhausted,
+    ];
+
+    fn description(self) -> &'static str {
+        match self {
+            Self::Unreachable => "unreachable",
+            Self::WrongIncarnation => "another process is there now",
+            Self::TooLarge => "too large for this way",
+            Self::Congested => "too much under way",
+            Self::Broken => "broken off",
+            Self::TimedOut => "no answer in time",
+            Self::Incompatible => "incompatible",
+            Self::Refused => "refused",
+            Self::Closed => "closed",
+            Self::Exhausted => "no room at this end",
+        }
+    }
+}
+
+/// Why an endpoint could not be opened.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ListenError {
+    /// An address could not be listened on.
+    #[error("cannot listen on {address}: {source}")]
+    Bind {
+        /// The address as configured.
+        address: String,
+        /// What the operating system said.
+        source: std::io::Error,
+    },
+    /// Something the transport needs is missing; the text says what to do.
+    #[error("{0}")]
+    Unavailable(String),
+    /// `listen` was called twice, or after `close`.
+    #[error("this endpoint was opened before")]
+    OpenedBefore,
+}
+
+/// The caller's number for one dispatch.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct AttemptId(pub u64);
+
+/// The transport's number for one arrival.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Ticket(pub u64);

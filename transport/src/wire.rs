@@ -1,0 +1,461 @@
+//! The fixed layout of a parcel, as it lies in a mailbox and in a network frame.
+//!
+//! A parcel is a [`ParcelHeader`] followed by a body: the receiver's name, then what
+//! [`Body`] it is. All integers are little-endian. A letter's body is its envelope, then the
+//! message in its three pieces ([`Payload`]); a report's body is written by this module; a credit
+//! has none.
+//!
+//! Everything here may come from a hostile peer: lengths are checked against what is there before
+//! they are used, and nothing is allocated by them.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::{BufMut, Bytes, BytesMut};
+use fipa_acl::{Letter, Payload};
+use zerocopy::little_endian::{U16, U32, U64};
+use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
+
+use crate::{
+    Attempt, Body, FailureReason, Incarnation, Kind, Location, Outcome, Parcel, Report, Stream,
+    WayError, WayFault,
+};
+
+/// The header of a parcel: [`HEADER_LEN`] bytes, little-endian.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, FromBytes, IntoBytes, Immutable, KnownLayout, Unaligned,
+)]
+#[repr(C)]
+pub struct ParcelHeader {
+    kind: u8,
+    hops: u8,
+    name_len: U16,
+    envelope_len: U32,
+    head_len: U32,
+    tail_len: U32,
+    content_len: U64,
+    sender: U64,
+    receiver: U64,
+    sequence: U64,
+    after: U64,
+    remaining_us: U64,
+}
+
+/// Length of a [`ParcelHeader`] in bytes.
+pub const HEADER_LEN: usize = size_of::<ParcelHeader>();
+
+const LETTER: u8 = 1;
+const REPORT: u8 = 2;
+const CREDIT: u8 = 3;
+
+/// Longest deadline that travels: one day. What a peer writes beyond is cut to it.
+pub const MAX_REMAINING: Duration = Duration::from_secs(24 * 60 * 60);
+
+/// Bytes that are not a parcel.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum WireError {
+    /// The kind is none that we know.
+    #[error("unknown kind of parcel: {0}")]
+    UnknownKind(u8),
+    /// The lengths in the header do not add up to the length of the body.
+    #[error("the header announces a body of {announced} bytes, and there are {found}")]
+    BodyLength {
+        /// What the header says.
+        announced: u64,
+        /// What is there.
+        found: u64,
+    },
+    /// The name is empty, longer than [`Parcel::MAX_NAME`], or not UTF-8.
+    #[error("the receiver's name is empty, too long, or not UTF-8")]
+    Name,
+    /// The body of a report makes no sense.
+    #[error("malformed report")]
+    Report,
+}
+
+impl ParcelHeader {
+    /// The header of a parcel, and its body: the pieces to be written behind the header, in order
+    /// and none of them empty. The memory of a letter is shared, not copied.
+    ///
+    /// # Errors
+    /// When the name or a piece in front of the content is longer than the header can say.
+    pub fn of(parcel: &Parcel) -> Result<(Self, Vec<Bytes>), WireError> {
+        if parcel.receiver.is_empty() || parcel.receiver.len() > Parcel::MAX_NAME {
+            return Err(WireError::Name);
+        }
+        let too_long = |len: usize| WireError::BodyLength {
+            announced: len as u64,
+            found: u64::from(u32::MAX),
+        };
+        let u32_of = |len: usize| u32::try_from(len).map(U32::new).map_err(|_| too_long(len));
+        let mut header = Self {
+            kind: CREDIT,
+            hops: parcel.hops,
+            name_len: U16::new(parcel.receiver.len() as u16),
+            envelope_len: U32::ZERO,
+            head_len: U32::ZERO,
+            tail_len: U32::ZERO,
+            content_len: U64::ZERO,
+            sender: U64::new(parcel.stream.sender.as_u64()),
+            receiver: U64::new(parcel.stream.receiver.as_u64()),
+            sequence: U64::new(parcel.sequence),
+            after: U64::new(parcel.after),
+            remaining_us: U64::new(parcel.remaining.min(MAX_REMAINING).as_micros() as u64),
+        };
+        let mut pieces = vec![Bytes::copy_from_slice(parcel.receiver.as_bytes())];
+        match &parcel.body {
+            Body::Letter(letter) => {
+                header.kind = LETTER;
+                header.envelope_len = u32_of(letter.envelope_len())?;
+                header.head_len = u32_of(letter.payload().head.len())?;
+                header.tail_len = u32_of(letter.payload().tail.len())?;
+                header.content_len = U64::new(letter.payload().content.len() as u64);
+                pieces.extend(letter.pieces().cloned());
+            }
+            Body::Report(report) => {
+                let body = write_report(report);
+                header.kind = REPORT;
+                header.head_len = u32_of(body.len())?;
+                pieces.push(body);
+            }
+            Body::Credit => {}
+        }
+        Ok((header, pieces))
+    }
+
+    /// Length of the body behind this header, in bytes. Not to be trusted before it has been
+    /// compared with a limit.
+    #[must_use]
+    pub fn body_len(&self) -> u64 {
+        // Cannot overflow from honest peers; saturates for others, who then fail the comparison.
+        (u64::from(self.name_len.get()) + u64::from(self.envelope_len.get()))
+            .saturating_add(u64::from(self.head_len.get()))
+            .saturating_add(u64::from(self.tail_len.get()))
+            .saturating_add(self.content_len.get())
+    }
+
+    /// Length of what stands in front of the content: name, envelope and head of the message.
+    /// This is what a receiver copies out of shared memory before it looks at it.
+    #[must_use]
+    pub fn front_len(&self) -> u64 {
+        u64::from(self.name_len.get())
+            + u64::from(self.envelope_len.get())
+            + u64::from(self.head_len.get())
+    }
+
+    /// Length of the content, in bytes.
+    #[must_use]
+    pub fn content_len(&self) -> u64 {
+        self.content_len.get()
+    }
+
+    /// The parcel with this header and a body that lies in one piece. Nothing is copied but the
+    /// name.
+    ///
+    /// # Errors
+    /// When header and body do not fit together.
+    pub fn parcel(&self, body: Bytes) -> Result<Parcel, WireError> {
+        let (front, content, tail) = self.split(body)?;
+        self.parcel_of_pieces(front, content, tail)
+    }
+
+    fn split(&self, mut body: Bytes) -> Result<(Bytes, Bytes, Bytes), WireError> {
+        if self.body_len() != body.len() as u64 {
+            return Err(WireError::BodyLength {
+                announced: self.body_len(),
+                found: body.len() as u64,
+            });
+        }
+        let front = body.split_to(self.front_len() as usize);
+        let content = body.split_to(self.content_len.get() as usize);
+        Ok((front, content, body))
+    }
+
+    /// The parcel with this header and a body in three pieces: what stands in front of the
+    /// content ([`front_len`](Self::front_len) bytes), the content, and what follows it. Nothing
+    /// is copied but the name.
+    ///
+    /// # Errors
+    /// When header and body do not fit together.
+    pub fn parcel_of_pieces(
+        &self,
+        mut front: Bytes,
+        content: Bytes,
+        tail: Bytes,
+    ) -> Result<Parcel, WireError> {
+        let fits = front.len() as u64 == self.front_len()
+            && content.len() as u64 == self.content_len.get()
+            && tail.len() as u64 == u64::from(self.tail_len.get());
+        if !fits {
+            let found = (front.len() + content.len() + tail.len()) as u64;
+            return Err(WireError::BodyLength {
+                announced: self.body_len(),
+                found,
+            });
+        }
+        let name = front.split_to(usize::from(self.name_len.get()));
+        if name.is_empty() || name.len() > Parcel::MAX_NAME {
+            return Err(WireError::Name);
+        }
+        let receiver: Arc<str> = std::str::from_utf8(&name)
+            .map_err(|_| WireError::Name)?
+            .into();
+        let body = match self.kind {
+            LETTER => {
+                let envelope = front.split_to(self.envelope_len.get() as usize);
+                Body::Letter(Letter::new(
+                    envelope,
+                    Payload {
+                        head: front,
+                        content,
+                        tail,
+                    },
+                ))
+            }
+            REPORT => Body::Report(read_report(&front).ok_or(WireError::Report)?),
+            CREDIT => Body::Credit,
+            other => return Err(WireError::UnknownKind(other)),
+        };
+        Ok(Parcel {
+            receiver,
+            stream: Stream {
+                sender: Incarnation::from_u64(self.sender.get()),
+                receiver: Incarnation::from_u64(self.receiver.get()),
+            },
+            sequence: self.sequence.get(),
+            after: self.after.get(),
+            remaining: Duration::from_micros(self.remaining_us.get()).min(MAX_REMAINING),
+            hops: self.hops,
+            body,
+        })
+    }
+}
+
+/// At most this many attempts are told in a report; the rest is left out, oldest first.
+const MAX_ATTEMPTS: usize = 32;
+
+/// The code of a failure reason in answers and reports: one byte, stable.
+#[must_use]
+pub fn reason_code(reason: FailureReason) -> u8 {
+    position(&FailureReason::CODES, &reason)
+}
+
+/// The failure reason with this code.
+#[must_use]
+pub fn reason_of_code(code: u8) -> Option<FailureReason> {
+    FailureReason::CODES.get(usize::from(code)).copied()
+}
+
+fn position<T: PartialEq>(all: &[T], one: &T) -> u8 {
+    all.iter()
+        .position(|other| other == one)
+        .map_or(u8::MAX, |place| place as u8)
+}
+
+/// Report := tag(0 delivered, 1 sent, 2 failed) code(kind or reason) n(attempts) attempt*
+/// attempt := kind fault location(u16 length, text) detail(u16 length, text)
+fn write_report(report: &Report) -> Bytes {
+    let mut out = BytesMut::new();
+    let (tag, code) = match &report.outcome {
+        Outcome::Delivered { via, .. } => (0, position(&Kind::ALL, via)),
+        Outcome::Sent { via, .. } => (1, position(&Kind::ALL, via)),
+        Outcome::Failed { reason, .. } => (2, reason_code(*reason)),
+    };
+    let attempts = report.outcome.attempts();
+    let told = &attempts[attempts.len().saturating_sub(MAX_ATTEMPTS)..];
+    out.put_slice(&[tag, code, told.len() as u8]);
+    for Attempt {
+        via,
+        location,
+        error,
+    } in told
+    {
+        out.put_u8(position(&Kind::ALL, via));
+        out.put_u8(position(&WayFault::CODES, &error.fault));
+        for text in [
+            location.to_string().as_str(),
+            truncated(&error.detail, 1024),
+        ] {
+            out.put_u16_le(text.len() as u16);
+            out.put_slice(text.as_bytes());
+        }
+    }
+    out.freeze()
+}
+
+fn read_report(bytes: &[u8]) -> Option<Report> {
+    let (&[tag, code, count], mut rest) = bytes.split_first_chunk()?;
+    if usize::from(count) > MAX_ATTEMPTS {
+        return None;
+    }
+    let mut attempts = Vec::new();
+    for _ in 0..count {
+        let (&[kind, fault], after) = rest.split_first_chunk()?;
+        rest = after;
+        let location: Location = text(&mut rest)?.parse().ok()?;
+        let detail = text(&mut rest)?.to_owned();
+        let fault = *WayFault::CODES.get(usize::from(fault))?;
+        attempts.push(Attempt {
+            via: kind_of_code(kind)?,
+            location,
+            error: WayError { fault, detail },
+        });
+    }
+    if !rest.is_empty() {
+        return None;
+    }
+    let outcome = match tag {
+        0 => Outcome::Delivered {
+            via: kind_of_code(code)?,
+            attempts,
+        },
+        1 => Outcome::Sent {
+            via: kind_of_code(code)?,
+            attempts,
+        },
+        2 => Outcome::Failed {
+            reason: reason_of_code(code)?,
+            attempts,
+        },
+        _ => return None,
+    };
+    Some(Report { outcome })
+}
+
+fn kind_of_code(code: u8) -> Option<Kind> {
+    Kind::ALL.get(usize::from(code)).copied()
+}
+
+fn text<'a>(rest: &mut &'a [u8]) -> Option<&'a str> {
+    let (len, after) = rest.split_first_chunk()?;
+    let (text, after) = after.split_at_checked(usize::from(u16::from_le_bytes(*len)))?;
+    *rest = after;
+    std::str::from_utf8(text).ok()
+}
+
+/// The text, cut to at most `max` bytes at a character boundary.
+#[must_use]
+pub fn truncated(text: &str, max: usize) -> &str {
+    &text[..text.floor_char_boundary(max)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parcel(body: Body) -> Parcel {
+        Parcel {
+            receiver: "béla@home".into(),
+            stream: Stream {
+                sender: Incarnation::from_u64(7),
+                receiver: Incarnation::from_u64(u64::MAX),
+            },
+            sequence: 3,
+            after: 2,
+            remaining: Duration::from_millis(1500),
+            hops: 1,
+            body,
+        }
+    }
+
+    fn split_letter() -> Letter {
+        Letter::new(
+            Bytes::from_static(b"envelope"),
+            Payload {
+                head: Bytes::from_static(b"head"),
+                content: Bytes::from_static(b"content"),
+                tail: Bytes::from_static(b"\x01"),
+            },
+        )
+        .stamped(Bytes::from_static(b"stamp"))
+    }
+
+    fn failed() -> Report {
+        let attempts = vec![Attempt {
+            via: Kind::Shm,
+            location: "shm://1#0000000000000001".parse().unwrap(),
+            error: WayError::new(WayFault::Broken, "gone"),
+        }];
+        Report {
+            outcome: Outcome::Failed {
+                reason: FailureReason::Loop,
+                attempts,
+            },
+        }
+    }
+
+    fn written(parcel: &Parcel) -> (ParcelHeader, Bytes) {
+        let (header, pieces) = ParcelHeader::of(parcel).unwrap();
+        (header, pieces.concat().into())
+    }
+
+    #[test]
+    fn the_header_has_no_hidden_padding() {
+        assert_eq!(HEADER_LEN, 64);
+    }
+
+    #[test]
+    fn every_kind_survives() {
+        for body in [
+            Body::Letter(split_letter()),
+            Body::Report(failed()),
+            Body::Credit,
+        ] {
+            let parcel = parcel(body);
+            let (header, body) = written(&parcel);
+            let read = header.parcel(body).unwrap();
+            match (&read.body, &parcel.body) {
+                (Body::Letter(read), Body::Letter(sent)) => {
+                    assert_eq!(read.to_bytes(), sent.to_bytes());
+                    assert_eq!(read.payload(), sent.payload());
+                }
+                (read, sent) => assert_eq!(read, sent),
+            }
+            let read = Parcel {
+                body: parcel.body.clone(),
+                ..read
+            };
+            assert_eq!(read, parcel);
+        }
+    }
+
+    #[test]
+    fn lengths_that_do_not_add_up_are_refused() {
+        let (header, body) = written(&parcel(Body::Letter(split_letter())));
+        assert!(matches!(
+            header.parcel(body.slice(..body.len() - 1)),
+            Err(WireError::BodyLength { .. })
+        ));
+        let huge = ParcelHeader {
+            content_len: U64::new(u64::MAX),
+            ..header
+        };
+        assert_eq!(huge.body_len(), u64::MAX);
+        assert!(matches!(
+            huge.parcel(body),
+            Err(WireError::BodyLength { .. })
+        ));
+    }
+
+    #[test]
+    fn names_and_kinds_are_checked() {
+        let (header, body) = written(&parcel(Body::Credit));
+        let nameless = ParcelHeader {
+            name_len: U16::ZERO,
+            ..header
+        };
+        assert_eq!(nameless.parcel(Bytes::new()), Err(WireError::Name));
+        let stranger = ParcelHeader { kind: 9, ..header };
+        assert_eq!(stranger.parcel(body), Err(WireError::UnknownKind(9)));
+    }
+
+    #[test]
+    fn every_truncation_of_a_report_is_refused() {
+        let whole = write_report(&failed());
+        for len in 0..whole.len() {
+            assert_eq!(read_report(&whole[..len]), None, "{len}");
+        }
+        assert_eq!(read_report(&whole), Some(failed()));
+    }
+}
