@@ -1,0 +1,79 @@
+//! Encoding and decoding beside their limit: a copy of the same bytes in the same run.
+
+use std::hint::black_box;
+use std::time::Duration;
+
+use bytes::{Bytes, BytesMut};
+use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
+use fipa_acl::{AgentId, EnvelopeView, Message, MessageView, Payload, Performative, bitefficient};
+
+const LETTER: &[u8] = include_bytes!("../tests/vectors/failure_letter.bin");
+
+/// The message with all 13 parameters.
+fn message(content_len: usize) -> Message {
+    let agent = |name: &str| AgentId::new(name).expect("a name");
+    Message::builder(Performative::Request)
+        .sender(agent("proxy"))
+        .receiver(agent("crex_0"))
+        .reply_to(agent("proxy"))
+        .content(vec![0x5a; content_len])
+        .language("test language")
+        .encoding("test encoding")
+        .ontology("test ontology")
+        .protocol("RIMRES")
+        .conversation_id("test conversationID")
+        .reply_with("test reply_with")
+        .in_reply_to("test in_reply_to")
+        .reply_by("20101223T120037980".parse().expect("a time"))
+        .build()
+        .expect("a message")
+}
+
+fn codec(criterion: &mut Criterion) {
+    for (name, content_len) in [("1B", 1), ("1KB", 1 << 10), ("1MB", 1 << 20)] {
+        let message = message(content_len);
+        let bytes: Bytes = message.to_payload().to_bytes();
+        let whole = Payload::from(bytes.clone());
+        let mut buffer = BytesMut::with_capacity(bytes.len());
+        let mut group = criterion.benchmark_group("message");
+        let id = |what: &str| BenchmarkId::new(what, name);
+        group.bench_function(id("memcpy"), |bench| {
+            bench.iter(|| {
+                buffer.clear();
+                buffer.extend_from_slice(black_box(&bytes));
+                black_box(&buffer);
+            });
+        });
+        group.bench_function(id("encode"), |bench| {
+            bench.iter(|| {
+                buffer.clear();
+                bitefficient::encode(black_box(&message), &mut buffer);
+                black_box(&buffer);
+            });
+        });
+        group.bench_function(id("encoded_len"), |bench| {
+            bench.iter(|| bitefficient::encoded_len(black_box(&message)));
+        });
+        group.bench_function(id("to_payload"), |bench| {
+            bench.iter(|| black_box(&message).to_payload());
+        });
+        group.bench_function(id("view"), |bench| {
+            bench.iter(|| black_box(MessageView::parse(black_box(&bytes))).is_ok());
+        });
+        group.bench_function(id("decode"), |bench| {
+            bench.iter(|| Message::decode(black_box(&whole)));
+        });
+    }
+    criterion.bench_function("envelope/view", |bench| {
+        bench.iter(|| black_box(EnvelopeView::parse(black_box(LETTER))).is_ok());
+    });
+}
+
+criterion_group! {
+    name = benches;
+    config = Criterion::default()
+        .warm_up_time(Duration::from_millis(300))
+        .measurement_time(Duration::from_secs(1));
+    targets = codec
+}
+criterion_main!(benches);

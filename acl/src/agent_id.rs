@@ -1,0 +1,262 @@
+//! The agent identifier (FIPA00023 clause 3.1).
+
+use std::fmt;
+use std::str::FromStr;
+
+use crate::word::{is_token, push_string_literal};
+
+/// Who an agent is: a globally unique name, and hints how to reach it.
+///
+/// Two identifiers are equal (`==`) when all they say is equal; they mean the same agent when
+/// their names are equal ([`same_agent`](Self::same_agent)).
+#[derive(Clone, PartialEq, Eq, Hash)]
+pub struct AgentId {
+    name: String,
+    addresses: Vec<String>,
+    resolvers: Vec<Self>,
+    user_defined: Vec<(String, String)>,
+}
+
+impl AgentId {
+    /// Longest name, in bytes.
+    pub const MAX_NAME: usize = 4096;
+    /// Deepest nesting of resolvers: an identifier without resolvers has depth 0.
+    pub const MAX_DEPTH: usize = 16;
+
+    /// An agent of this name, without addresses.
+    ///
+    /// # Errors
+    /// When the name is empty, longer than [`MAX_NAME`](Self::MAX_NAME) or has a NUL character.
+    pub fn new(name: impl Into<String>) -> Result<Self, AgentIdError> {
+        let name = name.into();
+        if name.is_empty() {
+            return Err(AgentIdError::EmptyName);
+        }
+        if name.len() > Self::MAX_NAME {
+            return Err(AgentIdError::NameTooLong(name.len()));
+        }
+        no_nul("name", &name)?;
+        Ok(Self {
+            name,
+            addresses: Vec::new(),
+            resolvers: Vec::new(),
+            user_defined: Vec::new(),
+        })
+    }
+
+    /// The same agent with one more transport address, less preferred than those before.
+    ///
+    /// # Errors
+    /// When the address is empty or has a NUL character.
+    pub fn with_address(mut self, address: impl Into<String>) -> Result<Self, AgentIdError> {
+        let address = address.into();
+        if address.is_empty() {
+            return Err(AgentIdError::EmptyAddress);
+        }
+        no_nul("address", &address)?;
+        self.addresses.push(address);
+        Ok(self)
+    }
+
+    /// The same agent with one more agent that can resolve its name.
+    ///
+    /// # Errors
+    /// When resolvers would be nested deeper than [`MAX_DEPTH`](Self::MAX_DEPTH).
+    pub fn with_resolver(mut self, resolver: Self) -> Result<Self, AgentIdError> {
+        if resolver.depth() >= Self::MAX_DEPTH {
+            return Err(AgentIdError::TooDeep);
+        }
+        self.resolvers.push(resolver);
+        Ok(self)
+    }
+
+    /// The same agent with one more user-defined parameter. The name is given without `X-`.
+    ///
+    /// # Errors
+    /// When the name is empty or has blanks, parentheses or control characters, or the value has
+    /// a NUL character.
+    pub fn with_user_defined(
+        mut self,
+        name: impl Into<String>,
+        value: impl Into<String>,
+    ) -> Result<Self, AgentIdError> {
+        let (name, value) = (name.into(), value.into());
+        if !is_token(&name) {
+            return Err(AgentIdError::UserDefinedName(
+                name.chars().take(60).collect(),
+            ));
+        }
+        no_nul("user-defined value", &value)?;
+        self.user_defined.push((name, value));
+        Ok(self)
+    }
+
+    /// The name.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Transport addresses (URLs), the preferred one first.
+    #[must_use]
+    pub fn addresses(&self) -> &[String] {
+        &self.addresses
+    }
+
+    /// Agents that can resolve the name, the preferred one first.
+    #[must_use]
+    pub fn resolvers(&self) -> &[Self] {
+        &self.resolvers
+    }
+
+    /// User-defined parameters, names without `X-`.
+    #[must_use]
+    pub fn user_defined(&self) -> &[(String, String)] {
+        &self.user_defined
+    }
+
+    /// Whether both mean the same agent: their names are equal.
+    #[must_use]
+    pub fn same_agent(&self, other: &Self) -> bool {
+        self.name == other.name
+    }
+
+    fn depth(&self) -> usize {
+        let below = self.resolvers.iter().map(|resolver| resolver.depth() + 1);
+        below.max().unwrap_or(0)
+    }
+
+    pub(crate) fn write_fipa00070(&self, out: &mut String) {
+        out.push_str("(agent-identifier :name ");
+        if is_token(&self.name) {
+            out.push_str(&self.name);
+        } else {
+            push_string_literal(out, &self.name);
+        }
+        if !self.addresses.is_empty() {
+            out.push_str(" :addresses (sequence");
+            for address in &self.addresses {
+                out.push(' ');
+                out.push_str(address);
+            }
+            out.push(')');
+        }
+        if !self.resolvers.is_empty() {
+            out.push_str(" :resolvers (sequence");
+            for resolver in &self.resolvers {
+                out.push(' ');
+                resolver.write_fipa00070(out);
+            }
+            out.push(')');
+        }
+        for (name, value) in &self.user_defined {
+            out.push_str(" :X-");
+            out.push_str(name);
+            out.push(' ');
+            push_string_literal(out, value);
+        }
+        out.push(')');
+    }
+}
+
+fn no_nul(part: &'static str, text: &str) -> Result<(), AgentIdError> {
+    if text.contains('\0') {
+        return Err(AgentIdError::Nul(part));
+    }
+    Ok(())
+}
+
+impl FromStr for AgentId {
+    type Err = AgentIdError;
+
+    /// The agent of this name: see [`AgentId::new`].
+    fn from_str(name: &str) -> Result<Self, Self::Err> {
+        Self::new(name)
+    }
+}
+
+/// Just the name; in the alternate form (`{:#}`) the whole identifier as FIPA00070 writes it.
+impl fmt::Display for AgentId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if !f.alternate() {
+            return f.pad(&self.name);
+        }
+        let mut text = String::new();
+        self.write_fipa00070(&mut text);
+        f.write_str(&text)
+    }
+}
+
+impl fmt::Debug for AgentId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{self:#}")
+    }
+}
+
+/// Why something cannot be (part of) an agent identifier.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum AgentIdError {
+    /// The name is empty.
+    #[error("an agent needs a name that is not empty")]
+    EmptyName,
+    /// The name is too long.
+    #[error("agent name of {0} bytes (at most {max} allowed)", max = AgentId::MAX_NAME)]
+    NameTooLong(usize),
+    /// There is a NUL character, which no encoding can carry.
+    #[error("the {0} of an agent identifier has a NUL character")]
+    Nul(&'static str),
+    /// A transport address is empty.
+    #[error("an address of an agent must not be empty")]
+    EmptyAddress,
+    /// Resolvers are nested too deep.
+    #[error("resolvers nested deeper than {max}", max = AgentId::MAX_DEPTH)]
+    TooDeep,
+    /// The name of a user-defined parameter is no word.
+    #[error(
+        "not a name for a user-defined parameter: {0:?} (no blanks, parentheses or control \
+         characters)"
+    )]
+    UserDefinedName(String),
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_and_parts_are_checked() {
+        assert_eq!(AgentId::new(""), Err(AgentIdError::EmptyName));
+        assert_eq!(AgentId::new("a\0"), Err(AgentIdError::Nul("name")));
+        let long = "x".repeat(AgentId::MAX_NAME + 1);
+        assert_eq!(AgentId::new(long), Err(AgentIdError::NameTooLong(4097)));
+        let bob = AgentId::new("bob").unwrap();
+        assert!(bob.clone().with_address("").is_err());
+        assert!(bob.clone().with_user_defined("a b", "c").is_err());
+        assert!(bob.with_user_defined("a", "\0").is_err());
+    }
+
+    #[test]
+    fn nesting_is_bounded() {
+        let mut agent = AgentId::new("a0").unwrap();
+        for depth in 1..=AgentId::MAX_DEPTH {
+            let outer = AgentId::new(format!("a{depth}")).unwrap();
+            agent = outer.with_resolver(agent).unwrap();
+        }
+        let outer = AgentId::new("outer").unwrap();
+        assert_eq!(outer.with_resolver(agent), Err(AgentIdError::TooDeep));
+    }
+
+    #[test]
+    fn the_name_decides_who_it_is() {
+        let plain = AgentId::new("bob@home").unwrap();
+        let known = plain.clone().with_address("tcp://h:1").unwrap();
+        assert_ne!(plain, known);
+        assert!(plain.same_agent(&known));
+        assert_eq!(known.to_string(), "bob@home");
+        assert_eq!(
+            format!("{known:#}"),
+            "(agent-identifier :name bob@home :addresses (sequence tcp://h:1))"
+        );
+    }
+}

@@ -1,0 +1,287 @@
+//! Agent identifiers in a bit-efficient message, borrowed.
+
+use crate::AgentId;
+use crate::bitefficient::reader::Reader;
+use crate::bitefficient::text::{Text, expression};
+use crate::error::{DecodeError, Problem};
+use crate::word::is_token;
+
+const CLAUSE: &str = "FIPA00069 2.1 AID";
+
+/// An agent identifier in an encoded message.
+#[derive(Debug, Clone, Copy)]
+pub struct AgentIdView<'a> {
+    name: &'a str,
+    /// Behind the code, up to and without the end of the list.
+    addresses: &'a [u8],
+    resolvers: &'a [u8],
+    /// What follows the name, up to and without the end of the identifier.
+    parameters: &'a [u8],
+}
+
+impl<'a> AgentIdView<'a> {
+    /// The name.
+    #[must_use]
+    pub fn name(&self) -> &'a str {
+        self.name
+    }
+
+    /// Transport addresses, the preferred one first.
+    pub fn addresses(&self) -> impl Iterator<Item = &'a str> + use<'a> {
+        let mut reader = Reader::new(self.addresses);
+        // Checked when the message was read: an error cannot occur, and would end the list.
+        std::iter::from_fn(move || {
+            (reader.peek()? == 0x10).then(|| reader.skip_peeked())?;
+            reader.plain(CLAUSE, "address").ok()
+        })
+    }
+
+    /// Agents that can resolve the name.
+    #[must_use]
+    pub fn resolvers(&self) -> AgentIds<'a> {
+        AgentIds::new(self.resolvers)
+    }
+
+    /// User-defined parameters, names without `X-`.
+    pub fn user_defined(&self) -> impl Iterator<Item = (&'a str, Text<'a>)> + use<'a> {
+        let mut reader = Reader::new(self.parameters);
+        std::iter::from_fn(move || {
+            loop {
+                match parameter(&mut reader, AgentId::MAX_DEPTH).ok()?? {
+                    Parameter::UserDefined(name, value) => return Some((name, value)),
+                    Parameter::Addresses(_) | Parameter::Resolvers(_) => {}
+                }
+            }
+        })
+    }
+
+    /// The identifier as an owned value.
+    pub(crate) fn to_owned(self) -> Result<AgentId, crate::AgentIdError> {
+        let mut agent = AgentId::new(self.name)?;
+        for address in self.addresses() {
+            agent = agent.with_address(address)?;
+        }
+        for resolver in self.resolvers() {
+            agent = agent.with_resolver(resolver.to_owned()?)?;
+        }
+        for (name, value) in self.user_defined() {
+            agent = agent.with_user_defined(name, value.as_str())?;
+        }
+        Ok(agent)
+    }
+}
+
+/// The agent identifiers of a set or sequence in an encoded message.
+#[derive(Debug, Clone, Default)]
+pub struct AgentIds<'a> {
+    reader: Option<Reader<'a>>,
+}
+
+impl<'a> AgentIds<'a> {
+    /// The identifiers in checked bytes.
+    pub(crate) fn new(bytes: &'a [u8]) -> Self {
+        Self {
+            reader: Some(Reader::new(bytes)),
+        }
+    }
+}
+
+impl<'a> Iterator for AgentIds<'a> {
+    type Item = AgentIdView<'a>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let reader = self.reader.as_mut()?;
+        (reader.remaining() > 0).then_some(())?;
+        // Checked when the message was read: an error cannot occur, and would end the list.
+        agent_id(reader, AgentId::MAX_DEPTH).ok()
+    }
+}
+
+/// Reads an agent identifier, whose resolvers may be nested `depth` deep.
+pub(crate) fn agent_id<'a>(
+    reader: &mut Reader<'a>,
+    depth: usize,
+) -> Result<AgentIdView<'a>, DecodeError> {
+    let code = reader.byte(CLAUSE, "an agent identifier")?;
+    if code != 0x02 {
+        return Err(reader.unexpected(CLAUSE, code, "an agent identifier"));
+    }
+    let offset = reader.offset();
+    let name = word(reader, "agent name")?;
+    let wrong = |problem| Err(DecodeError::new(offset, CLAUSE, problem));
+    if name.is_empty() {
+        return wrong(Problem::Empty("agent name"));
+    }
+    if name.len() > AgentId::MAX_NAME {
+        return wrong(Problem::TooLong("agent name"));
+    }
+    let mut view = AgentIdView {
+        name,
+        addresses: &[],
+        resolvers: &[],
+        parameters: &[],
+    };
+    let start = reader.position();
+    loop {
+        let before = reader.position();
+        match parameter(reader, depth)? {
+            Some(Parameter::Addresses(addresses)) => view.addresses = addresses,
+            Some(Parameter::Resolvers(resolvers)) => view.resolvers = resolvers,
+            Some(Parameter::UserDefined(..)) => {}
+            None => {
+                let with_end = reader.since(start);
+                view.parameters = with_end.get(..before - start).unwrap_or_default();
+                return Ok(view);
+            }
+        }
+    }
+}
+
+/// Reads agent identifiers up to the end of their set, and gives the bytes in front of that.
+pub(crate) fn agent_ids<'a>(
+    reader: &mut Reader<'a>,
+    depth: usize,
+) -> Result<&'a [u8], DecodeError> {
+    let start = reader.position();
+    loop {
+        let ids = reader.since(start);
+        if reader.take_if(0x01) {
+            return Ok(ids);
+        }
+        agent_id(reader, depth)?;
+    }
+}
+
+enum Parameter<'a> {
+    Addresses(&'a [u8]),
+    Resolvers(&'a [u8]),
+    UserDefined(&'a str, Text<'a>),
+}
+
+/// The next parameter of an identifier, or `None` at its end (or, in bytes cut out before, at
+/// theirs).
+fn parameter<'a>(
+    reader: &mut Reader<'a>,
+    depth: usize,
+) -> Result<Option<Parameter<'a>>, DecodeError> {
+    let code = reader.byte(CLAUSE, "an agent identifier")?;
+    Ok(Some(match code {
+        0x01 => return Ok(None),
+        0x02 => Parameter::Addresses(addresses(reader)?),
+        0x03 => {
+            let Some(depth) = depth.checked_sub(1) else {
+                return Err(reader.error(CLAUSE, Problem::TooDeep("resolvers")));
+            };
+            Parameter::Resolvers(agent_ids(reader, depth)?)
+        }
+        0x04 => {
+            let (name, value) = user_defined(reader)?;
+            Parameter::UserDefined(name, value)
+        }
+        other => return Err(reader.unexpected(CLAUSE, other, "a part of an agent identifier")),
+    }))
+}
+
+fn addresses<'a>(reader: &mut Reader<'a>) -> Result<&'a [u8], DecodeError> {
+    let start = reader.position();
+    loop {
+        let addresses = reader.since(start);
+        if reader.take_if(0x01) {
+            return Ok(addresses);
+        }
+        if word(reader, "address")?.is_empty() {
+            return Err(reader.error(CLAUSE, Problem::Empty("address")));
+        }
+    }
+}
+
+/// Reads a `BinWord`.
+#[inline]
+pub(crate) fn word<'a>(
+    reader: &mut Reader<'a>,
+    what: &'static str,
+) -> Result<&'a str, DecodeError> {
+    const CLAUSE: &str = "FIPA00069 2.1 BinWord";
+    match reader.byte(CLAUSE, what)? {
+        0x10 => reader.plain(CLAUSE, what),
+        0x11 => Err(reader.error(CLAUSE, Problem::CodeTable)),
+        other => Err(reader.unexpected(CLAUSE, other, what)),
+    }
+}
+
+/// Reads name and value of a user-defined parameter; the name comes without `X-`.
+pub(crate) fn user_defined<'a>(
+    reader: &mut Reader<'a>,
+) -> Result<(&'a str, Text<'a>), DecodeError> {
+    let offset = reader.offset();
+    let name = without_x(word(reader, "user-defined name")?);
+    if !is_token(name) {
+        let problem = Problem::NotAWord("name of a user-defined parameter");
+        return Err(DecodeError::new(offset, "FIPA00061 user-defined", problem));
+    }
+    // JADE writes an empty value as a lone 00, which is no expression.
+    if reader.take_if(0x00) {
+        return Ok((name, Text::plain("")));
+    }
+    Ok((name, expression(reader, "user-defined value")?))
+}
+
+/// The name of a user-defined parameter without its `X-`, which not every peer writes.
+pub(crate) fn without_x(name: &str) -> &str {
+    match name.as_bytes() {
+        [b'X' | b'x', b'-', _, ..] => name.get(2..).unwrap_or(name),
+        _ => name,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_parts_in_any_order() {
+        let bytes = b"\x02\x10a\0\x04\x10X-p\0\x12\x80\x03\x02\x10r\0\x01\x01\x02\x10u:1\0\x10u:2\0\x01\x01";
+        let mut reader = Reader::new(bytes);
+        let view = agent_id(&mut reader, 16).unwrap();
+        assert_eq!(reader.remaining(), 0);
+        assert_eq!(view.name(), "a");
+        assert_eq!(view.addresses().collect::<Vec<_>>(), ["u:1", "u:2"]);
+        assert_eq!(
+            view.resolvers().map(|r| r.name()).collect::<Vec<_>>(),
+            ["r"]
+        );
+        let user: Vec<_> = view.user_defined().collect();
+        assert_eq!(user, [("p", Text::plain("7"))]);
+        assert_eq!(
+            view.to_owned().unwrap().user_defined(),
+            [("p".into(), "7".into())]
+        );
+    }
+
+    #[test]
+    fn resolvers_are_not_followed_for_ever() {
+        let nested = |depth: usize| {
+            let mut bytes = b"\x02\x10a\0\x03".repeat(depth);
+            bytes.extend_from_slice(b"\x02\x10a\0\x01");
+            bytes.extend_from_slice(&b"\x01\x01".repeat(depth));
+            bytes
+        };
+        let deepest = nested(AgentId::MAX_DEPTH);
+        assert!(agent_id(&mut Reader::new(&deepest), AgentId::MAX_DEPTH).is_ok());
+        let error = agent_id(&mut Reader::new(&nested(50_000)), AgentId::MAX_DEPTH).unwrap_err();
+        assert_eq!(error.problem(), &Problem::TooDeep("resolvers"));
+    }
+
+    #[test]
+    fn names_and_addresses_must_be_there() {
+        for bytes in [
+            &b"\x02\x10\0\x01"[..],
+            b"\x02\x10a\0\x02\x10\0\x01\x01",
+            b"\x02\x10a\0",
+            b"\x02\x10a\0\x05",
+            b"\x03",
+        ] {
+            assert!(agent_id(&mut Reader::new(bytes), 16).is_err(), "{bytes:?}");
+        }
+    }
+}

@@ -1,0 +1,381 @@
+//! Reading what both bit-efficient formats consist of, with every bound checked.
+
+use crate::bitefficient::text::Text;
+use crate::error::{DecodeError, Problem};
+use crate::time::{Base, Fields, Time, Zone};
+
+/// A place in bytes that came from outside.
+#[derive(Debug, Clone)]
+pub(crate) struct Reader<'a> {
+    bytes: &'a [u8],
+    position: usize,
+    /// Where `bytes` begin in what is decoded, for errors.
+    base: usize,
+}
+
+type Result<T> = std::result::Result<T, DecodeError>;
+
+impl<'a> Reader<'a> {
+    pub(crate) fn new(bytes: &'a [u8]) -> Self {
+        Self::at(bytes, 0)
+    }
+
+    pub(crate) fn at(bytes: &'a [u8], base: usize) -> Self {
+        Self {
+            bytes,
+            position: 0,
+            base,
+        }
+    }
+
+    /// How many bytes were read.
+    #[inline]
+    pub(crate) fn position(&self) -> usize {
+        self.position
+    }
+
+    /// Where the next byte stands in what is decoded.
+    #[inline]
+    pub(crate) fn offset(&self) -> usize {
+        self.base + self.position
+    }
+
+    #[inline]
+    pub(crate) fn remaining(&self) -> usize {
+        self.bytes.len() - self.position
+    }
+
+    /// What was read since `start`, a former [`position`](Self::position).
+    #[inline]
+    pub(crate) fn since(&self, start: usize) -> &'a [u8] {
+        self.bytes.get(start..self.position).unwrap_or_default()
+    }
+
+    #[cold]
+    pub(crate) fn error(&self, clause: &'static str, problem: Problem) -> DecodeError {
+        DecodeError::new(self.offset(), clause, problem)
+    }
+
+    /// The error for the byte that was read last.
+    #[cold]
+    pub(crate) fn unexpected(
+        &self,
+        clause: &'static str,
+        found: u8,
+        expected: &'static str,
+    ) -> DecodeError {
+        let offset = self.offset().saturating_sub(1);
+        DecodeError::new(offset, clause, Problem::Unexpected { found, expected })
+    }
+
+    #[inline]
+    pub(crate) fn byte(&mut self, clause: &'static str, what: &'static str) -> Result<u8> {
+        match self.bytes.get(self.position) {
+            Some(&byte) => {
+                self.position += 1;
+                Ok(byte)
+            }
+            None => Err(self.error(clause, Problem::Truncated(what))),
+        }
+    }
+
+    #[inline]
+    pub(crate) fn peek(&self) -> Option<u8> {
+        self.bytes.get(self.position).copied()
+    }
+
+    /// Passes over the next byte, which was peeked at.
+    #[inline]
+    pub(crate) fn skip_peeked(&mut self) {
+        self.position = self.bytes.len().min(self.position + 1);
+    }
+
+    /// Reads the byte if it is the next one.
+    #[inline]
+    pub(crate) fn take_if(&mut self, byte: u8) -> bool {
+        let next = self.peek() == Some(byte);
+        if next {
+            self.position += 1;
+        }
+        next
+    }
+
+    #[inline]
+    pub(crate) fn bytes(
+        &mut self,
+        len: usize,
+        clause: &'static str,
+        what: &'static str,
+    ) -> Result<&'a [u8]> {
+        let rest = self.bytes.get(self.position..).unwrap_or_default();
+        match rest.get(..len) {
+            Some(taken) => {
+                self.position += len;
+                Ok(taken)
+            }
+            None => Err(self.error(clause, Problem::Truncated(what))),
+        }
+    }
+
+    pub(crate) fn u8_len(&mut self, clause: &'static str) -> Result<usize> {
+        self.byte(clause, "a length").map(usize::from)
+    }
+
+    pub(crate) fn u16_len(&mut self, clause: &'static str) -> Result<usize> {
+        let bytes = self.bytes(2, clause, "a length")?;
+        Ok(bytes
+            .iter()
+            .fold(0, |len, byte| len << 8 | usize::from(*byte)))
+    }
+
+    pub(crate) fn u32_len(&mut self, clause: &'static str) -> Result<usize> {
+        let bytes = self.bytes(4, clause, "a length")?;
+        let long = bytes
+            .iter()
+            .fold(0, |len, byte| len << 8 | u64::from(*byte));
+        usize::try_from(long).map_err(|_| self.error(clause, Problem::TooLong("length")))
+    }
+
+    /// The bytes up to the next NUL, which is read too.
+    #[inline]
+    pub(crate) fn until_nul(
+        &mut self,
+        clause: &'static str,
+        what: &'static str,
+    ) -> Result<&'a [u8]> {
+        let rest = self.bytes.get(self.position..).unwrap_or_default();
+        match find_nul(rest) {
+            Some(len) => {
+                self.position += len + 1;
+                Ok(rest.get(..len).unwrap_or_default())
+            }
+            None => Err(self.error(clause, Problem::Truncated(what))),
+        }
+    }
+
+    /// UTF-8 text up to the next NUL, as it stands.
+    #[inline]
+    pub(crate) fn plain(&mut self, clause: &'static str, what: &'static str) -> Result<&'a str> {
+        let offset = self.offset();
+        let bytes = self.until_nul(clause, what)?;
+        utf8(bytes, offset, clause, what)
+    }
+
+    /// Text up to the next NUL, by the rule for `String 00` that fits every peer: in quotation
+    /// marks (standard, fipa_services), with its length in front (fipa_services), or bare (JADE).
+    #[inline]
+    pub(crate) fn string(&mut self, clause: &'static str, what: &'static str) -> Result<Text<'a>> {
+        let offset = self.offset();
+        let (form, bytes) = string_form(self.until_nul(clause, what)?);
+        let text = utf8(bytes, offset, clause, what)?;
+        Ok(match form {
+            Form::Quoted => Text::quoted(text),
+            Form::Counted => Text::counted(text),
+            Form::Bare => Text::plain(text),
+        })
+    }
+
+    /// A date and time after its code byte (FIPA00069 `BinDateTime`), which says what follows.
+    pub(crate) fn date_time(&mut self, clause: &'static str) -> Result<Time> {
+        let code = self.byte(clause, "a date")?;
+        let base = match code {
+            0x20 | 0x24 => Base::Absolute,
+            0x21 | 0x25 => Base::After,
+            0x22 | 0x26 => Base::Before,
+            other => return Err(self.unexpected(clause, other, "the code of a date")),
+        };
+        let offset = self.offset();
+        let wrong = || DecodeError::new(offset, clause, Problem::DateTime);
+        let digits = self.bytes(9, clause, "a date")?;
+        let fields = bin_date(digits).ok_or_else(wrong)?;
+        let zone = if code >= 0x24 {
+            let letter = self.byte(clause, "a date")?;
+            Zone::of_letter(letter).ok_or_else(wrong)?
+        } else {
+            Zone::Unspecified
+        };
+        Time::new(base, zone, fields).map_err(|_| wrong())
+    }
+
+    /// Digits (FIPA00069 2.2): ends behind the first byte whose low nibble is 0.
+    pub(crate) fn digits(&mut self, clause: &'static str) -> Result<&'a [u8]> {
+        let rest = self.bytes.get(self.position..).unwrap_or_default();
+        let last = rest.iter().position(|byte| byte & 0x0f == 0);
+        let Some(last) = last else {
+            return Err(self.error(clause, Problem::Truncated("a number")));
+        };
+        let digits = self.bytes(last + 1, clause, "a number")?;
+        if digit_chars(digits).any(|char| char.is_none()) {
+            let offset = self.offset() - digits.len();
+            return Err(DecodeError::new(offset, clause, Problem::Number));
+        }
+        Ok(digits)
+    }
+}
+
+/// The way a `String` was written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Form {
+    Quoted,
+    Counted,
+    Bare,
+}
+
+/// Takes off quotation marks or a byte count. The escapes in a quoted text remain.
+#[inline]
+pub(crate) fn string_form(bytes: &[u8]) -> (Form, &[u8]) {
+    match bytes {
+        [b'"', inner @ .., b'"'] => (Form::Quoted, inner),
+        [b'#', rest @ ..] => match counted(rest) {
+            Some(text) => (Form::Counted, text),
+            None => (Form::Bare, bytes),
+        },
+        _ => (Form::Bare, bytes),
+    }
+}
+
+/// The text behind `n"`, if it is of n bytes.
+fn counted(bytes: &[u8]) -> Option<&[u8]> {
+    // A length has at most 10 digits; looking no further keeps hostile input cheap.
+    let mark = bytes.iter().take(11).position(|&byte| byte == b'"')?;
+    let (digits, text) = (bytes.get(..mark)?, bytes.get(mark + 1..)?);
+    let mut len = 0_usize;
+    for digit in digits {
+        if !digit.is_ascii_digit() {
+            return None;
+        }
+        len = len * 10 + usize::from(digit - b'0');
+    }
+    (!digits.is_empty() && len == text.len()).then_some(text)
+}
+
+/// Words and names are a few bytes long: looking at those first is quicker than starting a
+/// vectorised search.
+#[inline]
+fn find_nul(bytes: &[u8]) -> Option<usize> {
+    const NEAR: usize = 24;
+    let (near, far) = bytes.split_at_checked(NEAR).unwrap_or((bytes, &[]));
+    match near.iter().position(|&byte| byte == 0) {
+        Some(place) => Some(place),
+        None => memchr::memchr(0, far).map(|place| place + NEAR),
+    }
+}
+
+#[inline]
+pub(crate) fn utf8<'a>(
+    bytes: &'a [u8],
+    offset: usize,
+    clause: &'static str,
+    what: &'static str,
+) -> Result<&'a str> {
+    std::str::from_utf8(bytes).map_err(|error| {
+        DecodeError::new(offset + error.valid_up_to(), clause, Problem::NotUtf8(what))
+    })
+}
+
+/// The characters of digits that were read; `None` stands for a nibble without a meaning.
+pub(crate) fn digit_chars(digits: &[u8]) -> impl Iterator<Item = Option<char>> + '_ {
+    let nibbles = digits.iter().flat_map(|byte| [byte >> 4, byte & 0x0f]);
+    // Only the last byte can have padding.
+    let count = digits.len() * 2;
+    nibbles
+        .enumerate()
+        .filter(move |&(place, nibble)| !(nibble == 0 && place + 2 >= count))
+        .map(|(_, nibble)| match nibble {
+            1..=10 => Some(char::from(b'0' + nibble - 1)),
+            12 => Some('+'),
+            13 => Some('E'),
+            14 => Some('-'),
+            15 => Some('.'),
+            _ => None,
+        })
+}
+
+/// The nine bytes of `BinDate` (FIPA00069 2.3). Milliseconds are three digits and padding, or four
+/// digits (fipa_services). The fields between year and milliseconds may be one digit and padding.
+fn bin_date(digits: &[u8]) -> Option<Fields> {
+    let &[y1, y2, month, day, hour, minute, second, m1, m2] = digits else {
+        return None;
+    };
+    let two = |byte: u8| Some(nibble(byte >> 4)? * 10 + nibble(byte & 0x0f)?);
+    let padded = |byte: u8| match (byte >> 4, byte & 0x0f) {
+        (digit, 0) | (0, digit) => nibble(digit),
+        _ => two(byte),
+    };
+    let millisecond = if m2 & 0x0f == 0 {
+        u16::from(two(m1)?) * 10 + u16::from(nibble(m2 >> 4)?)
+    } else {
+        u16::from(two(m1)?) * 100 + u16::from(two(m2)?)
+    };
+    Some(Fields {
+        year: u16::from(two(y1)?) * 100 + u16::from(two(y2)?),
+        month: padded(month)?,
+        day: padded(day)?,
+        hour: padded(hour)?,
+        minute: padded(minute)?,
+        second: padded(second)?,
+        millisecond,
+    })
+}
+
+fn nibble(nibble: u8) -> Option<u8> {
+    (1..=10).contains(&nibble).then(|| nibble - 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn text_of(digits: &[u8]) -> String {
+        let mut reader = Reader::new(digits);
+        let read = reader.digits("").unwrap();
+        assert_eq!(reader.remaining(), 0);
+        digit_chars(read).map(Option::unwrap).collect()
+    }
+
+    #[test]
+    fn digits_of_the_clause() {
+        for (bytes, text) in [
+            (&[0x80][..], "7"),
+            (&[0x53, 0x00], "42"),
+            (&[0x21, 0x10], "100"),
+            (&[0xe2, 0xf6, 0x00], "-1.5"),
+            (&[0x76, 0x64, 0x70], "65536"),
+            (&[0x2d, 0x21, 0x00], "1E10"),
+        ] {
+            assert_eq!(text_of(bytes), text);
+        }
+        assert!(Reader::new(&[0x53]).digits("").is_err(), "no end");
+        assert!(Reader::new(&[0xb0]).digits("").is_err(), "B has no meaning");
+        assert!(
+            Reader::new(&[0x03, 0x10]).digits("").is_err(),
+            "padding in front"
+        );
+    }
+
+    #[test]
+    fn milliseconds_of_three_and_of_four_digits() {
+        let padded = [0x20, 0x31, 0x11, 0x16, 0x19, 0x15, 0x37, 0x62, 0x59, 0x20];
+        let four = [0x20, 0x31, 0x11, 0x16, 0x19, 0x15, 0x37, 0x62, 0x15, 0x92];
+        for bytes in [padded, four] {
+            let time = Reader::new(&bytes).date_time("").unwrap();
+            assert_eq!(time.to_string(), "20000508T042651481");
+        }
+    }
+
+    #[test]
+    fn the_form_of_strings() {
+        for (bytes, form, text) in [
+            (&b"\"hi\""[..], Form::Quoted, &b"hi"[..]),
+            (b"#2\"hi", Form::Counted, b"hi"),
+            (b"#3\"hi", Form::Bare, b"#3\"hi"),
+            (b"#\"\"", Form::Bare, b"#\"\""),
+            (b"#99999999999\"x", Form::Bare, b"#99999999999\"x"),
+            (b"\"", Form::Bare, b"\""),
+            (b"hi", Form::Bare, b"hi"),
+            (b"", Form::Bare, b""),
+        ] {
+            assert_eq!(string_form(bytes), (form, text));
+        }
+    }
+}

@@ -1,0 +1,436 @@
+//! Text parameters: words, strings, numbers and expressions, borrowed from the message.
+
+use std::borrow::Cow;
+use std::fmt;
+
+use crate::bitefficient::reader::{Form, Reader, digit_chars, string_form, utf8};
+use crate::error::{DecodeError, Problem};
+use crate::word::push_string_literal;
+
+/// A text parameter of an encoded message or envelope.
+///
+/// Most are there byte by byte; a string with escapes and an expression have to be written out,
+/// which [`as_str`](Self::as_str) does when it is called.
+#[derive(Clone, Copy)]
+pub struct Text<'a>(Repr<'a>);
+
+#[derive(Clone, Copy)]
+enum Repr<'a> {
+    /// As it stands.
+    Plain(&'a str),
+    /// As it stands, after a byte count: the hand of fipa_services.
+    Counted(&'a str),
+    /// The inside of quotation marks, `\"` standing for `"`.
+    Quoted(&'a str),
+    /// A number or an expression in its encoded form, checked.
+    Encoded(&'a [u8]),
+}
+
+impl<'a> Text<'a> {
+    /// The text; numbers and expressions as FIPA00070 writes them.
+    #[must_use]
+    pub fn as_str(&self) -> Cow<'a, str> {
+        match self.0 {
+            Repr::Plain(text) | Repr::Counted(text) => Cow::Borrowed(text),
+            Repr::Quoted(inner) => unescaped(inner),
+            Repr::Encoded(bytes) => Cow::Owned(render(bytes)),
+        }
+    }
+
+    /// Whether the text is empty.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        match self.0 {
+            Repr::Plain(text) | Repr::Counted(text) | Repr::Quoted(text) => text.is_empty(),
+            Repr::Encoded(_) => false,
+        }
+    }
+
+    /// The text as it stands in the bytes, escapes included; empty for numbers and expressions.
+    pub(crate) fn raw(&self) -> &'a str {
+        match self.0 {
+            Repr::Plain(text) | Repr::Counted(text) | Repr::Quoted(text) => text,
+            Repr::Encoded(_) => "",
+        }
+    }
+
+    pub(crate) fn plain(text: &'a str) -> Self {
+        Self(Repr::Plain(text))
+    }
+
+    pub(crate) fn quoted(inner: &'a str) -> Self {
+        Self(Repr::Quoted(inner))
+    }
+
+    pub(crate) fn counted(text: &'a str) -> Self {
+        Self(Repr::Counted(text))
+    }
+
+    /// Whether the text was written with a byte count, as only fipa_services does in envelopes.
+    pub(crate) fn is_counted(&self) -> bool {
+        matches!(self.0, Repr::Counted(_))
+    }
+}
+
+/// Compares the texts, however they are encoded.
+impl PartialEq for Text<'_> {
+    fn eq(&self, other: &Self) -> bool {
+        self.as_str() == other.as_str()
+    }
+}
+
+impl Eq for Text<'_> {}
+
+impl PartialEq<str> for Text<'_> {
+    fn eq(&self, other: &str) -> bool {
+        self.as_str() == other
+    }
+}
+
+impl PartialEq<&str> for Text<'_> {
+    fn eq(&self, other: &&str) -> bool {
+        self.as_str() == *other
+    }
+}
+
+impl fmt::Display for Text<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(&self.as_str())
+    }
+}
+
+impl fmt::Debug for Text<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:?}", self.as_str())
+    }
+}
+
+/// Deepest nesting of expressions that is accepted.
+pub(crate) const MAX_EXPRESSION_DEPTH: usize = 64;
+
+const CLAUSE: &str = "FIPA00069 2.1 BinExpression";
+
+/// Reads a `BinExpression`: checked in one pass, nothing kept but where it is.
+#[inline]
+pub(crate) fn expression<'a>(
+    reader: &mut Reader<'a>,
+    what: &'static str,
+) -> Result<Text<'a>, DecodeError> {
+    match reader.peek() {
+        // The two forms that nearly every text has.
+        Some(0x10) => {
+            reader.skip_peeked();
+            reader.plain(CLAUSE, what).map(Text::plain)
+        }
+        Some(0x14) => {
+            reader.skip_peeked();
+            reader.string(CLAUSE, what)
+        }
+        _ => other_expression(reader, what),
+    }
+}
+
+fn other_expression<'a>(
+    reader: &mut Reader<'a>,
+    what: &'static str,
+) -> Result<Text<'a>, DecodeError> {
+    let start = reader.position();
+    let code = reader.byte(CLAUSE, what)?;
+    match code {
+        // An opaque expression, a leftover of former editions: the string that follows is it.
+        0xff => {
+            let code = reader.byte(CLAUSE, what)?;
+            string_after(reader, code, what)
+        }
+        0x16 | 0x17 | 0x19 => string_after(reader, code, what),
+        0x12 | 0x13 => {
+            reader.digits(CLAUSE)?;
+            Ok(Text(Repr::Encoded(reader.since(start))))
+        }
+        0x60 | 0x70..=0x79 => {
+            check_levels(reader, code, what)?;
+            Ok(Text(Repr::Encoded(reader.since(start))))
+        }
+        0x11 | 0x15 | 0x18 => Err(reader.error(CLAUSE, Problem::CodeTable)),
+        other => Err(reader.unexpected(CLAUSE, other, "an expression")),
+    }
+}
+
+/// The text of a `BinString` whose code was read.
+fn string_after<'a>(
+    reader: &mut Reader<'a>,
+    code: u8,
+    what: &'static str,
+) -> Result<Text<'a>, DecodeError> {
+    if code == 0x14 {
+        return reader.string(CLAUSE, what);
+    }
+    if matches!(code, 0x15 | 0x18) {
+        return Err(reader.error(CLAUSE, Problem::CodeTable));
+    }
+    let len = match code {
+        0x16 => reader.u8_len(CLAUSE)?,
+        0x17 => reader.u16_len(CLAUSE)?,
+        0x19 => reader.u32_len(CLAUSE)?,
+        other => return Err(reader.unexpected(CLAUSE, other, "a string")),
+    };
+    let offset = reader.offset();
+    let bytes = reader.bytes(len, CLAUSE, what)?;
+    if memchr::memchr(0, bytes).is_some() {
+        return Err(DecodeError::new(offset, CLAUSE, Problem::Nul(what)));
+    }
+    utf8(bytes, offset, CLAUSE, what).map(Text::plain)
+}
+
+/// Walks over a parenthesised expression whose first byte was read, up to the parenthesis that
+/// closes it.
+fn check_levels(reader: &mut Reader<'_>, first: u8, what: &'static str) -> Result<(), DecodeError> {
+    let mut depth = 0_usize;
+    let mut code = first;
+    loop {
+        match code {
+            0x60 | 0x70..=0x79 => depth += 1,
+            0x40 | 0x50..=0x59 => depth = depth.saturating_sub(1),
+            _ => {}
+        }
+        if depth > MAX_EXPRESSION_DEPTH {
+            return Err(reader.error(CLAUSE, Problem::TooDeep("expressions")));
+        }
+        if depth == 0 {
+            // A token fused with the last parenthesis would stand outside of everything.
+            return if code == 0x40 {
+                Ok(())
+            } else {
+                Err(reader.error(CLAUSE, Problem::Unbalanced))
+            };
+        }
+        check_token(reader, code, what)?;
+        code = reader.byte(CLAUSE, what)?;
+    }
+}
+
+/// The kind of token that a code inside an expression announces.
+enum Token {
+    /// Nothing but the parenthesis.
+    None,
+    Word,
+    Number,
+    String,
+    Len8,
+    Len16,
+    Len32,
+}
+
+/// FIPA00069 2.1: the code of Len32 is x9 among the strings, and x8 among the levels.
+fn token_of(code: u8) -> Option<Token> {
+    Some(match code {
+        0x40 | 0x60 => Token::None,
+        0x10 | 0x50 | 0x70 => Token::Word,
+        0x12 | 0x13 | 0x52 | 0x53 | 0x72 | 0x73 => Token::Number,
+        0x14 | 0x54 | 0x74 => Token::String,
+        0x16 | 0x56 | 0x76 => Token::Len8,
+        0x17 | 0x57 | 0x77 => Token::Len16,
+        0x19 | 0x58 | 0x78 => Token::Len32,
+        _ => return None,
+    })
+}
+
+fn check_token(reader: &mut Reader<'_>, code: u8, what: &'static str) -> Result<(), DecodeError> {
+    let Some(token) = token_of(code) else {
+        return Err(match code {
+            0x11 | 0x15 | 0x18 | 0x51 | 0x55 | 0x59 | 0x71 | 0x75 | 0x79 => {
+                reader.error(CLAUSE, Problem::CodeTable)
+            }
+            other => reader.unexpected(CLAUSE, other, "an expression"),
+        });
+    };
+    match token {
+        Token::None => {}
+        Token::Word => {
+            reader.plain(CLAUSE, what)?;
+        }
+        Token::Number => {
+            reader.digits(CLAUSE)?;
+        }
+        Token::String => {
+            reader.string(CLAUSE, what)?;
+        }
+        Token::Len8 => {
+            string_after(reader, 0x16, what)?;
+        }
+        Token::Len16 => {
+            string_after(reader, 0x17, what)?;
+        }
+        Token::Len32 => {
+            string_after(reader, 0x19, what)?;
+        }
+    }
+    Ok(())
+}
+
+/// Writes a checked number or expression as FIPA00070 does.
+fn render(bytes: &[u8]) -> String {
+    let mut out = String::new();
+    let mut reader = Reader::new(bytes);
+    while let Some(code) = reader.peek() {
+        reader.skip_peeked();
+        match code {
+            0x40 | 0x50..=0x59 => out.push(')'),
+            0x60 | 0x70..=0x79 => {
+                separate(&mut out);
+                out.push('(');
+            }
+            _ => {}
+        }
+        // The bytes were checked when the message was read: this cannot fail.
+        if render_token(&mut reader, code, &mut out).is_err() {
+            break;
+        }
+    }
+    out
+}
+
+fn render_token(reader: &mut Reader<'_>, code: u8, out: &mut String) -> Result<(), DecodeError> {
+    let text = match token_of(code) {
+        None | Some(Token::None) => return Ok(()),
+        Some(Token::Word) => {
+            separate(out);
+            out.push_str(reader.plain(CLAUSE, "word")?);
+            return Ok(());
+        }
+        Some(Token::Number) => {
+            separate(out);
+            out.extend(digit_chars(reader.digits(CLAUSE)?).flatten());
+            return Ok(());
+        }
+        Some(Token::String) => reader.string(CLAUSE, "string")?,
+        Some(Token::Len8) => string_after(reader, 0x16, "string")?,
+        Some(Token::Len16) => string_after(reader, 0x17, "string")?,
+        Some(Token::Len32) => string_after(reader, 0x19, "string")?,
+    };
+    separate(out);
+    push_string_literal(out, &text.as_str());
+    Ok(())
+}
+
+fn separate(out: &mut String) {
+    if !out.is_empty() && !out.ends_with('(') {
+        out.push(' ');
+    }
+}
+
+/// `\"` becomes `"`; a backslash before anything else is a backslash.
+fn unescaped(inner: &str) -> Cow<'_, str> {
+    if memchr::memmem::find(inner.as_bytes(), b"\\\"").is_some() {
+        Cow::Owned(inner.replace("\\\"", "\""))
+    } else {
+        Cow::Borrowed(inner)
+    }
+}
+
+/// The content of a `14 String 00`, which need not be UTF-8.
+pub(crate) fn string_content(bytes: &[u8]) -> Cow<'_, [u8]> {
+    let (form, inner) = string_form(bytes);
+    let mut escapes = memchr::memmem::find_iter(inner, b"\\\"").peekable();
+    if form != Form::Quoted || escapes.peek().is_none() {
+        return Cow::Borrowed(inner);
+    }
+    let mut out = Vec::with_capacity(inner.len());
+    let mut done = 0;
+    for backslash in escapes {
+        out.extend_from_slice(inner.get(done..backslash).unwrap_or_default());
+        done = backslash + 1;
+    }
+    out.extend_from_slice(inner.get(done..).unwrap_or_default());
+    Cow::Owned(out)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(bytes: &[u8]) -> Result<String, DecodeError> {
+        let mut reader = Reader::new(bytes);
+        let text = expression(&mut reader, "test")?;
+        assert_eq!(reader.remaining(), 0);
+        Ok(text.as_str().into_owned())
+    }
+
+    #[test]
+    fn every_form_of_text() {
+        for (bytes, text) in [
+            (&b"\x10word\0"[..], "word"),
+            (b"\x14\"a \\\"b\\\"\"\0", "a \"b\""),
+            (b"\x14\"la\\ng\"\0", "la\\ng"),
+            (b"\x14\"on\"to\"\0", "on\"to"),
+            (b"\x14#3\"a\"b\0", "a\"b"),
+            (b"\x14a b\0", "a b"),
+            (b"\x16\x03a b", "a b"),
+            (b"\x17\x00\x01a", "a"),
+            (b"\x19\0\0\0\x01a", "a"),
+            (b"\xff\x14\"(x)\"\0", "(x)"),
+            (b"\x12\x53\x00", "42"),
+            (b"\x13\x80", "7"),
+        ] {
+            assert_eq!(read(bytes).as_deref(), Ok(text), "{bytes:?}");
+        }
+    }
+
+    #[test]
+    fn expressions_are_written_out() {
+        let fused = b"\x70seq\0\x12\x53\0\x12\xe2\xf6\0\x14\"a\"\0\x40";
+        assert_eq!(read(fused).unwrap(), "(seq 42 -1.5 \"a\")");
+        assert_eq!(read(b"\x60\x10HI\0\x40").unwrap(), "(HI)");
+        let levels = b"\x60\x60\x10a\0\x50b\0\x74\"c\"\0\x40\x40";
+        assert_eq!(read(levels).unwrap(), "((a) b (\"c\"))");
+        assert_eq!(
+            read(b"\x78\0\0\0\x01a\x58\0\0\0\x01b")
+                .unwrap_err()
+                .problem(),
+            &Problem::Unbalanced
+        );
+        assert_eq!(
+            read(b"\x60\x78\0\0\0\x01a\x58\0\0\0\x01b\x40").unwrap(),
+            "((\"a\") \"b\")"
+        );
+    }
+
+    #[test]
+    fn nesting_is_bounded() {
+        let nested = |depth: usize| [vec![0x60; depth], vec![0x40; depth]].concat();
+        assert!(read(&nested(MAX_EXPRESSION_DEPTH)).is_ok());
+        let error = read(&nested(MAX_EXPRESSION_DEPTH + 1)).unwrap_err();
+        assert_eq!(error.problem(), &Problem::TooDeep("expressions"));
+        assert!(read(&vec![0x60; 1_000_000]).is_err());
+    }
+
+    #[test]
+    fn nonsense_is_refused() {
+        for bytes in [
+            &b""[..],
+            b"\x10word",
+            b"\x14\"a\"",
+            b"\x16\x05a",
+            b"\x16\x01\0",
+            b"\x10\xff\0",
+            b"\x15\0",
+            b"\x60",
+            b"\x60\x71\0\x40",
+            b"\x40",
+            b"\x99",
+            b"\xff\x10a\0",
+        ] {
+            assert!(read(bytes).is_err(), "{bytes:?}");
+        }
+    }
+
+    #[test]
+    fn quoted_content_is_unescaped() {
+        assert_eq!(
+            string_content(br#""say \"hi\" \\ ""#),
+            &br#"say "hi" \\ "#[..]
+        );
+        assert_eq!(string_content(b"#3\"\xff\"\\"), &b"\xff\"\\"[..]);
+        assert_eq!(string_content(br#"raw \" text"#), &br#"raw \" text"#[..]);
+    }
+}

@@ -1,0 +1,453 @@
+//! A bit-efficient message, checked once and borrowed.
+
+use std::borrow::Cow;
+
+use crate::bitefficient::agent_id::{
+    AgentIdView, AgentIds, agent_id, agent_ids, user_defined, word,
+};
+use crate::bitefficient::reader::Reader;
+use crate::bitefficient::text::{Text, expression, string_content};
+use crate::error::{DecodeError, Problem};
+use crate::word::{is_token, is_word};
+use crate::{AgentId, Message, Payload, Performative, Representation, Time};
+
+/// The name that fipa_services writes for a sender that is not set.
+const UNDEFINED_AGENT: &str = "agent_id:undefined";
+
+/// An encoded message (FIPA00069), read without allocating.
+///
+/// The bytes are checked once, when the view is made; everything else hands out what lies in them.
+/// The reader is lenient: it takes what the standard says and what fipa_services and JADE write.
+/// Of a parameter that is there several times the last one counts, but for user-defined ones.
+#[derive(Debug, Clone)]
+pub struct MessageView<'a> {
+    performative: PerformativeView<'a>,
+    sender: Option<AgentIdView<'a>>,
+    receivers: AgentIds<'a>,
+    reply_to: AgentIds<'a>,
+    content: Option<ContentView<'a>>,
+    language: Option<Text<'a>>,
+    encoding: Option<Text<'a>>,
+    ontology: Option<Text<'a>>,
+    protocol: Option<&'a str>,
+    conversation_id: Option<Text<'a>>,
+    reply_with: Option<Text<'a>>,
+    in_reply_to: Option<Text<'a>>,
+    reply_by: Option<Time>,
+    /// Of a split message, the parameters in front of the content; and all others.
+    parameters: [&'a [u8]; 2],
+    has_user_defined: bool,
+}
+
+#[derive(Debug, Clone)]
+enum PerformativeView<'a> {
+    Standard(Performative),
+    Other(&'a str),
+}
+
+#[derive(Debug, Clone, Copy)]
+pub(super) enum ContentView<'a> {
+    /// Behind a length: the bytes as they are.
+    Bytes(&'a [u8]),
+    /// The same, beside the message: see [`Payload`].
+    Beside(&'a [u8]),
+    /// Up to a NUL: perhaps in quotation marks, perhaps with a byte count.
+    String(&'a [u8]),
+    /// An expression, from peers of before the edition of November 2002.
+    Expression(Text<'a>),
+}
+
+impl<'a> MessageView<'a> {
+    /// Reads a message that lies in one piece.
+    ///
+    /// # Errors
+    /// When the bytes are not one whole message in the bit-efficient encoding.
+    pub fn parse(bytes: &'a [u8]) -> Result<Self, DecodeError> {
+        Parser::new(bytes, None)?.message()
+    }
+
+    /// Reads a message that may be split around its content, which is not touched then.
+    ///
+    /// # Errors
+    /// When the pieces are not one whole message in the bit-efficient encoding. A split one must
+    /// be split just where its content is: `head` ends with the length of `content`.
+    pub fn parse_payload(payload: &'a Payload) -> Result<Self, DecodeError> {
+        let split = payload.is_split().then_some(Pieces {
+            content: &payload.content,
+            tail: &payload.tail,
+        });
+        Parser::new(&payload.head, split)?.message()
+    }
+
+    /// What the message does; allocates for a user-defined act.
+    #[must_use]
+    pub fn performative(&self) -> Performative {
+        match &self.performative {
+            PerformativeView::Standard(act) => act.clone(),
+            // Checked to be a word when the message was read.
+            PerformativeView::Other(name) => name.parse().unwrap_or(Performative::NotUnderstood),
+        }
+    }
+
+    /// The name of what the message does.
+    #[must_use]
+    pub fn performative_name(&self) -> &str {
+        match &self.performative {
+            PerformativeView::Standard(act) => act.as_str(),
+            PerformativeView::Other(name) => name,
+        }
+    }
+
+    /// Who sent it.
+    #[must_use]
+    pub fn sender(&self) -> Option<AgentIdView<'a>> {
+        self.sender
+    }
+
+    /// Whom it is for.
+    #[must_use]
+    pub fn receivers(&self) -> AgentIds<'a> {
+        self.receivers.clone()
+    }
+
+    /// Whom to send replies to, instead of the sender.
+    #[must_use]
+    pub fn reply_to(&self) -> AgentIds<'a> {
+        self.reply_to.clone()
+    }
+
+    /// What it says: a slice of the encoded message, unless it was written with escapes or as an
+    /// expression.
+    #[must_use]
+    pub fn content(&self) -> Option<Cow<'a, [u8]>> {
+        Some(match self.content? {
+            ContentView::Bytes(bytes) | ContentView::Beside(bytes) => Cow::Borrowed(bytes),
+            ContentView::String(bytes) => string_content(bytes),
+            ContentView::Expression(text) => match text.as_str() {
+                Cow::Borrowed(text) => Cow::Borrowed(text.as_bytes()),
+                Cow::Owned(text) => Cow::Owned(text.into_bytes()),
+            },
+        })
+    }
+
+    /// The language of the content.
+    #[must_use]
+    pub fn language(&self) -> Option<Text<'a>> {
+        self.language
+    }
+
+    /// The encoding of the content expression.
+    #[must_use]
+    pub fn encoding(&self) -> Option<Text<'a>> {
+        self.encoding
+    }
+
+    /// The ontology of the content.
+    #[must_use]
+    pub fn ontology(&self) -> Option<Text<'a>> {
+        self.ontology
+    }
+
+    /// The interaction protocol.
+    #[must_use]
+    pub fn protocol(&self) -> Option<&'a str> {
+        self.protocol
+    }
+
+    /// The conversation.
+    #[must_use]
+    pub fn conversation_id(&self) -> Option<Text<'a>> {
+        self.conversation_id
+    }
+
+    /// What a reply is to have as `in-reply-to`.
+    #[must_use]
+    pub fn reply_with(&self) -> Option<Text<'a>> {
+        self.reply_with
+    }
+
+    /// The `reply-with` of the message that this one answers.
+    #[must_use]
+    pub fn in_reply_to(&self) -> Option<Text<'a>> {
+        self.in_reply_to
+    }
+
+    /// The latest time for the next message of the conversation.
+    #[must_use]
+    pub fn reply_by(&self) -> Option<Time> {
+        self.reply_by
+    }
+
+    /// User-defined parameters in the order of the message, names without `X-`.
+    pub fn user_defined(&self) -> impl Iterator<Item = (&'a str, Text<'a>)> + use<'a> {
+        let walked = if self.has_user_defined {
+            self.parameters
+        } else {
+            [&[][..]; 2]
+        };
+        walked.into_iter().flat_map(|parameters| {
+            let mut reader = Reader::new(parameters);
+            std::iter::from_fn(move || {
+                // Checked when the message was read: an error cannot occur, and would end this.
+                while reader.remaining() > 0 {
+                    if let Parameter::UserDefined(name, value) = parameter(&mut reader).ok()? {
+                        return Some((name, value));
+                    }
+                }
+                None
+            })
+        })
+    }
+
+    pub(super) fn content_view(&self) -> Option<ContentView<'a>> {
+        self.content
+    }
+}
+
+const CLAUSE: &str = "FIPA00069 2.1 Message";
+
+enum Parameter<'a> {
+    Sender(AgentIdView<'a>),
+    Receivers(&'a [u8]),
+    Content(ContentView<'a>),
+    ReplyWith(Text<'a>),
+    ReplyBy(Time),
+    InReplyTo(Text<'a>),
+    ReplyTo(&'a [u8]),
+    Language(Text<'a>),
+    Encoding(Text<'a>),
+    Ontology(Text<'a>),
+    Protocol(&'a str),
+    ConversationId(Text<'a>),
+    UserDefined(&'a str, Text<'a>),
+    End,
+}
+
+#[inline]
+fn parameter<'a>(reader: &mut Reader<'a>) -> Result<Parameter<'a>, DecodeError> {
+    let code = reader.byte(CLAUSE, "a message")?;
+    Ok(match code {
+        0x00 => {
+            let (name, value) = user_defined(reader)?;
+            Parameter::UserDefined(name, value)
+        }
+        0x01 => Parameter::End,
+        0x02 => Parameter::Sender(agent_id(reader, AgentId::MAX_DEPTH)?),
+        0x03 => Parameter::Receivers(agent_ids(reader, AgentId::MAX_DEPTH)?),
+        0x04 => Parameter::Content(content(reader)?),
+        0x05 => Parameter::ReplyWith(expression(reader, "reply-with")?),
+        0x06 => Parameter::ReplyBy(reader.date_time("FIPA00069 2.3 BinDateTime")?),
+        0x07 => Parameter::InReplyTo(expression(reader, "in-reply-to")?),
+        0x08 => Parameter::ReplyTo(agent_ids(reader, AgentId::MAX_DEPTH)?),
+        0x09 => Parameter::Language(expression(reader, "language")?),
+        0x0a => Parameter::Encoding(expression(reader, "encoding")?),
+        0x0b => Parameter::Ontology(expression(reader, "ontology")?),
+        0x0c => Parameter::Protocol(protocol(reader)?),
+        0x0d => Parameter::ConversationId(expression(reader, "conversation-id")?),
+        other => return Err(reader.unexpected(CLAUSE, other, "a parameter of a message")),
+    })
+}
+
+fn protocol<'a>(reader: &mut Reader<'a>) -> Result<&'a str, DecodeError> {
+    let offset = reader.offset();
+    let name = word(reader, "protocol")?;
+    if is_token(name) {
+        return Ok(name);
+    }
+    let problem = Problem::NotAWord("protocol");
+    Err(DecodeError::new(offset, "FIPA00070 Word", problem))
+}
+
+fn content<'a>(reader: &mut Reader<'a>) -> Result<ContentView<'a>, DecodeError> {
+    const CLAUSE: &str = "FIPA00069 2.1 BinString";
+    let len = match reader.peek() {
+        Some(0x14) => {
+            reader.skip_peeked();
+            let bytes = reader.until_nul(CLAUSE, "content")?;
+            if bytes.len() as u64 > Message::MAX_CONTENT {
+                return Err(reader.error(CLAUSE, Problem::TooLong("content")));
+            }
+            return Ok(ContentView::String(bytes));
+        }
+        Some(0x16..=0x19) => content_len(reader)?,
+        _ => return Ok(ContentView::Expression(expression(reader, "content")?)),
+    };
+    Ok(ContentView::Bytes(reader.bytes(len, CLAUSE, "content")?))
+}
+
+/// Reads code and length of content that is given with its length.
+fn content_len(reader: &mut Reader<'_>) -> Result<usize, DecodeError> {
+    const CLAUSE: &str = "FIPA00069 2.1 BinString";
+    match reader.byte(CLAUSE, "content")? {
+        0x16 => reader.u8_len(CLAUSE),
+        0x17 => reader.u16_len(CLAUSE),
+        0x19 => reader.u32_len(CLAUSE),
+        0x18 => Err(reader.error(CLAUSE, Problem::CodeTable)),
+        other => Err(reader.unexpected(CLAUSE, other, "content with its length")),
+    }
+}
+
+/// What comes behind the head of a split message.
+#[derive(Clone, Copy)]
+struct Pieces<'a> {
+    content: &'a [u8],
+    tail: &'a [u8],
+}
+
+struct Parser<'a> {
+    reader: Reader<'a>,
+    /// The rest of a split message, until its content was met.
+    split: Option<Pieces<'a>>,
+    performative: PerformativeView<'a>,
+}
+
+impl<'a> Parser<'a> {
+    /// Reads what comes before the parameters.
+    fn new(bytes: &'a [u8], split: Option<Pieces<'a>>) -> Result<Self, DecodeError> {
+        let mut reader = Reader::new(bytes);
+        let id = reader.byte(CLAUSE, "a message")?;
+        match id {
+            0xfa => {}
+            0xfb | 0xfc => return Err(DecodeError::new(0, CLAUSE, Problem::CodeTable)),
+            _ => return Err(not_bit_efficient(bytes)),
+        }
+        // Peers write other versions than 1.0 and mean the same.
+        reader.byte(CLAUSE, "the version")?;
+        let offset = reader.offset();
+        let wrong = |clause, problem| DecodeError::new(offset, clause, problem);
+        let code = reader.byte(CLAUSE, "the performative")?;
+        let performative = if code == 0 {
+            let name = word(&mut reader, "performative")?;
+            if !is_word(name) {
+                let problem = Problem::NotAWord("performative");
+                return Err(wrong("FIPA00070 Word", problem));
+            }
+            PerformativeView::Other(name)
+        } else {
+            let act = Performative::of_code(code);
+            PerformativeView::Standard(act.ok_or_else(|| {
+                let expected = "the code of a performative";
+                wrong(
+                    CLAUSE,
+                    Problem::Unexpected {
+                        found: code,
+                        expected,
+                    },
+                )
+            })?)
+        };
+        Ok(Self {
+            reader,
+            split,
+            performative,
+        })
+    }
+
+    fn message(mut self) -> Result<MessageView<'a>, DecodeError> {
+        let mut view = MessageView {
+            performative: self.performative.clone(),
+            sender: None,
+            receivers: AgentIds::default(),
+            reply_to: AgentIds::default(),
+            content: None,
+            language: None,
+            encoding: None,
+            ontology: None,
+            protocol: None,
+            conversation_id: None,
+            reply_with: None,
+            in_reply_to: None,
+            reply_by: None,
+            parameters: [&[]; 2],
+            has_user_defined: false,
+        };
+        let mut start = self.reader.position();
+        loop {
+            let in_front = self.reader.since(start);
+            if let Some(content) = self.content_beside()? {
+                view.parameters[0] = in_front;
+                view.content = Some(ContentView::Beside(content));
+                start = self.reader.position();
+                continue;
+            }
+            match parameter(&mut self.reader)? {
+                Parameter::Sender(sender) => {
+                    view.sender = (sender.name() != UNDEFINED_AGENT).then_some(sender);
+                }
+                Parameter::Receivers(ids) => view.receivers = AgentIds::new(ids),
+                Parameter::Content(content) => {
+                    if let Some(ContentView::Beside(_)) = view.content {
+                        let problem = Problem::Split("there is more content behind the content");
+                        return Err(self.reader.error(CLAUSE, problem));
+                    }
+                    view.content = Some(content);
+                }
+                Parameter::ReplyWith(text) => view.reply_with = Some(text),
+                Parameter::ReplyBy(time) => view.reply_by = Some(time),
+                Parameter::InReplyTo(text) => view.in_reply_to = Some(text),
+                Parameter::ReplyTo(ids) => view.reply_to = AgentIds::new(ids),
+                Parameter::Language(text) => view.language = Some(text),
+                Parameter::Encoding(text) => view.encoding = Some(text),
+                Parameter::Ontology(text) => view.ontology = Some(text),
+                Parameter::Protocol(name) => view.protocol = Some(name),
+                Parameter::ConversationId(text) => view.conversation_id = Some(text),
+                Parameter::UserDefined(..) => view.has_user_defined = true,
+                Parameter::End => {
+                    view.parameters[1] = in_front;
+                    break;
+                }
+            }
+        }
+        self.end()?;
+        Ok(view)
+    }
+
+    /// Of a split message, the content if it is next. Reading goes on behind it then.
+    #[inline]
+    fn content_beside(&mut self) -> Result<Option<&'a [u8]>, DecodeError> {
+        const CLAUSE: &str = "FIPA00069 2.1 BinString";
+        let Some(Pieces { content, tail }) = self.split else {
+            return Ok(None);
+        };
+        // Code of the parameter, code and length of the string, and nothing more.
+        if self.reader.peek() != Some(0x04) || self.reader.remaining() > 6 {
+            return Ok(None);
+        }
+        let mut ahead = self.reader.clone();
+        ahead.skip_peeked();
+        let len = content_len(&mut ahead)?;
+        if ahead.remaining() > 0 {
+            return Ok(None);
+        }
+        if len != content.len() {
+            let problem = Problem::Split("the length of the content differs");
+            return Err(self.reader.error(CLAUSE, problem));
+        }
+        self.reader = Reader::at(tail, ahead.offset().saturating_add(len));
+        self.split = None;
+        Ok(Some(content))
+    }
+
+    fn end(&self) -> Result<(), DecodeError> {
+        let rest = self.reader.remaining();
+        if rest > 0 {
+            return Err(self.reader.error(CLAUSE, Problem::Trailing(rest)));
+        }
+        if self.split.is_some() {
+            let problem = Problem::Split("the head is a whole message already");
+            return Err(self.reader.error(CLAUSE, problem));
+        }
+        Ok(())
+    }
+}
+
+#[cold]
+fn not_bit_efficient(bytes: &[u8]) -> DecodeError {
+    let problem = match Representation::detect(bytes) {
+        Some(other @ (Representation::String | Representation::Xml)) => {
+            Problem::UnsupportedRepresentation(other)
+        }
+        _ => Problem::UnknownRepresentation,
+    };
+    DecodeError::new(0, CLAUSE, problem)
+}

@@ -1,0 +1,362 @@
+//! The message (FIPA00061): what agents say to each other, whatever it is encoded as.
+
+use std::fmt;
+
+use bytes::Bytes;
+
+use crate::builder::MessageBuilder;
+use crate::word::{is_token, push_string_literal};
+use crate::{AgentId, Performative, Time};
+
+/// A FIPA message.
+///
+/// Every message that exists can be encoded: [`MessageBuilder::build`] refuses what no encoding
+/// could carry, and decoding gives the same guarantee. Parameters that are absent are `None` or
+/// empty; content that is absent differs from content of no bytes.
+///
+/// Cloning shares the memory of the content. The content may lie in shared memory that another
+/// process of the same user can still write to: parse a copy of it where that matters.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Message {
+    pub(crate) performative: Performative,
+    pub(crate) sender: Option<AgentId>,
+    pub(crate) receivers: Vec<AgentId>,
+    pub(crate) reply_to: Vec<AgentId>,
+    pub(crate) content: Option<Bytes>,
+    pub(crate) language: Option<String>,
+    pub(crate) encoding: Option<String>,
+    pub(crate) ontology: Option<String>,
+    pub(crate) protocol: Option<String>,
+    pub(crate) conversation_id: Option<String>,
+    pub(crate) reply_with: Option<String>,
+    pub(crate) in_reply_to: Option<String>,
+    pub(crate) reply_by: Option<Time>,
+    pub(crate) user_defined: Vec<(String, String)>,
+}
+
+impl Message {
+    /// Most bytes of content that a message can have (FIPA00069: a length of 32 bits).
+    pub const MAX_CONTENT: u64 = u32::MAX as u64;
+
+    /// Begins a message.
+    pub fn builder(performative: Performative) -> MessageBuilder {
+        MessageBuilder::new(performative)
+    }
+
+    /// Begins a reply to this message.
+    ///
+    /// It goes to the agents in `reply-to`, or to the sender if there are none, and takes over
+    /// language, ontology, protocol and conversation id; `in-reply-to` is what this message has
+    /// as `reply-with`. The sender and, if an answer is expected, a new `reply-with` are for the
+    /// caller to set.
+    pub fn reply(&self, performative: Performative) -> MessageBuilder {
+        let receivers = if self.reply_to.is_empty() {
+            self.sender.iter().cloned().collect()
+        } else {
+            self.reply_to.clone()
+        };
+        MessageBuilder::of(Self {
+            receivers,
+            language: self.language.clone(),
+            ontology: self.ontology.clone(),
+            protocol: self.protocol.clone(),
+            conversation_id: self.conversation_id.clone(),
+            in_reply_to: self.reply_with.clone(),
+            ..Self::empty(performative)
+        })
+    }
+
+    /// Whether this message answers `other`.
+    ///
+    /// Both `in-reply-to` here and `reply-with` there decide when they are set; otherwise the
+    /// conversation id does (fipa_services does not look at the former), and then a message by
+    /// the sender of `other` itself is no answer. Nothing of another conversation is.
+    #[must_use]
+    pub fn is_reply_to(&self, other: &Self) -> bool {
+        let same_conversation = match (&self.conversation_id, &other.conversation_id) {
+            (Some(mine), Some(theirs)) => Some(mine == theirs),
+            _ => None,
+        };
+        let same_sender = match (&self.sender, &other.sender) {
+            (Some(mine), Some(theirs)) => mine.same_agent(theirs),
+            _ => false,
+        };
+        match (&self.in_reply_to, &other.reply_with) {
+            (Some(mine), Some(theirs)) => mine == theirs && same_conversation != Some(false),
+            _ => same_conversation == Some(true) && !same_sender,
+        }
+    }
+
+    /// What the message does.
+    #[must_use]
+    pub fn performative(&self) -> &Performative {
+        &self.performative
+    }
+
+    /// Who sent it; absent in anonymous messages.
+    #[must_use]
+    pub fn sender(&self) -> Option<&AgentId> {
+        self.sender.as_ref()
+    }
+
+    /// Whom it is for.
+    #[must_use]
+    pub fn receivers(&self) -> &[AgentId] {
+        &self.receivers
+    }
+
+    /// Whom to send replies to, instead of the sender.
+    #[must_use]
+    pub fn reply_to(&self) -> &[AgentId] {
+        &self.reply_to
+    }
+
+    /// What it says, in the language and encoding named by [`language`](Self::language) and
+    /// [`encoding`](Self::encoding).
+    #[must_use]
+    pub fn content(&self) -> Option<&Bytes> {
+        self.content.as_ref()
+    }
+
+    /// The language of the content.
+    #[must_use]
+    pub fn language(&self) -> Option<&str> {
+        self.language.as_deref()
+    }
+
+    /// The encoding of the content expression.
+    #[must_use]
+    pub fn encoding(&self) -> Option<&str> {
+        self.encoding.as_deref()
+    }
+
+    /// The ontology that gives the symbols in the content their meaning.
+    #[must_use]
+    pub fn ontology(&self) -> Option<&str> {
+        self.ontology.as_deref()
+    }
+
+    /// The interaction protocol that the message is part of.
+    #[must_use]
+    pub fn protocol(&self) -> Option<&str> {
+        self.protocol.as_deref()
+    }
+
+    /// The conversation that the message is part of.
+    #[must_use]
+    pub fn conversation_id(&self) -> Option<&str> {
+        self.conversation_id.as_deref()
+    }
+
+    /// What a reply to this message is to have as `in-reply-to`.
+    #[must_use]
+    pub fn reply_with(&self) -> Option<&str> {
+        self.reply_with.as_deref()
+    }
+
+    /// The `reply-with` of the message that this one answers.
+    #[must_use]
+    pub fn in_reply_to(&self) -> Option<&str> {
+        self.in_reply_to.as_deref()
+    }
+
+    /// The latest time for the next message of the conversation.
+    #[must_use]
+    pub fn reply_by(&self) -> Option<Time> {
+        self.reply_by
+    }
+
+    /// User-defined parameters in the order of the message, names without `X-`. Of several with
+    /// the same name the last one counts.
+    #[must_use]
+    pub fn user_defined(&self) -> &[(String, String)] {
+        &self.user_defined
+    }
+
+    pub(crate) fn empty(performative: Performative) -> Self {
+        Self {
+            performative,
+            sender: None,
+            receivers: Vec::new(),
+            reply_to: Vec::new(),
+            content: None,
+            language: None,
+            encoding: None,
+            ontology: None,
+            protocol: None,
+            conversation_id: None,
+            reply_with: None,
+            in_reply_to: None,
+            reply_by: None,
+            user_defined: Vec::new(),
+        }
+    }
+}
+
+/// Longest text or content that [`Message`]'s `Display` shows, in characters.
+const SHOWN: usize = 80;
+
+/// Like FIPA00070, for people to read: agents by name only, long texts cut. Not for machines.
+impl fmt::Display for Message {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "({}", self.performative)?;
+        if let Some(sender) = &self.sender {
+            write!(f, " :sender {sender}")?;
+        }
+        for (key, agents) in [("receiver", &self.receivers), ("reply-to", &self.reply_to)] {
+            if !agents.is_empty() {
+                write!(f, " :{key} (set")?;
+                for agent in agents {
+                    write!(f, " {agent}")?;
+                }
+                f.write_str(")")?;
+            }
+        }
+        for (key, value) in [
+            ("protocol", &self.protocol),
+            ("conversation-id", &self.conversation_id),
+            ("reply-with", &self.reply_with),
+            ("in-reply-to", &self.in_reply_to),
+            ("language", &self.language),
+            ("encoding", &self.encoding),
+            ("ontology", &self.ontology),
+        ] {
+            if let Some(value) = value {
+                write!(f, " :{key} {}", shown(value))?;
+            }
+        }
+        if let Some(reply_by) = self.reply_by {
+            write!(f, " :reply-by {reply_by}")?;
+        }
+        for (name, value) in &self.user_defined {
+            write!(f, " :X-{name} {}", shown(value))?;
+        }
+        if let Some(content) = &self.content {
+            write!(f, " :content {}", shown_content(content))?;
+        }
+        f.write_str(")")
+    }
+}
+
+fn shown(text: &str) -> String {
+    if is_token(text) && text.chars().nth(SHOWN).is_none() {
+        return text.to_owned();
+    }
+    shown_quoted(text)
+}
+
+fn shown_quoted(text: &str) -> String {
+    shown_start(text, text.len())
+}
+
+/// The start of a text of `len` bytes.
+fn shown_start(start: &str, len: usize) -> String {
+    let cut: String = start.chars().take(SHOWN).collect();
+    let mut out = String::new();
+    push_string_literal(&mut out, &cut.chars().flat_map(visible).collect::<String>());
+    if cut.len() < len {
+        out.push_str(&format!("… ({len} bytes)"));
+    }
+    out
+}
+
+fn shown_content(content: &Bytes) -> String {
+    // A copy, because nobody vouches that shared memory stays the UTF-8 it was found to be.
+    let start = content.slice(..content.len().min(4 * SHOWN)).to_vec();
+    match std::str::from_utf8(&start) {
+        Ok(text) => shown_start(text, content.len()),
+        // The last character was cut in two.
+        Err(error) if error.error_len().is_none() && start.len() < content.len() => {
+            let whole = start.get(..error.valid_up_to()).unwrap_or_default();
+            shown_start(&String::from_utf8_lossy(whole), content.len())
+        }
+        Err(_) => format!("<{} bytes>", content.len()),
+    }
+}
+
+/// Control characters would play tricks on a terminal.
+fn visible(c: char) -> impl Iterator<Item = char> {
+    let escaped = c.is_control().then(|| c.escape_default());
+    let plain = (!c.is_control()).then_some(c);
+    escaped.into_iter().flatten().chain(plain)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn agent(name: &str) -> AgentId {
+        AgentId::new(name).unwrap()
+    }
+
+    fn request() -> Message {
+        Message::builder(Performative::Request)
+            .sender(agent("alice"))
+            .receiver(agent("bob"))
+            .content("lift")
+            .language("plain")
+            .encoding("utf-8")
+            .ontology("crane")
+            .protocol("fipa-request")
+            .conversation_id("c 1")
+            .reply_with("r1")
+            .build()
+            .unwrap()
+    }
+
+    #[test]
+    fn a_reply_takes_over_what_the_standard_says() {
+        let reply = request().reply(Performative::Agree).build().unwrap();
+        assert_eq!(reply.receivers(), [agent("alice")]);
+        assert_eq!(reply.sender(), None);
+        assert_eq!(reply.language(), Some("plain"));
+        assert_eq!(reply.ontology(), Some("crane"));
+        assert_eq!(reply.protocol(), Some("fipa-request"));
+        assert_eq!(reply.conversation_id(), Some("c 1"));
+        assert_eq!(reply.in_reply_to(), Some("r1"));
+        assert_eq!((reply.encoding(), reply.reply_with()), (None, None));
+        assert_eq!(reply.content(), None);
+        assert!(reply.is_reply_to(&request()));
+    }
+
+    #[test]
+    fn reply_to_comes_before_the_sender() {
+        let mut message = request();
+        message.reply_to = vec![agent("carol"), agent("dave")];
+        let reply = message.reply(Performative::Agree).build().unwrap();
+        assert_eq!(reply.receivers(), [agent("carol"), agent("dave")]);
+    }
+
+    #[test]
+    fn what_counts_as_a_reply() {
+        let asked = request();
+        let mut answer = asked
+            .reply(Performative::Inform)
+            .sender(agent("bob"))
+            .build()
+            .unwrap();
+        answer.in_reply_to = Some("another".into());
+        assert!(!answer.is_reply_to(&asked));
+        answer.in_reply_to = None;
+        assert!(answer.is_reply_to(&asked), "the conversation decides");
+        answer.conversation_id = Some("c 2".into());
+        assert!(!answer.is_reply_to(&asked));
+        assert!(!asked.is_reply_to(&asked), "nobody answers himself");
+    }
+
+    #[test]
+    fn people_can_read_it() {
+        assert_eq!(
+            request().to_string(),
+            "(request :sender alice :receiver (set bob) :protocol fipa-request \
+             :conversation-id \"c 1\" :reply-with r1 :language plain :encoding utf-8 \
+             :ontology crane :content \"lift\")"
+        );
+        let mut long = request();
+        long.content = Some("x\x1b".repeat(100).into());
+        assert!(long.to_string().ends_with("… (200 bytes))"));
+        assert!(!long.to_string().contains('\x1b'));
+        long.content = Some(Bytes::from_static(b"\xff\xfe"));
+        assert!(long.to_string().contains(":content <2 bytes>"));
+    }
+}

@@ -1,0 +1,166 @@
+//! The communicative acts of FIPA00037.
+
+use std::fmt;
+use std::str::FromStr;
+
+use crate::word::is_word;
+
+macro_rules! performatives {
+    ($($(#[$doc:meta])* $variant:ident = $code:literal $name:literal,)*) => {
+        /// What a message does: one of the 22 acts of FIPA00037, or a user-defined one.
+        #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+        #[allow(clippy::exhaustive_enums, reason = "the standard is final")]
+        pub enum Performative {
+            $($(#[$doc])* $variant,)*
+            /// An act that only its users know.
+            Other(UserPerformative),
+        }
+
+        impl Performative {
+            /// The 22 acts of the standard, in the order of their codes in FIPA00069.
+            pub const STANDARD: [Self; 22] = [$(Self::$variant,)*];
+
+            /// The name as the standard spells it, or the user-defined one.
+            #[must_use]
+            pub fn as_str(&self) -> &str {
+                match self {
+                    $(Self::$variant => $name,)*
+                    Self::Other(user) => user.as_str(),
+                }
+            }
+
+            /// The code of a standard act (FIPA00069 clause 2.1, `MsgType`).
+            pub(crate) fn code(&self) -> Option<u8> {
+                match self {
+                    $(Self::$variant => Some($code),)*
+                    Self::Other(_) => None,
+                }
+            }
+        }
+    };
+}
+
+performatives! {
+    /// Accepting a proposal submitted before.
+    AcceptProposal = 0x01 "accept-proposal",
+    /// Agreeing to perform some action, possibly in the future.
+    Agree = 0x02 "agree",
+    /// Telling that an action that was asked for is no longer wanted.
+    Cancel = 0x03 "cancel",
+    /// Calling for proposals to perform an action.
+    Cfp = 0x04 "cfp",
+    /// Telling that a proposition the receiver was unsure of is true.
+    Confirm = 0x05 "confirm",
+    /// Telling that a proposition the receiver believes is false.
+    Disconfirm = 0x06 "disconfirm",
+    /// Telling that an action was attempted and failed.
+    Failure = 0x07 "failure",
+    /// Telling that a proposition is true.
+    Inform = 0x08 "inform",
+    /// Telling whether a proposition is true.
+    InformIf = 0x09 "inform-if",
+    /// Telling the object that a descriptor refers to.
+    InformRef = 0x0a "inform-ref",
+    /// Telling that a message was not understood.
+    NotUnderstood = 0x0b "not-understood",
+    /// Asking to pass a message on to others.
+    Propagate = 0x0c "propagate",
+    /// Proposing to perform an action under conditions.
+    Propose = 0x0d "propose",
+    /// Asking to select agents and send them a message.
+    Proxy = 0x0e "proxy",
+    /// Asking whether a proposition is true.
+    QueryIf = 0x0f "query-if",
+    /// Asking for the object that a descriptor refers to.
+    QueryRef = 0x10 "query-ref",
+    /// Refusing to perform an action.
+    Refuse = 0x11 "refuse",
+    /// Rejecting a proposal.
+    RejectProposal = 0x12 "reject-proposal",
+    /// Asking to perform an action.
+    Request = 0x13 "request",
+    /// Asking to perform an action when a proposition becomes true.
+    RequestWhen = 0x14 "request-when",
+    /// Asking to perform an action each time a proposition becomes true.
+    RequestWhenever = 0x15 "request-whenever",
+    /// Asking to be told of every change of what a descriptor refers to.
+    Subscribe = 0x16 "subscribe",
+}
+
+impl Performative {
+    /// The standard act with this code (FIPA00069).
+    pub(crate) fn of_code(code: u8) -> Option<Self> {
+        Self::STANDARD
+            .get(usize::from(code).checked_sub(1)?)
+            .cloned()
+    }
+}
+
+/// The name of a user-defined performative: a FIPA00070 word that is none of the 22 standard
+/// names. Made by parsing a [`Performative`].
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct UserPerformative(Box<str>);
+
+impl UserPerformative {
+    /// The name.
+    #[must_use]
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+/// Text that cannot name a performative.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "not a performative: {0:?} (a word is needed: no blanks or parentheses, and not beginning with \
+     a digit, '#', '-', '@' or '\"')"
+)]
+pub struct PerformativeError(String);
+
+impl FromStr for Performative {
+    type Err = PerformativeError;
+
+    /// The standard names are recognised in any case; any other word is a user-defined act.
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let standard = Self::STANDARD
+            .into_iter()
+            .find(|act| act.as_str().eq_ignore_ascii_case(text));
+        match standard {
+            Some(act) => Ok(act),
+            None if is_word(text) => Ok(Self::Other(UserPerformative(text.into()))),
+            None => Err(PerformativeError(text.chars().take(60).collect())),
+        }
+    }
+}
+
+impl fmt::Display for Performative {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.as_str())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn codes_are_those_of_the_standard() {
+        for (place, act) in Performative::STANDARD.iter().enumerate() {
+            assert_eq!(act.code().map(usize::from), Some(place + 1), "{act}");
+            assert_eq!(Performative::of_code(place as u8 + 1).as_ref(), Some(act));
+        }
+        assert_eq!(Performative::of_code(0), None);
+        assert_eq!(Performative::of_code(23), None);
+    }
+
+    #[test]
+    fn names_are_read_in_any_case_and_others_must_be_words() {
+        assert_eq!("INFORM".parse(), Ok(Performative::Inform));
+        assert_eq!("Query-Ref".parse(), Ok(Performative::QueryRef));
+        let user: Performative = "my-act".parse().unwrap();
+        assert_eq!((user.as_str(), user.code()), ("my-act", None));
+        for wrong in ["", "my act", "1st", "(inform"] {
+            assert!(wrong.parse::<Performative>().is_err(), "{wrong:?}");
+        }
+    }
+}

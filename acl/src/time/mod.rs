@@ -1,0 +1,411 @@
+//! Points in time and spans of it, as FIPA writes them (FIPA00070 `DateTime`, FIPA00069
+//! `BinDateTime`). No clock lives here: what is relative to now gets its now handed in.
+
+mod calendar;
+mod text;
+
+use std::time::{Duration, SystemTime};
+
+use self::calendar::{civil_from_days, days_from_civil, days_of_month};
+
+/// A FIPA date-time with milliseconds.
+///
+/// Either absolute, in UTC or in a zone that its text leaves open, or relative to when it is read.
+/// The text form is `20000508T042651481Z`, for relative times with a sign in front.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Time {
+    pub(crate) base: Base,
+    pub(crate) zone: Zone,
+    pub(crate) fields: Fields,
+}
+
+/// What a [`Time`] counts from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[allow(clippy::exhaustive_enums, reason = "the standard is final")]
+pub enum Base {
+    /// The calendar.
+    Absolute,
+    /// Now, forward.
+    After,
+    /// Now, backward.
+    Before,
+}
+
+/// The zone of a [`Time`], as its type designator says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[allow(clippy::exhaustive_enums, reason = "the standard is final")]
+pub enum Zone {
+    /// No designator: the local time of whoever wrote it (fipa_services, JADE).
+    Unspecified,
+    /// `Z`: UTC.
+    Utc,
+    /// Another letter, whose meaning the standard leaves open.
+    Letter(char),
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(crate) struct Fields {
+    pub(crate) year: u16,
+    pub(crate) month: u8,
+    pub(crate) day: u8,
+    pub(crate) hour: u8,
+    pub(crate) minute: u8,
+    pub(crate) second: u8,
+    pub(crate) millisecond: u16,
+}
+
+/// Text or digits that are not a FIPA date-time, or one that cannot be expressed as asked.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum TimeError {
+    /// The text has another form.
+    #[error(
+        "not a date-time: {0:?} (expected for example 20000508T042651481Z, +00000000T000030000 or \
+         2000-05-08T04:26:51.481Z)"
+    )]
+    Syntax(String),
+    /// A field is out of its range, for example month 13.
+    #[error("no such date or time of day: {0}")]
+    Range(String),
+    /// The year does not have four digits.
+    #[error("a time before the year 0 or after the year 9999 cannot be written")]
+    Year,
+    /// The span of time is longer than a relative time can say.
+    #[error("a span of {0} s is too long for a relative time")]
+    Span(u64),
+}
+
+const DAY: u64 = 24 * 60 * 60;
+/// How JADE reads the years and months of relative times.
+const DAYS_PER_YEAR: u64 = 365;
+const DAYS_PER_MONTH: u64 = 30;
+const MS_PER_DAY: i64 = 86_400_000;
+
+impl Time {
+    /// The time, in UTC and cut to milliseconds.
+    ///
+    /// # Errors
+    /// When the year does not have four digits.
+    pub fn from_system_time(time: SystemTime) -> Result<Self, TimeError> {
+        let ms = match time.duration_since(SystemTime::UNIX_EPOCH) {
+            Ok(after) => i64::try_from(after.as_millis()).map_err(|_| TimeError::Year)?,
+            Err(before) => {
+                // Cut towards the past, as it is done after 1970.
+                let before = before.duration().as_nanos().div_ceil(1_000_000);
+                -i64::try_from(before).map_err(|_| TimeError::Year)?
+            }
+        };
+        Self::from_unix_ms(ms)
+    }
+
+    /// So much later than when it will be read; cut to milliseconds.
+    ///
+    /// # Errors
+    /// When the span is 9999 years or more.
+    pub fn after(span: Duration) -> Result<Self, TimeError> {
+        Self::relative(Base::After, span)
+    }
+
+    /// So much earlier than when it will be read; cut to milliseconds.
+    ///
+    /// # Errors
+    /// When the span is 9999 years or more.
+    pub fn before(span: Duration) -> Result<Self, TimeError> {
+        Self::relative(Base::Before, span)
+    }
+
+    /// What it counts from.
+    #[must_use]
+    pub fn base(self) -> Base {
+        self.base
+    }
+
+    /// Whether it is relative to when it is read.
+    #[must_use]
+    pub fn is_relative(self) -> bool {
+        self.base != Base::Absolute
+    }
+
+    /// The zone its designator names.
+    #[must_use]
+    pub fn zone(self) -> Zone {
+        self.zone
+    }
+
+    /// The point in time. A relative time counts from `now`, with years of 365 and months of 30
+    /// days; an absolute one without `Z` is taken as UTC (see
+    /// [`with_local_offset`](Self::with_local_offset)).
+    #[must_use]
+    pub fn to_system_time(self, now: SystemTime) -> SystemTime {
+        let moved = match self.base {
+            Base::Absolute => {
+                let ms = self.unix_ms();
+                let span = Duration::from_millis(ms.unsigned_abs());
+                if ms < 0 {
+                    SystemTime::UNIX_EPOCH.checked_sub(span)
+                } else {
+                    SystemTime::UNIX_EPOCH.checked_add(span)
+                }
+            }
+            Base::After => now.checked_add(self.span()),
+            Base::Before => now.checked_sub(self.span()),
+        };
+        // Four-digit years always fit what operating systems count with, except around a
+        // `now` that is itself at the end of it.
+        moved.unwrap_or(now)
+    }
+
+    /// The same point in time in UTC, if it is an absolute time without `Z` that was written
+    /// where clocks are `seconds_east` ahead of UTC; otherwise unchanged.
+    ///
+    /// # Errors
+    /// When the year would no longer have four digits.
+    pub fn with_local_offset(self, seconds_east: i32) -> Result<Self, TimeError> {
+        if self.is_relative() || self.zone == Zone::Utc {
+            return Ok(self);
+        }
+        Self::from_unix_ms(self.unix_ms() - i64::from(seconds_east) * 1000)
+    }
+
+    /// Checks the ranges.
+    pub(crate) fn new(base: Base, zone: Zone, fields: Fields) -> Result<Self, TimeError> {
+        let Fields {
+            year,
+            month,
+            day,
+            hour,
+            minute,
+            second,
+            millisecond,
+        } = fields;
+        let fits = match base {
+            // A leap second is a legal 60; nobody here counts them.
+            Base::Absolute => {
+                (1..=12).contains(&month)
+                    && (1..=days_of_month(year, month)).contains(&day)
+                    && hour < 24
+                    && minute < 60
+                    && second <= 60
+            }
+            Base::After | Base::Before => {
+                month < 100 && day < 100 && hour < 100 && minute < 100 && second < 100
+            }
+        };
+        if !fits || year > 9999 || millisecond > 999 {
+            return Err(TimeError::Range(format!(
+                "{year:04}-{month:02}-{day:02} {hour:02}:{minute:02}:{second:02}.{millisecond:03}"
+            )));
+        }
+        Ok(Self { base, zone, fields })
+    }
+
+    fn relative(base: Base, span: Duration) -> Result<Self, TimeError> {
+        let seconds = span.as_secs();
+        let days = seconds / DAY;
+        let year = u16::try_from(days / DAYS_PER_YEAR).map_err(|_| TimeError::Span(seconds))?;
+        if year > 9999 {
+            return Err(TimeError::Span(seconds));
+        }
+        let small = |value: u64| u8::try_from(value).unwrap_or(u8::MAX);
+        let days = days % DAYS_PER_YEAR;
+        let fields = Fields {
+            year,
+            month: small(days / DAYS_PER_MONTH),
+            day: small(days % DAYS_PER_MONTH),
+            hour: small(seconds % DAY / 3600),
+            minute: small(seconds % 3600 / 60),
+            second: small(seconds % 60),
+            millisecond: u16::try_from(span.subsec_millis()).unwrap_or(999),
+        };
+        Self::new(base, Zone::Unspecified, fields)
+    }
+
+    fn span(self) -> Duration {
+        let Fields {
+            year,
+            month,
+            day,
+            hour,
+            minute,
+            second,
+            millisecond,
+        } = self.fields;
+        let days =
+            u64::from(year) * DAYS_PER_YEAR + u64::from(month) * DAYS_PER_MONTH + u64::from(day);
+        let seconds =
+            days * DAY + u64::from(hour) * 3600 + u64::from(minute) * 60 + u64::from(second);
+        Duration::from_secs(seconds) + Duration::from_millis(u64::from(millisecond))
+    }
+
+    fn from_unix_ms(ms: i64) -> Result<Self, TimeError> {
+        let (year, month, day) = civil_from_days(ms.div_euclid(MS_PER_DAY));
+        let in_day = ms.rem_euclid(MS_PER_DAY);
+        let year = u16::try_from(year).map_err(|_| TimeError::Year)?;
+        if year > 9999 {
+            return Err(TimeError::Year);
+        }
+        let small = |value: i64| u8::try_from(value).unwrap_or(u8::MAX);
+        let fields = Fields {
+            year,
+            month,
+            day,
+            hour: small(in_day / 3_600_000),
+            minute: small(in_day / 60_000 % 60),
+            second: small(in_day / 1000 % 60),
+            millisecond: u16::try_from(in_day % 1000).unwrap_or(999),
+        };
+        Self::new(Base::Absolute, Zone::Utc, fields)
+    }
+
+    /// Milliseconds since 1970, the zone taken as UTC.
+    fn unix_ms(self) -> i64 {
+        let Fields {
+            year,
+            month,
+            day,
+            hour,
+            minute,
+            second,
+            millisecond,
+        } = self.fields;
+        let seconds = i64::from(hour) * 3600 + i64::from(minute) * 60 + i64::from(second);
+        days_from_civil(i64::from(year), month, day) * MS_PER_DAY
+            + seconds * 1000
+            + i64::from(millisecond)
+    }
+}
+
+impl Zone {
+    /// The zone with this designator, which must be an ASCII letter.
+    pub(crate) fn of_letter(letter: u8) -> Option<Self> {
+        match letter {
+            b'Z' | b'z' => Some(Self::Utc),
+            letter if letter.is_ascii_alphabetic() => Some(Self::Letter(char::from(letter))),
+            _ => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn at(ms: u64) -> SystemTime {
+        SystemTime::UNIX_EPOCH + Duration::from_millis(ms)
+    }
+
+    #[test]
+    fn known_dates() {
+        for (ms, text, rfc3339) in [
+            (0, "19700101T000000000Z", "1970-01-01T00:00:00.000Z"),
+            (
+                957_760_011_481,
+                "20000508T042651481Z",
+                "2000-05-08T04:26:51.481Z",
+            ),
+            (
+                951_782_400_000,
+                "20000229T000000000Z",
+                "2000-02-29T00:00:00.000Z",
+            ),
+            (
+                253_402_300_799_999,
+                "99991231T235959999Z",
+                "9999-12-31T23:59:59.999Z",
+            ),
+        ] {
+            let time = Time::from_system_time(at(ms)).unwrap();
+            assert_eq!(time.to_string(), text);
+            assert_eq!(time.to_rfc3339().unwrap(), rfc3339);
+            assert_eq!(text.parse(), Ok(time));
+            assert_eq!(Time::from_rfc3339(rfc3339), Ok(time));
+            assert_eq!(time.to_system_time(at(1)), at(ms));
+        }
+        assert!(Time::from_system_time(at(253_402_300_800_000)).is_err());
+    }
+
+    #[test]
+    fn local_time_stays_local_until_somebody_knows_where() {
+        let local: Time = "20101223T120037980".parse().unwrap();
+        assert_eq!(local.zone(), Zone::Unspecified);
+        assert_eq!(local.to_rfc3339().unwrap(), "2010-12-23T12:00:37.980Z");
+        let utc = local.with_local_offset(3600).unwrap();
+        assert_eq!(utc.to_string(), "20101223T110037980Z");
+        assert_eq!(utc.with_local_offset(3600), Ok(utc));
+        assert_eq!("20101223Z120037980".parse(), Ok(local));
+    }
+
+    #[test]
+    fn offsets_and_fractions_of_rfc3339() {
+        for (text, expected) in [
+            ("2010-12-23T12:00:37+01:30", "20101223T103037000Z"),
+            ("2010-12-23t12:00:37.9z", "20101223T120037900Z"),
+            ("2010-12-23 12:00:37.123456-00:30", "20101223T123037123Z"),
+        ] {
+            assert_eq!(Time::from_rfc3339(text).unwrap().to_string(), expected);
+        }
+        for wrong in [
+            "",
+            "2010-12-23T12:00:37",
+            "2010-12-23T12:00:37.Z",
+            "2010-13-23T12:00:37Z",
+            "2010-02-29T12:00:37Z",
+            "2010-12-23T12:00:37+0100",
+            "0000-01-01T00:00:00+23:59",
+        ] {
+            assert!(Time::from_rfc3339(wrong).is_err(), "{wrong:?}");
+        }
+    }
+
+    #[test]
+    fn relative_times_count_from_now() {
+        let time = Time::after(Duration::from_secs(30)).unwrap();
+        assert_eq!(time.to_string(), "+00000000T000030000");
+        assert_eq!(time.to_rfc3339(), None);
+        assert_eq!(time.to_system_time(at(5)), at(30_005));
+        let ago = Time::before(Duration::from_secs(400 * DAY)).unwrap();
+        assert_eq!(ago.to_string(), "-00010105T000000000");
+        assert!(Time::after(Duration::MAX).is_err());
+    }
+
+    #[test]
+    fn nonsense_is_refused() {
+        for text in [
+            "",
+            "20000508",
+            "20000508X042651481",
+            "20000508T0426514",
+            "20001308T042651481",
+            "20000508T242651481",
+            "20000508T042651481ZZ",
+            "20000508T0426514811",
+            "2000é508T042651481",
+        ] {
+            assert!(text.parse::<Time>().is_err(), "{text:?}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn every_time_survives_its_texts(ms in 0_u64..253_402_300_800_000) {
+            let time = Time::from_system_time(at(ms)).unwrap();
+            prop_assert_eq!(time.to_string().parse(), Ok(time));
+            prop_assert_eq!(Time::from_rfc3339(&time.to_rfc3339().unwrap()), Ok(time));
+            prop_assert_eq!(time.to_system_time(at(0)), at(ms));
+        }
+
+        #[test]
+        fn every_span_survives(ms in 0_u64..9_999 * 365 * 86_400_000) {
+            let span = Duration::from_millis(ms);
+            prop_assert_eq!(Time::after(span).unwrap().span(), span);
+        }
+
+        #[test]
+        fn any_text_is_read_or_refused(text in "\\PC{0,40}") {
+            let _ = text.parse::<Time>();
+            let _ = Time::from_rfc3339(&text);
+        }
+    }
+}

@@ -1,0 +1,167 @@
+//! Times as text: FIPA00070 and RFC 3339.
+
+use std::fmt;
+use std::str::FromStr;
+
+use super::{Base, Fields, Time, TimeError, Zone};
+
+impl Time {
+    /// RFC 3339 text in UTC with milliseconds, or `None` for a relative time. A time without `Z`
+    /// is taken as UTC.
+    #[must_use]
+    pub fn to_rfc3339(self) -> Option<String> {
+        if self.is_relative() {
+            return None;
+        }
+        let Fields {
+            year,
+            month,
+            day,
+            hour,
+            minute,
+            second,
+            millisecond,
+        } = self.fields;
+        Some(format!(
+            "{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{millisecond:03}Z"
+        ))
+    }
+
+    /// Reads RFC 3339 text with any offset and any number of fractional digits, which are cut to
+    /// milliseconds. The result is in UTC.
+    ///
+    /// # Errors
+    /// When the text is none, or the year in UTC does not have four digits.
+    pub fn from_rfc3339(text: &str) -> Result<Self, TimeError> {
+        let parsed = parse_rfc3339(text).ok_or_else(|| syntax(text))?;
+        let (fields, seconds_east) = parsed;
+        let local = Self::new(Base::Absolute, Zone::Unspecified, fields)?;
+        local.with_local_offset(seconds_east)
+    }
+}
+
+/// The text form of FIPA00070.
+impl fmt::Display for Time {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let sign = match self.base {
+            Base::Absolute => "",
+            Base::After => "+",
+            Base::Before => "-",
+        };
+        let Fields {
+            year,
+            month,
+            day,
+            hour,
+            minute,
+            second,
+            millisecond,
+        } = self.fields;
+        write!(
+            f,
+            "{sign}{year:04}{month:02}{day:02}T{hour:02}{minute:02}{second:02}{millisecond:03}"
+        )?;
+        match self.zone {
+            Zone::Unspecified => Ok(()),
+            Zone::Utc => f.write_str("Z"),
+            Zone::Letter(letter) => write!(f, "{letter}"),
+        }
+    }
+}
+
+impl FromStr for Time {
+    type Err = TimeError;
+
+    /// Reads the text form of FIPA00070; `Z` in place of the `T` is accepted too (JADE).
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let (base, rest) = match text.as_bytes() {
+            [b'+', rest @ ..] => (Base::After, rest),
+            [b'-', rest @ ..] => (Base::Before, rest),
+            rest => (Base::Absolute, rest),
+        };
+        let (fields, designator) = parse_fipa(rest).ok_or_else(|| syntax(text))?;
+        let zone = match designator {
+            [] => Zone::Unspecified,
+            [letter] => Zone::of_letter(*letter).ok_or_else(|| syntax(text))?,
+            _ => return Err(syntax(text)),
+        };
+        Self::new(base, zone, fields)
+    }
+}
+
+fn syntax(text: &str) -> TimeError {
+    TimeError::Syntax(text.chars().take(40).collect())
+}
+
+fn parse_fipa(text: &[u8]) -> Option<(Fields, &[u8])> {
+    let (date, rest) = text.split_at_checked(8)?;
+    let (time, designator) = match rest {
+        [b'T' | b't' | b'Z' | b'z', rest @ ..] => rest.split_at_checked(9)?,
+        _ => return None,
+    };
+    let fields = Fields {
+        year: number(date.get(..4)?)?,
+        month: number(date.get(4..6)?)?.try_into().ok()?,
+        day: number(date.get(6..)?)?.try_into().ok()?,
+        hour: number(time.get(..2)?)?.try_into().ok()?,
+        minute: number(time.get(2..4)?)?.try_into().ok()?,
+        second: number(time.get(4..6)?)?.try_into().ok()?,
+        millisecond: number(time.get(6..)?)?,
+    };
+    Some((fields, designator))
+}
+
+/// `YYYY-MM-DDThh:mm:ss[.fraction](Z|+hh:mm|-hh:mm)`: the fields, and seconds east of UTC.
+fn parse_rfc3339(text: &str) -> Option<(Fields, i32)> {
+    let text = text.as_bytes();
+    let (local, rest) = text.split_at_checked(19)?;
+    let separators: [(usize, &[u8]); 5] =
+        [(4, b"-"), (7, b"-"), (10, b"Tt "), (13, b":"), (16, b":")];
+    for (place, allowed) in separators {
+        if !allowed.contains(local.get(place)?) {
+            return None;
+        }
+    }
+    let (fraction, zone) = match rest {
+        [b'.', rest @ ..] => {
+            let digits = rest.iter().take_while(|byte| byte.is_ascii_digit()).count();
+            let (fraction, zone) = rest.split_at_checked(digits)?;
+            (!fraction.is_empty()).then_some((fraction, zone))?
+        }
+        _ => (&b""[..], rest),
+    };
+    let millisecond = (0..3).fold(0, |ms, place| {
+        ms * 10 + u16::from(fraction.get(place).map_or(0, |digit| digit - b'0'))
+    });
+    let seconds_east = match zone {
+        b"Z" | b"z" => 0,
+        [sign @ (b'+' | b'-'), h1, h2, b':', m1, m2] => {
+            let hours = i32::from(number(&[*h1, *h2])?);
+            let minutes = i32::from(number(&[*m1, *m2])?);
+            if hours > 23 || minutes > 59 {
+                return None;
+            }
+            let seconds = hours * 3600 + minutes * 60;
+            if *sign == b'-' { -seconds } else { seconds }
+        }
+        _ => return None,
+    };
+    let fields = Fields {
+        year: number(local.get(..4)?)?,
+        month: number(local.get(5..7)?)?.try_into().ok()?,
+        day: number(local.get(8..10)?)?.try_into().ok()?,
+        hour: number(local.get(11..13)?)?.try_into().ok()?,
+        minute: number(local.get(14..16)?)?.try_into().ok()?,
+        second: number(local.get(17..19)?)?.try_into().ok()?,
+        millisecond,
+    };
+    Some((fields, seconds_east))
+}
+
+/// At most four digits.
+fn number(digits: &[u8]) -> Option<u16> {
+    digits.iter().try_fold(0_u16, |value, digit| {
+        let digit = digit.is_ascii_digit().then(|| digit - b'0')?;
+        value.checked_mul(10)?.checked_add(u16::from(digit))
+    })
+}

@@ -1,0 +1,280 @@
+//! Envelopes of peers that deviate, and envelopes that cannot be written.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
+
+use bytes::Bytes;
+use fipa_acl::{
+    AclRepresentation, AgentId, EncodeError, Envelope, EnvelopeParams, EnvelopeView, Letter,
+    Problem, Received, Representation, Time,
+};
+
+const DATE: &[u8] = b"\x20\x31\x11\x16\x19\x15\x37\x62\x59\x20";
+
+fn date() -> Time {
+    "20000508T042651481".parse().unwrap()
+}
+
+fn agent(name: &str) -> AgentId {
+    AgentId::new(name).unwrap()
+}
+
+fn base() -> EnvelopeParams {
+    EnvelopeParams {
+        acl_representation: Some(AclRepresentation::BitEfficient),
+        date: Some(date()),
+        ..EnvelopeParams::default()
+    }
+}
+
+fn stamp(by: &str) -> EnvelopeParams {
+    EnvelopeParams {
+        received: Some(Received::new(by, date())),
+        ..EnvelopeParams::default()
+    }
+}
+
+/// A base envelope with these encoded parameters and a length nobody should trust.
+fn encoded_base(parameters: &[u8]) -> Vec<u8> {
+    [b"\xfe\x00\x10\x10", DATE, parameters, b"\x01"].concat()
+}
+
+fn encoded_extension(stamp: &[u8], parameters: &[u8]) -> Vec<u8> {
+    [b"\xfd\x00\x01", stamp, DATE, b"\x01", parameters, b"\x01"].concat()
+}
+
+#[test]
+fn jade_puts_a_tag_in_front_of_stamps() {
+    let bytes = [encoded_extension(b"\x0ajade\0", b""), encoded_base(b"")].concat();
+    let (envelope, _) = Envelope::decode(&bytes).unwrap();
+    assert_eq!(envelope.extensions, [stamp("jade")]);
+    // A stamp that begins with that byte itself survives.
+    let envelope = Envelope {
+        base: base(),
+        extensions: vec![stamp("\njade")],
+    };
+    let bytes = envelope.encode_standard().unwrap();
+    assert_eq!(Envelope::decode(&bytes).unwrap().0, envelope);
+}
+
+#[test]
+fn jade_writes_user_defined_parameters_its_own_way() {
+    let parameters = b"\x00X-k v w\0\x03\x02a\0\x04X-p\0q\0\x01\x00X-l\0m\0";
+    let (envelope, _) = Envelope::decode(&encoded_base(parameters)).unwrap();
+    let pair = |name: &str, value: &str| (name.to_owned(), value.to_owned());
+    assert_eq!(
+        envelope.base.user_defined,
+        [pair("k", "v w"), pair("l", "m")]
+    );
+    assert_eq!(envelope.base.from.unwrap().user_defined(), [pair("p", "q")]);
+}
+
+#[test]
+fn jade_names_the_representation_without_a_code() {
+    let parameters = b"\x04fipa.acl.rep.string.std\0";
+    let (envelope, _) = Envelope::decode(&encoded_base(parameters)).unwrap();
+    assert_eq!(
+        envelope.base.acl_representation,
+        Some(AclRepresentation::String)
+    );
+}
+
+#[test]
+fn the_payload_length_may_have_a_tag() {
+    for parameters in [
+        &b"\x06\x12\x56\x00"[..],
+        b"\x06\x13\x56\x00",
+        b"\x06\x56\x00",
+    ] {
+        let (envelope, _) = Envelope::decode(&encoded_base(parameters)).unwrap();
+        assert_eq!(envelope.base.payload_length, Some(45));
+    }
+    for wrong in [
+        &b"\x06\x00"[..],
+        b"\x06\xe2\x00",
+        b"\x06\xaa\xaa\xaa\xaa\xaa\xaa\xaa\xaa\xaa\xaa\x00",
+    ] {
+        let error = Envelope::decode(&encoded_base(wrong)).unwrap_err();
+        assert_eq!(error.problem(), &Problem::Number);
+    }
+}
+
+#[test]
+fn the_order_of_extensions_is_that_of_their_writer() {
+    let intended = |name: &str| [b"\x09\x02", name.as_bytes(), b"\0\x01\x01"].concat();
+    let counted = |by: &str, to: &str| {
+        let by = format!("#{}\"{by}\0", by.len());
+        encoded_extension(by.as_bytes(), &intended(to))
+    };
+    let bare = |by: &str, to: &str| {
+        let by = format!("{by}\0");
+        encoded_extension(by.as_bytes(), &intended(to))
+    };
+    let order = |parts: &[Vec<u8>]| {
+        let bytes = [parts.concat(), encoded_base(&intended("base"))].concat();
+        let (envelope, len) = Envelope::decode(&bytes).unwrap();
+        let view = EnvelopeView::parse(&bytes).unwrap();
+        assert_eq!(view.len(), len);
+        let newest = view.receivers().map(|name| name.to_string());
+        let effective = envelope.effective().intended_receivers;
+        assert_eq!(newest.collect::<Vec<_>>(), [effective[0].name()]);
+        let stamps = envelope.extensions.iter().flat_map(|part| &part.received);
+        stamps
+            .map(|received| received.by.clone())
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(order(&[bare("new", "a"), bare("old", "b")]), ["old", "new"]);
+    assert_eq!(
+        order(&[counted("old", "a"), counted("new", "b")]),
+        ["old", "new"]
+    );
+    let through_both = [
+        bare("last", "a"),
+        bare("third", "b"),
+        counted("first", "c"),
+        counted("second", "d"),
+    ];
+    assert_eq!(order(&through_both), ["first", "second", "third", "last"]);
+    assert_eq!(order(&[]), [""; 0]);
+}
+
+#[test]
+fn within_one_part_the_last_value_counts() {
+    let parameters = b"\x03\x02a\0\x01\x03\x02b\0\x01\x09\x02c\0\x01\x01\x09\x01";
+    let bytes = encoded_base(parameters);
+    let (envelope, _) = Envelope::decode(&bytes).unwrap();
+    assert_eq!(envelope.base.from, Some(agent("b")));
+    assert_eq!(envelope.base.intended_receivers, [agent("c")]);
+    let view = EnvelopeView::parse(&bytes).unwrap();
+    assert_eq!(view.from_name().unwrap(), "b");
+    assert_eq!(view.receivers().count(), 1);
+}
+
+#[test]
+fn long_envelopes_have_long_lengths() {
+    for receivers in [6_000, 6_600, 20_000] {
+        let envelope = Envelope {
+            base: EnvelopeParams {
+                to: (0..receivers)
+                    .map(|n| agent(&format!("agent{n}")))
+                    .collect(),
+                ..base()
+            },
+            extensions: vec![stamp("mts")],
+        };
+        let bytes = envelope.encode_standard().unwrap();
+        let (read, len) = Envelope::decode(&bytes).unwrap();
+        assert_eq!((&read, len), (&envelope, bytes.len()));
+        let base = &bytes[Envelope::encode_extension(&stamp("mts")).unwrap().len()..];
+        let announced = match base {
+            [0xfe, 0, 0, a, b, c, d, ..] => u32::from_be_bytes([*a, *b, *c, *d]) as usize,
+            [0xfe, a, b, ..] => usize::from(u16::from_be_bytes([*a, *b])),
+            _ => panic!("no base envelope"),
+        };
+        assert_eq!(announced, base.len());
+    }
+}
+
+#[test]
+fn what_is_no_envelope_is_refused() {
+    let problem = |bytes: &[u8]| Envelope::decode(bytes).unwrap_err().problem().clone();
+    let xml = Representation::Xml;
+    assert_eq!(problem(b"<?xml?>"), Problem::UnsupportedRepresentation(xml));
+    assert!(matches!(
+        problem(b"hello"),
+        Problem::Unexpected { found: b'h', .. }
+    ));
+    assert!(matches!(problem(b""), Problem::Truncated(_)));
+    let extension = encoded_extension(b"mts\0", b"");
+    assert!(matches!(problem(&extension), Problem::Truncated(_)));
+    let followed = [&extension[..], b"\xfa\x10\x08\x01"].concat();
+    assert!(matches!(
+        problem(&followed),
+        Problem::Unexpected { found: 0xfa, .. }
+    ));
+    assert!(matches!(
+        problem(&extension.repeat(2000)),
+        Problem::TooDeep(_)
+    ));
+    assert!(matches!(
+        problem(&encoded_base(b"\x08")),
+        Problem::Unexpected { .. }
+    ));
+    let nested = [&b"\x03"[..], &b"\x02a\0\x03".repeat(50_000)].concat();
+    assert_eq!(
+        problem(&encoded_base(&nested)),
+        Problem::TooDeep("resolvers")
+    );
+}
+
+#[test]
+fn trailing_bytes_belong_to_the_payload() {
+    let bytes = [&encoded_base(b"")[..], b"rest"].concat();
+    let letter = Letter::split(Bytes::from(bytes)).unwrap();
+    assert_eq!(letter.payload().to_bytes(), "rest");
+    let with_rest = Letter::new(letter.to_bytes(), Bytes::new());
+    let error = with_rest.parse_envelope().unwrap_err();
+    assert_eq!(error.problem(), &Problem::Trailing(4));
+}
+
+#[test]
+fn what_cannot_be_written_is_an_error() {
+    let written = |params: EnvelopeParams| {
+        Envelope {
+            base: params,
+            extensions: vec![],
+        }
+        .encode_standard()
+    };
+    let missing = |parameter, of| Err(EncodeError::Missing { parameter, of });
+    let of = "a base envelope";
+    assert_eq!(
+        written(EnvelopeParams {
+            date: None,
+            ..base()
+        }),
+        missing("date", of)
+    );
+    let no_representation = EnvelopeParams {
+        acl_representation: None,
+        ..base()
+    };
+    assert_eq!(
+        written(no_representation),
+        missing("acl-representation", of)
+    );
+    let comments = |text: &str| EnvelopeParams {
+        comments: Some(text.into()),
+        ..base()
+    };
+    assert_eq!(written(comments("a\0b")), Err(EncodeError::Nul("comments")));
+    assert_eq!(written(comments("")), Err(EncodeError::Empty("comments")));
+    let user_defined = vec![("a b".to_owned(), String::new())];
+    let named = EnvelopeParams {
+        user_defined,
+        ..base()
+    };
+    assert_eq!(
+        written(named),
+        Err(EncodeError::UserDefinedName("a b".into()))
+    );
+
+    let extension = Envelope::encode_extension;
+    let of = "an extension envelope";
+    assert_eq!(
+        extension(&EnvelopeParams::default()),
+        missing("received", of)
+    );
+    let dated = EnvelopeParams {
+        date: Some(date()),
+        ..stamp("mts")
+    };
+    let parameter = "date";
+    assert_eq!(
+        extension(&dated),
+        Err(EncodeError::NoPlace { parameter, of })
+    );
+    assert_eq!(
+        extension(&stamp("")),
+        Err(EncodeError::Empty("received-by"))
+    );
+}

@@ -1,0 +1,232 @@
+//! Recorded messages and letters of real peers decode to what they mean.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD as BASE64;
+use bytes::Bytes;
+use fipa_acl::json::{envelope_to_json, message_from_json, message_to_json};
+use fipa_acl::{
+    AclRepresentation, AgentId, EnvelopeView, Letter, Message, MessageView, Payload, Performative,
+    Zone,
+};
+use serde_json::{Value, json};
+
+#[test]
+fn every_message_of_the_cpp_library() {
+    let files = vectors('m');
+    assert!(files.len() >= 35, "only {} found", files.len());
+    for path in files {
+        let mut expected = expected(&path)["message"].take();
+        if name(&path) == "m28_resolver_depth2" {
+            // The library writes resolvers one deep.
+            let resolver = &mut expected["sender"]["resolvers"][0];
+            resolver.as_object_mut().unwrap().remove("resolvers");
+        }
+        let bytes = Bytes::from(fs::read(&path).unwrap());
+        let message = decoded(&bytes, &path);
+        assert_eq!(with_base64(&message), expected, "{}", path.display());
+        assert_eq!(
+            message_from_json(&expected).map(|m| with_base64(&m)),
+            Ok(expected)
+        );
+
+        // What we write of it means the same.
+        let again = Message::decode(&message.to_payload()).unwrap();
+        assert_eq!(again, message, "{}", path.display());
+    }
+}
+
+#[test]
+fn every_letter_of_the_cpp_library() {
+    let files = vectors('e');
+    assert!(files.len() >= 11, "only {} found", files.len());
+    for path in files {
+        let mut expected = expected(&path);
+        if name(&path) == "e12_extra_override" {
+            // The format has no date in extensions.
+            let extension = &mut expected["envelope"]["extensions"][0];
+            extension.as_object_mut().unwrap().remove("date");
+        }
+        let bytes = Bytes::from(fs::read(&path).unwrap());
+        let (envelope, letter) = Letter::decode(bytes.clone()).unwrap();
+        let json = envelope_to_json(&envelope);
+        assert_eq!(json, expected["envelope"], "{}", path.display());
+        let payload = BASE64.decode(expected["payload_base64"].as_str().unwrap());
+        assert_eq!(letter.payload().to_bytes(), payload.unwrap());
+        assert_eq!(letter.parse_envelope().as_ref(), Ok(&envelope));
+
+        let effective = envelope.effective();
+        let view = EnvelopeView::parse(&bytes).unwrap();
+        assert_eq!(view.len(), letter.envelope_len());
+        assert_eq!(view.acl_representation(), effective.acl_representation);
+        let from = effective.from.as_ref().map(AgentId::name);
+        assert_eq!(
+            view.from_name().map(|name| name.to_string()).as_deref(),
+            from
+        );
+        let receivers: Vec<_> = view.receivers().map(|name| name.to_string()).collect();
+        let expected: Vec<_> = effective
+            .intended_receivers
+            .iter()
+            .map(AgentId::name)
+            .collect();
+        assert_eq!(receivers, expected, "{}", path.display());
+        let stamped = view.stamps().map(|stamp| stamp.by().to_string());
+        for received in envelope
+            .extensions
+            .iter()
+            .filter_map(|e| e.received.as_ref())
+        {
+            assert!(stamped.clone().any(|by| by == received.by));
+        }
+    }
+}
+
+#[test]
+fn a_letter_as_it_goes_over_tcp() {
+    let bytes = Bytes::from(fs::read(vector("tcp_letter.bin")).unwrap());
+    let (envelope, letter) = Letter::decode(bytes).unwrap();
+    let date = |stamp: &fipa_acl::Received| stamp.date.to_rfc3339().unwrap();
+    let [stamped, overriding] = &envelope.extensions[..] else {
+        panic!("two extensions expected: {envelope:?}");
+    };
+    let stamp = stamped.received.as_ref().unwrap();
+    assert_eq!(stamp.by, "send-mts");
+    assert_eq!(stamp.id.as_deref(), Some("1:20261120-11:26:44:998659"));
+    assert_eq!(date(stamp), "2026-11-20T11:26:44.998Z");
+    assert_eq!(overriding.received, None);
+    assert_eq!(overriding.intended_receivers[0].name(), "echo");
+    assert_eq!(
+        envelope.base.from.as_ref().unwrap().addresses(),
+        ["tcp://127.0.0.1:45615"]
+    );
+    assert_eq!(
+        envelope.base.payload_length,
+        Some(letter.payload().len() as u64)
+    );
+
+    let message = Message::decode(letter.payload()).unwrap();
+    let expected = json!({
+        "performative": "request",
+        "sender": { "name": "cpp-sender", "addresses": ["tcp://127.0.0.1:45615"] },
+        "receivers": [{ "name": "echo" }],
+        "content": "hello",
+        "reply_with": "rw-1",
+        "conversation_id": "conv-1",
+    });
+    assert_eq!(message_to_json(&message), expected);
+}
+
+#[test]
+fn a_failure_report() {
+    let bytes = Bytes::from(fs::read(vector("failure_letter.bin")).unwrap());
+    let (envelope, letter) = Letter::decode(bytes).unwrap();
+    let effective = envelope.effective();
+    assert_eq!(effective.from.unwrap().name(), "echo-mts");
+    assert_eq!(effective.intended_receivers[0].name(), "cpp-sender");
+    assert_eq!(
+        effective.acl_representation,
+        Some(AclRepresentation::BitEfficient)
+    );
+
+    let message = Message::decode(letter.payload()).unwrap();
+    assert_eq!(message.performative(), &Performative::Failure);
+    assert_eq!(message.sender().unwrap().name(), "echo-mts");
+    assert_eq!(message.in_reply_to(), Some("rw-1"));
+    assert_eq!(message.ontology(), Some("fipa-agent-management"));
+    let content = message.content().unwrap();
+    assert!(content.starts_with(b"(inform:sender(agent-identifier"));
+    assert_eq!(content.len(), 240);
+}
+
+#[test]
+fn messages_of_jade() {
+    let bytes = Bytes::from(fs::read(vector("jade_inform.be")).unwrap());
+    let expected = json!({
+        "performative": "inform",
+        "sender": { "name": "echo@jadetest", "addresses": ["http://127.0.0.1:7778/acc"] },
+        "receivers": [{ "name": "rusty@rustap", "addresses": ["http://127.0.0.1:9901/acc"] }],
+        "content": "hello jade",
+        "language": "fipa-sl",
+        "ontology": "test-onto",
+        "protocol": "fipa-request",
+        "conversation_id": "conv-1",
+        "reply_with": "rusty@rustap1795173064144",
+        "in_reply_to": "rw-1",
+    });
+    let inform = decoded(&bytes, Path::new("jade_inform.be"));
+    assert_eq!(message_to_json(&inform), expected);
+
+    let bytes = Bytes::from(fs::read(vector("jade_request.be")).unwrap());
+    let request = decoded(&bytes, Path::new("jade_request.be"));
+    assert_eq!(request.performative(), &Performative::Request);
+    assert_eq!(request.content().unwrap(), "hello jade");
+    assert!(inform.is_reply_to(&request));
+}
+
+#[test]
+fn local_times_of_the_cpp_library_stay_local() {
+    let bytes = fs::read(vector("m46_reply_by.be")).unwrap();
+    let time = MessageView::parse(&bytes).unwrap().reply_by().unwrap();
+    assert_eq!(time.zone(), Zone::Unspecified);
+    assert_eq!(time.to_string(), "20101223T120037980");
+}
+
+/// Decodes through view and owned value, which must agree on the content, and checks that the
+/// content is not copied.
+fn decoded(bytes: &Bytes, path: &Path) -> Message {
+    let message = Message::decode(&Payload::from(bytes.clone()))
+        .unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    let view = MessageView::parse(bytes).unwrap();
+    assert_eq!(
+        view.content().as_deref(),
+        message.content().map(|content| &content[..])
+    );
+    if let Some(content) = message.content().filter(|content| !content.is_empty()) {
+        assert!(
+            bytes.as_ptr_range().contains(&content.as_ptr()),
+            "{}",
+            path.display()
+        );
+    }
+    message
+}
+
+fn with_base64(message: &Message) -> Value {
+    let mut json = message_to_json(message);
+    let object = json.as_object_mut().unwrap();
+    if let Some(text) = object.remove("content") {
+        let encoded = BASE64.encode(text.as_str().unwrap());
+        object.insert("content_base64".into(), Value::String(encoded));
+    }
+    json
+}
+
+fn expected(path: &Path) -> Value {
+    serde_json::from_slice(&fs::read(path.with_extension("json")).unwrap()).unwrap()
+}
+
+fn name(path: &Path) -> &str {
+    path.file_stem().unwrap().to_str().unwrap()
+}
+
+fn vector(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("tests/vectors")
+        .join(name)
+}
+
+fn vectors(initial: char) -> Vec<PathBuf> {
+    let mut found: Vec<_> = fs::read_dir(vector(""))
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.extension().is_some_and(|ext| ext == "be"))
+        .filter(|path| name(path).starts_with(initial))
+        .collect();
+    found.sort();
+    found
+}
