@@ -1,0 +1,156 @@
+//! The format of an entries file: one JSON object.
+//!
+//! ```json
+//! {"format":"fipa-directory","version":1,"mts":{"name":"arm-mts","incarnation":"00ab…"},
+//!  "entries":[{"name":"arm_left","type":"gripper","incarnation":"00cd…",
+//!    "locations":["shm://…#00ab…"],"description":"…","registered":1795172400000,"role":"agent"}]}
+//! ```
+//! `registered` is in milliseconds since 1970, UTC. An entry of an agent on another host, which
+//! only a gateway writes, has `remote` with the message transport service that has it there; the
+//! gateway is the file's.
+//!
+//! A file is written by a process of the same user, which does not make it true: everything is
+//! checked, and a file with any mistake is refused as a whole.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use fipa_transport::{Incarnation, Location};
+use serde::{Deserialize, Serialize};
+
+use crate::entry::{millis_of_time, time_of_millis};
+use crate::{Entry, EntryError, Mts, Reach, Role, Source};
+
+const FORMAT: &str = "fipa-directory";
+const VERSION: u32 = 1;
+
+/// The entries of one process, by name.
+pub(super) type Entries = HashMap<Arc<str>, Arc<Entry>>;
+
+/// Most entries in one file.
+pub(super) const MAX_ENTRIES: usize = 65_536;
+
+pub(super) fn write<'a>(mts: &Mts, entries: impl Iterator<Item = &'a Arc<Entry>>) -> Vec<u8> {
+    let written = Written {
+        format: FORMAT.into(),
+        version: VERSION,
+        mts: mts.clone(),
+        entries: entries.map(|entry| WrittenEntry::of(entry)).collect(),
+    };
+    // Texts, numbers and lists of them: nothing that JSON could not hold.
+    serde_json::to_vec(&written).unwrap_or_default()
+}
+
+pub(super) fn read(bytes: &[u8]) -> Result<Entries, FileError> {
+    let written: Written = serde_json::from_slice(bytes).map_err(FileError::Json)?;
+    if written.format != FORMAT {
+        return Err(FileError::Format(written.format));
+    }
+    if written.version != VERSION {
+        return Err(FileError::Version(written.version));
+    }
+    if written.entries.len() > MAX_ENTRIES {
+        return Err(FileError::TooMany(written.entries.len()));
+    }
+    let mut entries = Entries::with_capacity(written.entries.len());
+    for one in written.entries {
+        let entry = Arc::new(one.into_entry(&written.mts)?);
+        if let Some(twice) = entries.insert(entry.name.clone(), entry) {
+            return Err(FileError::Twice(twice.name.clone()));
+        }
+    }
+    Ok(entries)
+}
+
+/// Bytes that are not an entries file.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum FileError {
+    #[error("malformed: {0}")]
+    Json(#[source] serde_json::Error),
+    #[error("the format is {0:?} and not {FORMAT:?}")]
+    Format(String),
+    #[error("version {0} is not understood (only {VERSION}); do all processes use one release?")]
+    Version(u32),
+    #[error("{0} entries, and at most {MAX_ENTRIES} are allowed")]
+    TooMany(usize),
+    #[error("the name {0:?} occurs twice")]
+    Twice(Arc<str>),
+    #[error("entry {name:?}: {error}")]
+    Entry { name: Arc<str>, error: EntryError },
+    #[error("entry {0:?} has no incarnation")]
+    NoIncarnation(Arc<str>),
+}
+
+#[derive(Serialize, Deserialize)]
+struct Written {
+    format: String,
+    version: u32,
+    mts: Mts,
+    entries: Vec<WrittenEntry>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct WrittenEntry {
+    name: Arc<str>,
+    #[serde(rename = "type", default, skip_serializing_if = "String::is_empty")]
+    agent_type: String,
+    incarnation: Incarnation,
+    locations: Vec<Location>,
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    description: String,
+    registered: u64,
+    role: Role,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    remote: Option<Mts>,
+}
+
+impl WrittenEntry {
+    fn of(entry: &Entry) -> Self {
+        let remote = match entry.reach {
+            Reach::Local => None,
+            Reach::Remote { .. } => Some(entry.mts.clone()),
+        };
+        Self {
+            name: entry.name.clone(),
+            agent_type: entry.agent_type.clone(),
+            incarnation: entry.incarnation,
+            locations: entry.locations.clone(),
+            description: entry.description.clone(),
+            registered: millis_of_time(entry.registered),
+            role: entry.role,
+            remote,
+        }
+    }
+
+    fn into_entry(self, mts: &Mts) -> Result<Entry, FileError> {
+        let reach = match self.remote {
+            None => Reach::Local,
+            Some(_) => Reach::Remote {
+                gateway: mts.incarnation,
+            },
+        };
+        // Peers may have none, processes of this host always have one.
+        if reach == Reach::Local && !self.incarnation.is_known() {
+            return Err(FileError::NoIncarnation(self.name));
+        }
+        let entry = Entry {
+            name: self.name,
+            agent_type: self.agent_type,
+            incarnation: self.incarnation,
+            locations: self.locations,
+            mts: self.remote.unwrap_or_else(|| mts.clone()),
+            description: self.description,
+            registered: time_of_millis(self.registered),
+            source: Source::Host,
+            reach,
+            role: self.role,
+        };
+        match entry.check() {
+            Ok(()) => Ok(entry),
+            Err(error) => {
+                let name = entry.name;
+                Err(FileError::Entry { name, error })
+            }
+        }
+    }
+}

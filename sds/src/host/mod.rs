@@ -1,0 +1,257 @@
+//! The directory of one host, without a broker: files in a private directory of the domain.
+//!
+//! * Each process holds an advisory lock on a file of its own for as long as it lives, and writes
+//!   what it has registered into another, which it replaces as a whole.
+//! * Names are given out under one more lock, which is held for as long as it takes to see that
+//!   nobody who lives has the name, and to write. The name of a process that has died is free at
+//!   once.
+//! * Everybody watches the directory. A process that ends, even by SIGKILL, closes its lock file,
+//!   and the kernel tells all others, who then forget its agents and remove its files.
+//! * Reading takes no system call. Only for a name that is not known the generation is read (one
+//!   call), and the files when it has changed.
+//!
+//! What must not live here: anything about the network. A gateway publishes here what it has
+//! learnt elsewhere.
+
+mod file;
+mod place;
+mod shared;
+mod watcher;
+
+use std::io;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use fipa_transport::Incarnation;
+
+use self::place::{Id, Place};
+use self::shared::Shared;
+use self::watcher::Watcher;
+use crate::{
+    DeregisterError, Directory, Entry, EntryError, Mts, Reach, RegisterError, Registration, Source,
+    Subscriber,
+};
+
+/// Where the directory of a host is, and who joins it.
+#[derive(Debug, Clone)]
+pub struct HostConfig {
+    /// The private directory of the domain: created with mode 0700 when it does not exist, and
+    /// refused when it belongs to somebody else, others may enter it, or it is a symbolic link.
+    pub dir: PathBuf,
+    /// The message transport service of this process.
+    pub mts: Mts,
+    /// Whether this process may publish agents of other hosts.
+    pub gateway: bool,
+}
+
+/// The agents of all processes of one domain on one host.
+///
+/// Leaves the directory when dropped.
+#[derive(Debug)]
+pub struct HostDirectory {
+    shared: Arc<Shared>,
+    config: HostConfig,
+    task: tokio::task::JoinHandle<()>,
+}
+
+impl HostDirectory {
+    /// Joins the directory. A task of the current tokio runtime keeps the view up to date.
+    ///
+    /// # Errors
+    /// When there is no runtime, or the directory is not private or cannot be used.
+    pub fn open(config: HostConfig) -> Result<Self, HostError> {
+        let runtime = tokio::runtime::Handle::try_current().map_err(|_| HostError::NoRuntime)?;
+        // Not the service's incarnation: a process may open the directory more than once.
+        let id = Id(Incarnation::random().as_u64());
+        let place = Place::join(&config.dir, id)?;
+        let shared = Arc::new(Shared::new(place, config.mts.clone()));
+        // Watching before reading, so that nothing is missed in between.
+        let begun = Watcher::new(&shared.place).and_then(|watcher| {
+            shared.refresh()?;
+            Ok(watcher)
+        });
+        let watcher = match begun {
+            Ok(watcher) => watcher,
+            Err(error) => {
+                // The first error is the one to be told.
+                let _ = shared.close();
+                return Err(error);
+            }
+        };
+        let task = runtime.spawn(watcher.run(Arc::clone(&shared)));
+        Ok(Self {
+            shared,
+            config,
+            task,
+        })
+    }
+
+    /// Replaces the agents of other hosts that this gateway publishes to the processes of this
+    /// one, who see them as [`Reach::Remote`] through this gateway; their locations are those at
+    /// which the gateway takes letters for them. They are not in this directory's own view.
+    ///
+    /// # Errors
+    /// When this is no gateway, an entry is not valid, there are too many, or they cannot be
+    /// written. Nothing has changed then.
+    pub fn publish_remote(&self, entries: Vec<Entry>) -> Result<(), HostError> {
+        if !self.config.gateway {
+            return Err(HostError::NoGateway);
+        }
+        let mut published = std::collections::BTreeMap::new();
+        for mut entry in entries {
+            entry.reach = Reach::Remote {
+                gateway: self.config.mts.incarnation,
+            };
+            let checked = entry.check();
+            checked.map_err(|error| HostError::Entry {
+                name: entry.name.clone(),
+                error,
+            })?;
+            published.insert(entry.name.clone(), Arc::new(entry));
+        }
+        self.shared.publish(published.into_values().collect())
+    }
+
+    /// Leaves the directory, with everything that was registered. The last process leaves it
+    /// empty. Dropping does the same and can only log what goes wrong.
+    ///
+    /// # Errors
+    /// When files cannot be removed.
+    pub fn close(&self) -> Result<(), HostError> {
+        self.task.abort();
+        self.shared.close()
+    }
+}
+
+impl Drop for HostDirectory {
+    fn drop(&mut self) {
+        if let Err(error) = self.close() {
+            tracing::error!(%error, "the host's directory was not left in order");
+        }
+    }
+}
+
+impl Directory for HostDirectory {
+    fn known(&self, name: &str) -> Option<Arc<Entry>> {
+        self.shared.table.known(name)
+    }
+
+    fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
+        self.shared.table.known_incarnation(incarnation)
+    }
+
+    fn refresh(&self) {
+        if let Err(error) = self.shared.refresh() {
+            tracing::error!(%error, "the view of the host's directory may be out of date");
+        }
+    }
+
+    fn entries(&self) -> Arc<[Arc<Entry>]> {
+        self.shared.table.entries()
+    }
+
+    fn generation(&self) -> u64 {
+        self.shared.table.generation()
+    }
+
+    fn subscribe(&self, subscriber: &Subscriber) {
+        self.shared.table.subscribe(subscriber);
+    }
+
+    fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {
+        let entry = registration.into_entry(&self.config.mts, Source::Host)?;
+        self.shared.register(entry)
+    }
+
+    fn deregister(&self, name: &str, incarnation: Incarnation) -> Result<(), DeregisterError> {
+        let ours = |entry: &Entry| entry.incarnation == incarnation;
+        self.shared.deregister(name, ours)
+    }
+}
+
+/// What goes wrong with the directory of a host.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum HostError {
+    /// Somebody else could read or change it.
+    #[error("refusing to use {}: {why}; remove it, or configure another directory", path.display())]
+    NotPrivate {
+        /// What is refused.
+        path: PathBuf,
+        /// Why.
+        why: String,
+    },
+    /// The lock of the domain was not to be had.
+    #[error(
+        "another process holds the lock {} and does not let go; is one stopped (state T in ps)?",
+        path.display()
+    )]
+    Busy {
+        /// The file that is locked.
+        path: PathBuf,
+    },
+    /// Somebody has removed the files of living processes.
+    #[error(
+        "the files in {} were removed while they were in use; end all processes of the domain and \
+         start them again",
+        path.display()
+    )]
+    Removed {
+        /// The directory.
+        path: PathBuf,
+    },
+    /// There are more files than processes can make.
+    #[error("too many files in {}; remove those that are no longer used", path.display())]
+    TooManyFiles {
+        /// The directory.
+        path: PathBuf,
+    },
+    /// A file is larger than allowed.
+    #[error("{} is too large to be an entries file", path.display())]
+    TooLarge {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The system refused something.
+    #[error("cannot {what} {}: {source}", path.display())]
+    Io {
+        /// What was tried.
+        what: &'static str,
+        /// On which file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The directory cannot be watched.
+    #[error(
+        "cannot watch {}: {source}; if too many instances or watches are in use, raise \
+         fs.inotify.max_user_instances or fs.inotify.max_user_watches",
+        path.display()
+    )]
+    Watch {
+        /// The directory.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// An entry to be published is not valid.
+    #[error("cannot publish {name:?}: {error}")]
+    Entry {
+        /// Its name.
+        name: Arc<str>,
+        /// What is wrong.
+        error: EntryError,
+    },
+    /// There is too much to be published.
+    #[error("the directory is full: {0}")]
+    Full(String),
+    /// Only a gateway publishes agents of other hosts.
+    #[error("this process is no gateway and cannot publish agents of other hosts")]
+    NoGateway,
+    /// The directory has been closed.
+    #[error("the directory has been closed")]
+    Closed,
+    /// A task is needed, and there is nobody to run it.
+    #[error("the host's directory must be opened within a tokio runtime")]
+    NoRuntime,
+}

@@ -1,0 +1,518 @@
+//! The private directory of a domain: opening it, its files, its lock.
+//!
+//! Everything is done relative to the directory's descriptor and without following symbolic
+//! links, so that what was checked is what is used.
+
+use std::fs::{DirBuilder, File, TryLockError};
+use std::io::{self, Read as _, Write as _};
+use std::os::fd::OwnedFd;
+use std::os::unix::fs::{DirBuilderExt as _, FileExt as _};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use parking_lot::{Mutex, MutexGuard};
+use rustix::fs::{AtFlags, FileType, Mode, OFlags, Timespec, Timestamps};
+use rustix::io::Errno;
+
+use super::HostError;
+
+/// What tells the files of one process from those of the others.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(super) struct Id(pub(super) u64);
+
+/// The files of the directory, by their names.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Name {
+    /// `lock`: held while the directory is changed; its first eight bytes are the generation.
+    Domain,
+    /// `<id>.lock`: held by a process as long as it lives.
+    Process(Id),
+    /// `<id>.entries`: what the process has registered.
+    Entries(Id),
+    /// `<id>.tmp`: what will be renamed to one of the others.
+    Temporary(Id),
+}
+
+impl Name {
+    pub(super) fn parse(name: &str) -> Option<Self> {
+        if name == "lock" {
+            return Some(Self::Domain);
+        }
+        let (id, kind) = name.split_once('.')?;
+        if id.len() != 16 || !id.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f')) {
+            return None;
+        }
+        let id = Id(u64::from_str_radix(id, 16).ok()?);
+        match kind {
+            "lock" => Some(Self::Process(id)),
+            "entries" => Some(Self::Entries(id)),
+            "tmp" => Some(Self::Temporary(id)),
+            _ => None,
+        }
+    }
+}
+
+impl std::fmt::Display for Name {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Domain => f.write_str("lock"),
+            Self::Process(Id(id)) => write!(f, "{id:016x}.lock"),
+            Self::Entries(Id(id)) => write!(f, "{id:016x}.entries"),
+            Self::Temporary(Id(id)) => write!(f, "{id:016x}.tmp"),
+        }
+    }
+}
+
+/// The directory, joined by this process.
+#[derive(Debug)]
+pub(super) struct Place {
+    path: PathBuf,
+    dir: OwnedFd,
+    domain: File,
+    /// An advisory lock belongs to the open file, which the threads of this process share.
+    threads: Mutex<()>,
+    id: Id,
+    /// Never read: holding it, open for writing, says that this process lives.
+    process: Mutex<Option<File>>,
+}
+
+/// How long to wait for the lock of the domain, which is held for less than a millisecond unless
+/// its holder has been stopped.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+impl Place {
+    /// Opens the directory, creates it if need be, checks it, and joins as a process with this
+    /// id.
+    pub(super) fn join(path: &Path, id: Id) -> Result<Self, HostError> {
+        // A trailing slash would make the kernel follow a symbolic link.
+        let path: PathBuf = path.components().collect();
+        let dir = open_private(&path)?;
+        let mut place = Self {
+            domain: open_domain(&dir, &path)?,
+            path,
+            dir,
+            threads: Mutex::new(()),
+            id,
+            process: Mutex::new(None),
+        };
+        let deadline = Instant::now() + PATIENCE;
+        while !place.try_join()? {
+            // The last process has left in between, and taken the lock file with it.
+            place.domain = open_domain(&place.dir, &place.path)?;
+            if Instant::now() > deadline {
+                return Err(HostError::Busy { path: place.path });
+            }
+        }
+        Ok(place)
+    }
+
+    fn try_join(&self) -> Result<bool, HostError> {
+        let guard = self.lock_any()?;
+        if !guard.is_current()? {
+            return Ok(false);
+        }
+        guard.sweep()?;
+        let temporary = Name::Temporary(self.id);
+        let file = self.create(temporary)?;
+        // Locked before it is seen by that name: a lock file that is not held is a dead process.
+        file.try_lock().map_err(|error| match error {
+            TryLockError::Error(source) => self.io("lock", temporary)(source),
+            TryLockError::WouldBlock => HostError::Busy {
+                path: self.path.join(temporary.to_string()),
+            },
+        })?;
+        self.rename(temporary, Name::Process(self.id))?;
+        *self.process.lock() = Some(file);
+        Ok(true)
+    }
+
+    pub(super) fn id(&self) -> Id {
+        self.id
+    }
+
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// A path to the directory that no rename can lead elsewhere.
+    pub(super) fn pinned_path(&self) -> PathBuf {
+        use std::os::fd::AsRawFd as _;
+        PathBuf::from(format!("/proc/self/fd/{}", self.dir.as_raw_fd()))
+    }
+
+    /// The number that grows with every change. Zero when there was none.
+    pub(super) fn generation(&self) -> Result<u64, HostError> {
+        let mut number = [0; 8];
+        match self.domain.read_exact_at(&mut number, 0) {
+            Ok(()) => Ok(u64::from_le_bytes(number)),
+            Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => Ok(0),
+            Err(error) => Err(self.io("read", Name::Domain)(error)),
+        }
+    }
+
+    /// The lock of the domain. Others wait while it is held.
+    pub(super) fn lock(&self) -> Result<Guard<'_>, HostError> {
+        let guard = self.lock_any()?;
+        if guard.is_current()? {
+            Ok(guard)
+        } else {
+            Err(HostError::Removed {
+                path: self.path.clone(),
+            })
+        }
+    }
+
+    /// The lock of the domain if it is free.
+    pub(super) fn try_lock(&self) -> Result<Option<Guard<'_>>, HostError> {
+        let Some(threads) = self.threads.try_lock() else {
+            return Ok(None);
+        };
+        match self.domain.try_lock() {
+            Ok(()) => Ok(Some(Guard {
+                place: self,
+                _threads: threads,
+            })),
+            Err(TryLockError::WouldBlock) => Ok(None),
+            Err(TryLockError::Error(source)) => Err(self.io("lock", Name::Domain)(source)),
+        }
+    }
+
+    fn lock_any(&self) -> Result<Guard<'_>, HostError> {
+        let deadline = Instant::now() + PATIENCE;
+        let mut pause = Duration::from_micros(50);
+        loop {
+            if let Some(guard) = self.try_lock()? {
+                return Ok(guard);
+            }
+            if Instant::now() > deadline {
+                return Err(HostError::Busy {
+                    path: self.path.join(Name::Domain.to_string()),
+                });
+            }
+            std::thread::sleep(pause);
+            pause = (pause * 2).min(Duration::from_millis(4));
+        }
+    }
+
+    /// Whether a process holds its lock file.
+    pub(super) fn lives(&self, id: Id) -> Result<bool, HostError> {
+        let name = Name::Process(id);
+        // Not for writing: closing it again would look like the end of that process.
+        let Some(file) = self.open(name)? else {
+            return Ok(false);
+        };
+        match file.try_lock_shared() {
+            Ok(()) => Ok(false),
+            Err(TryLockError::WouldBlock) => Ok(true),
+            Err(TryLockError::Error(source)) => Err(self.io("lock", name)(source)),
+        }
+    }
+
+    /// What our files there are, in no order. Anything else in the directory is left alone.
+    pub(super) fn names(&self) -> Result<Vec<Name>, HostError> {
+        let io = |error: Errno| self.io("list", Name::Domain)(error.into());
+        let mut names = Vec::new();
+        for found in rustix::fs::Dir::read_from(&self.dir).map_err(io)? {
+            let found = found.map_err(io)?;
+            let name = found.file_name().to_str().ok().and_then(Name::parse);
+            names.extend(name);
+            if names.len() > MAX_FILES {
+                return Err(HostError::TooManyFiles {
+                    path: self.path.clone(),
+                });
+            }
+        }
+        Ok(names)
+    }
+
+    /// Which entries file the process has; none when it has not written any.
+    pub(super) fn version(&self, id: Id) -> Result<Option<Version>, HostError> {
+        let name = Name::Entries(id);
+        match rustix::fs::statat(&self.dir, name.to_string(), AtFlags::SYMLINK_NOFOLLOW) {
+            Ok(stat) => Ok(Some(Version {
+                modified: (stat.st_mtime, stat.st_mtime_nsec),
+                inode: stat.st_ino,
+                len: stat.st_size,
+            })),
+            Err(Errno::NOENT) => Ok(None),
+            Err(error) => Err(self.io("examine", name)(error.into())),
+        }
+    }
+
+    /// The entries file of a process; none when there is none.
+    pub(super) fn read_entries(&self, id: Id) -> Result<Option<Vec<u8>>, HostError> {
+        let name = Name::Entries(id);
+        let Some(file) = self.open(name)? else {
+            return Ok(None);
+        };
+        let mut bytes = Vec::new();
+        let limit = MAX_ENTRIES_FILE as u64;
+        // The length may be a lie by the time it is read, so reading is limited, too.
+        file.take(limit + 1)
+            .read_to_end(&mut bytes)
+            .map_err(self.io("read", name))?;
+        if bytes.len() > MAX_ENTRIES_FILE {
+            return Err(HostError::TooLarge {
+                path: self.path.join(name.to_string()),
+            });
+        }
+        Ok(Some(bytes))
+    }
+
+    /// One of our files, for reading; none when there is none. Refuses what is not a file of
+    /// ours.
+    fn open(&self, name: Name) -> Result<Option<File>, HostError> {
+        // Without waiting, in case somebody has put a pipe there.
+        let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
+        match rustix::fs::openat(&self.dir, name.to_string(), flags, Mode::empty()) {
+            Ok(file) => check_file(file, &self.path, name).map(Some),
+            Err(Errno::NOENT) => Ok(None),
+            Err(error) => Err(self.io("open", name)(error.into())),
+        }
+    }
+
+    fn create(&self, name: Name) -> Result<File, HostError> {
+        let flags = OFlags::RDWR | OFlags::CREATE | OFlags::EXCL | OFlags::CLOEXEC;
+        rustix::fs::openat(&self.dir, name.to_string(), flags, PRIVATE)
+            .map(File::from)
+            .map_err(|error| self.io("create", name)(error.into()))
+    }
+
+    fn rename(&self, from: Name, to: Name) -> Result<(), HostError> {
+        rustix::fs::renameat(&self.dir, from.to_string(), &self.dir, to.to_string())
+            .map_err(|error| self.io("rename", from)(error.into()))
+    }
+
+    fn remove(&self, name: Name) -> Result<(), HostError> {
+        match rustix::fs::unlinkat(&self.dir, name.to_string(), AtFlags::empty()) {
+            Ok(()) | Err(Errno::NOENT) => Ok(()),
+            Err(error) => Err(self.io("remove", name)(error.into())),
+        }
+    }
+
+    fn io(&self, what: &'static str, name: Name) -> impl FnOnce(io::Error) -> HostError {
+        let path = self.path.join(name.to_string());
+        move |source| HostError::Io { what, path, source }
+    }
+}
+
+/// What tells an entries file from the one before.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Version {
+    /// Not a time: see [`Guard::write_entries`].
+    modified: (i64, u64),
+    inode: u64,
+    len: i64,
+}
+
+/// Most files in a directory: three per process, and there are not more processes on a host.
+const MAX_FILES: usize = 100_000;
+
+/// Largest entries file, in bytes.
+pub(super) const MAX_ENTRIES_FILE: usize = 32 * 1024 * 1024;
+
+const PRIVATE: Mode = Mode::RUSR.union(Mode::WUSR);
+
+/// The lock of the domain, held.
+pub(super) struct Guard<'a> {
+    place: &'a Place,
+    _threads: MutexGuard<'a, ()>,
+}
+
+impl Drop for Guard<'_> {
+    fn drop(&mut self) {
+        if let Err(error) = self.place.domain.unlock() {
+            tracing::error!(%error, path = %self.place.path.display(), "cannot unlock the directory");
+        }
+    }
+}
+
+impl Guard<'_> {
+    /// Whether the file that is locked is still the one that newcomers will lock.
+    fn is_current(&self) -> Result<bool, HostError> {
+        let place = self.place;
+        let io = |error: Errno| place.io("examine", Name::Domain)(error.into());
+        let held = rustix::fs::fstat(&place.domain).map_err(io)?;
+        let name = Name::Domain.to_string();
+        match rustix::fs::statat(&place.dir, name, AtFlags::SYMLINK_NOFOLLOW) {
+            Ok(found) => Ok((held.st_dev, held.st_ino) == (found.st_dev, found.st_ino)),
+            Err(Errno::NOENT) => Ok(false),
+            Err(error) => Err(io(error)),
+        }
+    }
+
+    /// Replaces this process's entries file, and lets everybody know. Returns the new generation.
+    pub(super) fn write_entries(&self, bytes: &[u8]) -> Result<u64, HostError> {
+        let place = self.place;
+        let generation = place.generation()?.wrapping_add(1);
+        let temporary = Name::Temporary(place.id);
+        place.remove(temporary)?;
+        let mut file = place.create(temporary)?;
+        let written = file.write_all(bytes).and_then(|()| {
+            // The time of modification is the version: clocks are too coarse and inodes are
+            // reused, so neither tells two files of one process apart.
+            let version = Timespec {
+                tv_sec: i64::try_from(generation & 0x7fff_ffff).unwrap_or(0),
+                tv_nsec: 0,
+            };
+            let times = Timestamps {
+                last_access: version,
+                last_modification: version,
+            };
+            rustix::fs::futimens(&file, &times).map_err(io::Error::from)
+        });
+        let renamed = written
+            .map_err(place.io("write", temporary))
+            .and_then(|()| place.rename(temporary, Name::Entries(place.id)));
+        if let Err(error) = renamed {
+            // What matters is the first error; the remains are removed by the next sweep.
+            let _ = place.remove(temporary);
+            return Err(error);
+        }
+        place
+            .domain
+            .write_all_at(&generation.to_le_bytes(), 0)
+            .map_err(place.io("write", Name::Domain))?;
+        Ok(generation)
+    }
+
+    /// Removes what dead processes have left. Returns how many processes live, this one included
+    /// once it has joined.
+    pub(super) fn sweep(&self) -> Result<usize, HostError> {
+        let mut living = std::collections::HashMap::new();
+        for name in self.place.names()? {
+            let id = match name {
+                Name::Domain => continue,
+                // Written under this lock only, so nobody is about to rename it.
+                Name::Temporary(_) => {
+                    self.place.remove(name)?;
+                    continue;
+                }
+                Name::Process(id) | Name::Entries(id) => id,
+            };
+            let lives = match living.get(&id) {
+                Some(lives) => *lives,
+                None => self.place.lives(id)?,
+            };
+            living.insert(id, lives);
+            if !lives {
+                self.place.remove(name)?;
+            }
+        }
+        Ok(living.values().filter(|lives| **lives).count())
+    }
+
+    /// Removes what a dead process has left.
+    pub(super) fn bury(&self, id: Id) -> Result<(), HostError> {
+        self.place.remove(Name::Entries(id))?;
+        self.place.remove(Name::Temporary(id))?;
+        self.place.remove(Name::Process(id))
+    }
+
+    /// Leaves the directory, and leaves it empty if this was the last process.
+    pub(super) fn leave(self) -> Result<(), HostError> {
+        self.bury(self.place.id)?;
+        // Only now: as long as it is held, others take this process for alive.
+        drop(self.place.process.lock().take());
+        if self.sweep()? == 0 && self.is_current()? {
+            self.place.remove(Name::Domain)?;
+        }
+        Ok(())
+    }
+}
+
+fn open_private(path: &Path) -> Result<OwnedFd, HostError> {
+    let io = |what| {
+        let path = path.to_owned();
+        move |source| HostError::Io { what, path, source }
+    };
+    let create = DirBuilder::new().recursive(true).mode(0o700).create(path);
+    match create {
+        Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
+            return Err(io("create")(error));
+        }
+        // What exists, perhaps as something else, is checked next.
+        _ => {}
+    }
+    let refused = |why: String| HostError::NotPrivate {
+        path: path.to_owned(),
+        why,
+    };
+    let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
+    let dir = match rustix::fs::open(path, flags, Mode::empty()) {
+        Ok(dir) => dir,
+        Err(Errno::LOOP | Errno::NOTDIR) => {
+            return Err(refused("it is not a directory but a link or a file".into()));
+        }
+        Err(error) => return Err(io("open")(error.into())),
+    };
+    let stat = rustix::fs::fstat(&dir).map_err(|error| io("examine")(error.into()))?;
+    let me = rustix::process::geteuid().as_raw();
+    if stat.st_uid != me {
+        let why = format!("it belongs to user {}, and this is user {me}", stat.st_uid);
+        return Err(refused(why));
+    }
+    if stat.st_mode & 0o077 != 0 {
+        let mode = stat.st_mode & 0o7777;
+        let why = format!("its mode is {mode:04o} and should be 0700");
+        return Err(refused(why));
+    }
+    Ok(dir)
+}
+
+fn open_domain(dir: &OwnedFd, path: &Path) -> Result<File, HostError> {
+    let flags = OFlags::RDWR | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::CLOEXEC;
+    let name = Name::Domain;
+    match rustix::fs::openat(dir, name.to_string(), flags | OFlags::NONBLOCK, PRIVATE) {
+        Ok(file) => check_file(file, path, name),
+        Err(error) => Err(HostError::Io {
+            what: "open",
+            path: path.join(name.to_string()),
+            source: error.into(),
+        }),
+    }
+}
+
+fn check_file(file: OwnedFd, dir: &Path, name: Name) -> Result<File, HostError> {
+    let path = dir.join(name.to_string());
+    let stat = match rustix::fs::fstat(&file) {
+        Ok(stat) => stat,
+        Err(error) => {
+            let (what, source) = ("examine", error.into());
+            return Err(HostError::Io { what, path, source });
+        }
+    };
+    let is_file = FileType::from_raw_mode(stat.st_mode) == FileType::RegularFile;
+    if is_file && stat.st_uid == rustix::process::geteuid().as_raw() {
+        return Ok(File::from(file));
+    }
+    let why = "it is not a file of this user".to_owned();
+    Err(HostError::NotPrivate { path, why })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_our_names_are_names() {
+        let id = Id(0x0123_4567_89ab_cdef);
+        for name in [
+            Name::Domain,
+            Name::Process(id),
+            Name::Entries(id),
+            Name::Temporary(id),
+        ] {
+            assert_eq!(Name::parse(&name.to_string()), Some(name));
+        }
+        for stranger in [
+            "",
+            "lock2",
+            "x.lock",
+            "0123456789ABCDEF.lock",
+            "+123456789abcdef.lock",
+        ] {
+            assert_eq!(Name::parse(stranger), None, "{stranger}");
+        }
+    }
+}

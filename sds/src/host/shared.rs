@@ -1,0 +1,310 @@
+//! What this process knows of the others, and how it changes what they know of it.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use parking_lot::Mutex;
+
+use super::HostError;
+use super::file::{self, Entries, FileError};
+use super::place::{Guard, Id, MAX_ENTRIES_FILE, Name, Place, Version};
+use crate::table::Table;
+use crate::{DeregisterError, Entry, Mts, RegisterError};
+
+/// The state behind a [`HostDirectory`](super::HostDirectory), shared with its task.
+///
+/// Locks are taken in this order: the domain's, `own`, `others`, the table's.
+#[derive(Debug)]
+pub(super) struct Shared {
+    pub(super) place: Place,
+    pub(super) table: Table<Id>,
+    mts: Mts,
+    own: Mutex<Own>,
+    others: Mutex<Others>,
+}
+
+/// What this process tells the others.
+#[derive(Debug, Default)]
+struct Own {
+    closed: bool,
+    agents: Entries,
+    /// Agents of other hosts, published by a gateway. Not in its own table: it knows them
+    /// better than through itself.
+    remote: Vec<Arc<Entry>>,
+}
+
+/// What the others have told.
+#[derive(Debug, Default)]
+struct Others {
+    generation: u64,
+    processes: HashMap<Id, Process>,
+}
+
+#[derive(Debug, Default)]
+struct Process {
+    version: Option<Version>,
+    entries: Entries,
+}
+
+impl Shared {
+    pub(super) fn new(place: Place, mts: Mts) -> Self {
+        Self {
+            place,
+            table: Table::new(),
+            mts,
+            own: Mutex::default(),
+            others: Mutex::default(),
+        }
+    }
+
+    /// Reads what others have written, if anybody has since the last time: one system call when
+    /// nobody has.
+    pub(super) fn refresh(&self) -> Result<(), HostError> {
+        let generation = self.place.generation()?;
+        let mut others = self.others.lock();
+        if others.generation == generation {
+            return Ok(());
+        }
+        self.scan(&mut others)?;
+        // The number was read before the files: what was written in between is read again.
+        others.generation = generation;
+        Ok(())
+    }
+
+    /// Reads everything again and checks who lives, whatever the generation says.
+    pub(super) fn rescan(&self) -> Result<(), HostError> {
+        let mut others = self.others.lock();
+        let known: Vec<Id> = others.processes.keys().copied().collect();
+        for id in known {
+            if !self.place.lives(id)? {
+                self.forget(&mut others, id);
+            }
+        }
+        self.scan(&mut others)
+    }
+
+    fn scan(&self, others: &mut Others) -> Result<(), HostError> {
+        for name in self.place.names()? {
+            if let Name::Entries(id) = name
+                && id != self.place.id()
+            {
+                self.read(others, id)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Reads what a process has written, if it has written anything new.
+    pub(super) fn process_wrote(&self, id: Id) -> Result<(), HostError> {
+        if id == self.place.id() {
+            return Ok(());
+        }
+        self.read(&mut self.others.lock(), id)
+    }
+
+    fn read(&self, others: &mut Others, id: Id) -> Result<(), HostError> {
+        let known = others.processes.get(&id);
+        let version = self.place.version(id)?;
+        if known.is_some_and(|process| process.version == version) {
+            return Ok(());
+        }
+        // Somebody new may be somebody dead, whose files nobody has removed yet.
+        if known.is_none() && !self.place.lives(id)? {
+            return Ok(());
+        }
+        let entries = self.read_file(id).unwrap_or_else(|error| {
+            // Its agents are not there for us, as if it had none; its next file may be better.
+            let path = self.place.path().join(Name::Entries(id).to_string());
+            tracing::error!(path = %path.display(), %error, "entries file ignored");
+            Entries::new()
+        });
+        let process = others.processes.entry(id).or_default();
+        // Taken before reading: what was replaced in between is read again.
+        process.version = version;
+        let before = std::mem::replace(&mut process.entries, entries);
+        self.tell(id, &before, &process.entries);
+        Ok(())
+    }
+
+    fn read_file(&self, id: Id) -> Result<Entries, ReadError> {
+        match self.place.read_entries(id)? {
+            Some(bytes) => Ok(file::read(&bytes)?),
+            None => Ok(Entries::new()),
+        }
+    }
+
+    fn tell(&self, id: Id, before: &Entries, after: &Entries) {
+        let left = before.keys().filter(|name| !after.contains_key(*name));
+        let left = left.map(|name| (id, name.clone(), None));
+        let changed = after
+            .iter()
+            .filter(|(name, entry)| before.get(*name) != Some(entry));
+        let changed = changed.map(|(name, entry)| (id, name.clone(), Some(Arc::clone(entry))));
+        self.table.update(left.chain(changed));
+    }
+
+    /// Forgets a process if it is dead. False when it lives.
+    pub(super) fn process_ended(&self, id: Id) -> Result<bool, HostError> {
+        if self.place.lives(id)? {
+            return Ok(false);
+        }
+        self.forget(&mut self.others.lock(), id);
+        Ok(true)
+    }
+
+    fn forget(&self, others: &mut Others, id: Id) {
+        if let Some(process) = others.processes.remove(&id) {
+            self.tell(id, &process.entries, &Entries::new());
+        }
+    }
+
+    /// Removes the files of a process if it is dead. False when somebody else is just changing
+    /// the directory.
+    pub(super) fn try_bury(&self, id: Id) -> Result<bool, HostError> {
+        let Some(guard) = self.place.try_lock()? else {
+            return Ok(false);
+        };
+        if !self.place.lives(id)? {
+            guard.bury(id)?;
+        }
+        Ok(true)
+    }
+
+    pub(super) fn register(&self, entry: Entry) -> Result<Arc<Entry>, RegisterError> {
+        let guard = self.place.lock().map_err(failed)?;
+        self.free(&guard, &entry)?;
+        let mut own = self.own.lock();
+        if own.closed {
+            return Err(RegisterError::Closed);
+        }
+        let entry = Arc::new(entry);
+        let before = own.agents.insert(entry.name.clone(), Arc::clone(&entry));
+        if let Err(error) = self.write(&guard, &own) {
+            match before {
+                Some(before) => own.agents.insert(before.name.clone(), before),
+                None => own.agents.remove(&entry.name),
+            };
+            return Err(match error {
+                WriteError::Full(why) => RegisterError::Full(why),
+                WriteError::Host(error) => failed(error),
+            });
+        }
+        self.table.put(self.place.id(), Arc::clone(&entry));
+        Ok(entry)
+    }
+
+    /// Sees to it that nobody who lives has the name.
+    fn free(&self, guard: &Guard<'_>, entry: &Entry) -> Result<(), RegisterError> {
+        self.refresh().map_err(failed)?;
+        while let Some((id, holder)) = self.table.holder(&entry.name) {
+            let ours = id == self.place.id();
+            if ours && holder.incarnation == entry.incarnation {
+                break;
+            }
+            if ours || self.place.lives(id).map_err(failed)? {
+                return Err(RegisterError::AlreadyRegistered { holder });
+            }
+            self.forget(&mut self.others.lock(), id);
+            guard.bury(id).map_err(failed)?;
+        }
+        Ok(())
+    }
+
+    pub(super) fn deregister(
+        &self,
+        name: &str,
+        of: impl Fn(&Entry) -> bool,
+    ) -> Result<(), DeregisterError> {
+        let failed = |error: WriteError| DeregisterError::Failed(Arc::new(error));
+        let guard = self.place.lock().map_err(|error| failed(error.into()))?;
+        let mut own = self.own.lock();
+        if own.closed {
+            return Err(DeregisterError::Closed);
+        }
+        let Some(entry) = own.agents.get(name).filter(|entry| of(entry)).cloned() else {
+            return Err(DeregisterError::NotRegistered(name.into()));
+        };
+        own.agents.remove(name);
+        if let Err(error) = self.write(&guard, &own) {
+            own.agents.insert(entry.name.clone(), entry);
+            return Err(failed(error));
+        }
+        let id = self.place.id();
+        self.table.release(id, name, entry.incarnation);
+        Ok(())
+    }
+
+    /// Replaces what this gateway publishes of other hosts.
+    pub(super) fn publish(&self, remote: Vec<Arc<Entry>>) -> Result<(), HostError> {
+        let guard = self.place.lock()?;
+        let mut own = self.own.lock();
+        if own.closed {
+            return Err(HostError::Closed);
+        }
+        if own.remote == remote {
+            return Ok(());
+        }
+        let before = std::mem::replace(&mut own.remote, remote);
+        self.write(&guard, &own).map_err(|error| {
+            own.remote = before;
+            match error {
+                WriteError::Full(why) => HostError::Full(why),
+                WriteError::Host(error) => error,
+            }
+        })
+    }
+
+    fn write(&self, guard: &Guard<'_>, own: &Own) -> Result<(), WriteError> {
+        // A name that is registered here is not also published as somebody else's.
+        let remote = own.remote.iter();
+        let remote = remote.filter(|entry| !own.agents.contains_key(&entry.name));
+        let count = own.agents.len() + own.remote.len();
+        if count > file::MAX_ENTRIES {
+            let most = file::MAX_ENTRIES;
+            let why = format!("{count} entries in one process, and at most {most} are allowed");
+            return Err(WriteError::Full(why));
+        }
+        let bytes = file::write(&self.mts, own.agents.values().chain(remote));
+        if bytes.len() > MAX_ENTRIES_FILE {
+            let len = bytes.len();
+            let why = format!(
+                "the entries of this process take {len} bytes, and at most {MAX_ENTRIES_FILE} are allowed"
+            );
+            return Err(WriteError::Full(why));
+        }
+        guard.write_entries(&bytes)?;
+        Ok(())
+    }
+
+    /// Leaves the directory. Doing it again does nothing.
+    pub(super) fn close(&self) -> Result<(), HostError> {
+        let guard = self.place.lock();
+        let mut own = self.own.lock();
+        if std::mem::replace(&mut own.closed, true) {
+            return Ok(());
+        }
+        let agents = std::mem::take(&mut own.agents);
+        self.tell(self.place.id(), &agents, &Entries::new());
+        guard?.leave()
+    }
+}
+
+#[derive(Debug, thiserror::Error)]
+enum ReadError {
+    #[error(transparent)]
+    Host(#[from] HostError),
+    #[error(transparent)]
+    File(#[from] FileError),
+}
+
+#[derive(Debug, thiserror::Error)]
+enum WriteError {
+    #[error("{0}")]
+    Full(String),
+    #[error(transparent)]
+    Host(#[from] HostError),
+}
+
+fn failed(error: HostError) -> RegisterError {
+    RegisterError::Failed(Arc::new(error))
+}

@@ -1,0 +1,40 @@
+//! The service directory: which agents there are, where they can be reached, and who joins and
+//! leaves.
+//!
+//! * [`Entry`] is what is known about one registration; [`Registration`] is what its owner says.
+//! * [`Directory`] is the one view everybody reads; [`Watch`] tells what changes in it.
+//! * [`MemoryDirectory`], [`StaticDirectory`], [`HostDirectory`] and (feature `mdns`)
+//!   `MdnsDirectory` are its back ends; [`MergedDirectory`] makes one view of several.
+//! * [`Query`] and [`Pattern`] search; [`resolve`] turns the name of a receiver into entries.
+//!
+//! The crate depends on `fipa-transport`, sideways, for two words only: an entry lists
+//! [`Location`](fipa_transport::Location)s, and a registration is told from an earlier one of the
+//! same name by its [`Incarnation`](fipa_transport::Incarnation).
+//!
+//! What must not live here: letters, routes, connections. Which of an agent's locations is tried
+//! first is the delivery core's business.
+
+mod directory;
+mod entry;
+mod host;
+#[cfg(feature = "mdns")]
+mod mdns;
+mod memory;
+mod merged;
+mod name;
+mod query;
+mod resolve;
+mod table;
+mod watch;
+
+pub use directory::{DeregisterError, Directory, RegisterError};
+pub use entry::{Entry, EntryError, Mts, Reach, Registration, Role, Source};
+pub use host::{HostConfig, HostDirectory, HostError};
+#[cfg(feature = "mdns")]
+pub use mdns::{MdnsConfig, MdnsDirectory, MdnsError, MdnsStatus, Withdrawal};
+pub use memory::{MemoryDirectory, StaticDirectory};
+pub use merged::MergedDirectory;
+pub use name::{MAX_NAME, NameError, check_name};
+pub use query::{Matcher, Pattern, PatternError, Query, is_pattern};
+pub use resolve::{Resolution, resolve};
+pub use watch::{Change, Subscriber, Watch};

@@ -1,0 +1,455 @@
+//! The directory of the local network: DNS-SD over multicast DNS.
+//!
+//! Every agent that a gateway announces is one record of the service type
+//! `_fipa_service_directory._udp`, which Avahi's tools and the C++ peers read as well; the format
+//! is in `record`. Multicast that fails, or is blocked, is never fatal: the
+//! [status](MdnsDirectory::status) says so.
+//!
+//! A name belongs to the earlier registration. The directory whose registration is the later one
+//! withdraws it and [tells](MdnsDirectory::withdrawals); nothing is ever renamed. The instance
+//! label of a record, on the other hand, means nothing between us: if it is taken by another
+//! name, another one is used.
+
+mod record;
+mod task;
+
+use std::collections::{HashMap, HashSet};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use fipa_transport::Incarnation;
+use mdns_sd::{IfKind, ServiceDaemon, ServiceInfo, TxtProperty};
+use parking_lot::Mutex;
+use tokio::sync::{Notify, broadcast};
+
+use crate::table::Table;
+use crate::{
+    DeregisterError, Directory, Entry, Mts, RegisterError, Registration, Source, Subscriber,
+};
+
+/// The type of the records, 22 characters long.
+const SERVICE_TYPE: &str = "_fipa_service_directory._udp.local.";
+/// More than the 15 that DNS-SD allows; without asking for it nothing is announced.
+const SERVICE_NAME_LEN: u8 = 22;
+/// The port of multicast DNS.
+const MDNS_PORT: u16 = 5353;
+/// Largest TXT record announced, in bytes: it has to fit one packet of 9000 bytes with the rest
+/// (RFC 6762 clause 17).
+const MAX_TXT: usize = 8000;
+
+/// How a gateway takes part in the directory of the network.
+#[derive(Debug, Clone)]
+pub struct MdnsConfig {
+    /// The gateway that announces, and takes letters for, what is registered.
+    pub mts: Mts,
+    /// The interfaces used, by name or address; none means all of them, loopback included.
+    pub interfaces: Vec<String>,
+    /// The UDP port, 5353; another one makes a directory of its own.
+    pub port: u16,
+}
+
+impl MdnsConfig {
+    /// All interfaces, and the usual port.
+    #[must_use]
+    pub fn new(mts: Mts) -> Self {
+        Self {
+            mts,
+            interfaces: Vec::new(),
+            port: MDNS_PORT,
+        }
+    }
+}
+
+/// The agents that other gateways announce on the local network, and what this one announces.
+///
+/// Its view has the others' only: a gateway knows its own better. Takes back what it has
+/// announced when dropped.
+#[derive(Debug)]
+pub struct MdnsDirectory {
+    shared: Arc<Shared>,
+    task: tokio::task::JoinHandle<()>,
+}
+
+/// A registration that was taken back because somebody else has had the name for longer.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Withdrawal {
+    /// What was registered here.
+    pub withdrawn: Arc<Entry>,
+    /// Who has the name.
+    pub holder: Arc<Entry>,
+}
+
+/// How the directory of the network fares.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct MdnsStatus {
+    /// How many registrations are announced.
+    pub announced: usize,
+    /// How many records of others are known.
+    pub known: usize,
+    /// How many records of others were not used: malformed, or too many.
+    pub refused: u64,
+    /// What went wrong last, if anything did.
+    pub last_error: Option<String>,
+}
+
+impl MdnsDirectory {
+    /// Most records of others that are kept.
+    pub const MAX_RECORDS: usize = 20_000;
+
+    /// Starts to listen; a task of the current tokio runtime keeps the view up to date. That
+    /// multicast does not work is not an error here but part of the [status](Self::status).
+    ///
+    /// # Errors
+    /// When there is no tokio runtime.
+    pub fn open(config: MdnsConfig) -> Result<Self, MdnsError> {
+        let runtime = tokio::runtime::Handle::try_current().map_err(|_| MdnsError::NoRuntime)?;
+        let daemon = ServiceDaemon::new_with_port(config.port);
+        let (daemon, failed) = match daemon {
+            Ok(daemon) => (Some(daemon), None),
+            Err(error) => (
+                None,
+                Some(format!("cannot open a multicast socket: {error}")),
+            ),
+        };
+        let shared = Arc::new(Shared {
+            daemon,
+            config,
+            table: Table::new(),
+            own: Mutex::default(),
+            withdrawals: broadcast::channel(64).0,
+            status: Mutex::new(MdnsStatus {
+                last_error: failed,
+                ..MdnsStatus::default()
+            }),
+            postponed: Notify::new(),
+        });
+        if let Some(daemon) = &shared.daemon
+            && let Err(error) = choose(daemon, &shared.config.interfaces)
+        {
+            shared.failed(format!("cannot choose the interfaces: {error}"));
+        }
+        let task = runtime.spawn(task::run(Arc::clone(&shared)));
+        Ok(Self { shared, task })
+    }
+
+    /// Tells of every registration that is withdrawn from now on. Who does not read for more
+    /// than 64 of them misses the oldest.
+    #[must_use]
+    pub fn withdrawals(&self) -> broadcast::Receiver<Withdrawal> {
+        self.shared.withdrawals.subscribe()
+    }
+
+    /// How it fares.
+    #[must_use]
+    pub fn status(&self) -> MdnsStatus {
+        let mut status = self.shared.status.lock().clone();
+        status.announced = self.shared.own.lock().agents.len();
+        status.known = self.shared.table.len();
+        status
+    }
+
+    /// Asks the network whether the record of this name is still there, because letters to it do
+    /// not arrive. If nobody answers, it leaves within a few seconds.
+    pub fn verify(&self, name: &str) {
+        let Some((fullname, _)) = self.shared.table.holder(name) else {
+            return;
+        };
+        let patience = Duration::from_secs(2);
+        let asked = self
+            .shared
+            .ask(|daemon| daemon.verify(fullname.to_string(), patience));
+        if let Err(error) = asked {
+            self.shared
+                .failed(format!("cannot verify the record of {name:?}: {error}"));
+        }
+    }
+
+    /// Takes back everything that was announced, with a goodbye, and stops listening. Blocks for
+    /// as long as it takes to send that. Doing it again does nothing.
+    pub fn close(&self) {
+        {
+            let mut own = self.shared.own.lock();
+            if std::mem::replace(&mut own.closed, true) {
+                return;
+            }
+            own.agents.clear();
+        }
+        self.task.abort();
+        let Ok(Some(ended)) = self.shared.ask(ServiceDaemon::shutdown) else {
+            return;
+        };
+        if ended.recv_timeout(Duration::from_secs(5)).is_err() {
+            tracing::error!("multicast DNS did not say goodbye in time");
+        }
+    }
+}
+
+impl Drop for MdnsDirectory {
+    fn drop(&mut self) {
+        self.close();
+    }
+}
+
+impl Directory for MdnsDirectory {
+    fn known(&self, name: &str) -> Option<Arc<Entry>> {
+        self.shared.table.known(name)
+    }
+
+    fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
+        self.shared.table.known_incarnation(incarnation)
+    }
+
+    fn entries(&self) -> Arc<[Arc<Entry>]> {
+        self.shared.table.entries()
+    }
+
+    fn generation(&self) -> u64 {
+        self.shared.table.generation()
+    }
+
+    fn subscribe(&self, subscriber: &Subscriber) {
+        self.shared.table.subscribe(subscriber);
+    }
+
+    /// Announces the agent. Its locations are those at which this gateway takes letters for it.
+    fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {
+        let entry = registration.into_entry(&self.shared.config.mts, Source::Mdns)?;
+        self.shared.register(entry)
+    }
+
+    fn deregister(&self, name: &str, incarnation: Incarnation) -> Result<(), DeregisterError> {
+        self.shared.deregister(name, incarnation)
+    }
+}
+
+/// Why the directory of the network was not opened.
+#[derive(Debug, Clone, thiserror::Error)]
+#[non_exhaustive]
+pub enum MdnsError {
+    /// A task is needed, and there is nobody to run it.
+    #[error("the network's directory must be opened within a tokio runtime")]
+    NoRuntime,
+}
+
+struct Shared {
+    /// None when there was no socket to be had.
+    daemon: Option<ServiceDaemon>,
+    config: MdnsConfig,
+    /// The others' entries, by the full name of their record, spelt as they spell it: the daemon
+    /// knows it by that only.
+    table: Table<Arc<str>>,
+    own: Mutex<Own>,
+    withdrawals: broadcast::Sender<Withdrawal>,
+    status: Mutex<MdnsStatus>,
+    /// Tells the task that there is something to be announced later.
+    postponed: Notify,
+}
+
+impl std::fmt::Debug for Shared {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Shared")
+            .field("config", &self.config)
+            .field("status", &self.status)
+            .finish_non_exhaustive()
+    }
+}
+
+#[derive(Debug, Default)]
+struct Own {
+    closed: bool,
+    agents: HashMap<Arc<str>, Announced>,
+    /// Full names of which the daemon has just said goodbye, and until when they rest. It says so
+    /// twice, and would take the second goodbye for somebody else's claim to the name.
+    resting: HashMap<Arc<str>, Instant>,
+    /// Full names that the daemon has renamed, and will rename ever after.
+    spoilt: HashSet<Arc<str>>,
+}
+
+#[derive(Debug)]
+struct Announced {
+    entry: Arc<Entry>,
+    /// The full name of its record, in lower case.
+    fullname: Arc<str>,
+    /// The host of its record. Each has its own, because the daemon says goodbye to the host
+    /// with the record.
+    host: Incarnation,
+    /// How many labels have been tried.
+    attempt: u32,
+    /// When it is to be announced, if it is not yet.
+    due: Option<Instant>,
+}
+
+/// How long a full name rests after a goodbye.
+const REST: Duration = Duration::from_secs(1);
+
+/// Most full names remembered as spoilt.
+const MAX_SPOILT: usize = 1024;
+
+impl Shared {
+    fn register(&self, entry: Entry) -> Result<Arc<Entry>, RegisterError> {
+        let mut own = self.own.lock();
+        if own.closed {
+            return Err(RegisterError::Closed);
+        }
+        let announced = own.agents.get(&entry.name);
+        let ours = announced.map(|announced| Arc::clone(&announced.entry));
+        if let Some(holder) = ours.or_else(|| self.table.known(&entry.name))
+            && holder.incarnation != entry.incarnation
+        {
+            return Err(RegisterError::AlreadyRegistered { holder });
+        }
+        let len: usize = record::encode(&entry)
+            .iter()
+            .map(|(key, value)| key.len() + value.len() + 2)
+            .sum();
+        if len > MAX_TXT {
+            let why = format!("the record would have {len} bytes, and at most {MAX_TXT} fit");
+            return Err(RegisterError::Full(why));
+        }
+        let entry = Arc::new(entry);
+        let attempt = announced.map_or(0, |announced| announced.attempt);
+        self.announce(&mut own, &entry, attempt)
+            .map_err(|error| RegisterError::Failed(Arc::new(error)))?;
+        Ok(entry)
+    }
+
+    /// Announces the entry under the first label, from this attempt on, that is free; at once, or
+    /// when the label has rested.
+    fn announce(
+        &self,
+        own: &mut Own,
+        entry: &Arc<Entry>,
+        mut attempt: u32,
+    ) -> Result<(), mdns_sd::Error> {
+        let fullname = loop {
+            let fullname = fullname(&record::label(&entry.name, attempt));
+            let mut others = own.agents.iter().filter(|(name, _)| **name != entry.name);
+            let free = others.all(|(_, other)| other.fullname != fullname);
+            if free && !own.spoilt.contains(&fullname) {
+                break fullname;
+            }
+            attempt += 1;
+        };
+        let before = own.agents.get(&entry.name);
+        let before = before.filter(|announced| announced.fullname == fullname);
+        let announced = Announced {
+            entry: Arc::clone(entry),
+            host: before.map_or_else(Incarnation::random, |announced| announced.host),
+            due: own.resting.get(&fullname).copied(),
+            fullname,
+            attempt,
+        };
+        if announced.due.is_some() {
+            self.postponed.notify_one();
+        } else {
+            self.tell_daemon(&announced)?;
+        }
+        own.agents.insert(entry.name.clone(), announced);
+        Ok(())
+    }
+
+    fn tell_daemon(&self, announced: &Announced) -> Result<(), mdns_sd::Error> {
+        let label = record::label(&announced.entry.name, announced.attempt);
+        let host = format!("fipa-{}.local.", announced.host);
+        let properties = record::encode(&announced.entry);
+        let properties: Vec<TxtProperty> = properties.into_iter().map(TxtProperty::from).collect();
+        // The port stands in the locations; the addresses are those of this host.
+        let service = ServiceInfo::new(SERVICE_TYPE, &label, &host, "", 0, properties)?;
+        let service = service.enable_addr_auto();
+        self.ask(|daemon| daemon.register(service.clone()))?;
+        Ok(())
+    }
+
+    /// Announces what has been postponed and is due, and says when the next is.
+    fn announce_due(&self) -> Option<Instant> {
+        let mut own = self.own.lock();
+        let now = Instant::now();
+        own.resting.retain(|_, until| *until > now);
+        for announced in own.agents.values_mut() {
+            if announced.due.is_some_and(|due| due <= now) {
+                announced.due = None;
+                if let Err(error) = self.tell_daemon(announced) {
+                    let name = &announced.entry.name;
+                    self.failed(format!("cannot announce {name:?}: {error}"));
+                }
+            }
+        }
+        own.agents.values().filter_map(|one| one.due).min()
+    }
+
+    /// Takes the record back, with a goodbye.
+    fn take_back(&self, own: &mut Own, name: &str) -> Result<(), mdns_sd::Error> {
+        let Some(announced) = own.agents.get(name) else {
+            return Ok(());
+        };
+        let now = Instant::now();
+        own.resting.retain(|_, until| *until > now);
+        if announced.due.is_none() {
+            self.ask(|daemon| daemon.unregister(&announced.fullname))?;
+            own.resting
+                .insert(Arc::clone(&announced.fullname), now + REST);
+        }
+        own.agents.remove(name);
+        Ok(())
+    }
+
+    fn deregister(&self, name: &str, incarnation: Incarnation) -> Result<(), DeregisterError> {
+        let mut own = self.own.lock();
+        if own.closed {
+            return Err(DeregisterError::Closed);
+        }
+        let announced = own.agents.get(name);
+        if announced.is_none_or(|one| one.entry.incarnation != incarnation) {
+            return Err(DeregisterError::NotRegistered(name.into()));
+        }
+        self.take_back(&mut own, name)
+            .map_err(|error| DeregisterError::Failed(Arc::new(error)))
+    }
+
+    /// Gives the daemon something to do. It takes so many things at a time and asks others to
+    /// come again, which is waited for; nothing at all happens when there is no daemon.
+    fn ask<T>(
+        &self,
+        what: impl Fn(&ServiceDaemon) -> Result<T, mdns_sd::Error>,
+    ) -> Result<Option<T>, mdns_sd::Error> {
+        let Some(daemon) = &self.daemon else {
+            return Ok(None);
+        };
+        let deadline = Instant::now() + Duration::from_secs(5);
+        loop {
+            match what(daemon) {
+                Err(mdns_sd::Error::Again) if Instant::now() < deadline => {
+                    std::thread::sleep(Duration::from_millis(1));
+                }
+                done => return done.map(Some),
+            }
+        }
+    }
+
+    fn failed(&self, error: String) {
+        tracing::warn!(%error, "multicast DNS");
+        self.status.lock().last_error = Some(error);
+    }
+}
+
+/// The full name of a record with this label, in lower case. Labels have no dots and no
+/// backslashes, which would have to be escaped.
+fn fullname(label: &str) -> Arc<str> {
+    format!("{label}.{SERVICE_TYPE}").to_lowercase().into()
+}
+
+fn choose(daemon: &ServiceDaemon, interfaces: &[String]) -> Result<(), mdns_sd::Error> {
+    daemon.set_service_name_len_max(SERVICE_NAME_LEN)?;
+    if interfaces.is_empty() {
+        return Ok(());
+    }
+    let chosen: Vec<IfKind> = interfaces
+        .iter()
+        .map(|interface| match interface.parse() {
+            Ok(address) => IfKind::Addr(address),
+            Err(_) => IfKind::Name(interface.clone()),
+        })
+        .collect();
+    daemon.disable_interface(IfKind::All)?;
+    daemon.enable_interface(chosen)
+}

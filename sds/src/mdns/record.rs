@@ -1,0 +1,574 @@
+//! A directory entry as a DNS-SD record, and back.
+//!
+//! The record is that of the peers (fipa_services, JADE's proxy), to which keys of our own are
+//! added. In this order:
+//!
+//! | key | value |
+//! |---|---|
+//! | `TYPE` | the agent's type |
+//! | `LOCATOR` | `tcp://a.b.c.d:port fipa::services::transports::MessageTransport;`, repeated |
+//! | `DESCRIPTION` | the description |
+//! | `TIMESTAMP` | when it was registered, `%Y%m%d-%H:%M:%S:usec` |
+//! | `fipa-version` | `1` |
+//! | `fipa-name` | the exact name |
+//! | `fipa-id` | the incarnation |
+//! | `fipa-mts`, `fipa-mts-id` | name and incarnation of the gateway that announces it |
+//! | `fipa-role` | `gateway`, or absent for an agent |
+//! | `fipa-time` | when it was registered, in milliseconds since 1970, UTC |
+//! | `fipa-locations` | all locations, in order, with a space between two |
+//! | `fipa-type`, `fipa-description` | in full, when the peers' key has only the beginning |
+//!
+//! What the peers read keeps to what they can take: at most 200 bytes in a value, no scheme but
+//! `tcp`, and numeric IPv4 addresses; the rest is left out for them. A value of ours that is
+//! longer goes on in `key.1`, `key.2` and so on. No key ever occurs twice.
+//!
+//! `TIMESTAMP` has no zone. The peers write local time; we write UTC, and take theirs for UTC,
+//! too: among ourselves `fipa-time` counts, which knows no zones.
+//!
+//! The instance label is the name with `?` for every `.`, as the peers have it, whenever that can
+//! be turned back; see [`label`].
+
+use std::time::SystemTime;
+
+use fipa_transport::{Incarnation, Kind, Location};
+
+use crate::entry::{millis_of_time, time_of_millis};
+use crate::{Entry, EntryError, Mts, Reach, Role, Source};
+
+/// The signature of the peers' locations that speak what we speak.
+const SIGNATURE: &str = "fipa::services::transports::MessageTransport";
+
+/// Longest value that the peers write, and that we write into one string.
+const MAX_VALUE: usize = 200;
+
+/// Most strings over which a value of ours is spread: enough for the longest legal one.
+const MAX_PARTS: usize = 32;
+
+/// Longest label of a DNS name, in bytes.
+const MAX_LABEL: usize = 63;
+
+/// The strings of a TXT record, in order: keys and values.
+pub(super) type Properties = Vec<(String, Vec<u8>)>;
+
+/// The TXT record of an entry.
+pub(super) fn encode(entry: &Entry) -> Properties {
+    let mut properties = Properties::new();
+    let time = millis_of_time(entry.registered);
+    for (key, value) in [
+        ("TYPE", cut(&entry.agent_type).to_owned()),
+        ("LOCATOR", locator(&entry.locations)),
+        ("DESCRIPTION", cut(&entry.description).to_owned()),
+        ("TIMESTAMP", timestamp(time)),
+    ] {
+        properties.push((key.to_owned(), value.into_bytes()));
+    }
+    let mut own = |key: &str, value: &str| {
+        let value = value.as_bytes();
+        // An empty value is one part, too.
+        let parts = value
+            .chunks(MAX_VALUE)
+            .chain(value.is_empty().then_some(value));
+        for (number, part) in parts.enumerate() {
+            properties.push((part_key(key, number), part.to_vec()));
+        }
+    };
+    own("fipa-version", "1");
+    own("fipa-name", &entry.name);
+    own("fipa-id", &entry.incarnation.to_string());
+    own("fipa-mts", &entry.mts.name);
+    own("fipa-mts-id", &entry.mts.incarnation.to_string());
+    if entry.role == Role::Gateway {
+        own("fipa-role", "gateway");
+    }
+    own("fipa-time", &time.to_string());
+    let locations: Vec<String> = entry.locations.iter().map(Location::to_string).collect();
+    own("fipa-locations", &locations.join(" "));
+    for (key, whole) in [
+        ("fipa-type", &entry.agent_type),
+        ("fipa-description", &entry.description),
+    ] {
+        if whole.len() > MAX_VALUE {
+            own(key, whole);
+        }
+    }
+    properties
+}
+
+/// The entry of a record found on the network.
+///
+/// With `fipa-version` the record is one of ours, and has to be right. Without, it is a peer's,
+/// of which is taken what there is; `now` stands in for a time that it does not tell.
+pub(super) fn decode(
+    label: &str,
+    properties: &[(&str, &[u8])],
+    now: SystemTime,
+) -> Result<Entry, RecordError> {
+    let record = Record(properties);
+    let entry = match record.text("fipa-version")? {
+        Some(version) if version == "1" => ours(&record)?,
+        Some(version) => return Err(RecordError::Version(version.chars().take(40).collect())),
+        None => theirs(label, &record, now),
+    };
+    entry.check()?;
+    Ok(entry)
+}
+
+/// The instance label of a name: at most 63 bytes, neither dots nor backslashes.
+///
+/// It is the name with `?` for `.` when a peer can turn that back into the name, else the
+/// beginning of it with a hash of the name, which `attempt` changes: labels that differ only in
+/// the case of letters are the same on the network, so the first may be taken by another name.
+pub(super) fn label(name: &str, attempt: u32) -> String {
+    let plain = name.replace('.', "?");
+    let faithful = plain.len() <= MAX_LABEL && !name.contains(['?', '\\']);
+    if faithful && attempt == 0 {
+        return plain;
+    }
+    let hash = format!("~{:016x}", fnv1a(name, attempt));
+    let beginning = plain.replace('\\', "_");
+    let beginning = &beginning[..beginning.floor_char_boundary(MAX_LABEL - hash.len())];
+    format!("{beginning}{hash}")
+}
+
+/// What is wrong with a record.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub(super) enum RecordError {
+    #[error("version {0:?} of the record is not understood")]
+    Version(String),
+    #[error("the key {0} is missing")]
+    Missing(&'static str),
+    #[error("the value of {0} makes no sense")]
+    Value(&'static str),
+    #[error("the value of {0} is too long")]
+    TooLong(&'static str),
+    #[error(transparent)]
+    Entry(#[from] EntryError),
+}
+
+/// Reads the strings of a record by key.
+struct Record<'a>(&'a [(&'a str, &'a [u8])]);
+
+impl Record<'_> {
+    /// The first value of that key, whatever the case of its letters (RFC 6763 clause 6.4).
+    fn value(&self, key: &str) -> Option<&[u8]> {
+        let found = self.0.iter().find(|(k, _)| k.eq_ignore_ascii_case(key));
+        found.map(|(_, value)| *value)
+    }
+
+    /// The value of one of our keys, with all its parts.
+    fn text(&self, key: &'static str) -> Result<Option<String>, RecordError> {
+        let mut parts = (0..MAX_PARTS + 1).map_while(|number| self.value(&part_key(key, number)));
+        let Some(first) = parts.next() else {
+            return Ok(None);
+        };
+        let mut whole = first.to_vec();
+        for (number, part) in parts.enumerate() {
+            if number + 1 == MAX_PARTS {
+                return Err(RecordError::TooLong(key));
+            }
+            whole.extend_from_slice(part);
+        }
+        let text = String::from_utf8(whole).map_err(|_| RecordError::Value(key))?;
+        Ok(Some(text))
+    }
+
+    fn parsed<T: std::str::FromStr>(&self, key: &'static str) -> Result<T, RecordError> {
+        let text = self.text(key)?.ok_or(RecordError::Missing(key))?;
+        text.parse().map_err(|_| RecordError::Value(key))
+    }
+
+    /// A text of the peers: what of it is legal.
+    fn their_text(&self, key: &str, max: usize) -> String {
+        let text = String::from_utf8_lossy(self.value(key).unwrap_or_default());
+        let mut text: String = text.chars().filter(|c| !c.is_control()).collect();
+        text.truncate(text.floor_char_boundary(max));
+        text
+    }
+}
+
+fn ours(record: &Record<'_>) -> Result<Entry, RecordError> {
+    let key = "fipa-locations";
+    let locations = record.text(key)?.ok_or(RecordError::Missing(key))?;
+    let mut known = Vec::new();
+    for location in locations.split(' ').filter(|location| !location.is_empty()) {
+        match location.parse() {
+            Ok(location) => known.push(location),
+            // A transport that a later version has is no reason not to use the others.
+            Err(fipa_transport::LocationError::UnknownKind(_)) => {}
+            Err(_) => return Err(RecordError::Value(key)),
+        }
+    }
+    let role = match record.text("fipa-role")?.as_deref() {
+        None => Role::Agent,
+        Some("gateway") => Role::Gateway,
+        Some(_) => return Err(RecordError::Value("fipa-role")),
+    };
+    let whole = |ours: &'static str, theirs: &'static str| {
+        let text = match record.text(ours)? {
+            Some(whole) => whole,
+            None => record.text(theirs)?.unwrap_or_default(),
+        };
+        Ok::<_, RecordError>(text)
+    };
+    let mts: Incarnation = record.parsed("fipa-mts-id")?;
+    Ok(Entry {
+        name: record.parsed::<String>("fipa-name")?.into(),
+        agent_type: whole("fipa-type", "TYPE")?,
+        incarnation: record.parsed("fipa-id")?,
+        locations: known,
+        mts: Mts::new(record.parsed::<String>("fipa-mts")?, mts),
+        description: whole("fipa-description", "DESCRIPTION")?,
+        registered: time_of_millis(record.parsed("fipa-time")?),
+        source: Source::Mdns,
+        reach: Reach::Remote { gateway: mts },
+        role,
+    })
+}
+
+fn theirs(label: &str, record: &Record<'_>, now: SystemTime) -> Entry {
+    let name = label.replace('?', ".");
+    let registered = record
+        .value("TIMESTAMP")
+        .and_then(|value| std::str::from_utf8(value).ok())
+        .and_then(millis_of_timestamp)
+        .unwrap_or_else(|| millis_of_time(now));
+    let locator = record.value("LOCATOR").unwrap_or_default();
+    Entry {
+        agent_type: record.their_text("TYPE", Entry::MAX_TYPE),
+        incarnation: Incarnation::UNKNOWN,
+        locations: locations_of_locator(&String::from_utf8_lossy(locator)),
+        // Peers do not say which service it is; each agent might have its own.
+        mts: Mts::new(name.as_str(), Incarnation::UNKNOWN),
+        name: name.into(),
+        description: record.their_text("DESCRIPTION", Entry::MAX_DESCRIPTION),
+        registered: time_of_millis(registered),
+        source: Source::Mdns,
+        reach: Reach::Remote {
+            gateway: Incarnation::UNKNOWN,
+        },
+        role: Role::Agent,
+    }
+}
+
+/// The locations that the peers can parse (an unknown scheme makes them throw), as many as fit.
+fn locator(locations: &[Location]) -> String {
+    let mut locator = String::new();
+    for location in locations {
+        let numeric: Result<std::net::SocketAddrV4, _> = location.address().parse();
+        if location.kind() != Kind::Tcp || numeric.is_err() {
+            continue;
+        }
+        let one = format!("tcp://{} {SIGNATURE};", location.address());
+        if locator.len() + one.len() <= MAX_VALUE {
+            locator += &one;
+        }
+    }
+    locator
+}
+
+/// `address signature[ service-signature];`, repeated. Schemes that we do not have are left out,
+/// and so are signatures of what we cannot speak (JADE's proxy agent), rather than sending there
+/// what nobody understands.
+fn locations_of_locator(locator: &str) -> Vec<Location> {
+    let location = |one: &str| {
+        let mut words = one.split_ascii_whitespace();
+        let address = words.next()?;
+        let understood = words.next().is_none_or(|signature| signature == SIGNATURE);
+        let location: Location = address.parse().ok()?;
+        (understood && location.kind() == Kind::Tcp).then_some(location)
+    };
+    let locations = locator.split(';').filter_map(location);
+    locations.take(Entry::MAX_LOCATIONS).collect()
+}
+
+const TIMESTAMP: &str = "%Y%m%d-%H:%M:%S";
+
+fn timestamp(millis: u64) -> String {
+    let time = i64::try_from(millis).ok();
+    let time = time.and_then(|millis| jiff::Timestamp::from_millisecond(millis).ok());
+    let time = time.unwrap_or(jiff::Timestamp::UNIX_EPOCH);
+    format!("{}:{:06}", time.strftime(TIMESTAMP), millis % 1000 * 1000)
+}
+
+fn millis_of_timestamp(text: &str) -> Option<u64> {
+    let (seconds, micros) = match text.match_indices(':').nth(2) {
+        Some((at, _)) => (text.get(..at)?, text.get(at + 1..)?),
+        None => (text, "0"),
+    };
+    let micros: u64 = micros.parse().ok().filter(|micros| *micros < 1_000_000)?;
+    let time = jiff::civil::DateTime::strptime(TIMESTAMP, seconds).ok()?;
+    let time = time.to_zoned(jiff::tz::TimeZone::UTC).ok()?;
+    let millis = u64::try_from(time.timestamp().as_millisecond()).ok()?;
+    Some(millis + micros / 1000)
+}
+
+fn part_key(key: &str, number: usize) -> String {
+    match number {
+        0 => key.to_owned(),
+        _ => format!("{key}.{number}"),
+    }
+}
+
+fn cut(text: &str) -> &str {
+    &text[..text.floor_char_boundary(MAX_VALUE)]
+}
+
+/// Fowler, Noll and Vo: not to be guessed is not the point, being the same everywhere is.
+fn fnv1a(name: &str, attempt: u32) -> u64 {
+    let bytes = name.bytes().chain(attempt.to_be_bytes());
+    bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
+        (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::{Duration, UNIX_EPOCH};
+
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::MAX_NAME;
+
+    fn read(label: &str, properties: &Properties) -> Result<Entry, RecordError> {
+        let borrowed: Vec<(&str, &[u8])> = properties
+            .iter()
+            .map(|(key, value)| (key.as_str(), value.as_slice()))
+            .collect();
+        decode(label, &borrowed, UNIX_EPOCH)
+    }
+
+    fn example() -> Entry {
+        let gateway = Incarnation::from_u64(0xab);
+        Entry {
+            name: "arm.left@crex".into(),
+            agent_type: "gripper".to_owned(),
+            incarnation: Incarnation::from_u64(7),
+            locations: vec![
+                "quic://10.0.0.2:1#00000000000000ab".parse().unwrap(),
+                "tcp://[fe80::1%eth0]:7788".parse().unwrap(),
+                "tcp://10.0.0.2:7788#00000000000000ab".parse().unwrap(),
+            ],
+            mts: Mts::new("crex-mts", gateway),
+            description: "left".to_owned(),
+            registered: UNIX_EPOCH + Duration::from_millis(1_795_172_400_123),
+            source: Source::Mdns,
+            reach: Reach::Remote { gateway },
+            role: Role::Agent,
+        }
+    }
+
+    #[test]
+    fn peers_find_what_they_expect() {
+        let properties = encode(&example());
+        let texts: Vec<String> = properties
+            .iter()
+            .map(|(key, value)| format!("{key}={}", String::from_utf8_lossy(value)))
+            .collect();
+        assert_eq!(
+            texts[..4],
+            [
+                "TYPE=gripper",
+                "LOCATOR=tcp://10.0.0.2:7788 fipa::services::transports::MessageTransport;",
+                "DESCRIPTION=left",
+                "TIMESTAMP=20261120-11:00:00:123000",
+            ]
+        );
+        assert_eq!(label(&example().name, 0), "arm?left@crex");
+    }
+
+    #[test]
+    fn what_peers_announce_is_read() {
+        let properties = [
+            ("timestamp", &b"20261120-11:00:00:123456"[..]),
+            (
+                "LOCATOR",
+                b"udt://10.0.0.2:1 fipa::services::transports::MessageTransport;\
+                  tcp://10.0.0.2:7788 fipa::services::transports::MessageTransport x;\
+                  tcp://10.0.0.3:6789 JadeProxyAgent;;;tcp://",
+            ),
+            ("TYPE", b"\xff\x00sensor"),
+        ];
+        let entry = decode("echo@192?0?2?2:1099/JADE", &properties, UNIX_EPOCH).unwrap();
+        assert_eq!(&*entry.name, "echo@192.0.2.2:1099/JADE");
+        assert_eq!(entry.agent_type, "\u{fffd}sensor");
+        assert_eq!(
+            entry.locations,
+            ["tcp://10.0.0.2:7788".parse::<Location>().unwrap()]
+        );
+        assert_eq!(entry.description, "");
+        assert_eq!(entry.registered, example().registered);
+        assert!(!entry.incarnation.is_known());
+
+        let now = UNIX_EPOCH + Duration::from_secs(5);
+        let bare = decode("bare", &[], now).unwrap();
+        assert_eq!(bare.registered, now);
+        assert!(decode("", &[], now).is_err());
+    }
+
+    #[test]
+    fn times_without_sense_are_not_times() {
+        let time = millis_of_timestamp;
+        assert_eq!(time("19700101-00:00:01"), Some(1000));
+        assert_eq!(time("19700101-00:00:01:002999"), Some(1002));
+        for bad in [
+            "",
+            ":::",
+            "19700101-00:00:01:",
+            "19690101-00:00:00:0",
+            "19701301-00:00:00:0",
+        ] {
+            assert_eq!(time(bad), None, "{bad:?}");
+        }
+    }
+
+    #[test]
+    fn labels_of_different_names_differ() {
+        let long = "x".repeat(100);
+        for (one, other) in [
+            ("a.b", "a?b"),
+            ("a\\b", "a_b"),
+            (&*long, &*"x".repeat(101)),
+            (&*long, &*"x".repeat(46)),
+        ] {
+            assert_ne!(label(one, 0), label(other, 0));
+        }
+        assert_ne!(label("arm", 1), label("arm", 2));
+        assert!(label("arm", 1).starts_with("arm~"));
+    }
+
+    #[test]
+    fn a_record_of_ours_has_to_be_right() {
+        let good = encode(&example());
+        for (key, wrong) in [
+            ("fipa-version", "2"),
+            ("fipa-id", "7"),
+            ("fipa-time", "-1"),
+            ("fipa-role", "king"),
+            ("fipa-locations", "tcp://a b"),
+            ("fipa-name", ""),
+            ("fipa-name", "a\nb"),
+        ] {
+            let mut record = good.clone();
+            record.retain(|(k, _)| k != key);
+            record.push((key.to_owned(), wrong.as_bytes().to_vec()));
+            assert!(read("x", &record).is_err(), "{key}={wrong}");
+        }
+        for missing in ["fipa-id", "fipa-name", "fipa-mts-id", "fipa-time"] {
+            let mut record = good.clone();
+            record.retain(|(key, _)| key != missing);
+            assert_eq!(read("x", &record), Err(RecordError::Missing(missing)));
+        }
+        let mut endless = good.clone();
+        endless.extend((1..100).map(|number| (format!("fipa-mts.{number}"), vec![b'x'; 200])));
+        assert_eq!(read("x", &endless), Err(RecordError::TooLong("fipa-mts")));
+    }
+
+    fn any_text(max: usize) -> impl Strategy<Value = String> {
+        let chars = prop_oneof![
+            4 => any::<char>(),
+            1 => prop::sample::select(vec!['.', '?', '\\', ';', ' ', '=', 'é', '\u{1F980}']),
+        ];
+        prop::collection::vec(chars, 0..max).prop_map(move |chars| {
+            let mut text: String = chars.into_iter().filter(|c| !c.is_control()).collect();
+            text.truncate(text.floor_char_boundary(max));
+            text
+        })
+    }
+
+    fn any_name() -> impl Strategy<Value = String> {
+        any_text(MAX_NAME).prop_filter("not empty", |name| !name.is_empty())
+    }
+
+    fn any_location() -> impl Strategy<Value = Location> {
+        let kind = prop::sample::select(Kind::ALL.to_vec());
+        let address = "[!-\"$-:<-~é]{1,200}";
+        (kind, address, any::<u64>()).prop_map(|(kind, address, incarnation)| {
+            Location::new(kind, &address)
+                .unwrap()
+                .with_incarnation(Incarnation::from_u64(incarnation))
+        })
+    }
+
+    prop_compose! {
+        fn any_entry()(
+            name in any_name(),
+            agent_type in any_text(Entry::MAX_TYPE),
+            incarnation: u64,
+            locations in prop::collection::vec(any_location(), 0..=Entry::MAX_LOCATIONS),
+            mts_name in any_name(),
+            mts: u64,
+            description in any_text(Entry::MAX_DESCRIPTION),
+            millis: u64,
+            gateway: bool,
+        ) -> Entry {
+            let mts = Mts::new(mts_name, Incarnation::from_u64(mts));
+            Entry {
+                name: name.into(),
+                agent_type,
+                incarnation: Incarnation::from_u64(incarnation),
+                locations,
+                reach: Reach::Remote { gateway: mts.incarnation },
+                mts,
+                description,
+                registered: time_of_millis(millis),
+                source: Source::Mdns,
+                role: if gateway { Role::Gateway } else { Role::Agent },
+            }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn every_legal_entry_survives(entry in any_entry(), label in any_text(63)) {
+            prop_assert_eq!(entry.check(), Ok(()));
+            let properties = encode(&entry);
+            let mut keys = std::collections::HashSet::new();
+            for (key, value) in &properties {
+                prop_assert!(keys.insert(key.to_lowercase()), "{} occurs twice", key);
+                prop_assert!(key.len() + 1 + value.len() <= 255);
+            }
+            prop_assert_eq!(read(&label, &properties), Ok(entry));
+        }
+
+        #[test]
+        fn labels_are_legal_and_can_be_turned_back(name in any_name(), attempt in 0..3_u32) {
+            let label = label(&name, attempt);
+            prop_assert!(!label.is_empty() && label.len() <= MAX_LABEL);
+            prop_assert!(!label.contains(['.', '\\']));
+            let turned_back = label.replace('?', ".") == name;
+            prop_assert!(turned_back || label.contains('~'));
+        }
+
+        #[test]
+        fn arbitrary_records_do_no_harm(
+            label in any_text(63),
+            mut properties in prop::collection::vec(
+                (
+                    prop_oneof![
+                        "[ -<>-~]{0,20}",
+                        "fipa-(name|id|mts|mts-id|time|locations|role|type)(\\.[0-9]{1,2})?",
+                        "TYPE|LOCATOR|DESCRIPTION|TIMESTAMP",
+                    ],
+                    prop::collection::vec(any::<u8>(), 0..255),
+                ),
+                0..40,
+            ),
+            ours: bool,
+        ) {
+            if ours {
+                properties.push(("fipa-version".to_owned(), b"1".to_vec()));
+            }
+            if let Ok(entry) = read(&label, &properties) {
+                prop_assert_eq!(entry.check(), Ok(()));
+            }
+        }
+
+        #[test]
+        fn arbitrary_locators_and_times_do_no_harm(text in any_text(300)) {
+            let _ = locations_of_locator(&text);
+            let _ = millis_of_timestamp(&text);
+        }
+    }
+}

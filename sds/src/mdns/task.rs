@@ -1,0 +1,226 @@
+//! The task that listens to the network.
+
+use std::collections::HashSet;
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use mdns_sd::{DaemonEvent, Receiver, ResolvedService, ServiceDaemon, ServiceEvent};
+use tokio::time::Instant;
+
+use super::{MAX_SPOILT, MdnsDirectory, SERVICE_TYPE, Shared, Withdrawal, record};
+use crate::Entry;
+
+/// Keeps the view up to date and our names unambiguous, for ever.
+pub(super) async fn run(shared: Arc<Shared>) {
+    let Some(monitor) = subscribe(&shared, ServiceDaemon::monitor) else {
+        return;
+    };
+    let mut unconfirmed = HashSet::new();
+    // The daemon drops a listener who has fallen behind; then all is asked for again.
+    while let Some(found) = subscribe(&shared, |daemon| daemon.browse(SERVICE_TYPE)) {
+        listen(&shared, &found, &monitor, &mut unconfirmed).await;
+        shared.failed("events were lost; asking the network again".to_owned());
+        unconfirmed = shared.table.origins();
+        tokio::time::sleep(Duration::from_secs(1)).await;
+    }
+}
+
+fn subscribe<T>(
+    shared: &Shared,
+    what: impl Fn(&ServiceDaemon) -> Result<Receiver<T>, mdns_sd::Error>,
+) -> Option<Receiver<T>> {
+    match shared.ask(what) {
+        Ok(receiver) => receiver,
+        Err(error) => {
+            shared.failed(format!("cannot listen: {error}"));
+            None
+        }
+    }
+}
+
+/// Handles what happens until a channel ends. What was known before and has not been found again
+/// after a while is gone.
+async fn listen(
+    shared: &Shared,
+    found: &Receiver<ServiceEvent>,
+    monitor: &Receiver<DaemonEvent>,
+    unconfirmed: &mut HashSet<Arc<str>>,
+) {
+    let give_up = Instant::now() + Duration::from_secs(5);
+    loop {
+        let due = shared.announce_due();
+        tokio::select! {
+            () = shared.postponed.notified() => {}
+            () = until(due), if due.is_some() => {}
+            event = found.recv_async() => match event {
+                Ok(ServiceEvent::ServiceResolved(service)) => {
+                    unconfirmed.remove(service.get_fullname());
+                    resolved(shared, &service);
+                }
+                Ok(ServiceEvent::ServiceRemoved(_, fullname)) => removed(shared, &fullname),
+                Ok(ServiceEvent::SearchStopped(_)) | Err(_) => return,
+                Ok(_) => {}
+            },
+            event = monitor.recv_async() => match event {
+                Ok(DaemonEvent::NameChange(change)) => renamed(shared, &change.original),
+                Ok(DaemonEvent::Error(error)) => shared.failed(error.to_string()),
+                Ok(_) => {}
+                Err(_) => return,
+            },
+            () = tokio::time::sleep_until(give_up), if !unconfirmed.is_empty() => {
+                for fullname in unconfirmed.drain() {
+                    removed(shared, &fullname);
+                }
+            }
+        }
+    }
+}
+
+async fn until(due: Option<std::time::Instant>) {
+    if let Some(due) = due {
+        tokio::time::sleep_until(due.into()).await;
+    }
+}
+
+fn resolved(shared: &Shared, service: &ResolvedService) {
+    let fullname: Arc<str> = service.get_fullname().into();
+    let properties: Vec<(&str, &[u8])> = service
+        .get_properties()
+        .iter()
+        .map(|property| (property.key(), property.val().unwrap_or_default()))
+        .collect();
+    let label = label_of(service.get_fullname());
+    let entry = match record::decode(&label, &properties, SystemTime::now()) {
+        Ok(entry) => Arc::new(entry),
+        Err(error) => {
+            shared.status.lock().refused += 1;
+            tracing::debug!(record = label, %error, "record not used");
+            // It may have been right before.
+            return removed(shared, &fullname);
+        }
+    };
+    if entry.mts.incarnation == shared.config.mts.incarnation {
+        return own_found(shared, &fullname, &entry);
+    }
+    if shared.table.len() >= MdnsDirectory::MAX_RECORDS && !shared.table.has_origin(&fullname) {
+        let mut status = shared.status.lock();
+        status.refused += 1;
+        status.last_error = Some("too many records on the network".to_owned());
+        return;
+    }
+    shared.table.replace(&fullname, Some(Arc::clone(&entry)));
+    contested(shared, &entry);
+}
+
+fn removed(shared: &Shared, fullname: &str) {
+    shared.table.replace(&fullname.into(), None);
+}
+
+/// One of our own records has come back, perhaps by another name than we have given it: then the
+/// daemon has renamed it, and its telling so was lost.
+fn own_found(shared: &Shared, fullname: &str, entry: &Entry) {
+    let original = {
+        let own = shared.own.lock();
+        let announced = own.agents.get(&entry.name);
+        let announced = announced.filter(|one| one.entry.incarnation == entry.incarnation);
+        // The rest is what the network still remembers of labels we have given up.
+        announced
+            .filter(|one| is_renamed(&fullname.to_lowercase(), &one.fullname))
+            .map(|one| Arc::clone(&one.fullname))
+    };
+    if let Some(original) = original {
+        renamed(shared, &original);
+    }
+}
+
+/// Whether the one full name is the other with ` (2)` or the like behind its label.
+fn is_renamed(fullname: &str, original: &str) -> bool {
+    let label = label_of(original);
+    label_of(fullname)
+        .strip_prefix(&label)
+        .and_then(|rest| {
+            rest.strip_prefix(" (")?
+                .strip_suffix(')')?
+                .parse::<u32>()
+                .ok()
+        })
+        .is_some()
+}
+
+/// The label of one of our records was taken, and the daemon has chosen another one. Whose name
+/// it is, is not known yet: it may be another name with the same label. We choose our own label;
+/// if the name is the same, both will see that and the later gives way.
+fn renamed(shared: &Shared, original: &str) {
+    let original = original.to_lowercase();
+    let mut own = shared.own.lock();
+    let announced = own.agents.values().find(|one| *one.fullname == *original);
+    let Some(announced) = announced else {
+        return;
+    };
+    let (entry, attempt) = (Arc::clone(&announced.entry), announced.attempt + 1);
+    if own.spoilt.len() >= MAX_SPOILT {
+        // What is forgotten is noticed again, just a little later.
+        own.spoilt.clear();
+    }
+    own.spoilt.insert(original.into());
+    let withdrawn = shared.take_back(&mut own, &entry.name);
+    let announced = withdrawn.and_then(|()| shared.announce(&mut own, &entry, attempt));
+    if let Err(error) = announced {
+        let name = &entry.name;
+        shared.failed(format!(
+            "cannot announce {name:?} by another label: {error}"
+        ));
+    }
+}
+
+/// If we announce the same name, the later registration is withdrawn: by us when it is ours.
+fn contested(shared: &Shared, theirs: &Arc<Entry>) {
+    let mut own = shared.own.lock();
+    let Some(ours) = own.agents.get(&theirs.name) else {
+        return;
+    };
+    let age = |entry: &Entry| (entry.registered, entry.incarnation);
+    if age(&ours.entry) < age(theirs) {
+        return;
+    }
+    let withdrawn = Arc::clone(&ours.entry);
+    if let Err(error) = shared.take_back(&mut own, &withdrawn.name) {
+        let name = &withdrawn.name;
+        shared.failed(format!("cannot withdraw {name:?}: {error}"));
+    }
+    drop(own);
+    let name = &withdrawn.name;
+    tracing::warn!(%name, holder = %theirs.mts.name, "an earlier registration has the name");
+    // That nobody listens is up to the owner.
+    let _ = shared.withdrawals.send(Withdrawal {
+        withdrawn,
+        holder: Arc::clone(theirs),
+    });
+}
+
+/// The first label of a full name, as it was given.
+fn label_of(fullname: &str) -> String {
+    let label = fullname
+        .len()
+        .checked_sub(SERVICE_TYPE.len() + 1)
+        .and_then(|len| fullname.get(..len))
+        .unwrap_or(fullname);
+    label.replace("\\.", ".").replace("\\\\", "\\")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn renamed_records_are_recognised() {
+        let full = |label: &str| format!("{label}.{SERVICE_TYPE}");
+        assert_eq!(label_of(&full("arm?left")), "arm?left");
+        assert_eq!(label_of(&full(r"arm\.left")), "arm.left");
+        assert_eq!(label_of("x"), "x");
+        assert!(is_renamed(&full("arm (2)"), &full("arm")));
+        for other in ["arm", "arm (x)", "arm~01 (2)", "arm 2"] {
+            assert!(!is_renamed(&full(other), &full("arm")), "{other}");
+        }
+    }
+}

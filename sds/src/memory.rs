@@ -1,0 +1,133 @@
+//! The back ends that live in this process alone.
+
+use std::sync::Arc;
+use std::time::SystemTime;
+
+use fipa_transport::{Incarnation, Location};
+
+use crate::entry::{millis_of_time, time_of_millis};
+use crate::table::Table;
+use crate::{
+    DeregisterError, Directory, Entry, EntryError, Mts, Reach, RegisterError, Registration, Role,
+    Source, Subscriber,
+};
+
+/// A directory of the agents of one process.
+#[derive(Debug)]
+pub struct MemoryDirectory {
+    mts: Mts,
+    table: Table<()>,
+}
+
+impl MemoryDirectory {
+    /// An empty directory; what is registered is served by this message transport service.
+    #[must_use]
+    pub fn new(mts: Mts) -> Self {
+        Self {
+            mts,
+            table: Table::new(),
+        }
+    }
+}
+
+impl Directory for MemoryDirectory {
+    fn known(&self, name: &str) -> Option<Arc<Entry>> {
+        self.table.known(name)
+    }
+
+    fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
+        self.table.known_incarnation(incarnation)
+    }
+
+    fn entries(&self) -> Arc<[Arc<Entry>]> {
+        self.table.entries()
+    }
+
+    fn generation(&self) -> u64 {
+        self.table.generation()
+    }
+
+    fn subscribe(&self, subscriber: &Subscriber) {
+        self.table.subscribe(subscriber);
+    }
+
+    fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {
+        let entry = Arc::new(registration.into_entry(&self.mts, Source::Memory)?);
+        match self.table.claim((), Arc::clone(&entry)) {
+            Ok(()) => Ok(entry),
+            Err(holder) => Err(RegisterError::AlreadyRegistered { holder }),
+        }
+    }
+
+    fn deregister(&self, name: &str, incarnation: Incarnation) -> Result<(), DeregisterError> {
+        if self.table.release((), name, incarnation) {
+            Ok(())
+        } else {
+            Err(DeregisterError::NotRegistered(name.into()))
+        }
+    }
+}
+
+/// The gateways that the configuration names, for networks on which nobody can be discovered.
+///
+/// Their incarnations are unknown until somebody has talked to them; the agents behind them are
+/// learnt then, and elsewhere.
+#[derive(Debug)]
+pub struct StaticDirectory {
+    table: Table<()>,
+}
+
+impl StaticDirectory {
+    /// A directory of gateways by name, each with its locations in order of preference.
+    ///
+    /// # Errors
+    /// When a name is not valid or has too many locations.
+    pub fn new<N: Into<Arc<str>>>(
+        gateways: impl IntoIterator<Item = (N, Vec<Location>)>,
+    ) -> Result<Self, EntryError> {
+        let table = Table::new();
+        let registered = time_of_millis(millis_of_time(SystemTime::now()));
+        for (name, locations) in gateways {
+            let name = name.into();
+            let entry = Entry {
+                name: name.clone(),
+                agent_type: String::new(),
+                incarnation: Incarnation::UNKNOWN,
+                locations,
+                mts: Mts::new(name, Incarnation::UNKNOWN),
+                description: String::new(),
+                registered,
+                source: Source::Static,
+                reach: Reach::Remote {
+                    gateway: Incarnation::UNKNOWN,
+                },
+                role: Role::Gateway,
+            };
+            entry.check()?;
+            table.put((), Arc::new(entry));
+        }
+        Ok(Self { table })
+    }
+}
+
+impl Directory for StaticDirectory {
+    fn known(&self, name: &str) -> Option<Arc<Entry>> {
+        self.table.known(name)
+    }
+
+    fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
+        self.table.known_incarnation(incarnation)
+    }
+
+    fn entries(&self) -> Arc<[Arc<Entry>]> {
+        self.table.entries()
+    }
+
+    fn generation(&self) -> u64 {
+        self.table.generation()
+    }
+
+    fn subscribe(&self, subscriber: &Subscriber) {
+        self.table.subscribe(subscriber);
+    }
+}

@@ -1,0 +1,191 @@
+//! One view of several directories.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use arc_swap::ArcSwapOption;
+use fipa_transport::Incarnation;
+
+use crate::{
+    Change, DeregisterError, Directory, Entry, RegisterError, Registration, Subscriber, Watch,
+};
+
+/// Several directories as one.
+///
+/// When more than one knows a name, the entry that [precedes](Entry::precedes) is seen, and of
+/// equals (one registration learnt twice) that of the directory named first. Registrations go to
+/// the first directory that can be written.
+pub struct MergedDirectory {
+    back_ends: BackEnds,
+    sorted: ArcSwapOption<Sorted>,
+}
+
+type BackEnds = Arc<[Arc<dyn Directory>]>;
+
+struct Sorted {
+    generations: Vec<u64>,
+    entries: Arc<[Arc<Entry>]>,
+}
+
+impl MergedDirectory {
+    /// The view of these directories; what lives closer is named first.
+    #[must_use]
+    pub fn new(back_ends: Vec<Arc<dyn Directory>>) -> Self {
+        Self {
+            back_ends: back_ends.into(),
+            sorted: ArcSwapOption::empty(),
+        }
+    }
+
+    fn generations(&self) -> impl Iterator<Item = u64> {
+        self.back_ends.iter().map(|one| one.generation())
+    }
+}
+
+impl std::fmt::Debug for MergedDirectory {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("MergedDirectory")
+            .field("back_ends", &self.back_ends.len())
+            .finish_non_exhaustive()
+    }
+}
+
+impl Directory for MergedDirectory {
+    fn known(&self, name: &str) -> Option<Arc<Entry>> {
+        holder(&self.back_ends, name)
+    }
+
+    fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
+        let found = |one: &Arc<dyn Directory>| one.known_incarnation(incarnation);
+        let entry = self.back_ends.iter().find_map(found)?;
+        // Somebody who lost the name in the merged view is not in it.
+        self.known(&entry.name)
+            .filter(|holder| holder.incarnation == incarnation)
+    }
+
+    fn refresh(&self) {
+        for one in self.back_ends.iter() {
+            one.refresh();
+        }
+    }
+
+    fn entries(&self) -> Arc<[Arc<Entry>]> {
+        if let Some(sorted) = &*self.sorted.load()
+            && self.generations().eq(sorted.generations.iter().copied())
+        {
+            return Arc::clone(&sorted.entries);
+        }
+        // Taken before reading: what changes meanwhile is read again next time.
+        let generations = self.generations().collect();
+        let mut merged: HashMap<Arc<str>, Arc<Entry>> = HashMap::new();
+        for one in self.back_ends.iter() {
+            for entry in one.entries().iter() {
+                let better = merged
+                    .get(&entry.name)
+                    .is_none_or(|holder| entry.precedes(holder));
+                if better {
+                    merged.insert(entry.name.clone(), Arc::clone(entry));
+                }
+            }
+        }
+        let mut entries: Vec<_> = merged.into_values().collect();
+        entries.sort_unstable_by(|a, b| a.name.cmp(&b.name));
+        let entries: Arc<[_]> = entries.into();
+        self.sorted.store(Some(Arc::new(Sorted {
+            generations,
+            entries: Arc::clone(&entries),
+        })));
+        entries
+    }
+
+    fn generation(&self) -> u64 {
+        // Each of them only grows, so the sum changes whenever one does.
+        self.generations().fold(0, u64::wrapping_add)
+    }
+
+    /// The subscriber is told what changes in each directory, unmerged; [`watch`](Self::watch)
+    /// tells what changes in the merged view.
+    fn subscribe(&self, subscriber: &Subscriber) {
+        for one in self.back_ends.iter() {
+            one.subscribe(subscriber);
+        }
+    }
+
+    fn watch(&self) -> Watch {
+        let (subscriber, watch) = Watch::new();
+        self.subscribe(&subscriber);
+        watch.merging(MergedView::new(&self.back_ends))
+    }
+
+    fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {
+        if let Some(holder) = self.lookup(&registration.name)
+            && holder.incarnation != registration.incarnation
+        {
+            return Err(RegisterError::AlreadyRegistered { holder });
+        }
+        for one in self.back_ends.iter() {
+            match one.register(registration.clone()) {
+                Err(RegisterError::ReadOnly) => {}
+                done => return done,
+            }
+        }
+        Err(RegisterError::ReadOnly)
+    }
+
+    fn deregister(&self, name: &str, incarnation: Incarnation) -> Result<(), DeregisterError> {
+        for one in self.back_ends.iter() {
+            match one.deregister(name, incarnation) {
+                Err(DeregisterError::ReadOnly) => {}
+                done => return done,
+            }
+        }
+        Err(DeregisterError::ReadOnly)
+    }
+}
+
+fn holder(back_ends: &[Arc<dyn Directory>], name: &str) -> Option<Arc<Entry>> {
+    let claims = back_ends.iter().filter_map(|one| one.known(name));
+    claims.reduce(|best, next| if next.precedes(&best) { next } else { best })
+}
+
+/// What a watcher of a merged view has been told so far.
+pub(crate) struct MergedView {
+    back_ends: BackEnds,
+    told: HashMap<Arc<str>, Arc<Entry>>,
+}
+
+impl MergedView {
+    fn new(back_ends: &BackEnds) -> Self {
+        let mut view = Self {
+            back_ends: Arc::clone(back_ends),
+            told: HashMap::new(),
+        };
+        view.reread();
+        view
+    }
+
+    /// What a change in one of the directories means for the merged view, if anything.
+    pub(crate) fn told(&mut self, raw: Change) -> Option<Change> {
+        let Some(name) = raw.name() else {
+            self.reread();
+            return Some(Change::Lagged);
+        };
+        let after = holder(&self.back_ends, name);
+        let before = match &after {
+            Some(entry) => self.told.insert(name.clone(), Arc::clone(entry)),
+            None => self.told.remove(name),
+        };
+        Change::between(before, after)
+    }
+
+    fn reread(&mut self) {
+        self.told.clear();
+        for one in self.back_ends.iter() {
+            for entry in one.entries().iter() {
+                if let Some(entry) = holder(&self.back_ends, &entry.name) {
+                    self.told.insert(entry.name.clone(), entry);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,78 @@
+//! What may be the name of an agent.
+
+/// Longest name of an agent, in bytes.
+///
+/// The standards set no limit. This one leaves room for the longest names in use (`agent@host:port`
+/// of JADE, coalitions of several agents) while a name still fits an mDNS record many times over.
+pub const MAX_NAME: usize = 1024;
+
+/// Why a name cannot be the name of an agent.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum NameError {
+    /// There is no name.
+    #[error("the name is empty; give the agent a name of 1 to {MAX_NAME} bytes")]
+    Empty,
+    /// The name is longer than [`MAX_NAME`].
+    #[error("the name has {0} bytes; at most {MAX_NAME} are allowed")]
+    TooLong(usize),
+    /// The name has a control character.
+    #[error("the name {name:?} has the control character {character:?} at byte {at}; remove it")]
+    Control {
+        /// The name.
+        name: String,
+        /// The character.
+        character: char,
+        /// Where it stands, in bytes from the beginning.
+        at: usize,
+    },
+}
+
+/// Whether this can be the name of an agent: UTF-8 of 1 to [`MAX_NAME`] bytes without control
+/// characters.
+///
+/// # Errors
+/// Says what is wrong with the name.
+pub fn check_name(name: &str) -> Result<(), NameError> {
+    if name.is_empty() {
+        return Err(NameError::Empty);
+    }
+    if name.len() > MAX_NAME {
+        return Err(NameError::TooLong(name.len()));
+    }
+    match name.char_indices().find(|(_, c)| c.is_control()) {
+        Some((at, character)) => Err(NameError::Control {
+            name: name.to_owned(),
+            character,
+            at,
+        }),
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_limits_are_the_limits() {
+        for good in [
+            "a",
+            "béla@home:1099/JADE",
+            ".",
+            "arm (left)",
+            &"x".repeat(MAX_NAME),
+        ] {
+            assert_eq!(check_name(good), Ok(()));
+        }
+        assert_eq!(check_name(""), Err(NameError::Empty));
+        let long = "é".repeat(MAX_NAME / 2 + 1);
+        assert_eq!(check_name(&long), Err(NameError::TooLong(MAX_NAME + 2)));
+        for (bad, place) in [("a\nb", 1), ("\0", 0), ("é\u{85}", 2)] {
+            assert!(
+                matches!(check_name(bad), Err(NameError::Control { at, .. }) if at == place),
+                "{bad:?}"
+            );
+        }
+    }
+}

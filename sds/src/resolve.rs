@@ -1,0 +1,107 @@
+//! From the name of a receiver to the entries it means.
+
+use std::sync::Arc;
+
+use crate::{Directory, Entry, Matcher, Pattern, PatternError, Query, Role, is_pattern};
+
+/// Whom the name of a receiver means.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Resolution {
+    /// The entry of that name.
+    Exact(Arc<Entry>),
+    /// The entries that match a pattern, by name; at least one.
+    Multicast(Vec<Arc<Entry>>),
+    /// Nobody: an unknown name, or a pattern that matches nobody but the sender.
+    None,
+}
+
+/// Whom `receiver` means in a letter from `sender`.
+///
+/// An exact name comes first, whatever characters it has. Otherwise, what
+/// [is a pattern](is_pattern) means every agent whose whole name matches, except the sender
+/// itself and gateways, which nobody means who writes to `.*`.
+///
+/// # Errors
+/// When the name is a pattern that is not valid.
+pub fn resolve(
+    directory: &dyn Directory,
+    receiver: &str,
+    sender: &str,
+) -> Result<Resolution, PatternError> {
+    if let Some(entry) = directory.lookup(receiver) {
+        return Ok(Resolution::Exact(entry));
+    }
+    if !is_pattern(receiver) {
+        return Ok(Resolution::None);
+    }
+    let pattern = Pattern::new(receiver)?;
+    // The look-up that found nobody has already made the directory look for what is new.
+    let mut found = directory.search(&Query::by_name(Matcher::Pattern(pattern)));
+    found.retain(|entry| *entry.name != *sender && entry.role == Role::Agent);
+    Ok(if found.is_empty() {
+        Resolution::None
+    } else {
+        Resolution::Multicast(found)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use fipa_transport::Incarnation;
+
+    use super::*;
+    use crate::{MemoryDirectory, Mts, Registration};
+
+    fn directory(names: &[&str]) -> MemoryDirectory {
+        let directory = MemoryDirectory::new(Mts::new("mts", Incarnation::random()));
+        for name in names {
+            let agent = Registration::new(*name, Incarnation::random(), Vec::new());
+            directory.register(agent).unwrap();
+        }
+        let mut gateway = Registration::new("arm_gateway", Incarnation::random(), Vec::new());
+        gateway.role = Role::Gateway;
+        directory.register(gateway).unwrap();
+        directory
+    }
+
+    fn names(resolution: &Resolution) -> Vec<&str> {
+        match resolution {
+            Resolution::Exact(entry) => vec![&*entry.name],
+            Resolution::Multicast(entries) => entries.iter().map(|entry| &*entry.name).collect(),
+            Resolution::None => Vec::new(),
+        }
+    }
+
+    #[test]
+    fn exact_names_come_before_patterns() {
+        let directory = directory(&["arm_.*", "arm_left", "arm_right", "arm.left"]);
+        let exact = resolve(&directory, "arm_.*", "me").unwrap();
+        assert!(matches!(exact, Resolution::Exact(_)));
+        assert_eq!(names(&exact), ["arm_.*"]);
+        let dot = resolve(&directory, "arm.left", "me").unwrap();
+        assert_eq!(names(&dot), ["arm.left"]);
+        assert_eq!(
+            resolve(&directory, "arm.right", "me").unwrap(),
+            Resolution::None
+        );
+    }
+
+    #[test]
+    fn the_sender_and_gateways_are_left_out_of_a_multicast() {
+        let directory = directory(&["arm_left", "arm_right", "camera"]);
+        let both = resolve(&directory, "arm_.+", "camera").unwrap();
+        assert_eq!(names(&both), ["arm_left", "arm_right"]);
+        let one = resolve(&directory, "arm_.+", "arm_left").unwrap();
+        assert_eq!(names(&one), ["arm_right"]);
+        assert!(matches!(one, Resolution::Multicast(_)));
+        let nobody = resolve(&directory, "came.*", "camera").unwrap();
+        assert_eq!(nobody, Resolution::None);
+        let gateway = resolve(&directory, "arm_gateway", "camera").unwrap();
+        assert_eq!(names(&gateway), ["arm_gateway"]);
+    }
+
+    #[test]
+    fn a_bad_pattern_is_an_error() {
+        assert!(resolve(&directory(&[]), "arm_(", "me").is_err());
+    }
+}

@@ -1,0 +1,226 @@
+//! The index behind the back ends: who claims which name, and who has it.
+
+use std::collections::HashMap;
+use std::hash::Hash;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use arc_swap::ArcSwapOption;
+use fipa_transport::Incarnation;
+use parking_lot::RwLock;
+
+use crate::watch::Hub;
+use crate::{Change, Entry, Subscriber};
+
+/// Entries by the origin that claims them (a process, a record). When several claim one name, the
+/// entry that [precedes](Entry::precedes) has it, and the others wait for it to leave.
+#[derive(Debug)]
+pub(crate) struct Table<O> {
+    index: RwLock<Index<O>>,
+    sorted: ArcSwapOption<Sorted>,
+    generation: AtomicU64,
+    hub: Hub,
+}
+
+#[derive(Debug)]
+struct Index<O> {
+    /// Never an empty list; who has the name stands first.
+    claims: HashMap<Arc<str>, Vec<(O, Arc<Entry>)>>,
+    incarnations: HashMap<Incarnation, Arc<Entry>>,
+    /// What origins of one entry each have said last.
+    #[cfg(feature = "mdns")]
+    origins: HashMap<O, Arc<str>>,
+}
+
+#[derive(Debug)]
+struct Sorted {
+    generation: u64,
+    entries: Arc<[Arc<Entry>]>,
+}
+
+impl<O: Clone + Eq + Hash> Table<O> {
+    pub(crate) fn new() -> Self {
+        Self {
+            index: RwLock::new(Index {
+                claims: HashMap::new(),
+                incarnations: HashMap::new(),
+                #[cfg(feature = "mdns")]
+                origins: HashMap::new(),
+            }),
+            sorted: ArcSwapOption::empty(),
+            generation: AtomicU64::new(0),
+            hub: Hub::default(),
+        }
+    }
+
+    pub(crate) fn known(&self, name: &str) -> Option<Arc<Entry>> {
+        self.index.read().holder(name).cloned()
+    }
+
+    pub(crate) fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
+        self.index.read().incarnations.get(&incarnation).cloned()
+    }
+
+    /// Who has the name, and who claims it for them.
+    pub(crate) fn holder(&self, name: &str) -> Option<(O, Arc<Entry>)> {
+        self.index.read().claims.get(name)?.first().cloned()
+    }
+
+    pub(crate) fn entries(&self) -> Arc<[Arc<Entry>]> {
+        if let Some(sorted) = &*self.sorted.load()
+            && sorted.generation == self.generation()
+        {
+            return Arc::clone(&sorted.entries);
+        }
+        let index = self.index.read();
+        // Changes happen under the write lock, so this number belongs to these entries.
+        let generation = self.generation();
+        let holders = index.claims.values().filter_map(|claims| claims.first());
+        let mut entries: Vec<_> = holders.map(|(_, entry)| Arc::clone(entry)).collect();
+        drop(index);
+        entries.sort_unstable_by(|a, b| a.name.cmp(&b.name));
+        let entries: Arc<[_]> = entries.into();
+        self.sorted.store(Some(Arc::new(Sorted {
+            generation,
+            entries: Arc::clone(&entries),
+        })));
+        entries
+    }
+
+    pub(crate) fn generation(&self) -> u64 {
+        self.generation.load(Ordering::Acquire)
+    }
+
+    pub(crate) fn subscribe(&self, subscriber: &Subscriber) {
+        self.hub.subscribe(subscriber);
+    }
+
+    /// Puts the entry in, in place of the one that the same origin claims by that name.
+    pub(crate) fn put(&self, origin: O, entry: Arc<Entry>) {
+        self.update(std::iter::once((origin, entry.name.clone(), Some(entry))));
+    }
+
+    /// Puts the entry in unless an entry of another incarnation has the name, which is then
+    /// returned.
+    pub(crate) fn claim(&self, origin: O, entry: Arc<Entry>) -> Result<(), Arc<Entry>> {
+        let mut index = self.index.write();
+        match index.holder(&entry.name) {
+            Some(holder) if holder.incarnation != entry.incarnation => Err(Arc::clone(holder)),
+            _ => {
+                self.apply(&mut index, origin, entry.name.clone(), Some(entry));
+                Ok(())
+            }
+        }
+    }
+
+    /// Takes out what the origin claims by that name, if it has this incarnation.
+    pub(crate) fn release(&self, origin: O, name: &str, incarnation: Incarnation) -> bool {
+        let mut index = self.index.write();
+        let claims = index.claims.get(name);
+        let claim = claims.and_then(|claims| {
+            claims
+                .iter()
+                .find(|(of, entry)| *of == origin && entry.incarnation == incarnation)
+        });
+        let Some(name) = claim.map(|(_, entry)| entry.name.clone()) else {
+            return false;
+        };
+        self.apply(&mut index, origin, name, None);
+        true
+    }
+
+    /// Puts in what an origin of one entry says now, in place of what it said before.
+    #[cfg(feature = "mdns")]
+    pub(crate) fn replace(&self, origin: &O, entry: Option<Arc<Entry>>) {
+        let mut index = self.index.write();
+        let before = index.origins.get(origin).cloned();
+        if let Some(name) = before
+            && entry.as_ref().is_none_or(|entry| entry.name != name)
+        {
+            self.apply(&mut index, origin.clone(), name, None);
+            index.origins.remove(origin);
+        }
+        if let Some(entry) = entry {
+            index.origins.insert(origin.clone(), entry.name.clone());
+            self.apply(&mut index, origin.clone(), entry.name.clone(), Some(entry));
+        }
+    }
+
+    /// Whether the origin has said anything, by [`replace`](Self::replace).
+    #[cfg(feature = "mdns")]
+    pub(crate) fn has_origin(&self, origin: &O) -> bool {
+        self.index.read().origins.contains_key(origin)
+    }
+
+    /// Who has said anything, by [`replace`](Self::replace).
+    #[cfg(feature = "mdns")]
+    pub(crate) fn origins(&self) -> std::collections::HashSet<O> {
+        self.index.read().origins.keys().cloned().collect()
+    }
+
+    /// How many have said anything, by [`replace`](Self::replace).
+    #[cfg(feature = "mdns")]
+    pub(crate) fn len(&self) -> usize {
+        self.index.read().origins.len()
+    }
+
+    /// Puts in and takes out in one go.
+    pub(crate) fn update(
+        &self,
+        updates: impl IntoIterator<Item = (O, Arc<str>, Option<Arc<Entry>>)>,
+    ) {
+        let mut index = self.index.write();
+        for (origin, name, entry) in updates {
+            self.apply(&mut index, origin, name, entry);
+        }
+    }
+
+    /// Watchers are told under the lock, so that they are told in the order in which it happened.
+    fn apply(&self, index: &mut Index<O>, origin: O, name: Arc<str>, entry: Option<Arc<Entry>>) {
+        let before = index.holder(&name).cloned();
+        index.set(origin, &name, entry);
+        let after = index.holder(&name).cloned();
+        index.reindex(before.as_ref(), after.as_ref());
+        if let Some(change) = Change::between(before, after) {
+            self.generation.fetch_add(1, Ordering::Release);
+            self.hub.tell(&change);
+        }
+    }
+}
+
+impl<O: Eq> Index<O> {
+    fn holder(&self, name: &str) -> Option<&Arc<Entry>> {
+        let claims = self.claims.get(name)?;
+        claims.first().map(|(_, entry)| entry)
+    }
+
+    fn set(&mut self, origin: O, name: &Arc<str>, entry: Option<Arc<Entry>>) {
+        let mut claims = self.claims.remove(name).unwrap_or_default();
+        claims.retain(|(of, _)| *of != origin);
+        if let Some(entry) = entry {
+            let place = claims
+                .iter()
+                .position(|(_, other)| entry.precedes(other))
+                .unwrap_or(claims.len());
+            claims.insert(place, (origin, entry));
+        }
+        if !claims.is_empty() {
+            self.claims.insert(name.clone(), claims);
+        }
+    }
+
+    fn reindex(&mut self, before: Option<&Arc<Entry>>, after: Option<&Arc<Entry>>) {
+        if let Some(before) = before
+            && let Some(indexed) = self.incarnations.get(&before.incarnation)
+            && indexed.name == before.name
+        {
+            self.incarnations.remove(&before.incarnation);
+        }
+        if let Some(after) = after
+            && after.incarnation.is_known()
+        {
+            self.incarnations
+                .insert(after.incarnation, Arc::clone(after));
+        }
+    }
+}

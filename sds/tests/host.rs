@@ -1,0 +1,460 @@
+//! The directory of one host, with real processes that come, go and are killed.
+
+// The exception that clippy.toml makes for tests does not reach what they call.
+#![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)]
+
+mod common;
+
+use std::collections::BTreeMap;
+use std::io::{BufRead as _, BufReader, Write as _};
+use std::os::unix::fs::{PermissionsExt, symlink};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+
+use common::{conforms, eventually, next, registration};
+use fipa_sds::{
+    Change, Directory, Entry, HostConfig, HostDirectory, HostError, Mts, Reach, RegisterError,
+    Role, Source,
+};
+use fipa_transport::Incarnation;
+
+fn config(dir: &Path) -> HostConfig {
+    HostConfig {
+        dir: dir.to_owned(),
+        mts: Mts::new("mts", Incarnation::random()),
+        gateway: false,
+    }
+}
+
+fn open(dir: &Path) -> HostDirectory {
+    HostDirectory::open(config(dir)).unwrap()
+}
+
+fn files(dir: &Path) -> Vec<String> {
+    let entries = std::fs::read_dir(dir).unwrap();
+    let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+    names.collect()
+}
+
+/// A directory that does not exist yet, in one that goes away with the test.
+fn place() -> (tempfile::TempDir, PathBuf) {
+    let parent = tempfile::tempdir().unwrap();
+    let dir = parent.path().join("domain");
+    (parent, dir)
+}
+
+/// Another process of the domain: this test binary again, running only [`child_process`].
+struct Process {
+    child: Child,
+    commands: ChildStdin,
+    answers: BufReader<ChildStdout>,
+}
+
+const DIR_VARIABLE: &str = "FIPA_SDS_TEST_DIR";
+
+impl Process {
+    fn start(dir: &Path) -> Self {
+        let mut process = Self::start_unready(dir);
+        assert_eq!(process.answer(), "ready");
+        process
+    }
+
+    fn start_unready(dir: &Path) -> Self {
+        let mut child = Command::new(std::env::current_exe().unwrap())
+            .args(["--exact", "child_process", "--ignored", "--nocapture", "-q"])
+            .env(DIR_VARIABLE, dir)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        Self {
+            commands: child.stdin.take().unwrap(),
+            answers: BufReader::new(child.stdout.take().unwrap()),
+            child,
+        }
+    }
+
+    fn tell(&mut self, command: &str) {
+        writeln!(self.commands, "{command}").unwrap();
+    }
+
+    /// The next answer; what the test harness prints in between is not one.
+    fn answer(&mut self) -> String {
+        let mut line = String::new();
+        loop {
+            line.clear();
+            let read = self.answers.read_line(&mut line).unwrap();
+            assert_ne!(read, 0, "the other process ended");
+            if let Some((_, answer)) = line.trim_end().split_once("@@") {
+                return answer.to_owned();
+            }
+        }
+    }
+
+    fn ask(&mut self, command: &str) -> String {
+        self.tell(command);
+        self.answer()
+    }
+
+    fn kill(&mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+#[test]
+#[ignore = "is the other process of the other tests"]
+fn child_process() {
+    let dir = PathBuf::from(std::env::var_os(DIR_VARIABLE).expect("started by another test"));
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let _context = runtime.enter();
+    let directory = open(&dir);
+    println!("@@ready");
+    for line in std::io::stdin().lines() {
+        let line = line.unwrap();
+        let (command, name) = line.split_once(' ').unwrap_or((&line, ""));
+        let answer = match command {
+            "register" => match directory.register(registration(name)) {
+                Ok(_) => "ok".to_owned(),
+                Err(RegisterError::AlreadyRegistered { .. }) => "taken".to_owned(),
+                Err(other) => other.to_string(),
+            },
+            "lookup" => directory.lookup(name).is_some().to_string(),
+            "churn" => {
+                for round in 0..25 {
+                    let visitor = open(&dir);
+                    visitor
+                        .register(registration(&format!("{name}_{round}")))
+                        .unwrap();
+                    visitor.close().unwrap();
+                }
+                "ok".to_owned()
+            }
+            "close" => {
+                directory.close().unwrap();
+                "ok".to_owned()
+            }
+            other => panic!("unknown command {other}"),
+        };
+        println!("@@{answer}");
+    }
+}
+
+#[tokio::test]
+async fn host_conforms() {
+    let (_parent, dir) = place();
+    let (one, two) = (open(&dir), open(&dir));
+    conforms(&one, &two).await;
+    conforms(&two, &two).await;
+}
+
+#[tokio::test]
+async fn the_directory_is_private_and_empty_after_the_last() {
+    let (_parent, dir) = place();
+    let (one, two) = (open(&dir), open(&dir));
+    let mode = std::fs::metadata(&dir).unwrap().permissions().mode();
+    assert_eq!(mode & 0o7777, 0o700);
+    one.register(registration("arm")).unwrap();
+    two.register(registration("leg")).unwrap();
+    for name in files(&dir) {
+        let mode = std::fs::metadata(dir.join(name)).unwrap().permissions();
+        assert_eq!(mode.mode() & 0o7777, 0o600);
+    }
+    one.close().unwrap();
+    assert!(matches!(
+        one.register(registration("foot")),
+        Err(RegisterError::Closed)
+    ));
+    assert!(two.lookup("leg").is_some());
+    drop(two);
+    assert_eq!(files(&dir), Vec::<String>::new());
+}
+
+#[tokio::test]
+async fn a_name_registered_a_moment_ago_is_found() {
+    let (_parent, dir) = place();
+    let (one, two) = (open(&dir), open(&dir));
+    for round in 0..200 {
+        let name = format!("agent_{round}");
+        one.register(registration(&name)).unwrap();
+        // No await in between: the task that listens has not run.
+        assert!(two.lookup(&name).is_some(), "{name}");
+    }
+}
+
+#[tokio::test]
+async fn two_processes_cannot_have_one_name() {
+    const NAMES: usize = 40;
+    let (_parent, dir) = place();
+    let mut processes: Vec<_> = (0..4).map(|_| Process::start(&dir)).collect();
+    for number in 0..NAMES {
+        for process in &mut processes {
+            process.tell(&format!("register agent_{number}"));
+        }
+    }
+    let mut owners = BTreeMap::new();
+    for process in &mut processes {
+        for number in 0..NAMES {
+            let owner: &mut usize = owners.entry(number).or_default();
+            match process.answer().as_str() {
+                "ok" => *owner += 1,
+                answer => assert_eq!(answer, "taken"),
+            }
+        }
+    }
+    assert!(owners.values().all(|owners| *owners == 1), "{owners:?}");
+    let here = open(&dir);
+    assert_eq!(here.entries().len(), NAMES);
+}
+
+#[tokio::test]
+async fn a_killed_process_loses_its_names_at_once() {
+    let (_parent, dir) = place();
+    let mut victim = Process::start(&dir);
+    let mut witness = Process::start(&dir);
+    let here = open(&dir);
+    let mut watch = here.watch();
+    for name in ["arm", "leg"] {
+        assert_eq!(victim.ask(&format!("register {name}")), "ok");
+        assert!(matches!(next(&mut watch).await, Change::Joined(_)));
+        assert_eq!(witness.ask(&format!("lookup {name}")), "true");
+    }
+
+    victim.kill();
+    let mut left = Vec::new();
+    for _ in 0..2 {
+        match next(&mut watch).await {
+            Change::Left(entry) => left.push(entry.name.to_string()),
+            other => panic!("{other:?}"),
+        }
+    }
+    left.sort();
+    assert_eq!(left, ["arm", "leg"]);
+    assert_eq!(here.lookup("arm"), None);
+    while witness.ask("lookup leg") == "true" {}
+    assert_eq!(witness.ask("register arm"), "ok");
+    // Two processes, two lock files; and the entries of the one that has registered.
+    eventually("its files are removed", || {
+        (files(&dir).len() == 4).then_some(())
+    })
+    .await;
+
+    witness.kill();
+    eventually("the other's files are removed", || {
+        (files(&dir).len() == 2).then_some(())
+    })
+    .await;
+    drop(here);
+    assert_eq!(files(&dir), Vec::<String>::new());
+}
+
+#[tokio::test]
+async fn a_name_is_free_before_anybody_has_noticed_the_death() {
+    let (_parent, dir) = place();
+    let here = open(&dir);
+    for _ in 0..10 {
+        let mut victim = Process::start(&dir);
+        assert_eq!(victim.ask("register arm"), "ok");
+        assert!(here.lookup("arm").is_some());
+        victim.kill();
+        // No await in between: the task that listens has not run.
+        let again = registration("arm");
+        here.register(again.clone()).unwrap();
+        here.deregister("arm", again.incarnation).unwrap();
+    }
+}
+
+#[tokio::test]
+async fn the_last_one_cleans_up_after_the_killed() {
+    let (_parent, dir) = place();
+    let mut victims = [Process::start(&dir), Process::start(&dir)];
+    for (number, victim) in victims.iter_mut().enumerate() {
+        assert_eq!(victim.ask(&format!("register agent_{number}")), "ok");
+    }
+    victims.iter_mut().for_each(Process::kill);
+    assert_ne!(files(&dir), Vec::<String>::new());
+    let here = open(&dir);
+    assert_eq!(here.lookup("agent_0"), None);
+    assert_eq!(here.entries().len(), 0);
+    drop(here);
+    assert_eq!(files(&dir), Vec::<String>::new());
+}
+
+#[tokio::test]
+async fn coming_and_going_at_the_same_time_leaves_nothing() {
+    let (_parent, dir) = place();
+    let mut processes: Vec<_> = (0..3).map(|_| Process::start(&dir)).collect();
+    for process in &mut processes {
+        assert_eq!(process.ask("close"), "ok");
+    }
+    assert_eq!(files(&dir), Vec::<String>::new());
+    // Now nobody stays, and the lock itself comes and goes.
+    for (number, process) in processes.iter_mut().enumerate() {
+        process.tell(&format!("churn visitor_{number}"));
+    }
+    for process in &mut processes {
+        assert_eq!(process.answer(), "ok");
+    }
+    assert_eq!(files(&dir), Vec::<String>::new());
+}
+
+#[tokio::test]
+async fn a_directory_that_is_not_private_is_refused() {
+    let refused = |dir: &Path| match HostDirectory::open(config(dir)) {
+        Err(HostError::NotPrivate { why, .. }) => why,
+        other => panic!("{other:?}"),
+    };
+    let parent = tempfile::tempdir().unwrap();
+    let real = parent.path().join("real");
+    std::fs::create_dir(&real).unwrap();
+    std::fs::set_permissions(&real, PermissionsExt::from_mode(0o750)).unwrap();
+    assert!(refused(&real).contains("0750"));
+    std::fs::set_permissions(&real, PermissionsExt::from_mode(0o700)).unwrap();
+    drop(open(&real));
+
+    let link = parent.path().join("link");
+    symlink(&real, &link).unwrap();
+    assert!(refused(&link).contains("link"));
+    assert!(refused(&link.join("")).contains("link"), "trailing slash");
+    let file = parent.path().join("file");
+    std::fs::write(&file, "").unwrap();
+    assert!(refused(&file).contains("file"));
+
+    // Only root can give a directory away.
+    if rustix::process::geteuid().is_root() {
+        std::os::unix::fs::chown(&real, Some(12345), None).unwrap();
+        assert!(refused(&real).contains("12345"));
+    }
+}
+
+#[tokio::test]
+async fn planted_files_are_not_believed_and_not_followed() {
+    let (parent, dir) = place();
+    let here = open(&dir);
+    let mut other = Process::start(&dir);
+    assert_eq!(other.ask("register arm"), "ok");
+    assert!(here.lookup("arm").is_some());
+    let theirs = files(&dir)
+        .into_iter()
+        .find(|name| name.ends_with(".entries"));
+    let theirs = dir.join(theirs.unwrap());
+    let good = std::fs::read_to_string(&theirs).unwrap();
+
+    let plant = |bytes: &str| {
+        let temporary = parent.path().join("written");
+        std::fs::write(&temporary, bytes).unwrap();
+        std::fs::rename(&temporary, &theirs).unwrap();
+    };
+    let nonsense = [
+        String::new(),
+        "{".to_owned(),
+        good.replace("\"version\":1", "\"version\":9"),
+        good.replace("\"arm\"", "\"a\\nm\""),
+        good.replace("\"arm\"", &format!("\"{}\"", "x".repeat(2000))),
+        good.replace("shm://", "carrier-pigeon://"),
+        good.replace("\"entries\":[", "\"entries\":[{},"),
+    ];
+    for bytes in nonsense {
+        assert_ne!(bytes, good);
+        plant(&bytes);
+        eventually(&format!("refused: {bytes:.200}"), || {
+            here.known("arm").is_none().then_some(())
+        })
+        .await;
+        plant(&good);
+        eventually("believed", || here.known("arm")).await;
+    }
+
+    // Something that is not a file, and something that leads elsewhere.
+    std::fs::remove_file(&theirs).unwrap();
+    rustix::fs::mknodat(
+        rustix::fs::CWD,
+        &theirs,
+        rustix::fs::FileType::Fifo,
+        rustix::fs::Mode::RWXU,
+        0,
+    )
+    .unwrap();
+    let newcomer = open(&dir);
+    assert_eq!(newcomer.lookup("arm"), None);
+    drop(newcomer);
+    std::fs::remove_file(&theirs).unwrap();
+    let precious = parent.path().join("precious");
+    std::fs::write(&precious, &good).unwrap();
+    symlink(&precious, &theirs).unwrap();
+    let newcomer = open(&dir);
+    assert_eq!(newcomer.lookup("arm"), None);
+    drop(newcomer);
+    assert_eq!(other.ask("register leg"), "ok");
+    assert!(here.lookup("leg").is_some());
+    assert_eq!(std::fs::read_to_string(&precious).unwrap(), good);
+}
+
+#[tokio::test]
+async fn a_gateway_publishes_what_it_has_learnt() {
+    let (_parent, dir) = place();
+    let here = open(&dir);
+    let entry = Entry {
+        name: "camera".into(),
+        agent_type: "sensor".to_owned(),
+        incarnation: Incarnation::random(),
+        locations: vec!["shm://gateway".parse().unwrap()],
+        mts: Mts::new("far-mts", Incarnation::random()),
+        description: String::new(),
+        registered: std::time::UNIX_EPOCH,
+        source: Source::Mdns,
+        reach: Reach::Local,
+        role: Role::Agent,
+    };
+    let denied = here.publish_remote(vec![entry.clone()]);
+    assert!(matches!(denied, Err(HostError::NoGateway)));
+
+    let gateway = HostDirectory::open(HostConfig {
+        gateway: true,
+        ..config(&dir)
+    })
+    .unwrap();
+    let incarnation = gateway
+        .register(registration("gateway"))
+        .unwrap()
+        .mts
+        .incarnation;
+    gateway.publish_remote(vec![entry.clone()]).unwrap();
+    let found = here.lookup("camera").unwrap();
+    let expected = Entry {
+        source: Source::Host,
+        reach: Reach::Remote {
+            gateway: incarnation,
+        },
+        ..entry.clone()
+    };
+    assert_eq!(*found, expected);
+    assert_eq!(gateway.lookup("camera"), None);
+    match here.register(registration("camera")) {
+        Err(RegisterError::AlreadyRegistered { holder }) => assert_eq!(*holder, expected),
+        other => panic!("{other:?}"),
+    }
+
+    // What lives here comes before what the network says, however early it claims to be.
+    let local = here.register(registration("arm")).unwrap();
+    let impostor = Entry {
+        name: "arm".into(),
+        ..entry
+    };
+    gateway.publish_remote(vec![impostor]).unwrap();
+    let third = open(&dir);
+    assert_eq!(third.lookup("arm").unwrap().incarnation, local.incarnation);
+    eventually("camera is withdrawn", || {
+        here.lookup("camera").is_none().then_some(())
+    })
+    .await;
+    drop(gateway);
+    assert!(third.lookup("arm").is_some());
+}

@@ -1,0 +1,190 @@
+//! The directory of the network, on the loopback interface.
+
+// The exception that clippy.toml makes for tests does not reach what they call.
+#![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)]
+
+mod common;
+
+use std::net::UdpSocket;
+use std::time::{Duration, UNIX_EPOCH};
+
+use common::{conforms, eventually, next, registration};
+use fipa_sds::{Change, Directory, MdnsConfig, MdnsDirectory, Mts, Reach, RegisterError, Source};
+use fipa_transport::{Incarnation, Location};
+
+/// A port that nobody else uses, so that tests do not see each other.
+fn free_port() -> u16 {
+    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+    socket.local_addr().unwrap().port()
+}
+
+fn open(port: u16, name: &str) -> MdnsDirectory {
+    let config = MdnsConfig {
+        interfaces: vec!["lo".to_owned()],
+        port,
+        ..MdnsConfig::new(Mts::new(name, Incarnation::random()))
+    };
+    MdnsDirectory::open(config).unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn mdns_conforms() {
+    let port = free_port();
+    let (one, two) = (open(port, "one"), open(port, "two"));
+    conforms(&one, &two).await;
+    assert_eq!(one.status().last_error, None);
+    assert_eq!(two.status().last_error, None);
+    assert_eq!(two.status().refused, 0);
+}
+
+#[tokio::test]
+async fn entries_are_marked_and_ones_own_are_not_read_back() {
+    let port = free_port();
+    let (one, two) = (open(port, "one"), open(port, "two"));
+    one.register(registration("arm")).unwrap();
+    two.register(registration("leg")).unwrap();
+    let arm = eventually("arm", || two.lookup("arm")).await;
+    let leg = eventually("leg", || one.lookup("leg")).await;
+    assert_eq!(leg.source, Source::Mdns);
+    assert_eq!(&*leg.mts.name, "two");
+    let gateway = leg.mts.incarnation;
+    assert_eq!(leg.reach, Reach::Remote { gateway });
+    // By now each has heard both.
+    assert_eq!(one.entries().to_vec(), [leg]);
+    assert_eq!(two.entries().to_vec(), [arm]);
+    assert_eq!((one.status().announced, one.status().known), (1, 1));
+    assert!(matches!(
+        two.register(registration("arm")),
+        Err(RegisterError::AlreadyRegistered { .. })
+    ));
+}
+
+#[tokio::test]
+async fn closing_says_goodbye() {
+    let port = free_port();
+    let (one, two) = (open(port, "one"), open(port, "two"));
+    one.register(registration("arm")).unwrap();
+    let mut watch = two.watch();
+    assert!(matches!(next(&mut watch).await, Change::Joined(_)));
+    one.close();
+    assert!(matches!(next(&mut watch).await, Change::Left(_)));
+    assert!(matches!(
+        one.register(registration("leg")),
+        Err(RegisterError::Closed)
+    ));
+}
+
+/// Two register one name before they can know of each other; `first` is who is heard first.
+async fn conflict(first: u64, second: u64) {
+    let port = free_port();
+    let (one, two) = (open(port, "one"), open(port, "two"));
+    let witness = open(port, "witness");
+    let mut withdrawn = (one.withdrawals(), two.withdrawals());
+    let agent = |millis| {
+        let mut agent = registration("arm");
+        agent.registered = UNIX_EPOCH + Duration::from_millis(millis);
+        agent
+    };
+    let (agent_one, agent_two) = (agent(first), agent(second));
+    one.register(agent_one.clone()).unwrap();
+    two.register(agent_two.clone()).unwrap();
+
+    let (loser, winner, receiver) = if first < second {
+        (agent_two, agent_one, &mut withdrawn.1)
+    } else {
+        (agent_one, agent_two, &mut withdrawn.0)
+    };
+    let told = tokio::time::timeout(common::WATCHDOG, receiver.recv());
+    let told = told.await.expect("the loser is told").unwrap();
+    assert_eq!(told.withdrawn.incarnation, loser.incarnation);
+    assert_eq!(told.holder.incarnation, winner.incarnation);
+    eventually("one record is left, and it is the earlier's", || {
+        let entries = witness.entries();
+        let holder = entries.first()?;
+        (witness.status().known == 1 && holder.incarnation == winner.incarnation).then_some(())
+    })
+    .await;
+    assert_eq!(&*witness.entries()[0].name, "arm");
+    assert_eq!(one.status().announced + two.status().announced, 1);
+}
+
+#[tokio::test]
+async fn the_later_of_two_registrations_is_withdrawn() {
+    conflict(1000, 2000).await;
+}
+
+#[tokio::test]
+async fn the_later_of_two_registrations_is_withdrawn_though_it_was_heard_first() {
+    conflict(2000, 1000).await;
+}
+
+#[tokio::test]
+async fn different_names_may_share_a_label() {
+    let port = free_port();
+    let (one, two) = (open(port, "one"), open(port, "two"));
+    // The same label for the network, which does not tell upper from lower case.
+    one.register(registration("Arm")).unwrap();
+    two.register(registration("aRM")).unwrap();
+    eventually("both", || one.lookup("aRM").zip(two.lookup("Arm"))).await;
+    assert_eq!((one.status().known, two.status().known), (1, 1));
+    assert_eq!((one.status().announced, two.status().announced), (1, 1));
+}
+
+#[tokio::test]
+async fn large_entries_are_announced_and_too_large_ones_refused() {
+    let port = free_port();
+    let (one, two) = (open(port, "one"), open(port, "two"));
+    let mut large = registration("large");
+    large.description = "x".repeat(1024);
+    let location =
+        |len: usize| -> Location { format!("quic://{}", "y".repeat(len)).parse().unwrap() };
+    large.locations = (0..8).map(|_| location(400)).collect();
+    one.register(large.clone()).unwrap();
+    let found = eventually("large", || two.lookup("large")).await;
+    assert_eq!(found.locations, large.locations);
+    assert_eq!(found.description, large.description);
+
+    let three = open(port, &"m".repeat(1024));
+    let mut huge = registration(&"n".repeat(1024));
+    huge.description = "x".repeat(1024);
+    huge.agent_type = "x".repeat(255);
+    huge.locations = (0..8)
+        .map(|_| location(512).with_incarnation(Incarnation::random()))
+        .collect();
+    match three.register(huge) {
+        Err(RegisterError::Full(why)) => assert!(why.contains("8000"), "{why}"),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[tokio::test]
+async fn a_gateway_that_vanished_is_noticed_by_verification() {
+    let port = free_port();
+    let two = open(port, "two");
+    // Announced by hand, by somebody who then ends without a goodbye.
+    let mut peer = std::process::Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "announcing_process", "--ignored", "-q"])
+        .env("FIPA_SDS_TEST_PORT", port.to_string())
+        .spawn()
+        .unwrap();
+    let found = eventually("the other process", || two.lookup("Arm")).await;
+    assert_eq!(&*found.mts.name, "elsewhere");
+    peer.kill().unwrap();
+    peer.wait().unwrap();
+    assert!(two.lookup("Arm").is_some());
+    two.verify("Arm");
+    eventually("gone", || two.lookup("Arm").is_none().then_some(())).await;
+}
+
+#[test]
+#[ignore = "is the other process of another test"]
+fn announcing_process() {
+    let port = std::env::var("FIPA_SDS_TEST_PORT").expect("started by another test");
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let _context = runtime.enter();
+    let directory = open(port.parse().unwrap(), "elsewhere");
+    directory.register(registration("Arm")).unwrap();
+    loop {
+        std::thread::park();
+    }
+}
