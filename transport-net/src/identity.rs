@@ -1,0 +1,91 @@
+//! Who an endpoint says it is.
+
+use fipa_transport::Incarnation;
+
+/// How a message transport service introduces itself to its peers.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Identity {
+    /// Name of the message transport service, for people; at most [`Identity::MAX_TEXT`] bytes.
+    pub name: String,
+    /// The life of this service. Must be known: peers recognise it, and refuse to talk to
+    /// somebody else who took over its port.
+    pub incarnation: Incarnation,
+    /// The domain the service belongs to; at most [`Identity::MAX_TEXT`] bytes.
+    pub domain: String,
+    /// What tells this host from others, for example its machine id; at most
+    /// [`Identity::MAX_TEXT`] bytes. Peers with the same host and domain count as local.
+    pub host: String,
+}
+
+impl Identity {
+    /// Longest text in an identity, in bytes.
+    pub const MAX_TEXT: usize = 255;
+
+    /// What is wrong with this identity, for people.
+    pub(crate) fn fault(&self) -> Option<String> {
+        if !self.incarnation.is_known() {
+            return Some("the identity of a network transport needs a known incarnation".into());
+        }
+        [
+            ("name", &self.name),
+            ("domain", &self.domain),
+            ("host", &self.host),
+        ]
+        .into_iter()
+        .find(|(_, text)| text.len() > Self::MAX_TEXT)
+        .map(|(what, text)| {
+            let (len, max) = (text.len(), Self::MAX_TEXT);
+            format!("the {what} in the identity has {len} bytes; at most {max} are allowed")
+        })
+    }
+
+    /// Whether somebody with the other identity is on another host, or in another domain, which
+    /// stands for one.
+    pub(crate) fn is_remote(&self, other: &Self) -> bool {
+        self.host != other.host || self.domain != other.domain
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn identity() -> Identity {
+        Identity {
+            name: "crex-mts".into(),
+            incarnation: Incarnation::from_u64(1),
+            domain: "default".into(),
+            host: "crex".into(),
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_said_in_a_hello_is_told() {
+        assert_eq!(identity().fault(), None);
+        let unknown = Identity {
+            incarnation: Incarnation::UNKNOWN,
+            ..identity()
+        };
+        assert!(unknown.fault().unwrap().contains("incarnation"));
+        let long = Identity {
+            domain: "x".repeat(256),
+            ..identity()
+        };
+        assert!(long.fault().unwrap().contains("domain"));
+    }
+
+    #[test]
+    fn another_host_or_another_domain_is_remote() {
+        let other_host = Identity {
+            host: "sherpa".into(),
+            ..identity()
+        };
+        let other_domain = Identity {
+            domain: "test".into(),
+            ..identity()
+        };
+        assert!(!identity().is_remote(&identity()));
+        assert!(identity().is_remote(&other_host));
+        assert!(identity().is_remote(&other_domain));
+    }
+}

@@ -1,0 +1,165 @@
+//! The listening side: accepting connections and telling by their first byte who is there.
+
+use std::io;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use bytes::BytesMut;
+use fipa_transport::ListenError;
+use socket2::{Domain, Protocol, SockRef, Socket, Type};
+use tokio::io::AsyncReadExt;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::time::{sleep, timeout};
+
+use super::address;
+use super::config::Limits;
+use super::endpoint::{Endpoint, Stranger};
+use super::frame::{FrameReader, MAGIC};
+use super::link::Running;
+use super::unframed;
+
+/// Connections that the system holds until they are accepted.
+const BACKLOG: i32 = 256;
+
+/// Bytes read at first.
+const FIRST_READ: usize = 4096;
+
+/// How long accepting rests when the system has no descriptors left.
+const REST: Duration = Duration::from_millis(100);
+
+/// Opens a listening socket.
+pub(crate) fn bind(text: &str) -> Result<std::net::TcpListener, ListenError> {
+    let address =
+        address::numeric(text).map_err(|error| ListenError::Unavailable(error.to_string()))?;
+    open(address).map_err(|error| {
+        let advice = match error.kind() {
+            io::ErrorKind::AddrInUse => {
+                "; another process listens there: stop it, or choose another port \
+                 (port 0 lets the system choose)"
+            }
+            io::ErrorKind::AddrNotAvailable => {
+                "; this machine has no such address (`ip address` lists those it has)"
+            }
+            io::ErrorKind::PermissionDenied => "; choose a port above 1023",
+            _ => "",
+        };
+        ListenError::Bind {
+            address: text.to_owned(),
+            source: io::Error::new(error.kind(), format!("{error}{advice}")),
+        }
+    })
+}
+
+fn open(address: SocketAddr) -> io::Result<std::net::TcpListener> {
+    let socket = Socket::new(
+        Domain::for_address(address),
+        Type::STREAM.nonblocking(),
+        Some(Protocol::TCP),
+    )?;
+    // A restarted process gets its port back although old connections linger. Two listeners on
+    // one port stay impossible.
+    socket.set_reuse_address(true)?;
+    if address.is_ipv6() {
+        socket.set_only_v6(true)?;
+    }
+    socket.bind(&address.into())?;
+    socket.listen(BACKLOG)?;
+    Ok(socket.into())
+}
+
+/// What every socket of ours is set to.
+pub(crate) fn prepare(stream: &TcpStream, limits: &Limits) -> io::Result<()> {
+    stream.set_nodelay(true)?;
+    // Bytes that the peer's host does not confirm: a cable was pulled.
+    SockRef::from(stream).set_tcp_user_timeout(Some(limits.keep_alive.saturating_mul(2)))
+}
+
+/// Accepts connections until it is aborted.
+pub(crate) async fn accept(endpoint: Arc<Endpoint>, listener: TcpListener) {
+    loop {
+        match listener.accept().await {
+            Ok((stream, from)) => {
+                let Some(place) = endpoint.receive_stranger() else {
+                    return;
+                };
+                let number = place.number;
+                let task = receive(endpoint.clone(), place, stream, from);
+                let task = tokio::spawn(task).abort_handle();
+                endpoint.stranger_started(number, task);
+            }
+            Err(error) => {
+                let before = endpoint
+                    .tally()
+                    .accept_failures
+                    .fetch_add(1, Ordering::Relaxed);
+                warn_seldom(
+                    before,
+                    format_args!("cannot accept a connection: {error} (`ulimit -n`?)"),
+                );
+                sleep(REST).await;
+            }
+        }
+    }
+}
+
+async fn receive(endpoint: Arc<Endpoint>, place: Stranger, stream: TcpStream, from: SocketAddr) {
+    if let Err(error) = prepare(&stream, endpoint.limits()) {
+        tracing::debug!(%from, "connection broke at once: {error}");
+        return;
+    }
+    let (mut read, write) = stream.into_split();
+    let mut begun = BytesMut::with_capacity(FIRST_READ);
+    let patience = endpoint.limits().handshake_timeout;
+    let refused = match timeout(patience, read.read_buf(&mut begun)).await {
+        Ok(Ok(1..)) => match begun.first() {
+            Some(first) if *first == MAGIC[0] => {
+                let Some((link, sink)) = endpoint.accepted() else {
+                    return;
+                };
+                let reader = FrameReader::new(endpoint.limits().max_letter, begun);
+                Running::new(endpoint, link, sink)
+                    .serve((read, write), reader, from, || drop(place))
+                    .await;
+                return;
+            }
+            Some(0xfe | 0xfd) => match unframed::read(&endpoint, &mut read, begun).await {
+                Ok(letter) => {
+                    unframed::hand_on(&endpoint, letter);
+                    return;
+                }
+                Err(refused) => refused.to_string(),
+            },
+            Some(b'<') => {
+                let before = endpoint.tally().refused_xml.fetch_add(1, Ordering::Relaxed);
+                let what = "a letter with an XML envelope was refused: only bit-efficient ones \
+                            are understood";
+                warn_seldom(before, format_args!("{from}: {what}"));
+                return;
+            }
+            first => format!("nothing begins with {first:02x?}"),
+        },
+        // Somebody only looked whether the port is open.
+        Ok(Ok(0)) => return,
+        Ok(Err(error)) => {
+            tracing::debug!(%from, "connection broke at once: {error}");
+            return;
+        }
+        Err(_) => "no byte came in time".to_owned(),
+    };
+    let counter = &endpoint.tally().refused_nonsense;
+    let before = counter.fetch_add(1, Ordering::Relaxed);
+    warn_seldom(before, format_args!("{from}: connection closed: {refused}"));
+}
+
+/// Warns the first time, the second, the fourth, the eighth …: what others do to us must not fill
+/// our log.
+pub(crate) fn warn_seldom(times_before: u64, what: std::fmt::Arguments<'_>) {
+    let times = times_before.saturating_add(1);
+    if times.is_power_of_two() {
+        tracing::warn!(times, "{what}");
+    } else {
+        tracing::debug!(times, "{what}");
+    }
+}

@@ -1,0 +1,114 @@
+//! The body of an answer frame.
+//!
+//! One byte says which answer: 0 accepted, 1 in custody, 2 busy, 3 out of order, 4 failed. Behind
+//! 3 stands the last position taken (8 bytes, little-endian); behind 4 the code of the reason (one
+//! byte) and the detail (UTF-8 to the end).
+
+use bytes::{BufMut, BytesMut};
+use fipa_transport::Answer;
+use fipa_transport::wire::{reason_code, reason_of_code, truncated};
+
+/// Longest body of an answer, in bytes.
+pub(crate) const MAX_ANSWER: usize = 2 + Answer::MAX_DETAIL;
+
+const ACCEPTED: u8 = 0;
+const CUSTODY: u8 = 1;
+const BUSY: u8 = 2;
+const OUT_OF_ORDER: u8 = 3;
+const FAILED: u8 = 4;
+
+pub(crate) fn len(answer: &Answer) -> usize {
+    match answer {
+        Answer::OutOfOrder { .. } => 9,
+        Answer::Failed { detail, .. } => 2 + truncated(detail, Answer::MAX_DETAIL).len(),
+        _ => 1,
+    }
+}
+
+pub(crate) fn encode(answer: &Answer, out: &mut BytesMut) {
+    match answer {
+        Answer::Accepted => out.put_u8(ACCEPTED),
+        Answer::Custody => out.put_u8(CUSTODY),
+        Answer::OutOfOrder { last } => {
+            out.put_u8(OUT_OF_ORDER);
+            out.put_u64_le(*last);
+        }
+        Answer::Failed { reason, detail } => {
+            out.put_slice(&[FAILED, reason_code(*reason)]);
+            out.put_slice(truncated(detail, Answer::MAX_DETAIL).as_bytes());
+        }
+        // Busy, and whatever may be added to the answers: "not now" is what an older peer does
+        // least harm with.
+        _ => out.put_u8(BUSY),
+    }
+}
+
+pub(crate) fn decode(body: &[u8]) -> Option<Answer> {
+    match body {
+        [ACCEPTED] => Some(Answer::Accepted),
+        [CUSTODY] => Some(Answer::Custody),
+        [BUSY] => Some(Answer::Busy),
+        [OUT_OF_ORDER, position @ ..] => {
+            let last = u64::from_le_bytes(position.try_into().ok()?);
+            Some(Answer::OutOfOrder { last })
+        }
+        [FAILED, code, detail @ ..] => {
+            let reason = reason_of_code(*code)?;
+            let detail = std::str::from_utf8(detail).ok()?;
+            Some(Answer::failed(reason, detail))
+        }
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use fipa_transport::FailureReason;
+
+    use super::*;
+
+    #[test]
+    fn every_answer_survives() {
+        for answer in [
+            Answer::Accepted,
+            Answer::Custody,
+            Answer::Busy,
+            Answer::OutOfOrder { last: u64::MAX },
+            Answer::failed(FailureReason::NoSuchAgent, "nobody is called béla"),
+        ] {
+            let mut body = BytesMut::new();
+            encode(&answer, &mut body);
+            assert_eq!(body.len(), len(&answer));
+            assert!(body.len() <= MAX_ANSWER);
+            assert_eq!(decode(&body), Some(answer));
+        }
+    }
+
+    #[test]
+    fn a_long_detail_is_cut_at_a_character() {
+        let mut body = BytesMut::new();
+        let detail = "é".repeat(Answer::MAX_DETAIL);
+        let answer = Answer::failed(FailureReason::Refused, detail);
+        encode(&answer, &mut body);
+        assert_eq!(body.len(), len(&answer));
+        match decode(&body) {
+            Some(Answer::Failed { detail, .. }) => assert_eq!(detail.len(), Answer::MAX_DETAIL),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn nonsense_is_refused() {
+        for wrong in [
+            &[][..],
+            &[0, 0],
+            &[3, 1],
+            &[4],
+            &[4, 200],
+            &[4, 0, 0xff],
+            &[9],
+        ] {
+            assert_eq!(decode(wrong), None, "{wrong:?}");
+        }
+    }
+}

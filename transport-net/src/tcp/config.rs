@@ -1,0 +1,71 @@
+//! What the owner of an endpoint chooses.
+
+use std::time::Duration;
+
+use crate::Identity;
+
+/// Configuration of a [`TcpTransport`](crate::TcpTransport).
+#[derive(Debug, Clone)]
+pub struct TcpConfig {
+    /// Numeric addresses to listen on, for example `127.0.0.1:0`, `[::1]:7788`, `0.0.0.0:7788` or
+    /// `[fe80::1%eth0]:7788`. Port 0 lets the system choose. `[::]` is IPv6 only: list `0.0.0.0`
+    /// beside it for both. May be empty: then letters can be sent, and peers can answer over the
+    /// connections made for that.
+    pub listen: Vec<String>,
+    /// How this endpoint introduces itself.
+    pub identity: Identity,
+    /// What it takes and how long it waits.
+    pub limits: Limits,
+}
+
+/// Bounds of a TCP endpoint. Memory is at most about `max_connections` × (`max_queued_bytes` +
+/// `max_letter`), and only when every peer drives it there by really sending the bytes.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Limits {
+    /// Largest letter sent or taken, in bytes. Default 64 MiB.
+    pub max_letter: usize,
+    /// Most connections whose peer has introduced itself, or that this side opened. Default 256.
+    pub max_connections: usize,
+    /// Most accepted connections that have not introduced themselves (an old peer never does).
+    /// One more pushes out the oldest. Default 64.
+    pub max_strangers: usize,
+    /// Most parcels per connection and direction that are not answered yet. Default 1024.
+    pub max_in_flight: usize,
+    /// Most bytes per connection that wait to be handed to the kernel; a single letter is always
+    /// let in. Default 64 MiB.
+    pub max_queued_bytes: usize,
+    /// How long opening a connection may take. Default 2 s.
+    pub connect_timeout: Duration,
+    /// How long a new connection may take to say hello. Default 5 s.
+    pub handshake_timeout: Duration,
+    /// How long a frame, or an old peer's letter, may stand half arrived with less than
+    /// [`Limits::MIN_PROGRESS`] bytes of progress. Default 10 s.
+    pub stall_timeout: Duration,
+    /// After this long without a byte from the peer it is asked for a sign of life; after as long
+    /// again without one the connection is given up. Default 10 s.
+    pub keep_alive: Duration,
+    /// After this long without a letter or an answer a connection is closed. Default 60 s.
+    pub idle_close: Duration,
+}
+
+impl Limits {
+    /// Bytes that must arrive within `stall_timeout` while something is half arrived.
+    pub const MIN_PROGRESS: u64 = 4096;
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            max_letter: 64 << 20,
+            max_connections: 256,
+            max_strangers: 64,
+            max_in_flight: 1024,
+            max_queued_bytes: 64 << 20,
+            connect_timeout: Duration::from_secs(2),
+            handshake_timeout: Duration::from_secs(5),
+            stall_timeout: Duration::from_secs(10),
+            keep_alive: Duration::from_secs(10),
+            idle_close: Duration::from_secs(60),
+        }
+    }
+}

@@ -1,0 +1,528 @@
+//! One connection without its socket: frames and `now` in, bytes to write and events out.
+//!
+//! The connection keeps the honest account of parcels. A parcel is *waiting* until the kernel has
+//! begun to take it, and *begun* until its answer arrives; when the connection ends, the former
+//! cannot have arrived and the latter may have.
+
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
+use std::io::IoSlice;
+use std::time::Instant;
+
+use fipa_transport::{
+    Answer, AttemptId, Body, Conclusion, Incarnation, Parcel, WayError, WayFault,
+};
+
+use super::config::Limits;
+use super::end::End;
+use super::frame::{self, Frame};
+use super::hello::Hello;
+use super::outbox::{About, Outbox, Progress};
+
+/// Numbers of parcels stay below this, so that a ticket has room for the connection's number too.
+pub(crate) const MAX_ID: u64 = 1 << 40;
+
+/// Control frames that may wait to be written before pings are no longer answered: a peer that
+/// does not read needs no more signs of life.
+const MAX_CONTROL: usize = 4;
+
+/// Which side opened the connection.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Role {
+    /// This side, looking for this incarnation (which may be unknown).
+    Dialler { expected: Incarnation },
+    /// The other side.
+    Acceptor,
+}
+
+/// What happened, in order.
+#[derive(Debug, PartialEq)]
+pub(crate) enum Event {
+    /// The peer introduced itself, and is the one that was meant. To be
+    /// [welcomed](Connection::welcome), or the connection to be ended.
+    Greeted,
+    /// A parcel arrived, to be answered by its number.
+    Arrived { id: u64, parcel: Box<Parcel> },
+    /// A parcel sent from here came to its end.
+    Concluded(AttemptId, Conclusion),
+}
+
+/// Why a parcel is not taken for sending.
+#[derive(Debug, PartialEq)]
+pub(crate) enum SendError {
+    /// The connection has ended: another one is needed.
+    Ended,
+    /// The parcel does not go.
+    Way(WayError),
+}
+
+#[derive(Debug)]
+pub(crate) struct Connection {
+    limits: Limits,
+    role: Role,
+    hello: Hello,
+    peer: Option<Hello>,
+    /// Whether parcels may be sent: the peer is known, and knows this side.
+    open: bool,
+    /// Whether it is about to end for idleness: what comes now needs another connection.
+    retiring: bool,
+    ended: bool,
+    outbox: Outbox,
+    /// Parcels sent from here, by number, until their answer arrives.
+    sent: BTreeMap<u64, Sent>,
+    attempts: HashMap<AttemptId, u64>,
+    last_sent: u64,
+    /// How many of `sent` have begun.
+    begun: usize,
+    /// Parcels that arrived and are not answered.
+    arrivals: HashSet<u64>,
+    last_arrival: u64,
+    answers_waiting: usize,
+    control_waiting: usize,
+    parcels_written: u64,
+    events: VecDeque<Event>,
+    clock: Clock,
+}
+
+#[derive(Debug)]
+struct Sent {
+    /// None when it was abandoned.
+    attempt: Option<AttemptId>,
+    letter_len: u64,
+    begun: bool,
+}
+
+/// What the timers go by.
+#[derive(Debug)]
+struct Clock {
+    /// When the socket was connected, before the peer's hello.
+    connected: Option<Instant>,
+    received: Instant,
+    written: Instant,
+    /// When something last went on that makes the connection useful.
+    busy: Instant,
+    pinged: bool,
+    /// Since when a frame has been half arrived, and the bytes that came since.
+    partial: Option<(Instant, u64)>,
+}
+
+impl Connection {
+    /// A connection whose socket is connected, or (for the dialler) will be.
+    pub(crate) fn new(limits: Limits, role: Role, hello: Hello, now: Instant) -> Self {
+        let connected = (role == Role::Acceptor).then_some(now);
+        Self {
+            limits,
+            role,
+            hello,
+            peer: None,
+            open: false,
+            retiring: false,
+            ended: false,
+            outbox: Outbox::default(),
+            sent: BTreeMap::new(),
+            attempts: HashMap::new(),
+            last_sent: 0,
+            begun: 0,
+            arrivals: HashSet::new(),
+            last_arrival: 0,
+            answers_waiting: 0,
+            control_waiting: 0,
+            parcels_written: 0,
+            events: VecDeque::new(),
+            clock: Clock {
+                connected,
+                received: now,
+                written: now,
+                busy: now,
+                pinged: false,
+                partial: None,
+            },
+        }
+    }
+
+    /// The dialler's socket is connected.
+    pub(crate) fn connected(&mut self, now: Instant) {
+        self.clock.connected = Some(now);
+        self.clock.received = now;
+        self.clock.written = now;
+        self.say_hello();
+    }
+
+    /// The peer that has introduced itself is wanted.
+    pub(crate) fn welcome(&mut self) {
+        if self.role == Role::Acceptor {
+            self.say_hello();
+        }
+        self.open = true;
+    }
+
+    /// The peer's hello, once it came.
+    pub(crate) fn peer(&self) -> Option<&Hello> {
+        self.peer.as_ref()
+    }
+
+    /// Takes a parcel for sending.
+    ///
+    /// # Errors
+    /// When it does not go; nothing has been changed then.
+    pub(crate) fn send(&mut self, attempt: AttemptId, parcel: &Parcel) -> Result<(), SendError> {
+        let refuse = |fault, detail: String| Err(SendError::Way(WayError::new(fault, detail)));
+        if self.ended || self.retiring {
+            return Err(SendError::Ended);
+        }
+        let letter_len = letter_len(parcel);
+        let peer_max = self.peer.as_ref().map_or(u64::MAX, |peer| peer.max_letter);
+        if letter_len > peer_max {
+            return Err(SendError::Way(too_large_for_peer(letter_len, peer_max)));
+        }
+        let Limits {
+            max_in_flight,
+            max_queued_bytes,
+            ..
+        } = self.limits;
+        if self.sent.len() >= max_in_flight.max(1) {
+            let detail = format!("{max_in_flight} parcels are on their way (max_in_flight)");
+            return refuse(WayFault::Congested, detail);
+        }
+        let id = self.last_sent + 1;
+        if id >= MAX_ID {
+            return refuse(WayFault::Congested, "the connection is worn out".into());
+        }
+        let pieces = match frame::parcel(id, parcel) {
+            Ok(pieces) => pieces,
+            Err(error) => return refuse(WayFault::TooLarge, error.to_string()),
+        };
+        let queued = self.outbox.parcel_bytes();
+        let len: usize = pieces.iter().map(bytes::Bytes::len).sum();
+        if queued > 0 && queued.saturating_add(len) > max_queued_bytes {
+            let detail = format!("{queued} bytes wait to be sent (max_queued_bytes)");
+            return refuse(WayFault::Congested, detail);
+        }
+        self.last_sent = id;
+        self.outbox.push_parcel(id, pieces);
+        self.attempts.insert(attempt, id);
+        self.sent.insert(
+            id,
+            Sent {
+                attempt: Some(attempt),
+                letter_len,
+                begun: false,
+            },
+        );
+        Ok(())
+    }
+
+    /// Forgets an attempt: it is not sent if that can still be helped, and not concluded.
+    pub(crate) fn abandon(&mut self, attempt: AttemptId) {
+        let Some(id) = self.attempts.remove(&attempt) else {
+            return;
+        };
+        if self.outbox.remove_parcel(id) {
+            self.sent.remove(&id);
+        } else if let Some(sent) = self.sent.get_mut(&id) {
+            // The peer counts it until it has answered, so it goes on filling the window.
+            sent.attempt = None;
+        }
+    }
+
+    /// Answers a parcel that arrived. Unknown ones are ignored.
+    pub(crate) fn answer(&mut self, id: u64, answer: &Answer, now: Instant) {
+        if !self.ended && self.arrivals.remove(&id) {
+            self.answers_waiting += 1;
+            self.clock.busy = now;
+            self.outbox
+                .push_urgent(About::Answer, frame::answer(id, answer));
+        }
+    }
+
+    /// So many bytes arrived, and a frame is half arrived now, or not.
+    pub(crate) fn received(&mut self, bytes: usize, partial: bool, now: Instant) {
+        self.clock.received = now;
+        self.clock.pinged = false;
+        self.clock.partial = match (self.clock.partial, partial) {
+            (_, false) => None,
+            (None, true) => Some((now, 0)),
+            (Some((since, before)), true) => Some((since, before.saturating_add(bytes as u64))),
+        };
+    }
+
+    /// Takes a frame from the peer.
+    ///
+    /// # Errors
+    /// When the connection is over because of it.
+    pub(crate) fn handle_frame(&mut self, frame: Frame, now: Instant) -> Result<(), End> {
+        if self.ended {
+            // What arrives behind a goodbye has been disowned by it.
+            return Ok(());
+        }
+        match (frame, self.peer.is_some()) {
+            (Frame::Hello(hello), false) => self.greet(hello, now),
+            (Frame::Goodbye { last }, _) => Err(End::Goodbye { last }),
+            (_, false) => Err(End::Nonsense("something else before the hello".into())),
+            (Frame::Hello(_), true) => Err(End::Nonsense("a second hello".into())),
+            (Frame::Parcel { id, parcel }, true) => self.arrive(id, parcel, now),
+            (Frame::Answer { id, answer }, true) => self.conclude(id, answer, now),
+            (Frame::Ping, true) => {
+                if self.control_waiting < MAX_CONTROL {
+                    self.push_control(frame::pong());
+                }
+                Ok(())
+            }
+            (Frame::Pong, true) => Ok(()),
+        }
+    }
+
+    /// The next thing that happened.
+    pub(crate) fn poll_event(&mut self) -> Option<Event> {
+        self.events.pop_front()
+    }
+
+    /// Fills `slices` with what is to be written next and says how many were filled.
+    pub(crate) fn gather<'a>(&'a self, slices: &mut [IoSlice<'a>]) -> usize {
+        self.outbox.gather(slices, self.window())
+    }
+
+    /// Whether there is nothing to write now.
+    pub(crate) fn is_flushed(&self) -> bool {
+        self.outbox.is_idle(self.window())
+    }
+
+    /// The kernel took so many bytes of what [`gather`](Self::gather) had shown.
+    pub(crate) fn written(&mut self, taken: usize, now: Instant) {
+        self.clock.written = now;
+        let Self {
+            outbox,
+            sent,
+            begun,
+            answers_waiting,
+            control_waiting,
+            parcels_written,
+            clock,
+            ..
+        } = self;
+        outbox.written(taken, |progress| match progress {
+            Progress::Begun(About::Parcel(id)) => {
+                if let Some(sent) = sent.get_mut(&id) {
+                    sent.begun = true;
+                    *begun += 1;
+                    clock.busy = now;
+                }
+            }
+            Progress::Begun(About::Answer | About::Control) => {}
+            Progress::Written(About::Parcel(_)) => *parcels_written += 1,
+            Progress::Written(About::Answer) => *answers_waiting -= 1,
+            Progress::Written(About::Control) => *control_waiting -= 1,
+        });
+    }
+
+    /// Parcels handed to the kernel since this was last asked.
+    pub(crate) fn take_parcels_written(&mut self) -> u64 {
+        std::mem::take(&mut self.parcels_written)
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) is to be called at the latest.
+    pub(crate) fn poll_timeout(&self) -> Option<Instant> {
+        let connected = self.clock.connected?;
+        let stalled = self
+            .clock
+            .partial
+            .map(|(since, _)| since + self.limits.stall_timeout);
+        if self.peer.is_none() {
+            return Some(connected + self.limits.handshake_timeout);
+        }
+        let alive = self.sign_of_life_due();
+        let idle = self
+            .is_idle()
+            .then(|| self.clock.busy + self.limits.idle_close);
+        [stalled, Some(alive), idle].into_iter().flatten().min()
+    }
+
+    /// Does what is due.
+    ///
+    /// # Errors
+    /// When the connection is over.
+    pub(crate) fn handle_timeout(&mut self, now: Instant) -> Result<(), End> {
+        let Some(connected) = self.clock.connected else {
+            return Ok(());
+        };
+        if self.peer.is_none() {
+            return if now >= connected + self.limits.handshake_timeout {
+                Err(End::TooSlow("the peer did not say hello in time"))
+            } else {
+                Ok(())
+            };
+        }
+        if let Some((since, bytes)) = self.clock.partial
+            && now >= since + self.limits.stall_timeout
+        {
+            if bytes < Limits::MIN_PROGRESS {
+                return Err(End::TooSlow("the peer stopped in the middle of a frame"));
+            }
+            self.clock.partial = Some((now, 0));
+        }
+        if self.is_idle() && now >= self.clock.busy + self.limits.idle_close {
+            self.retiring = true;
+            return Err(End::Idle);
+        }
+        if now >= self.sign_of_life_due() {
+            if self.clock.pinged {
+                return Err(End::Silent);
+            }
+            self.clock.pinged = true;
+            self.push_control(frame::ping());
+        }
+        Ok(())
+    }
+
+    /// Ends the connection: gives every parcel sent from here its conclusion, in the order of
+    /// sending. After an orderly end what is left to write is a goodbye.
+    pub(crate) fn end(&mut self, end: &End) -> Vec<(AttemptId, Conclusion)> {
+        if std::mem::replace(&mut self.ended, true) {
+            return Vec::new();
+        }
+        self.outbox.drop_parcels();
+        if end.is_orderly() && self.clock.connected.is_some() {
+            self.push_control(frame::goodbye(self.last_arrival));
+        }
+        self.arrivals.clear();
+        self.attempts.clear();
+        let taken = match end {
+            End::Goodbye { last } => *last,
+            _ => u64::MAX,
+        };
+        let greeted = self.peer.is_some();
+        std::mem::take(&mut self.sent)
+            .into_iter()
+            .filter_map(|(id, sent)| {
+                let conclusion = if sent.begun && id <= taken {
+                    Conclusion::Unconfirmed(end.after())
+                } else {
+                    Conclusion::NotSent(end.before(greeted))
+                };
+                Some((sent.attempt?, conclusion))
+            })
+            .collect()
+    }
+
+    /// How many more parcels may begin.
+    fn window(&self) -> usize {
+        let Some(peer) = self.peer.as_ref().filter(|_| self.open) else {
+            return 0;
+        };
+        (peer.max_in_flight as usize).saturating_sub(self.begun)
+    }
+
+    fn is_idle(&self) -> bool {
+        self.attempts.is_empty() && self.arrivals.is_empty() && self.answers_waiting == 0
+    }
+
+    /// When the peer must be asked for a sign of life, or (after that) given up. Bytes that the
+    /// kernel still takes show that the peer reads: it may be busy with a large letter.
+    fn sign_of_life_due(&self) -> Instant {
+        if self.clock.pinged {
+            let last = self.clock.received.max(self.clock.written);
+            return last.max(self.clock.received + self.limits.keep_alive) + self.limits.keep_alive;
+        }
+        self.clock.received + self.limits.keep_alive
+    }
+
+    fn say_hello(&mut self) {
+        let hello = frame::hello(&self.hello);
+        self.push_control(hello);
+    }
+
+    fn push_control(&mut self, frame: bytes::Bytes) {
+        self.control_waiting += 1;
+        self.outbox.push_urgent(About::Control, frame);
+    }
+
+    fn greet(&mut self, hello: Hello, now: Instant) -> Result<(), End> {
+        let found = hello.identity.incarnation;
+        if let Role::Dialler { expected } = self.role
+            && expected.is_known()
+            && expected != found
+        {
+            return Err(End::WrongIncarnation { expected, found });
+        }
+        if hello.max_in_flight == 0 {
+            return Err(End::Nonsense("the peer takes no parcels at all".into()));
+        }
+        self.clock.busy = now;
+        self.events.push_back(Event::Greeted);
+        // These were taken before it was known how much the peer takes.
+        let too_large: Vec<(u64, u64)> = self
+            .sent
+            .iter()
+            .filter(|(_, sent)| sent.letter_len > hello.max_letter)
+            .map(|(id, sent)| (*id, sent.letter_len))
+            .collect();
+        for (id, len) in too_large {
+            self.outbox.remove_parcel(id);
+            let sent = self.sent.remove(&id);
+            if let Some(attempt) = sent.and_then(|sent| sent.attempt) {
+                self.attempts.remove(&attempt);
+                let error = too_large_for_peer(len, hello.max_letter);
+                let concluded = Event::Concluded(attempt, Conclusion::NotSent(error));
+                self.events.push_back(concluded);
+            }
+        }
+        self.peer = Some(hello);
+        Ok(())
+    }
+
+    fn arrive(&mut self, id: u64, parcel: Box<Parcel>, now: Instant) -> Result<(), End> {
+        if id <= self.last_arrival || id >= MAX_ID {
+            return Err(End::Nonsense("parcels whose numbers do not rise".into()));
+        }
+        if self.arrivals.len() + self.answers_waiting >= self.limits.max_in_flight.max(1) {
+            return Err(End::Nonsense("more parcels than may be in flight".into()));
+        }
+        if letter_len(&parcel) > self.limits.max_letter as u64 {
+            return Err(End::Nonsense("a larger letter than may be sent".into()));
+        }
+        self.last_arrival = id;
+        self.arrivals.insert(id);
+        self.clock.busy = now;
+        self.events.push_back(Event::Arrived { id, parcel });
+        Ok(())
+    }
+
+    fn conclude(&mut self, id: u64, answer: Answer, now: Instant) -> Result<(), End> {
+        match self.sent.remove(&id) {
+            Some(sent) if sent.begun => {
+                self.begun -= 1;
+                self.clock.busy = now;
+                if let Some(attempt) = sent.attempt {
+                    self.attempts.remove(&attempt);
+                    let conclusion = Conclusion::Answered(answer);
+                    self.events.push_back(Event::Concluded(attempt, conclusion));
+                }
+                Ok(())
+            }
+            Some(unsent) => {
+                // Put back: it still needs its conclusion.
+                self.sent.insert(id, unsent);
+                Err(End::Nonsense("an answer to what was never sent".into()))
+            }
+            None => Err(End::Nonsense("an answer to what was never asked".into())),
+        }
+    }
+}
+
+/// Length of the letter in a parcel; what is no letter is small.
+pub(crate) fn letter_len(parcel: &Parcel) -> u64 {
+    match &parcel.body {
+        Body::Letter(letter) => letter.len() as u64,
+        Body::Report(_) | Body::Credit => 0,
+    }
+}
+
+fn too_large_for_peer(len: u64, max: u64) -> WayError {
+    WayError::new(
+        WayFault::TooLarge,
+        format_args!("{len} bytes; the peer takes letters of up to {max}"),
+    )
+}
+
+#[cfg(test)]
+#[path = "connection_tests.rs"]
+mod tests;

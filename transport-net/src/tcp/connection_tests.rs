@@ -1,0 +1,481 @@
+use std::time::Duration;
+
+use bytes::{BufMut, Bytes, BytesMut};
+use fipa_acl::Letter;
+use fipa_transport::Stream;
+use proptest::prelude::*;
+
+use super::super::frame::{FrameReader, HEADER_LEN};
+use super::super::hello::tests::sample;
+use super::*;
+
+fn parcel(sequence: u64, len: usize) -> Parcel {
+    Parcel {
+        receiver: "arm".into(),
+        stream: Stream {
+            sender: Incarnation::from_u64(1),
+            receiver: Incarnation::from_u64(2),
+        },
+        sequence,
+        after: 0,
+        remaining: Duration::from_secs(1),
+        hops: 0,
+        body: Body::Letter(Letter::new(
+            Bytes::from_static(b"e"),
+            Bytes::from(vec![7; len]),
+        )),
+    }
+}
+
+fn limits() -> Limits {
+    Limits {
+        max_letter: 5000,
+        max_in_flight: 8,
+        ..Limits::default()
+    }
+}
+
+/// One side of a simulated connection: what it did, and what the network holds for it.
+struct Side {
+    connection: Connection,
+    reader: FrameReader,
+    /// Bytes on their way to this side.
+    coming: BytesMut,
+    /// Parcels that arrived, by their sequence, and those not answered yet, by number.
+    arrived: Vec<u64>,
+    open: Vec<u64>,
+    concluded: BTreeMap<AttemptId, Vec<Conclusion>>,
+    dispatched: Vec<u64>,
+    abandoned: Vec<u64>,
+    end: Option<End>,
+}
+
+impl Side {
+    fn new(role: Role, incarnation: u64, now: Instant) -> Self {
+        let mut hello = sample(incarnation);
+        hello.max_letter = limits().max_letter as u64;
+        let mut connection = Connection::new(limits(), role, hello, now);
+        if role != Role::Acceptor {
+            connection.connected(now);
+        }
+        Self {
+            connection,
+            reader: FrameReader::new(limits().max_letter, BytesMut::new()),
+            coming: BytesMut::new(),
+            arrived: Vec::new(),
+            open: Vec::new(),
+            concluded: BTreeMap::new(),
+            dispatched: Vec::new(),
+            abandoned: Vec::new(),
+            end: None,
+        }
+    }
+
+    fn dispatch(&mut self, len: usize) -> Result<(), SendError> {
+        let sequence = self.dispatched.len() as u64;
+        self.connection
+            .send(AttemptId(sequence), &parcel(sequence, len))?;
+        self.dispatched.push(sequence);
+        Ok(())
+    }
+
+    /// Up to `max` bytes go into the network.
+    fn transmit(&mut self, max: usize, to: &mut BytesMut, now: Instant) {
+        let mut slices = [IoSlice::new(&[]); 5];
+        let count = self.connection.gather(&mut slices);
+        let shown: Vec<u8> = slices[..count].iter().flat_map(|s| s.to_vec()).collect();
+        let taken = shown.len().min(max);
+        to.put_slice(&shown[..taken]);
+        self.connection.written(taken, now);
+    }
+
+    /// Up to `max` bytes come out of the network.
+    fn receive(&mut self, max: usize, now: Instant) {
+        let step = {
+            let mut space = self.reader.space();
+            let step = max.min(self.coming.len()).min(space.remaining_mut());
+            space.put_slice(&self.coming.split_to(step));
+            step
+        };
+        while let Some(frame) = self.reader.next().unwrap() {
+            if let Err(end) = self.connection.handle_frame(frame, now) {
+                self.finish(end);
+            }
+            self.take_events();
+        }
+        let partial = self.reader.is_partial();
+        self.connection.received(step, partial, now);
+    }
+
+    fn take_events(&mut self) {
+        while let Some(event) = self.connection.poll_event() {
+            match event {
+                Event::Greeted => self.connection.welcome(),
+                Event::Arrived { id, parcel } => {
+                    self.arrived.push(parcel.sequence);
+                    self.open.push(id);
+                }
+                Event::Concluded(attempt, conclusion) => {
+                    self.concluded.entry(attempt).or_default().push(conclusion);
+                }
+            }
+        }
+    }
+
+    fn finish(&mut self, end: End) {
+        for (attempt, conclusion) in self.connection.end(&end) {
+            self.concluded.entry(attempt).or_default().push(conclusion);
+        }
+        self.end.get_or_insert(end);
+    }
+
+    fn answer(&mut self, pick: usize, now: Instant) {
+        if !self.open.is_empty() {
+            let id = self.open.swap_remove(pick % self.open.len());
+            self.connection.answer(id, &Answer::Accepted, now);
+        }
+    }
+
+    /// What must be true once this side has ended and the other took all it ever will.
+    fn check(&self, other: &Self) -> Result<(), TestCaseError> {
+        for sequence in &self.dispatched {
+            let conclusions = self.concluded.get(&AttemptId(*sequence));
+            if self.abandoned.contains(sequence) {
+                continue;
+            }
+            let Some([conclusion]) = conclusions.map(Vec::as_slice) else {
+                return Err(TestCaseError::fail(format!("{sequence}: {conclusions:?}")));
+            };
+            let arrived = other.arrived.contains(sequence);
+            match conclusion {
+                Conclusion::NotSent(_) => prop_assert!(!arrived, "{sequence} was sent"),
+                Conclusion::Answered(_) => prop_assert!(arrived, "{sequence} had not arrived"),
+                _ => {}
+            }
+        }
+        prop_assert!(other.arrived.is_sorted(), "order: {:?}", other.arrived);
+        let mut once = other.arrived.clone();
+        once.dedup();
+        prop_assert_eq!(&once, &other.arrived);
+        Ok(())
+    }
+}
+
+#[derive(Debug, Clone)]
+enum Step {
+    Dispatch(usize),
+    Abandon(usize),
+    Answer(usize),
+    Transmit(usize),
+    Receive(usize),
+}
+
+fn step() -> impl Strategy<Value = (bool, Step)> {
+    let step = prop_oneof![
+        4 => (0_usize..5000).prop_map(Step::Dispatch),
+        1 => any::<usize>().prop_map(Step::Abandon),
+        3 => any::<usize>().prop_map(Step::Answer),
+        6 => (1_usize..6000).prop_map(Step::Transmit),
+        6 => (1_usize..6000).prop_map(Step::Receive),
+    ];
+    (any::<bool>(), step)
+}
+
+fn perform(step: &Step, this: &mut Side, other: &mut Side, now: Instant) {
+    match step {
+        Step::Dispatch(len) => match this.dispatch(*len) {
+            Err(SendError::Way(error)) => assert_eq!(error.fault, WayFault::Congested),
+            Err(SendError::Ended) => assert!(this.end.is_some()),
+            Ok(()) => {}
+        },
+        Step::Abandon(pick) if !this.dispatched.is_empty() => {
+            let sequence = this.dispatched[pick % this.dispatched.len()];
+            if !this.concluded.contains_key(&AttemptId(sequence)) {
+                this.connection.abandon(AttemptId(sequence));
+                this.abandoned.push(sequence);
+            }
+        }
+        Step::Abandon(_) => {}
+        Step::Answer(pick) => this.answer(*pick, now),
+        Step::Transmit(max) => this.transmit(*max, &mut other.coming, now),
+        Step::Receive(max) => this.receive(*max, now),
+    }
+}
+
+fn pair(now: Instant) -> (Side, Side) {
+    let expected = Incarnation::from_u64(2);
+    (
+        Side::new(Role::Dialler { expected }, 1, now),
+        Side::new(Role::Acceptor, 2, now),
+    )
+}
+
+/// Lets both sides do all they can. Says whether they are done.
+fn settle(a: &mut Side, b: &mut Side, now: Instant) {
+    for _ in 0..2000 {
+        for pick in 0..2 {
+            a.answer(pick, now);
+            b.answer(pick, now);
+        }
+        a.transmit(usize::MAX, &mut b.coming, now);
+        b.transmit(usize::MAX, &mut a.coming, now);
+        a.receive(usize::MAX, now);
+        b.receive(usize::MAX, now);
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 300, ..ProptestConfig::default() })]
+
+    /// Whatever happens in whatever order, a connection that lives answers everything.
+    #[test]
+    fn every_parcel_is_answered_once_and_in_order(
+        steps in prop::collection::vec(step(), 0..200),
+    ) {
+        let now = Instant::now();
+        let (mut a, mut b) = pair(now);
+        for (first, step) in &steps {
+            let (this, other) = if *first { (&mut a, &mut b) } else { (&mut b, &mut a) };
+            perform(step, this, other, now);
+        }
+        settle(&mut a, &mut b, now);
+        prop_assert_eq!((&a.end, &b.end), (&None, &None));
+        a.check(&b)?;
+        b.check(&a)?;
+        for side in [&a, &b] {
+            prop_assert!(side.connection.sent.is_empty());
+            prop_assert!(side.connection.attempts.is_empty());
+            prop_assert_eq!(side.connection.begun, 0);
+            prop_assert_eq!(side.connection.outbox.parcel_bytes(), 0);
+            prop_assert!(side.connection.is_idle());
+        }
+    }
+
+    /// However a connection ends, nothing that was called not sent arrives.
+    #[test]
+    fn conclusions_are_honest_when_a_connection_ends(
+        steps in prop::collection::vec(step(), 0..120),
+        end in prop_oneof![
+            Just(End::Hangup),
+            Just(End::Closed),
+            Just(End::Idle),
+            Just(End::Silent),
+        ],
+        lost in any::<bool>(),
+        first in any::<bool>(),
+    ) {
+        let now = Instant::now();
+        let (mut a, mut b) = pair(now);
+        for (first, step) in &steps {
+            let (this, other) = if *first { (&mut a, &mut b) } else { (&mut b, &mut a) };
+            perform(step, this, other, now);
+        }
+        let (ending, other) = if first { (&mut a, &mut b) } else { (&mut b, &mut a) };
+        let orderly = end.is_orderly();
+        ending.finish(end);
+        if orderly && !lost {
+            settle(ending, other, now);
+        } else {
+            // The peer's kernel may hold what the ended side wrote.
+            while !lost && !other.coming.is_empty() {
+                other.receive(1000, now);
+            }
+        }
+        other.finish(End::Hangup);
+        ending.check(other)?;
+        other.check(ending)?;
+    }
+}
+
+/// Both have said hello.
+fn greeted(now: Instant) -> (Side, Side) {
+    let (mut a, mut b) = pair(now);
+    settle(&mut a, &mut b, now);
+    assert!(a.connection.peer().is_some() && b.connection.peer().is_some());
+    (a, b)
+}
+
+#[test]
+fn another_incarnation_ends_it_before_anything_is_sent() {
+    let now = Instant::now();
+    let expected = Incarnation::from_u64(3);
+    let mut a = Side::new(Role::Dialler { expected }, 1, now);
+    let mut b = Side::new(Role::Acceptor, 2, now);
+    a.dispatch(10).unwrap();
+    settle(&mut a, &mut b, now);
+    let found = Incarnation::from_u64(2);
+    assert_eq!(a.end, Some(End::WrongIncarnation { expected, found }));
+    match &a.concluded[&AttemptId(0)][..] {
+        [Conclusion::NotSent(error)] => assert_eq!(error.fault, WayFault::WrongIncarnation),
+        other => panic!("{other:?}"),
+    }
+    assert_eq!(b.arrived, []);
+}
+
+#[test]
+fn a_letter_that_the_peer_does_not_take_is_not_sent() {
+    let now = Instant::now();
+    let (mut a, mut b) = pair(now);
+    b.connection.hello.max_letter = 100;
+    a.dispatch(101).unwrap();
+    a.dispatch(10).unwrap();
+    settle(&mut a, &mut b, now);
+    match &a.concluded[&AttemptId(0)][..] {
+        [Conclusion::NotSent(error)] => assert_eq!(error.fault, WayFault::TooLarge),
+        other => panic!("{other:?}"),
+    }
+    assert_eq!(b.arrived, [1]);
+    assert!(matches!(a.dispatch(101), Err(SendError::Way(error))
+        if error.fault == WayFault::TooLarge));
+}
+
+#[test]
+fn the_window_of_the_peer_is_kept_and_congestion_told() {
+    let now = Instant::now();
+    let (mut a, mut b) = pair(now);
+    b.connection.hello.max_in_flight = 2;
+    settle(&mut a, &mut b, now);
+    for _ in 0..limits().max_in_flight {
+        a.dispatch(10).unwrap();
+    }
+    assert!(matches!(a.dispatch(10), Err(SendError::Way(error))
+        if error.fault == WayFault::Congested));
+    a.transmit(usize::MAX, &mut b.coming, now);
+    a.transmit(usize::MAX, &mut b.coming, now);
+    assert!(a.connection.is_flushed());
+    b.receive(usize::MAX, now);
+    assert_eq!(b.arrived, [0, 1]);
+}
+
+#[test]
+fn bytes_that_wait_are_bounded_and_one_letter_always_fits() {
+    let now = Instant::now();
+    let (mut a, _) = pair(now);
+    a.connection.limits.max_queued_bytes = 100;
+    a.dispatch(4000).unwrap();
+    assert!(matches!(a.dispatch(1), Err(SendError::Way(error))
+        if error.fault == WayFault::Congested));
+    a.connection.abandon(AttemptId(0));
+    a.dispatch(1).unwrap();
+}
+
+#[test]
+fn what_a_peer_must_not_send_ends_the_connection() {
+    let now = Instant::now();
+    let nonsense = |frames: Vec<Frame>| {
+        let (mut a, _) = greeted(now);
+        let last = frames
+            .into_iter()
+            .map(|frame| a.connection.handle_frame(frame, now))
+            .last();
+        assert!(matches!(last, Some(Err(End::Nonsense(_)))), "{last:?}");
+    };
+    let arrive = |id, len| Frame::Parcel {
+        id,
+        parcel: Box::new(parcel(1, len)),
+    };
+    let answer = Frame::Answer {
+        id: 1,
+        answer: Answer::Accepted,
+    };
+    nonsense(vec![Frame::Hello(sample(2))]);
+    nonsense(vec![arrive(2, 1), arrive(2, 1)]);
+    nonsense(vec![arrive(MAX_ID, 1)]);
+    nonsense(vec![arrive(1, 5001)]);
+    nonsense((1..=9).map(|id| arrive(id, 1)).collect());
+    nonsense(vec![answer]);
+    let (_, mut stranger) = pair(now);
+    let end = stranger.connection.handle_frame(Frame::Ping, now);
+    assert!(matches!(end, Err(End::Nonsense(_))));
+}
+
+#[test]
+fn a_peer_that_pings_and_does_not_read_gets_few_pongs() {
+    let now = Instant::now();
+    let (mut a, _) = greeted(now);
+    for _ in 0..1000 {
+        a.connection.handle_frame(Frame::Ping, now).unwrap();
+    }
+    let mut pongs = BytesMut::new();
+    a.transmit(usize::MAX, &mut pongs, now);
+    assert!(pongs.len() <= MAX_CONTROL * HEADER_LEN);
+}
+
+#[test]
+fn silence_is_asked_about_and_then_ends_it() {
+    let mut now = Instant::now();
+    let (mut a, mut b) = greeted(now);
+    a.connection.limits.idle_close = Duration::from_secs(1000);
+    let keep_alive = limits().keep_alive;
+    // As long as the peer answers pings, nothing happens.
+    for _ in 0..5 {
+        now += keep_alive;
+        assert!(a.connection.poll_timeout().unwrap() <= now);
+        a.connection.handle_timeout(now).unwrap();
+        settle(&mut a, &mut b, now);
+    }
+    now += keep_alive;
+    a.connection.handle_timeout(now).unwrap();
+    a.transmit(usize::MAX, &mut b.coming, now);
+    now += keep_alive;
+    assert_eq!(a.connection.handle_timeout(now), Err(End::Silent));
+}
+
+#[test]
+fn idleness_ends_it_but_not_while_something_is_open() {
+    let start = Instant::now();
+    let (mut a, mut b) = greeted(start);
+    let mut now = start;
+    a.dispatch(1).unwrap();
+    a.transmit(usize::MAX, &mut b.coming, now);
+    b.receive(usize::MAX, now);
+    for _ in 0..20 {
+        now += limits().keep_alive;
+        a.connection.handle_timeout(now).unwrap();
+        b.connection.handle_timeout(now).unwrap();
+        a.transmit(usize::MAX, &mut b.coming, now);
+        b.receive(usize::MAX, now);
+        b.transmit(usize::MAX, &mut a.coming, now);
+        a.receive(usize::MAX, now);
+    }
+    settle(&mut a, &mut b, now);
+    assert_eq!(a.concluded.len(), 1);
+    now += limits().idle_close;
+    assert_eq!(a.connection.handle_timeout(now), Err(End::Idle));
+    assert_eq!(a.dispatch(1), Err(SendError::Ended));
+}
+
+#[test]
+fn a_frame_that_stops_half_way_ends_it_and_a_slow_one_does_not() {
+    let mut now = Instant::now();
+    let (mut a, _) = greeted(now);
+    a.connection.received(100, true, now);
+    for _ in 0..3 {
+        now += limits().stall_timeout / 2;
+        a.connection
+            .received(Limits::MIN_PROGRESS as usize, true, now);
+        now += limits().stall_timeout / 2;
+        a.connection.handle_timeout(now).unwrap();
+    }
+    // One byte a second.
+    for _ in 0..10 {
+        now += limits().stall_timeout / 10;
+        a.connection.received(1, true, now);
+    }
+    assert!(matches!(
+        a.connection.handle_timeout(now),
+        Err(End::TooSlow(_))
+    ));
+}
+
+#[test]
+fn a_hello_must_come_in_time() {
+    let now = Instant::now();
+    let (mut a, b) = pair(now);
+    let late = now + limits().handshake_timeout;
+    assert_eq!(b.connection.poll_timeout(), Some(late));
+    assert!(matches!(
+        a.connection.handle_timeout(late),
+        Err(End::TooSlow(_))
+    ));
+}

@@ -1,0 +1,389 @@
+//! What the connections of one endpoint share: who is connected, and which connection leads
+//! where.
+//!
+//! A location stays with one connection for as long as that lives, so that order holds. A
+//! location with a known incarnation uses whatever connection there is with that incarnation,
+//! whichever side opened it; so reports find their way back to peers that cannot be dialled. When
+//! two endpoints connect to each other at the same time both connections are kept: the one that is
+//! not used closes when it has been idle.
+
+use std::collections::{BTreeMap, HashMap};
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Instant;
+
+use fipa_transport::{Hop, Incarnation, Kind, Location, Sink, Ticket, WayError, WayFault};
+use parking_lot::Mutex;
+use tokio::runtime::Handle;
+use tokio::task::AbortHandle;
+
+use super::address;
+use super::config::{Limits, TcpConfig};
+use super::connection::{Connection, Role};
+use super::counters::{Tally, count};
+use super::end::End;
+use super::hello::Hello;
+use super::link::{Link, MAX_LINKS, of_ticket};
+
+#[derive(Debug)]
+pub(crate) struct Endpoint {
+    pub(crate) config: TcpConfig,
+    pub(crate) runtime: Handle,
+    tally: Tally,
+    registry: Mutex<Registry>,
+}
+
+#[derive(Default)]
+struct Registry {
+    phase: Phase,
+    sink: Option<Arc<dyn Sink>>,
+    listening: Vec<String>,
+    listeners: Vec<AbortHandle>,
+    /// Connections that were dialled, or whose peer has said hello.
+    links: HashMap<u32, Arc<Link>>,
+    /// The connection that was opened for a location.
+    dialled: HashMap<Location, Arc<Link>>,
+    /// A connection with the service of this incarnation, and all others in the order they came.
+    known: HashMap<Incarnation, Vec<Arc<Link>>>,
+    /// The peers' last connections for each of the locations they dialled.
+    inbound: HashMap<Inbound, (u64, Arc<Link>)>,
+    /// Accepted connections that have not introduced themselves, oldest first.
+    strangers: BTreeMap<u64, Option<AbortHandle>>,
+    last_stranger: u64,
+    last_number: u32,
+    last_serial: u64,
+}
+
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+enum Phase {
+    #[default]
+    New,
+    Open,
+    Closed,
+}
+
+/// What tells a peer's connections for one location from others. With the address, so that a
+/// stranger elsewhere cannot push out somebody's connection by using its incarnation.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct Inbound {
+    incarnation: Incarnation,
+    ip: IpAddr,
+    dialled: String,
+}
+
+/// The connection for a location.
+pub(crate) enum Way {
+    /// It is there.
+    There(Arc<Link>),
+    /// It has just been made up and is still to be opened.
+    ToDial(Arc<Link>, Arc<dyn Sink>),
+}
+
+impl std::fmt::Debug for Registry {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Registry")
+            .field("phase", &self.phase)
+            .field("listening", &self.listening)
+            .field("links", &self.links.len())
+            .field("strangers", &self.strangers.len())
+            .finish_non_exhaustive()
+    }
+}
+
+impl Endpoint {
+    pub(crate) fn new(config: TcpConfig, runtime: Handle) -> Arc<Self> {
+        Arc::new(Self {
+            config,
+            runtime,
+            tally: Tally::default(),
+            registry: Mutex::default(),
+        })
+    }
+
+    pub(crate) fn limits(&self) -> &Limits {
+        &self.config.limits
+    }
+
+    pub(crate) fn tally(&self) -> &Tally {
+        &self.tally
+    }
+
+    /// Who is told, while the endpoint is open.
+    pub(crate) fn sink(&self) -> Option<Arc<dyn Sink>> {
+        self.registry.lock().sink.clone()
+    }
+
+    /// Begins to exist. Says whether it had not before.
+    pub(crate) fn open(
+        &self,
+        sink: Arc<dyn Sink>,
+        listening: Vec<String>,
+        listen: impl FnOnce() -> Vec<AbortHandle>,
+    ) -> bool {
+        let mut registry = self.registry.lock();
+        if registry.phase != Phase::New {
+            return false;
+        }
+        registry.phase = Phase::Open;
+        registry.sink = Some(sink);
+        registry.listening = listening;
+        registry.listeners = listen();
+        true
+    }
+
+    pub(crate) fn is_new(&self) -> bool {
+        self.registry.lock().phase == Phase::New
+    }
+
+    /// Ends everything. The connections' tasks conclude what is outstanding.
+    pub(crate) fn close(&self) {
+        let (links, tasks) = {
+            let mut registry = self.registry.lock();
+            registry.phase = Phase::Closed;
+            registry.sink = None;
+            let mut tasks = std::mem::take(&mut registry.listeners);
+            tasks.extend(
+                std::mem::take(&mut registry.strangers)
+                    .into_values()
+                    .flatten(),
+            );
+            let links: Vec<_> = registry.links.values().cloned().collect();
+            (links, tasks)
+        };
+        for task in tasks {
+            task.abort();
+        }
+        for link in links {
+            link.leave(End::Closed);
+        }
+    }
+
+    /// The connection that leads to a location, made up when there is none.
+    pub(crate) fn way_to(&self, to: &Location) -> Result<Way, WayError> {
+        let mut registry = self.registry.lock();
+        let sink = match (registry.phase, &registry.sink) {
+            (Phase::Open, Some(sink)) => sink.clone(),
+            (Phase::New, _) => {
+                return Err(WayError::new(WayFault::Closed, "listen was not called yet"));
+            }
+            _ => return Err(End::Closed.after()),
+        };
+        let known = registry.known.get(&to.incarnation());
+        let there = registry
+            .dialled
+            .get(to)
+            .or_else(|| known.and_then(|links| links.first()));
+        if let Some(link) = there {
+            return Ok(Way::There(link.clone()));
+        }
+        if registry.links.len() >= self.limits().max_connections {
+            return Err(End::Crowd.after());
+        }
+        let serial = registry.last_serial + 1;
+        registry.last_serial = serial;
+        let role = Role::Dialler {
+            expected: to.incarnation(),
+        };
+        let link = self.make_link(&mut registry, role, serial, to.to_string());
+        registry.links.insert(link.number, link.clone());
+        registry.dialled.insert(to.clone(), link.clone());
+        Ok(Way::ToDial(link, sink))
+    }
+
+    /// The link with this ticket, and the parcel's number on it.
+    pub(crate) fn of_ticket(&self, ticket: Ticket) -> Option<(Arc<Link>, u64)> {
+        let (number, id) = of_ticket(ticket);
+        let link = self.registry.lock().links.get(&number).cloned()?;
+        Some((link, id))
+    }
+
+    /// Every connection there is.
+    pub(crate) fn links(&self) -> Vec<Arc<Link>> {
+        self.registry.lock().links.values().cloned().collect()
+    }
+
+    /// A link for a connection that was accepted, unless the endpoint has been closed.
+    pub(crate) fn accepted(&self) -> Option<(Arc<Link>, Arc<dyn Sink>)> {
+        let mut registry = self.registry.lock();
+        let sink = registry.sink.clone()?;
+        let link = self.make_link(&mut registry, Role::Acceptor, 0, String::new());
+        Some((link, sink))
+    }
+
+    fn make_link(
+        &self,
+        registry: &mut Registry,
+        role: Role,
+        serial: u64,
+        dialled: String,
+    ) -> Arc<Link> {
+        let hello = Hello {
+            identity: self.config.identity.clone(),
+            max_letter: self.limits().max_letter as u64,
+            max_in_flight: u32::try_from(self.limits().max_in_flight.max(1)).unwrap_or(u32::MAX),
+            serial,
+            dialled,
+            listening: registry.listening.clone(),
+        };
+        loop {
+            registry.last_number = (registry.last_number + 1) % MAX_LINKS;
+            if !registry.links.contains_key(&registry.last_number) {
+                break;
+            }
+        }
+        let connection = Connection::new(self.limits().clone(), role, hello, Instant::now());
+        Link::new(registry.last_number, connection)
+    }
+
+    /// A peer has introduced itself on a connection. Returns where its parcels come from.
+    ///
+    /// # Errors
+    /// When the connection is not wanted.
+    pub(crate) async fn enter(
+        &self,
+        link: &Arc<Link>,
+        peer: &Hello,
+        from: SocketAddr,
+    ) -> Result<Option<Hop>, End> {
+        let incarnation = peer.identity.incarnation;
+        let inbound = Inbound {
+            incarnation,
+            ip: from.ip(),
+            dialled: peer.dialled.clone(),
+        };
+        let mut superseded = None;
+        {
+            let mut registry = self.registry.lock();
+            if registry.phase != Phase::Open {
+                return Err(End::Closed);
+            }
+            if !registry.links.contains_key(&link.number) {
+                if registry.links.len() >= self.limits().max_connections {
+                    count(&self.tally.refused_crowd);
+                    return Err(End::Crowd);
+                }
+                registry.links.insert(link.number, link.clone());
+            }
+            if peer.dialled.is_empty() {
+                count(&self.tally.dialled);
+            } else {
+                count(&self.tally.accepted);
+                match registry.inbound.get(&inbound) {
+                    Some((serial, _)) if *serial > peer.serial => return Err(End::Superseded),
+                    Some((_, before)) => superseded = Some(before.clone()),
+                    None => {}
+                }
+                let this = (peer.serial, link.clone());
+                registry.inbound.insert(inbound, this);
+            }
+            let known = registry.known.entry(incarnation).or_default();
+            known.push(link.clone());
+            count(&self.tally.connections);
+        }
+        if let Some(superseded) = superseded {
+            // What the peer sent on its connection before this one must not arrive after what it
+            // sends now.
+            superseded.leave(End::Superseded);
+            superseded.over().await;
+        }
+        let remote = self.config.identity.is_remote(&peer.identity);
+        let back = address::way_back(&peer.listening, from).to_string();
+        let location = Location::new(Kind::Tcp, &back)
+            .map_err(|error| End::Nonsense(error.to_string()))?
+            .with_incarnation(incarnation);
+        Ok(Some(Hop { location, remote }))
+    }
+
+    /// A connection has ended: nothing leads there any more.
+    pub(crate) fn left(&self, link: &Arc<Link>, end: &End) {
+        if end.is_misbehaviour() {
+            let before = self.tally.refused_nonsense.fetch_add(1, Ordering::Relaxed);
+            super::accept::warn_seldom(before, format_args!("connection closed: {}", end.after()));
+        } else {
+            tracing::debug!(link = link.number, "connection ended: {}", end.after());
+        }
+        if let End::NotOpened(_) = end {
+            count(&self.tally.dial_failures);
+        }
+        self.forget(link);
+    }
+
+    /// Takes a connection out of every table.
+    pub(crate) fn forget(&self, link: &Arc<Link>) {
+        let mut registry = self.registry.lock();
+        if registry
+            .links
+            .get(&link.number)
+            .is_some_and(|there| Arc::ptr_eq(there, link))
+        {
+            registry.links.remove(&link.number);
+        }
+        let is_other = |other: &Arc<Link>| !Arc::ptr_eq(other, link);
+        registry.dialled.retain(|_, other| is_other(other));
+        registry.inbound.retain(|_, (_, other)| is_other(other));
+        let mut was_known = false;
+        registry.known.retain(|_, links| {
+            let before = links.len();
+            links.retain(is_other);
+            was_known |= links.len() < before;
+            !links.is_empty()
+        });
+        if was_known {
+            self.tally.connections.fetch_sub(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Gives a place to an accepted connection that has not introduced itself, unless the endpoint
+    /// has been closed; one too many pushes out the oldest.
+    pub(crate) fn receive_stranger(self: &Arc<Self>) -> Option<Stranger> {
+        let (number, pushed_out) = {
+            let mut registry = self.registry.lock();
+            if registry.phase != Phase::Open {
+                return None;
+            }
+            registry.last_stranger += 1;
+            let crowded = registry.strangers.len() >= self.limits().max_strangers.max(1);
+            let oldest = registry
+                .strangers
+                .iter()
+                .find_map(|(number, task)| Some((*number, task.clone()?)))
+                .filter(|_| crowded);
+            if let Some((number, _)) = &oldest {
+                registry.strangers.remove(number);
+            }
+            let number = registry.last_stranger;
+            registry.strangers.insert(number, None);
+            (number, oldest)
+        };
+        if let Some((_, task)) = pushed_out {
+            count(&self.tally.refused_crowd);
+            task.abort();
+        }
+        Some(Stranger {
+            endpoint: self.clone(),
+            number,
+        })
+    }
+
+    /// The stranger with this number is served by this task.
+    pub(crate) fn stranger_started(&self, number: u64, task: AbortHandle) {
+        // Otherwise it is no stranger any more, or gone.
+        if let Some(place) = self.registry.lock().strangers.get_mut(&number) {
+            *place = Some(task);
+        }
+    }
+}
+
+/// The place of one stranger; dropping it gives the place free.
+#[derive(Debug)]
+pub(crate) struct Stranger {
+    endpoint: Arc<Endpoint>,
+    pub(crate) number: u64,
+}
+
+impl Drop for Stranger {
+    fn drop(&mut self) {
+        self.endpoint.registry.lock().strangers.remove(&self.number);
+    }
+}

@@ -1,0 +1,200 @@
+use std::time::Duration;
+
+use fipa_acl::{Letter, Payload};
+use fipa_transport::{Body, FailureReason, Incarnation, Stream};
+use proptest::prelude::*;
+
+use super::*;
+
+fn letter_parcel(head: Vec<u8>, content: Vec<u8>) -> Parcel {
+    let payload = Payload {
+        head: head.into(),
+        content: content.into(),
+        tail: Bytes::from_static(b"\x01"),
+    };
+    Parcel {
+        receiver: "arm@crex".into(),
+        stream: Stream {
+            sender: Incarnation::from_u64(1),
+            receiver: Incarnation::from_u64(2),
+        },
+        sequence: 1,
+        after: 1,
+        remaining: Duration::from_secs(1),
+        hops: 0,
+        body: Body::Letter(Letter::new(Bytes::from_static(b"envelope"), payload)),
+    }
+}
+
+/// Puts bytes into the reader in pieces of at most these sizes, over and over.
+fn read(
+    reader: &mut FrameReader,
+    mut bytes: &[u8],
+    sizes: &[usize],
+) -> Result<Vec<Frame>, FrameError> {
+    let mut frames = Vec::new();
+    let mut sizes = sizes.iter().cycle();
+    while !bytes.is_empty() {
+        let mut space = reader.space();
+        assert!(
+            space.remaining_mut() > 0,
+            "a full buffer would read as end of stream"
+        );
+        let step = (*sizes.next().unwrap())
+            .max(1)
+            .min(bytes.len())
+            .min(space.remaining_mut());
+        space.put_slice(&bytes[..step]);
+        bytes = &bytes[step..];
+        while let Some(frame) = reader.next()? {
+            frames.push(frame);
+        }
+    }
+    Ok(frames)
+}
+
+fn reader(max_letter: usize) -> FrameReader {
+    FrameReader::new(max_letter, BytesMut::new())
+}
+
+fn header(version: u8, kind: u8, body_len: u64) -> Vec<u8> {
+    FrameHeader {
+        magic: MAGIC,
+        version,
+        kind,
+        flags: U16::ZERO,
+        id: U64::new(1),
+        body_len: U64::new(body_len),
+    }
+    .as_bytes()
+    .to_vec()
+}
+
+#[test]
+fn the_header_has_24_bytes_and_begins_like_no_envelope() {
+    assert_eq!(HEADER_LEN, 24);
+    assert!(![0xfe, 0xfd, b'<'].contains(&MAGIC[0]));
+}
+
+#[test]
+fn a_written_letter_is_not_copied_and_a_read_one_lies_in_one_piece() {
+    let sent = letter_parcel(vec![1; 10], vec![2; 100_000]);
+    let Body::Letter(letter) = &sent.body else {
+        panic!()
+    };
+    let pieces = parcel(9, &sent).unwrap();
+    assert!(
+        pieces
+            .iter()
+            .any(|piece| piece.as_ptr() == letter.payload().content.as_ptr())
+    );
+    let frames = read(&mut reader(1 << 20), &pieces.concat(), &[5000]).unwrap();
+    let [Frame::Parcel { id: 9, parcel }] = &frames[..] else {
+        panic!("{frames:?}")
+    };
+    let Body::Letter(read) = &parcel.body else {
+        panic!()
+    };
+    assert_eq!(read.to_bytes(), letter.to_bytes());
+    let (head, content) = (&read.payload().head, &read.payload().content);
+    assert_eq!(head.as_ptr_range().end, content.as_ptr());
+}
+
+#[test]
+fn announcing_much_takes_no_memory() {
+    let mut reader = reader(4 << 30);
+    let announced = 4 << 30;
+    assert_eq!(
+        read(&mut reader, &header(VERSION, PARCEL, announced), &[24]),
+        Ok(vec![])
+    );
+    assert!(reader.space().remaining_mut() <= FIRST_STEP);
+    for filled in 0..100 {
+        let step = vec![0; 64 * 1024];
+        assert_eq!(read(&mut reader, &step, &[usize::MAX]), Ok(vec![]));
+        let body = reader.body.as_ref().unwrap();
+        let arrived = (filled + 1) * step.len();
+        assert_eq!(body.bytes.len(), arrived);
+        assert!(body.bytes.capacity() <= 4 * arrived.max(FIRST_STEP));
+    }
+}
+
+#[test]
+fn what_is_no_frame_is_refused_at_once() {
+    let refused = |bytes: &[u8]| read(&mut reader(1 << 20), bytes, &[1]).unwrap_err();
+    assert_eq!(refused(b"GET / HTTP/1.1"), FrameError::Magic(*b"G\0\0\0"));
+    assert_eq!(refused(b"fipx"), FrameError::Magic(*b"fipx"));
+    assert_eq!(refused(&header(2, HELLO, 0)), FrameError::Version(2));
+    assert_eq!(refused(&header(VERSION, 77, 0)), FrameError::Kind(77));
+    for (kind, len) in [
+        (HELLO, MAX_HELLO as u64 + 1),
+        (PARCEL, 63),
+        (PARCEL, (1 << 20) + PARCEL_ALLOWANCE + 1),
+        (PARCEL, u64::MAX),
+        (ANSWER, MAX_ANSWER as u64 + 1),
+        (PING, 1),
+        (GOODBYE, 1),
+    ] {
+        let error = refused(&header(VERSION, kind, len));
+        assert!(matches!(error, FrameError::Length { .. }), "{kind} {len}");
+    }
+    let mut parcel = header(VERSION, PARCEL, 64);
+    parcel.extend([0; 64]);
+    assert_eq!(refused(&parcel), FrameError::Parcel(WireError::Name));
+}
+
+fn any_frame() -> impl Strategy<Value = Vec<u8>> {
+    let bytes = |max| prop::collection::vec(any::<u8>(), 1..max);
+    prop_oneof![
+        (any::<u64>(), bytes(300), bytes(300)).prop_map(|(id, head, content)| {
+            parcel(id, &letter_parcel(head, content)).unwrap().concat()
+        }),
+        (any::<u64>(), bytes(10), bytes(60_000)).prop_map(|(id, head, content)| {
+            parcel(id, &letter_parcel(head, content)).unwrap().concat()
+        }),
+        any::<u64>().prop_map(|id| answer(id, &Answer::Busy).to_vec()),
+        any::<u64>()
+            .prop_map(|id| { answer(id, &Answer::failed(FailureReason::Loop, "again")).to_vec() }),
+        (1..u64::MAX).prop_map(|i| hello(&super::super::hello::tests::sample(i)).to_vec()),
+        Just(ping().to_vec()),
+        Just(pong().to_vec()),
+        any::<u64>().prop_map(|last| goodbye(last).to_vec()),
+    ]
+}
+
+proptest! {
+    /// However a stream is cut into pieces, the same frames come out, each as it would alone.
+    #[test]
+    fn chunking_does_not_matter(
+        written in prop::collection::vec(any_frame(), 1..12),
+        sizes in prop::collection::vec(1_usize..40_000, 1..8),
+        small in prop::collection::vec(1_usize..30, 1..8),
+    ) {
+        let alone: Vec<Frame> = written
+            .iter()
+            .map(|bytes| read(&mut reader(1 << 20), bytes, &[usize::MAX]).unwrap().remove(0))
+            .collect();
+        for sizes in [&sizes, &small] {
+            let mut reader = reader(1 << 20);
+            prop_assert_eq!(&read(&mut reader, &written.concat(), sizes).unwrap(), &alone);
+            prop_assert!(!reader.is_partial());
+        }
+    }
+
+    /// No bytes make the reader panic or hold more than it was given.
+    #[test]
+    fn arbitrary_bytes_do_no_harm(
+        mut bytes in prop::collection::vec(any::<u8>(), 0..4000),
+        version in prop_oneof![9 => Just(VERSION), 1 => any::<u8>()],
+        kind in 0_u8..8,
+        len in prop_oneof![0_u64..3000, any::<u64>()],
+        sizes in prop::collection::vec(1_usize..2000, 1..8),
+    ) {
+        let mut stream = header(version, kind, len);
+        stream.append(&mut bytes);
+        let mut reader = reader(1 << 16);
+        if let Ok(frames) = read(&mut reader, &stream, &sizes) {
+            prop_assert!(frames.len() <= stream.len() / HEADER_LEN);
+        }
+    }
+}

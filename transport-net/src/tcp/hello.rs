@@ -1,0 +1,177 @@
+//! The body of a hello frame: how two endpoints introduce themselves.
+//!
+//! A fixed part of 28 bytes, little-endian (incarnation 8, largest letter 8, most parcels in
+//! flight 4, number of this connection 8), then texts, each with its length in two bytes in
+//! front: name, domain, host, the location that was dialled (empty from the side that accepted),
+//! and then, after their number in one byte, the addresses the endpoint listens on. Bytes behind
+//! that belong to later versions and are ignored.
+
+use bytes::{BufMut, Bytes, BytesMut};
+use fipa_transport::{Incarnation, Location};
+use zerocopy::little_endian::{U32, U64};
+use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
+
+use crate::Identity;
+
+/// Longest body of a hello, in bytes.
+pub(crate) const MAX_HELLO: usize = 16 * 1024;
+
+/// Longest text of a location with kind and incarnation, in bytes.
+const MAX_DIALLED: usize = Location::MAX_ADDRESS + 32;
+
+/// At most this many addresses are told; the best stand first.
+const MAX_LISTENING: usize = 16;
+
+#[derive(FromBytes, IntoBytes, Immutable, KnownLayout, Unaligned)]
+#[repr(C)]
+struct Fixed {
+    incarnation: U64,
+    max_letter: U64,
+    max_in_flight: U32,
+    serial: U64,
+}
+
+/// What one side says about itself when a connection begins.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Hello {
+    pub(crate) identity: Identity,
+    /// Largest letter taken, in bytes.
+    pub(crate) max_letter: u64,
+    /// Most parcels taken before answers to earlier ones have been read.
+    pub(crate) max_in_flight: u32,
+    /// Rises with every connection that this endpoint opens.
+    pub(crate) serial: u64,
+    /// The location this connection was opened for, as the opener knows it.
+    pub(crate) dialled: String,
+    /// Addresses the endpoint listens on, best first.
+    pub(crate) listening: Vec<String>,
+}
+
+impl Hello {
+    pub(crate) fn encode(&self) -> Bytes {
+        let fixed = Fixed {
+            incarnation: U64::new(self.identity.incarnation.as_u64()),
+            max_letter: U64::new(self.max_letter),
+            max_in_flight: U32::new(self.max_in_flight),
+            serial: U64::new(self.serial),
+        };
+        let mut out = BytesMut::new();
+        out.put_slice(fixed.as_bytes());
+        let Identity {
+            name, domain, host, ..
+        } = &self.identity;
+        for text in [name, domain, host, &self.dialled] {
+            put_text(&mut out, text);
+        }
+        let told = self.listening.iter().take(MAX_LISTENING);
+        out.put_u8(told.len() as u8);
+        told.for_each(|text| put_text(&mut out, text));
+        out.freeze()
+    }
+
+    pub(crate) fn decode(body: &[u8]) -> Option<Self> {
+        let (fixed, mut rest) = Fixed::read_from_prefix(body).ok()?;
+        let incarnation = Incarnation::from_u64(fixed.incarnation.get());
+        if !incarnation.is_known() {
+            return None;
+        }
+        let identity = Identity {
+            name: text(&mut rest, Identity::MAX_TEXT)?,
+            incarnation,
+            domain: text(&mut rest, Identity::MAX_TEXT)?,
+            host: text(&mut rest, Identity::MAX_TEXT)?,
+        };
+        let dialled = text(&mut rest, MAX_DIALLED)?;
+        let (&count, after) = rest.split_first()?;
+        rest = after;
+        if usize::from(count) > MAX_LISTENING {
+            return None;
+        }
+        let listening = (0..count)
+            .map(|_| text(&mut rest, Location::MAX_ADDRESS))
+            .collect::<Option<_>>()?;
+        Some(Self {
+            identity,
+            max_letter: fixed.max_letter.get(),
+            max_in_flight: fixed.max_in_flight.get(),
+            serial: fixed.serial.get(),
+            dialled,
+            listening,
+        })
+    }
+}
+
+fn put_text(out: &mut BytesMut, text: &str) {
+    let text = fipa_transport::wire::truncated(text, MAX_DIALLED);
+    out.put_u16_le(text.len() as u16);
+    out.put_slice(text.as_bytes());
+}
+
+fn text(rest: &mut &[u8], max: usize) -> Option<String> {
+    let (len, after) = rest.split_first_chunk()?;
+    let len = usize::from(u16::from_le_bytes(*len));
+    let (text, after) = after.split_at_checked(len)?;
+    *rest = after;
+    let text = std::str::from_utf8(text).ok()?;
+    (len <= max).then(|| text.to_owned())
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    pub(crate) fn sample(incarnation: u64) -> Hello {
+        Hello {
+            identity: Identity {
+                name: "crex-mts".into(),
+                incarnation: Incarnation::from_u64(incarnation),
+                domain: "default".into(),
+                host: "crex".into(),
+            },
+            max_letter: 1 << 20,
+            max_in_flight: 8,
+            serial: 3,
+            dialled: "tcp://10.0.0.2:7788".into(),
+            listening: vec!["10.0.0.1:7788".into(), "[::1]:7788".into()],
+        }
+    }
+
+    #[test]
+    fn a_hello_survives_and_may_grow() {
+        let hello = sample(7);
+        let mut body = hello.encode().to_vec();
+        assert_eq!(Hello::decode(&body), Some(hello.clone()));
+        body.extend_from_slice(b"from a later version");
+        assert_eq!(Hello::decode(&body), Some(hello));
+    }
+
+    #[test]
+    fn every_truncation_and_an_unknown_incarnation_are_refused() {
+        let body = sample(7).encode();
+        for len in 0..body.len() {
+            assert_eq!(Hello::decode(&body[..len]), None, "{len}");
+        }
+        assert_eq!(Hello::decode(&sample(0).encode()), None);
+    }
+
+    #[test]
+    fn the_longest_hello_fits() {
+        let mut hello = sample(7);
+        hello.dialled = "x".repeat(MAX_DIALLED);
+        hello.listening = vec!["x".repeat(Location::MAX_ADDRESS); MAX_LISTENING + 1];
+        let body = hello.encode();
+        assert!(body.len() <= MAX_HELLO);
+        assert_eq!(Hello::decode(&body).unwrap().listening.len(), MAX_LISTENING);
+    }
+
+    proptest! {
+        #[test]
+        fn arbitrary_bytes_do_no_harm(body in prop::collection::vec(any::<u8>(), 0..400)) {
+            if let Some(hello) = Hello::decode(&body) {
+                prop_assert_eq!(Hello::decode(&hello.encode()), Some(hello));
+            }
+        }
+    }
+}

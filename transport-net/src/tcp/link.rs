@@ -1,0 +1,415 @@
+//! A connection with its socket: the thin shell around [`Connection`].
+//!
+//! Whoever has something to send writes it to the socket at once, on its own thread, as far as the
+//! kernel takes it; the connection's task writes the rest. Only that task reads, and only it calls
+//! the sink.
+
+use std::io::{self, IoSlice};
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+use fipa_transport::{Answer, AttemptId, Hop, Parcel, Sink, Ticket};
+use parking_lot::Mutex;
+use tokio::io::AsyncReadExt;
+use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
+use tokio::sync::{Notify, watch};
+use tokio::time::{sleep_until, timeout};
+
+use super::connection::{Connection, Event, MAX_ID, SendError};
+use super::counters::count;
+use super::end::End;
+use super::endpoint::Endpoint;
+use super::frame::FrameReader;
+
+/// Pieces handed to the kernel in one call.
+const MAX_SLICES: usize = 64;
+
+/// Bytes written in one go before others get their turn.
+const MAX_BURST: usize = 1 << 20;
+
+/// Numbers of links stay below this (see [`Link::ticket`]).
+pub(crate) const MAX_LINKS: u32 = 1 << 24;
+
+#[derive(Debug)]
+pub(crate) struct Link {
+    /// Unique among the links of an endpoint.
+    pub(crate) number: u32,
+    state: Mutex<State>,
+    /// Wakes the task: there is something to write, or an end.
+    wake: Notify,
+    over: watch::Sender<bool>,
+    begun: AtomicBool,
+}
+
+#[derive(Debug)]
+struct State {
+    connection: Connection,
+    writer: Option<Arc<OwnedWriteHalf>>,
+    /// Why the task is to end the connection.
+    ending: Option<End>,
+}
+
+/// How far writing got.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Flushed {
+    All,
+    Rest,
+}
+
+impl Link {
+    pub(crate) fn new(number: u32, connection: Connection) -> Arc<Self> {
+        Arc::new(Self {
+            number,
+            state: Mutex::new(State {
+                connection,
+                writer: None,
+                ending: None,
+            }),
+            wake: Notify::new(),
+            over: watch::Sender::new(false),
+            begun: AtomicBool::new(false),
+        })
+    }
+
+    /// Whether the task has begun, and will see to it that every parcel gets its conclusion.
+    pub(crate) fn has_begun(&self) -> bool {
+        self.begun.load(Ordering::Acquire)
+    }
+
+    /// The socket is connected.
+    pub(crate) fn connected(&self, now: Instant) {
+        self.state.lock().connection.connected(now);
+    }
+
+    /// Takes a parcel for sending, and writes what the kernel takes at once.
+    pub(crate) fn send(&self, attempt: AttemptId, parcel: &Parcel) -> Result<(), SendError> {
+        let mut state = self.state.lock();
+        state.connection.send(attempt, parcel)?;
+        self.flush(&mut state);
+        Ok(())
+    }
+
+    pub(crate) fn abandon(&self, attempt: AttemptId) {
+        self.state.lock().connection.abandon(attempt);
+    }
+
+    /// Answers a parcel that arrived on this link, by its number.
+    pub(crate) fn answer(&self, id: u64, answer: &Answer) {
+        let mut state = self.state.lock();
+        state.connection.answer(id, answer, Instant::now());
+        self.flush(&mut state);
+    }
+
+    /// Asks the task to end the connection.
+    pub(crate) fn leave(&self, end: End) {
+        self.state.lock().ending.get_or_insert(end);
+        self.wake.notify_one();
+    }
+
+    /// Waits until somebody asks for the end.
+    pub(crate) async fn leaving(&self) -> End {
+        loop {
+            if let Some(end) = self.state.lock().ending.clone() {
+                return end;
+            }
+            self.wake.notified().await;
+        }
+    }
+
+    /// Waits until the last parcel of this connection has been handed to the sink.
+    pub(crate) async fn over(&self) {
+        // The sender lives in self: an error is impossible, and would mean the same.
+        let _ = self.over.subscribe().wait_for(|over| *over).await;
+    }
+
+    /// The endpoint's number for an arrival on this link.
+    fn ticket(&self, id: u64) -> Ticket {
+        Ticket(u64::from(self.number) * MAX_ID + id)
+    }
+
+    /// Writes what the kernel takes, and sees to it that the task writes the rest.
+    fn flush(&self, state: &mut State) {
+        if state.flush() == Flushed::Rest {
+            self.wake.notify_one();
+        }
+    }
+}
+
+/// The link's number and the parcel's number in a ticket.
+pub(crate) fn of_ticket(ticket: Ticket) -> (u32, u64) {
+    let number = u32::try_from(ticket.0 / MAX_ID).unwrap_or(u32::MAX);
+    (number, ticket.0 % MAX_ID)
+}
+
+impl State {
+    fn flush(&mut self) -> Flushed {
+        let Some(writer) = &self.writer else {
+            return Flushed::All;
+        };
+        let mut burst = 0;
+        while !self.connection.is_flushed() {
+            if burst >= MAX_BURST {
+                return Flushed::Rest;
+            }
+            let mut slices = [IoSlice::new(&[]); MAX_SLICES];
+            let count = self.connection.gather(&mut slices);
+            match writer.try_write_vectored(&slices[..count]) {
+                Ok(0) => {
+                    let nothing = "the system takes no more bytes".into();
+                    self.ending.get_or_insert(End::Broken(nothing));
+                    return Flushed::Rest;
+                }
+                Ok(taken) => {
+                    burst += taken;
+                    self.connection.written(taken, Instant::now());
+                }
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => return Flushed::Rest,
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) => {
+                    self.ending.get_or_insert(End::Broken(error.to_string()));
+                    return Flushed::Rest;
+                }
+            }
+        }
+        Flushed::All
+    }
+}
+
+/// What the task of a link needs beside the link.
+pub(crate) struct Running {
+    endpoint: Arc<Endpoint>,
+    link: Arc<Link>,
+    sink: Arc<dyn Sink>,
+    /// Where parcels on this link come from, once the peer has said hello.
+    hop: Option<Hop>,
+    end: End,
+}
+
+impl Running {
+    /// To be made by the task itself: from now on the link gets its end, whatever happens to the
+    /// task.
+    pub(crate) fn new(endpoint: Arc<Endpoint>, link: Arc<Link>, sink: Arc<dyn Sink>) -> Self {
+        link.begun.store(true, Ordering::Release);
+        Self {
+            endpoint,
+            link,
+            sink,
+            hop: None,
+            // What is said when the runtime drops the task.
+            end: End::Closed,
+        }
+    }
+
+    /// Ends a link whose socket could not be connected.
+    pub(crate) fn fail(mut self, end: End) {
+        self.end = end;
+    }
+
+    /// Serves the connection to its end. `greeted` is called when the peer has introduced itself.
+    pub(crate) async fn serve(
+        mut self,
+        (read, writer): (OwnedReadHalf, OwnedWriteHalf),
+        mut reader: FrameReader,
+        from: SocketAddr,
+        greeted: impl FnOnce() + Send,
+    ) {
+        let mut read = read;
+        let writer = Arc::new(writer);
+        self.link.state.lock().writer = Some(writer.clone());
+        let mut greeted = Some(greeted);
+        let end = self.exchange(&mut read, &writer, &mut reader, from, &mut greeted);
+        self.end = end.await;
+        drop(writer);
+        let (link, patience) = (self.link.clone(), self.endpoint.limits().handshake_timeout);
+        let orderly = self.end.is_orderly();
+        drop(self);
+        if orderly {
+            // A peer that does not hang up in time is left alone.
+            let _ = timeout(patience, farewell(&link, read)).await;
+        }
+        link.state.lock().writer = None;
+    }
+
+    async fn exchange(
+        &mut self,
+        read: &mut OwnedReadHalf,
+        writer: &OwnedWriteHalf,
+        reader: &mut FrameReader,
+        from: SocketAddr,
+        greeted: &mut Option<impl FnOnce() + Send>,
+    ) -> End {
+        let timer = sleep_until(Instant::now().into());
+        tokio::pin!(timer);
+        let link = self.link.clone();
+        if let Err(end) = self.take_frames(reader, 0, from, greeted).await {
+            return end;
+        }
+        loop {
+            let (flushed, due) = {
+                let mut state = link.state.lock();
+                let flushed = state.flush();
+                self.endpoint
+                    .tally()
+                    .parcels_out
+                    .fetch_add(state.connection.take_parcels_written(), Ordering::Relaxed);
+                if let Some(end) = state.ending.clone() {
+                    return end;
+                }
+                (flushed, state.connection.poll_timeout())
+            };
+            // Most of the time what is due moves away: then the timer is left to go off early.
+            let armed = timer.deadline().into_std();
+            if let Some(due) = due
+                && (timer.is_elapsed() || due < armed)
+            {
+                timer.as_mut().reset(due.into());
+            }
+            let mut space = reader.space();
+            tokio::select! {
+                arrived = read.read_buf(&mut space) => {
+                    let arrived = match arrived {
+                        Ok(0) => return End::Hangup,
+                        Ok(bytes) => bytes,
+                        Err(error) => return End::Broken(error.to_string()),
+                    };
+                    if let Err(end) = self.take_frames(reader, arrived, from, greeted).await {
+                        return end;
+                    }
+                }
+                ready = writer.writable(), if flushed == Flushed::Rest => {
+                    if let Err(error) = ready {
+                        return End::Broken(error.to_string());
+                    }
+                }
+                () = link.wake.notified() => {}
+                () = &mut timer => {
+                    let mut state = link.state.lock();
+                    if let Err(end) = state.connection.handle_timeout(Instant::now()) {
+                        return end;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Hands on what has arrived in whole frames, and answers.
+    async fn take_frames(
+        &mut self,
+        reader: &mut FrameReader,
+        arrived: usize,
+        from: SocketAddr,
+        greeted: &mut Option<impl FnOnce() + Send>,
+    ) -> Result<(), End> {
+        let now = Instant::now();
+        let link = self.link.clone();
+        loop {
+            let frame = reader.next().map_err(|e| End::Nonsense(e.to_string()))?;
+            let Some(frame) = frame else { break };
+            let events: [Option<Event>; 2];
+            {
+                let mut state = link.state.lock();
+                if let Some(end) = state.ending.clone() {
+                    return Err(end);
+                }
+                state.connection.handle_frame(frame, now)?;
+                events = [state.connection.poll_event(), state.connection.poll_event()];
+            }
+            for event in events.into_iter().flatten() {
+                self.handle_event(event, from, greeted).await?;
+            }
+            loop {
+                // Rare: a hello that makes many waiting letters too large.
+                let Some(event) = link.state.lock().connection.poll_event() else {
+                    break;
+                };
+                self.handle_event(event, from, greeted).await?;
+            }
+        }
+        let mut state = link.state.lock();
+        state.connection.received(arrived, reader.is_partial(), now);
+        Ok(())
+    }
+
+    async fn handle_event(
+        &mut self,
+        event: Event,
+        from: SocketAddr,
+        greeted: &mut Option<impl FnOnce() + Send>,
+    ) -> Result<(), End> {
+        match event {
+            Event::Greeted => {
+                let peer = self.link.state.lock().connection.peer().cloned();
+                if let Some(peer) = peer {
+                    self.hop = self.endpoint.enter(&self.link, &peer, from).await?;
+                }
+                self.link.state.lock().connection.welcome();
+                if let Some(greeted) = greeted.take() {
+                    greeted();
+                }
+            }
+            Event::Arrived { id, parcel } => {
+                count(&self.endpoint.tally().parcels_in);
+                let Some(from) = self.hop.clone() else {
+                    return Err(End::Nonsense("a parcel from nobody".into()));
+                };
+                let ticket = self.link.ticket(id);
+                let verdict = self.sink.arrived(fipa_transport::Arrival {
+                    parcel: *parcel,
+                    from,
+                    ticket,
+                });
+                if let fipa_transport::Verdict::Now(answer) = verdict {
+                    let mut state = self.link.state.lock();
+                    state.connection.answer(id, &answer, Instant::now());
+                }
+            }
+            Event::Concluded(attempt, conclusion) => self.sink.concluded(attempt, conclusion),
+        }
+        Ok(())
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let concluded = {
+            let mut state = self.link.state.lock();
+            let written = state.connection.take_parcels_written();
+            self.endpoint
+                .tally()
+                .parcels_out
+                .fetch_add(written, Ordering::Relaxed);
+            if !self.end.is_orderly() {
+                state.writer = None;
+            }
+            state.connection.end(&self.end)
+        };
+        self.endpoint.left(&self.link, &self.end);
+        for (attempt, conclusion) in concluded {
+            self.sink.concluded(attempt, conclusion);
+        }
+        self.link.over.send_replace(true);
+    }
+}
+
+/// Writes what is left, closes this direction, and waits for the peer to close the other: closing
+/// while bytes of the peer are unread would destroy what is on its way to it.
+async fn farewell(link: &Link, mut read: OwnedReadHalf) {
+    loop {
+        let writer = {
+            let mut state = link.state.lock();
+            let flushed = state.flush();
+            match (flushed, &state.writer) {
+                (Flushed::Rest, Some(writer)) => writer.clone(),
+                _ => break,
+            }
+        };
+        if writer.writable().await.is_err() {
+            return;
+        }
+    }
+    link.state.lock().writer = None;
+    let mut ignored = [0; 4096];
+    while matches!(read.read(&mut ignored).await, Ok(1..)) {}
+}

@@ -1,0 +1,160 @@
+//! Letters of old peers (fipa_services): one per connection, without a header, until end of
+//! stream.
+
+use bytes::{Bytes, BytesMut};
+use fipa_acl::{DecodeError, EncodeError, Envelope, EnvelopeParams, Letter};
+use fipa_transport::Kind;
+use tokio::io::{AsyncRead, AsyncReadExt};
+use tokio::time::{Instant, timeout_at};
+
+use super::config::Limits;
+use super::counters::count;
+use super::endpoint::Endpoint;
+
+/// Why an old peer's letter is not taken.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub(crate) enum UnframedError {
+    #[error("a letter of more than {0} bytes (max_letter)")]
+    TooLarge(usize),
+    #[error("a letter stopped arriving half way")]
+    TooSlow,
+    #[error("a letter broke off: {0}")]
+    Broken(#[from] std::io::Error),
+    #[error("its envelope cannot be read: {0}")]
+    Envelope(#[from] DecodeError),
+    #[error("its envelope cannot be written in the standard dialect: {0}")]
+    Standard(#[from] EncodeError),
+}
+
+/// Reads a letter that has `begun` to its end. Its envelope is brought into the standard dialect;
+/// the message behind it is not touched.
+pub(crate) async fn read(
+    endpoint: &Endpoint,
+    source: &mut (impl AsyncRead + Unpin),
+    begun: BytesMut,
+) -> Result<Letter, UnframedError> {
+    let whole = read_to_end(endpoint.limits(), source, begun).await?;
+    let (envelope, length) = Envelope::decode(&whole)?;
+    let message = whole.slice(length.min(whole.len())..);
+    let envelope = with_stamped_extensions(envelope).encode_standard()?;
+    Ok(Letter::new(envelope, message))
+}
+
+/// The same envelope with stamped extensions only, as FIPA00088 wants them: fipa_services narrows
+/// a letter to one receiver with an extension that has no stamp. Such overriding parameters, and
+/// dates, for which an extension has no place, go to the next older part. What counts in effect
+/// stays the same.
+fn with_stamped_extensions(envelope: Envelope) -> Envelope {
+    let Envelope {
+        mut base,
+        extensions,
+    } = envelope;
+    let mut stamped: Vec<EnvelopeParams> = Vec::new();
+    for mut extension in extensions {
+        if let Some(date) = extension.date.take() {
+            base.date = Some(date);
+        }
+        if extension.received.is_some() {
+            stamped.push(extension);
+        } else {
+            overrule(stamped.last_mut().unwrap_or(&mut base), extension);
+        }
+    }
+    Envelope {
+        base,
+        extensions: stamped,
+    }
+}
+
+fn overrule(older: &mut EnvelopeParams, newer: EnvelopeParams) {
+    fn one<T>(older: &mut Option<T>, newer: Option<T>) {
+        if newer.is_some() {
+            *older = newer;
+        }
+    }
+    fn list<T>(older: &mut Vec<T>, newer: Vec<T>) {
+        if !newer.is_empty() {
+            *older = newer;
+        }
+    }
+    one(&mut older.from, newer.from);
+    one(&mut older.comments, newer.comments);
+    one(&mut older.acl_representation, newer.acl_representation);
+    one(&mut older.payload_length, newer.payload_length);
+    one(&mut older.payload_encoding, newer.payload_encoding);
+    one(&mut older.transport_behaviour, newer.transport_behaviour);
+    list(&mut older.to, newer.to);
+    list(&mut older.intended_receivers, newer.intended_receivers);
+    older.user_defined.extend(newer.user_defined);
+}
+
+/// Hands a letter to the sink, unless the endpoint has been closed.
+pub(crate) fn hand_on(endpoint: &Endpoint, letter: Letter) {
+    if let Some(sink) = endpoint.sink() {
+        count(&endpoint.tally().unframed_in);
+        sink.arrived_unframed(letter, Kind::Tcp);
+    }
+}
+
+async fn read_to_end(
+    limits: &Limits,
+    source: &mut (impl AsyncRead + Unpin),
+    mut bytes: BytesMut,
+) -> Result<Bytes, UnframedError> {
+    let mut window = (Instant::now() + limits.stall_timeout, bytes.len());
+    loop {
+        if bytes.len() > limits.max_letter {
+            return Err(UnframedError::TooLarge(limits.max_letter));
+        }
+        if bytes.len() == bytes.capacity() {
+            bytes.reserve(bytes.len().max(4096));
+        }
+        match timeout_at(window.0, source.read_buf(&mut bytes)).await {
+            Ok(Ok(0)) => return Ok(bytes.freeze()),
+            Ok(Ok(_)) => {}
+            Ok(Err(error)) => return Err(error.into()),
+            Err(_) => {
+                let progress = (bytes.len() - window.1) as u64;
+                if progress < Limits::MIN_PROGRESS {
+                    return Err(UnframedError::TooSlow);
+                }
+                window = (Instant::now() + limits.stall_timeout, bytes.len());
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use fipa_acl::AgentId;
+
+    use super::*;
+
+    /// A letter as a fipa_services peer sent it.
+    const TCP_LETTER: &[u8] = include_bytes!("../../tests/data/tcp_letter.bin");
+
+    #[test]
+    fn extensions_without_a_stamp_are_folded_and_count_as_before() {
+        let (recorded, _) = Envelope::decode(TCP_LETTER).unwrap();
+        let override_only = EnvelopeParams {
+            intended_receivers: vec![AgentId::new("arm").unwrap()],
+            comments: Some("newest".into()),
+            date: recorded.base.date,
+            ..EnvelopeParams::default()
+        };
+        let mut oldest_first = recorded.clone();
+        oldest_first.extensions.insert(0, override_only.clone());
+        let mut newest_last = recorded.clone();
+        newest_last.extensions.push(override_only);
+        for envelope in [recorded, oldest_first, newest_last] {
+            let folded = with_stamped_extensions(envelope.clone());
+            assert_eq!(folded.effective(), envelope.effective());
+            assert!(folded.extensions.iter().all(|e| e.received.is_some()));
+            let stamps =
+                |e: &Envelope| e.extensions.iter().filter(|e| e.received.is_some()).count();
+            assert_eq!(stamps(&folded), stamps(&envelope));
+            folded.encode_standard().unwrap();
+        }
+    }
+}

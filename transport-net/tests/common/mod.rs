@@ -1,0 +1,187 @@
+//! What the tests of the TCP endpoint share: endpoints on loopback, a sink that records, and
+//! waiting for a condition.
+#![allow(dead_code, reason = "each test file uses a part of it")]
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use fipa_acl::{Letter, Payload};
+use fipa_transport::{
+    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel, Sink,
+    Stream, Ticket, Transport, Verdict, WayError,
+};
+use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport};
+use parking_lot::Mutex;
+use tokio::runtime::Runtime;
+
+pub(crate) fn runtime() -> Runtime {
+    tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .enable_all()
+        .build()
+        .unwrap()
+}
+
+pub(crate) fn config(listen: &[&str]) -> TcpConfig {
+    TcpConfig {
+        listen: listen.iter().map(|text| (*text).into()).collect(),
+        identity: Identity {
+            name: "test-mts".into(),
+            incarnation: Incarnation::random(),
+            domain: "test".into(),
+            host: "here".into(),
+        },
+        limits: Limits {
+            // Whoever waits this long in a test waits for ever.
+            connect_timeout: Duration::from_secs(30),
+            handshake_timeout: Duration::from_secs(30),
+            ..Limits::default()
+        },
+    }
+}
+
+#[derive(Default)]
+pub(crate) struct Record {
+    pub(crate) arrivals: Vec<(Parcel, Hop, Ticket)>,
+    pub(crate) unframed: Vec<(Letter, Kind)>,
+    pub(crate) concluded: HashMap<AttemptId, Vec<Conclusion>>,
+}
+
+pub(crate) struct Recorder {
+    pub(crate) record: Mutex<Record>,
+    verdict: Verdict,
+}
+
+impl Sink for Recorder {
+    fn arrived(&self, arrival: Arrival) -> Verdict {
+        let Arrival {
+            parcel,
+            from,
+            ticket,
+        } = arrival;
+        self.record.lock().arrivals.push((parcel, from, ticket));
+        self.verdict.clone()
+    }
+
+    fn arrived_unframed(&self, letter: Letter, via: Kind) {
+        self.record.lock().unframed.push((letter, via));
+    }
+
+    fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {
+        let mut record = self.record.lock();
+        record
+            .concluded
+            .entry(attempt)
+            .or_default()
+            .push(conclusion);
+    }
+}
+
+/// An endpoint that listens.
+pub(crate) struct Party {
+    pub(crate) transport: TcpTransport,
+    pub(crate) sink: Arc<Recorder>,
+    pub(crate) locations: Vec<Location>,
+    pub(crate) runtime: Runtime,
+}
+
+impl Party {
+    pub(crate) fn new() -> Self {
+        Self::with(config(&["127.0.0.1:0"]))
+    }
+
+    pub(crate) fn with(config: TcpConfig) -> Self {
+        Self::judging(config, Verdict::Now(Answer::Accepted))
+    }
+
+    pub(crate) fn judging(config: TcpConfig, verdict: Verdict) -> Self {
+        let runtime = runtime();
+        let transport = TcpTransport::new(config, runtime.handle().clone());
+        let sink = Arc::new(Recorder {
+            record: Mutex::default(),
+            verdict,
+        });
+        let locations = transport.listen(sink.clone()).unwrap();
+        Self {
+            transport,
+            sink,
+            locations,
+            runtime,
+        }
+    }
+
+    pub(crate) fn location(&self) -> &Location {
+        &self.locations[0]
+    }
+
+    pub(crate) fn send(&self, attempt: u64, to: &Location, parcel: Parcel) -> Result<(), WayError> {
+        self.transport.dispatch(AttemptId(attempt), to, parcel)
+    }
+
+    /// Waits for the conclusion of an attempt.
+    pub(crate) fn conclusion(&self, attempt: u64) -> Conclusion {
+        until("a conclusion", || {
+            let record = self.sink.record.lock();
+            record.concluded.get(&AttemptId(attempt))?.first().cloned()
+        })
+    }
+
+    pub(crate) fn arrivals(&self) -> usize {
+        self.sink.record.lock().arrivals.len()
+    }
+
+    /// A letter gets through to there and back.
+    pub(crate) fn assert_reaches(&self, attempt: u64, to: &Party) {
+        self.send(attempt, to.location(), parcel(1, "still there?"))
+            .unwrap();
+        assert_eq!(self.conclusion(attempt), accepted());
+    }
+}
+
+pub(crate) fn accepted() -> Conclusion {
+    Conclusion::Answered(Answer::Accepted)
+}
+
+pub(crate) fn until<T>(what: &str, condition: impl Fn() -> Option<T>) -> T {
+    let started = Instant::now();
+    loop {
+        if let Some(value) = condition() {
+            return value;
+        }
+        let elapsed = started.elapsed();
+        assert!(
+            elapsed < Duration::from_secs(60),
+            "gave up waiting for: {what}"
+        );
+        std::thread::sleep(Duration::from_micros(200));
+    }
+}
+
+pub(crate) fn parcel(sequence: u64, content: impl Into<Bytes>) -> Parcel {
+    let payload = Payload {
+        head: Bytes::from_static(b"head"),
+        content: content.into(),
+        tail: Bytes::from_static(b"\x01"),
+    };
+    letter_parcel(
+        sequence,
+        Letter::new(Bytes::from_static(b"envelope"), payload),
+    )
+}
+
+pub(crate) fn letter_parcel(sequence: u64, letter: Letter) -> Parcel {
+    Parcel {
+        receiver: "arm_1".into(),
+        stream: Stream {
+            sender: Incarnation::from_u64(1),
+            receiver: Incarnation::from_u64(2),
+        },
+        sequence,
+        after: 0,
+        remaining: Duration::from_secs(5),
+        hops: 0,
+        body: Body::Letter(letter),
+    }
+}

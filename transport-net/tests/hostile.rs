@@ -1,0 +1,290 @@
+//! Old peers and hostile ones: raw bytes thrown at the port.
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test or bench that cannot go on may panic"
+)]
+
+mod common;
+
+use std::io::{Read, Write};
+use std::net::{Shutdown, TcpStream};
+use std::time::Duration;
+
+use common::{Party, config, parcel, until};
+use fipa_acl::Envelope;
+use fipa_transport::{Conclusion, Kind, Location, WayFault};
+use fipa_transport_net::{Counters, Limits};
+
+/// A letter as a fipa_services peer sent it.
+const TCP_LETTER: &[u8] = include_bytes!("data/tcp_letter.bin");
+
+fn impatient() -> Party {
+    let mut config = config(&["127.0.0.1:0"]);
+    config.limits.handshake_timeout = Duration::from_millis(300);
+    config.limits.stall_timeout = Duration::from_millis(300);
+    Party::with(config)
+}
+
+fn connect(to: &Party) -> TcpStream {
+    let stream = TcpStream::connect(to.location().address()).unwrap();
+    // A watchdog for reads that never end.
+    stream
+        .set_read_timeout(Some(Duration::from_secs(60)))
+        .unwrap();
+    stream
+}
+
+/// Waits until the other side closes the connection.
+fn assert_shut_out(stream: &mut TcpStream) {
+    let mut bytes = [0; 1024];
+    loop {
+        match stream.read(&mut bytes) {
+            Ok(0) => return,
+            Ok(_) => {}
+            Err(error) => {
+                assert_eq!(error.kind(), std::io::ErrorKind::ConnectionReset, "{error}");
+                return;
+            }
+        }
+    }
+}
+
+fn counted(party: &Party, what: impl Fn(&Counters) -> u64, expected: u64) {
+    until("a counter", || {
+        (what(&party.transport.counters()) == expected).then_some(())
+    });
+}
+
+/// The first 24 bytes of a frame.
+fn header(kind: u8, body_len: u64) -> Vec<u8> {
+    let mut header = b"fipa\x01".to_vec();
+    header.extend([kind, 0, 0]);
+    header.extend(1_u64.to_le_bytes());
+    header.extend(body_len.to_le_bytes());
+    header
+}
+
+fn hello(incarnation: u64) -> Vec<u8> {
+    let mut body = Vec::new();
+    body.extend(incarnation.to_le_bytes());
+    body.extend((1_u64 << 30).to_le_bytes());
+    body.extend(100_u32.to_le_bytes());
+    body.extend(1_u64.to_le_bytes());
+    for text in ["rogue", "test", "there", "tcp://127.0.0.1:1"] {
+        body.extend((text.len() as u16).to_le_bytes());
+        body.extend(text.as_bytes());
+    }
+    body.push(0);
+    let mut frame = header(1, body.len() as u64);
+    frame.extend(body);
+    frame
+}
+
+#[test]
+fn a_recorded_letter_of_an_old_peer_arrives_in_the_standard_dialect() {
+    let (original, length) = Envelope::decode(TCP_LETTER).unwrap();
+    let party = Party::new();
+    for (number, step) in [TCP_LETTER.len(), 7].into_iter().enumerate() {
+        let mut stream = connect(&party);
+        for piece in TCP_LETTER.chunks(step) {
+            stream.write_all(piece).unwrap();
+        }
+        stream.shutdown(Shutdown::Write).unwrap();
+        counted(&party, |c| c.unframed_in, number as u64 + 1);
+    }
+    let record = until("both letters", || {
+        let record = party.sink.record.lock();
+        (record.unframed.len() == 2).then_some(record)
+    });
+    for (letter, via) in &record.unframed {
+        assert_eq!(*via, Kind::Tcp);
+        assert_ne!(letter.envelope(), TCP_LETTER[..length]);
+        let (envelope, read) = Envelope::decode(&letter.envelope()).unwrap();
+        assert_eq!(read, letter.envelope_len());
+        assert_eq!(envelope.encode_standard().unwrap(), letter.envelope());
+        assert_eq!(envelope.effective(), original.effective());
+        let receivers = envelope.effective().intended_receivers;
+        let names: Vec<&str> = receivers.iter().map(|receiver| receiver.name()).collect();
+        assert_eq!(names, ["echo"]);
+        assert_eq!(letter.payload().to_bytes(), TCP_LETTER[length..]);
+    }
+}
+
+#[test]
+fn what_is_no_letter_is_refused() {
+    let party = impatient();
+    let garbage: [&[u8]; 7] = [
+        b"GET / HTTP/1.1\r\n\r\n",
+        b"\0",
+        b"fipX",
+        &header(1, 1 << 40),
+        &header(99, 0),
+        &header(4, 0),
+        &[0xfe, 0xff, 0xff, 0xff],
+    ];
+    for bytes in garbage {
+        let mut stream = connect(&party);
+        // The other side may close before everything is written.
+        let _ = stream.write_all(bytes);
+        let _ = stream.shutdown(Shutdown::Write);
+        assert_shut_out(&mut stream);
+    }
+    counted(&party, |c| c.refused_nonsense, garbage.len() as u64);
+    let mut stream = connect(&party);
+    stream
+        .write_all(b"<?xml version=\"1.0\"?><envelope>")
+        .unwrap();
+    assert_shut_out(&mut stream);
+    counted(&party, |c| c.refused_xml, 1);
+    Party::new().assert_reaches(1, &party);
+}
+
+#[test]
+fn who_is_slow_is_shut_out_and_nobody_else_notices() {
+    let party = impatient();
+    let mut after_hello = hello(76);
+    after_hello.extend(&header(2, 1000)[..10]);
+    let mut half_a_parcel = hello(77);
+    half_a_parcel.extend(header(2, 60 << 20));
+    let beginnings: [&[u8]; 5] = [b"", b"fip", &after_hello, &half_a_parcel, &TCP_LETTER[..20]];
+    let streams: Vec<TcpStream> = beginnings
+        .iter()
+        .map(|beginning| {
+            let mut stream = connect(&party);
+            stream.write_all(beginning).unwrap();
+            stream
+        })
+        .collect();
+    Party::new().assert_reaches(1, &party);
+    for (index, mut stream) in streams.into_iter().enumerate() {
+        // One byte now and then does not help those who had begun well.
+        let mut drip = stream.try_clone().unwrap();
+        let dripping = std::thread::spawn(move || {
+            while index >= 2 && drip.write_all(b"\0").is_ok() {
+                std::thread::sleep(Duration::from_millis(50));
+            }
+        });
+        assert_shut_out(&mut stream);
+        dripping.join().unwrap();
+    }
+    counted(&party, |c| c.refused_nonsense, beginnings.len() as u64);
+    counted(&party, |c| c.connections, 0);
+    assert_eq!(party.arrivals(), 1);
+}
+
+#[test]
+fn announcing_gigabytes_is_refused_at_once() {
+    let party = Party::new();
+    let mut stream = connect(&party);
+    let mut bytes = hello(77);
+    bytes.extend(header(2, 4 << 30));
+    stream.write_all(&bytes).unwrap();
+    assert_shut_out(&mut stream);
+    counted(&party, |c| c.refused_nonsense, 1);
+}
+
+#[test]
+fn a_letter_of_an_old_peer_is_bounded() {
+    let mut small = config(&["127.0.0.1:0"]);
+    small.limits.max_letter = 100_000;
+    let party = Party::with(small);
+    let mut stream = connect(&party);
+    let piece = [0xfe; 10_000];
+    while stream.write_all(&piece).is_ok() {}
+    assert_shut_out(&mut stream);
+    counted(&party, |c| c.refused_nonsense, 1);
+}
+
+#[test]
+fn a_thousand_silent_connections_hold_few_descriptors_and_stop_nobody() {
+    let party = Party::new();
+    let max = Limits::default().max_strangers as u64;
+    let mut streams: Vec<TcpStream> = Vec::new();
+    for _ in 0..1000 {
+        streams.push(connect(&party));
+        if streams.len() > 200 {
+            // What has been pushed out may be forgotten here too: the test has few descriptors.
+            let mut oldest = streams.remove(0);
+            assert_shut_out(&mut oldest);
+        }
+    }
+    Party::new().assert_reaches(1, &party);
+    counted(&party, |c| c.refused_crowd, 1000 + 1 - max);
+}
+
+#[test]
+fn too_many_introduced_peers_are_refused_and_told() {
+    let mut few = config(&["127.0.0.1:0"]);
+    few.limits.max_connections = 2;
+    let party = Party::with(few);
+    let peers = [Party::new(), Party::new(), Party::new()];
+    peers[0].assert_reaches(1, &party);
+    peers[1].assert_reaches(1, &party);
+    peers[2].send(1, party.location(), parcel(1, "x")).unwrap();
+    match peers[2].conclusion(1) {
+        Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Refused, "{error}"),
+        other => panic!("{other:?}"),
+    }
+    let error = party
+        .send(1, peers[2].location(), parcel(1, "x"))
+        .unwrap_err();
+    assert_eq!(error.fault, WayFault::Congested, "{error}");
+    peers[0].assert_reaches(2, &party);
+}
+
+#[test]
+fn a_server_that_is_none_of_ours_is_incompatible() {
+    let party = Party::new();
+    for (attempt, greeting) in [&b"SSH-2.0-OpenSSH_9.6\r\n"[..], b""]
+        .into_iter()
+        .enumerate()
+    {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap().to_string();
+        let server = std::thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
+            stream.write_all(greeting).unwrap();
+            // Reads what came, so that closing is no reset.
+            let _ = stream.read(&mut [0; 1000]);
+        });
+        let to = Location::new(Kind::Tcp, &address).unwrap();
+        party.send(attempt as u64, &to, parcel(1, "x")).unwrap();
+        match party.conclusion(attempt as u64) {
+            Conclusion::NotSent(error) => {
+                assert_eq!(error.fault, WayFault::Incompatible, "{error}")
+            }
+            other => panic!("{other:?}"),
+        }
+        server.join().unwrap();
+    }
+}
+
+#[test]
+fn a_peer_that_stops_reading_is_given_up() {
+    let mut lively = config(&["127.0.0.1:0"]);
+    lively.limits.keep_alive = Duration::from_millis(300);
+    let party = Party::with(lively);
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    let server = std::thread::spawn(move || {
+        let (mut stream, _) = listener.accept().unwrap();
+        stream.write_all(&hello(77)).unwrap();
+        stream
+    });
+    let to = Location::new(Kind::Tcp, &address).unwrap();
+    // More than the system's buffers take.
+    for attempt in 0..3 {
+        party
+            .send(attempt, &to, parcel(attempt, vec![0; 16 << 20]))
+            .unwrap();
+    }
+    match party.conclusion(0) {
+        Conclusion::Unconfirmed(error) => assert_eq!(error.fault, WayFault::TimedOut, "{error}"),
+        other => panic!("{other:?}"),
+    }
+    match party.conclusion(2) {
+        Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::TimedOut, "{error}"),
+        other => panic!("{other:?}"),
+    }
+    drop(server.join().unwrap());
+}

@@ -1,0 +1,282 @@
+//! What TCP endpoints do for each other, on loopback.
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test or bench that cannot go on may panic"
+)]
+
+mod common;
+
+use std::time::Duration;
+
+use bytes::Bytes;
+use common::{Party, accepted, config, letter_parcel, parcel, until};
+use fipa_acl::Letter;
+use fipa_transport::{
+    Answer, Body, Conclusion, Incarnation, Kind, ListenError, Location, Transport, Verdict,
+    WayFault,
+};
+use fipa_transport_net::TcpTransport;
+
+#[test]
+fn late_answers_may_come_in_any_order() {
+    let a = Party::new();
+    let b = Party::judging(config(&["127.0.0.1:0"]), Verdict::Later);
+    for attempt in 0..100 {
+        a.send(attempt, b.location(), parcel(attempt, "x")).unwrap();
+    }
+    until("all arrivals", || (b.arrivals() == 100).then_some(()));
+    let tickets: Vec<_> = {
+        let record = b.sink.record.lock();
+        let order: Vec<u64> = record.arrivals.iter().map(|(p, ..)| p.sequence).collect();
+        assert_eq!(order, (0..100).collect::<Vec<_>>());
+        record.arrivals.iter().map(|arrival| arrival.2).collect()
+    };
+    for (last, ticket) in tickets.into_iter().enumerate().rev() {
+        let last = last as u64;
+        b.transport.answer(ticket, Answer::OutOfOrder { last });
+    }
+    for last in 0..100 {
+        let answer = Answer::OutOfOrder { last };
+        assert_eq!(a.conclusion(last), Conclusion::Answered(answer));
+    }
+}
+
+#[test]
+fn big_letters_and_letters_of_many_pieces_arrive_whole_among_small_ones() {
+    let (a, b) = (Party::new(), Party::new());
+    let big: Bytes = (0..16 << 20).map(|i: u32| (i ^ (i >> 9)) as u8).collect();
+    let mut many = Letter::new(Bytes::from_static(b"base"), Bytes::from_static(b"message"));
+    for number in 0..500_u16 {
+        many = many.stamped(Bytes::from(number.to_be_bytes().repeat(11)));
+    }
+    for round in 0..3 {
+        let letters = [
+            parcel(0, big.clone()),
+            letter_parcel(1, many.clone()),
+            parcel(2, "x"),
+        ];
+        for (attempt, letter) in (round * 3..).zip(letters) {
+            a.send(attempt, b.location(), letter.clone()).unwrap();
+            // The other direction is not held up.
+            b.send(attempt, a.location(), parcel(attempt, "y")).unwrap();
+        }
+    }
+    for attempt in 0..9 {
+        assert_eq!(a.conclusion(attempt), accepted());
+        assert_eq!(b.conclusion(attempt), accepted());
+    }
+    let record = b.sink.record.lock();
+    for (index, (arrived, ..)) in record.arrivals.iter().enumerate() {
+        let Body::Letter(letter) = &arrived.body else {
+            panic!("a letter was sent")
+        };
+        match index % 3 {
+            0 => assert!(letter.payload().content == big),
+            1 => assert!(letter.to_bytes() == many.to_bytes()),
+            _ => assert_eq!(letter.payload().content, "x"),
+        }
+    }
+}
+
+#[test]
+fn one_connection_serves_both_directions_also_for_who_does_not_listen() {
+    let silent = Party::judging(config(&[]), Verdict::Now(Answer::Accepted));
+    assert_eq!(silent.locations, []);
+    let b = Party::new();
+    silent.assert_reaches(1, &b);
+    let hop = b.sink.record.lock().arrivals[0].1.clone();
+    assert!(!hop.remote);
+    b.send(1, &hop.location, parcel(1, "back")).unwrap();
+    assert_eq!(b.conclusion(1), accepted());
+    assert_eq!(silent.arrivals(), 1);
+    let counters = b.transport.counters();
+    assert_eq!((counters.accepted, counters.dialled), (1, 0));
+    assert_eq!(counters.connections, 1);
+}
+
+#[test]
+fn another_host_or_domain_is_remote() {
+    let b = Party::new();
+    for (attempt, (host, domain)) in [("there", "test"), ("here", "other")]
+        .into_iter()
+        .enumerate()
+    {
+        let mut far = config(&["127.0.0.1:0"]);
+        far.identity.host = host.into();
+        far.identity.domain = domain.into();
+        Party::with(far).assert_reaches(1, &b);
+        assert!(b.sink.record.lock().arrivals[attempt].1.remote);
+    }
+}
+
+#[test]
+fn a_restarted_peer_is_another_one_and_can_be_reached_again() {
+    let a = Party::new();
+    let b = Party::new();
+    a.assert_reaches(0, &b);
+    let old = b.location().clone();
+    let address = old.address().to_owned();
+    drop(b);
+    until("the port to be free", || {
+        std::net::TcpListener::bind(&address).ok()
+    });
+    let b = Party::with(config(&[&address]));
+    assert_eq!(b.location().address(), address);
+    let fault = until("the old connection to be gone", || {
+        static ATTEMPT: std::sync::atomic::AtomicU64 = std::sync::atomic::AtomicU64::new(100);
+        let attempt = ATTEMPT.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+        a.send(attempt, &old, parcel(1, "to the old one")).ok()?;
+        match a.conclusion(attempt) {
+            Conclusion::NotSent(error) if error.fault == WayFault::WrongIncarnation => Some(error),
+            Conclusion::NotSent(_) | Conclusion::Unconfirmed(_) => None,
+            other => panic!("{other:?}"),
+        }
+    });
+    assert!(
+        fault
+            .detail
+            .contains(&b.location().incarnation().to_string()),
+        "{fault}"
+    );
+    assert_eq!(b.arrivals(), 0);
+    a.assert_reaches(1, &b);
+    let anyone = Location::new(Kind::Tcp, &address).unwrap();
+    a.send(2, &anyone, parcel(2, "whoever is there")).unwrap();
+    assert_eq!(a.conclusion(2), accepted());
+}
+
+#[test]
+fn an_idle_connection_closes_and_opens_again() {
+    let mut impatient = config(&["127.0.0.1:0"]);
+    impatient.limits.idle_close = Duration::from_millis(50);
+    let (a, b) = (Party::with(impatient), Party::new());
+    for attempt in 0..3 {
+        a.assert_reaches(attempt, &b);
+        until("the connection to close", || {
+            let open = |party: &Party| party.transport.counters().connections;
+            (open(&a) == 0 && open(&b) == 0).then_some(())
+        });
+    }
+    assert_eq!(a.transport.counters().dialled, 3);
+    assert_eq!(b.transport.counters().refused_nonsense, 0);
+}
+
+#[test]
+fn a_connection_kept_open_by_an_unanswered_letter_is_kept_alive() {
+    let mut lively = config(&["127.0.0.1:0"]);
+    lively.limits.idle_close = Duration::from_millis(20);
+    lively.limits.keep_alive = Duration::from_millis(200);
+    let a = Party::with(lively);
+    let b = Party::judging(config(&["127.0.0.1:0"]), Verdict::Later);
+    a.send(1, b.location(), parcel(1, "x")).unwrap();
+    until("the arrival", || (b.arrivals() == 1).then_some(()));
+    // Several times as long as it takes to give up a silent peer.
+    std::thread::sleep(Duration::from_millis(1200));
+    let ticket = b.sink.record.lock().arrivals[0].2;
+    b.transport.answer(ticket, Answer::Custody);
+    assert_eq!(a.conclusion(1), Conclusion::Answered(Answer::Custody));
+}
+
+#[test]
+fn both_may_connect_at_the_same_time() {
+    for _ in 0..20 {
+        let (a, b) = (Party::new(), Party::new());
+        std::thread::scope(|scope| {
+            for (from, to) in [(&a, &b), (&b, &a)] {
+                scope.spawn(move || {
+                    for attempt in 0..20 {
+                        let to = to.location();
+                        from.send(attempt, to, parcel(attempt, "x")).unwrap();
+                    }
+                });
+            }
+        });
+        for attempt in 0..20 {
+            assert_eq!(a.conclusion(attempt), accepted());
+            assert_eq!(b.conclusion(attempt), accepted());
+        }
+        for party in [&a, &b] {
+            let record = party.sink.record.lock();
+            let order: Vec<u64> = record.arrivals.iter().map(|(p, ..)| p.sequence).collect();
+            assert_eq!(order, (0..20).collect::<Vec<_>>());
+        }
+    }
+}
+
+#[test]
+fn nobody_there_is_told_with_the_address() {
+    let a = Party::new();
+    let listener = tokio::net::TcpSocket::new_v4().unwrap();
+    listener.bind("127.0.0.1:0".parse().unwrap()).unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    for (attempt, text) in [address.as_str(), "no.such.name.invalid:7788", "no-port"]
+        .into_iter()
+        .enumerate()
+    {
+        let attempt = attempt as u64;
+        let to = Location::new(Kind::Tcp, text).unwrap();
+        a.send(attempt, &to, parcel(1, "x")).unwrap();
+        match a.conclusion(attempt) {
+            Conclusion::NotSent(error) => {
+                assert_eq!(error.fault, WayFault::Unreachable);
+                assert!(error.detail.contains(text), "{error}");
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+    assert_eq!(a.transport.counters().dial_failures, 3);
+}
+
+#[test]
+fn a_port_in_use_is_told_with_address_and_advice() {
+    let a = Party::new();
+    let taken = a.location().address();
+    let sink = a.sink.clone();
+    let runtime = a.runtime.handle().clone();
+    let second = TcpTransport::new(config(&["127.0.0.1:0", taken]), runtime.clone());
+    match second.listen(sink.clone()) {
+        Err(error @ ListenError::Bind { .. }) => {
+            let text = error.to_string();
+            assert!(text.contains(taken), "{text}");
+            assert!(text.contains("choose another port"), "{text}");
+        }
+        other => panic!("{other:?}"),
+    }
+    let nonsense = TcpTransport::new(config(&["localhost"]), runtime.clone());
+    let error = nonsense.listen(sink.clone()).unwrap_err().to_string();
+    assert!(error.contains("127.0.0.1:7788"), "{error}");
+    let mut unknown = config(&[]);
+    unknown.identity.incarnation = Incarnation::UNKNOWN;
+    let unknown = TcpTransport::new(unknown, runtime);
+    assert!(matches!(
+        unknown.listen(sink),
+        Err(ListenError::Unavailable(_))
+    ));
+}
+
+#[test]
+fn listening_everywhere_names_addresses_that_lead_back() {
+    let (a, b) = (Party::new(), Party::with(config(&["0.0.0.0:0", "[::]:0"])));
+    assert!(!b.locations.is_empty());
+    for (attempt, location) in b.locations.iter().enumerate() {
+        assert!(!location.address().contains("0.0.0.0"), "{location}");
+        let anyone = Location::new(Kind::Tcp, location.address()).unwrap();
+        a.send(attempt as u64, &anyone, parcel(1, "x")).unwrap();
+        assert_eq!(a.conclusion(attempt as u64), accepted(), "{location}");
+    }
+}
+
+#[test]
+fn a_runtime_that_is_gone_is_told() {
+    let (a, b) = (Party::new(), Party::new());
+    let orphan = {
+        let runtime = common::runtime();
+        let orphan = TcpTransport::new(config(&["127.0.0.1:0"]), runtime.handle().clone());
+        orphan.listen(a.sink.clone()).unwrap();
+        orphan
+    };
+    let error = orphan
+        .dispatch(fipa_transport::AttemptId(1), b.location(), parcel(1, "x"))
+        .unwrap_err();
+    assert_eq!(error.fault, WayFault::Closed, "{error}");
+}
