@@ -1,0 +1,337 @@
+//! The receiving end: an agent's queue, and what is remembered of every sender so that letters
+//! are taken once and in order.
+
+use std::collections::{HashMap, VecDeque};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use fipa_acl::Letter;
+use fipa_transport::{Answer, FailureReason, Incarnation, Kind, Location, Parcel, Stream};
+
+use super::MAX_DEADLINE;
+
+/// A letter taken from an agent's queue.
+#[derive(Debug, Clone)]
+pub struct Received {
+    /// The letter.
+    pub letter: Letter,
+    /// How it came, on its last stretch; none for what this process told the agent itself.
+    pub via: Option<Kind>,
+}
+
+/// An agent of this process.
+#[derive(Debug)]
+pub(crate) struct Inbox {
+    pub(crate) name: Arc<str>,
+    queue: VecDeque<Received>,
+    bound: usize,
+    senders: HashMap<Incarnation, Taken>,
+    /// Who was told that the queue is full and waits for a credit, in order.
+    waiting: VecDeque<(Stream, Location)>,
+    /// Failure messages in the queue, which do not count against its bound.
+    failures: usize,
+    next_sweep: Option<Instant>,
+    pub(crate) next_sequence: u64,
+}
+
+/// What is remembered of one sender: enough to tell a letter that was taken from one that was
+/// left out of the order.
+#[derive(Debug)]
+struct Taken {
+    last: u64,
+    recent: VecDeque<u64>,
+    seen: Instant,
+}
+
+/// How many taken letters of a sender are remembered one by one. More than any window of letters
+/// under way: only what is under way can be tried again.
+const RECENT: usize = 128;
+/// Senders remembered by one agent. They are not forgotten before every letter of theirs has
+/// passed its deadline, so the bound is on how many different lives may write within an hour.
+const MAX_SENDERS: usize = 65_536;
+/// Streams that wait for a credit. One beyond is not told, and asks again by itself.
+const MAX_WAITING: usize = 4096;
+/// Failure messages that may lie in a queue beyond its bound.
+const MAX_FAILURES: usize = 256;
+
+impl Inbox {
+    pub(crate) fn new(name: Arc<str>, bound: usize) -> Self {
+        Self {
+            name,
+            queue: VecDeque::new(),
+            bound,
+            senders: HashMap::new(),
+            waiting: VecDeque::new(),
+            failures: 0,
+            next_sweep: None,
+            next_sequence: 1,
+        }
+    }
+
+    /// Takes a letter into the queue, or says why not.
+    pub(crate) fn accept(
+        &mut self,
+        now: Instant,
+        parcel: &Parcel,
+        letter: Letter,
+        via: Kind,
+        back: &Location,
+    ) -> Answer {
+        let (stream, sequence) = (parcel.stream, parcel.sequence);
+        if let Some(taken) = self.senders.get_mut(&stream.sender) {
+            taken.seen = now;
+            if sequence <= taken.last {
+                return taken.answer_again(sequence);
+            }
+            if parcel.after > taken.last {
+                return Answer::OutOfOrder { last: taken.last };
+            }
+        } else if stream.sender.is_known() && parcel.after > 0 {
+            return Answer::OutOfOrder { last: 0 };
+        }
+        if self.queue.len() - self.failures >= self.bound {
+            self.wait(stream, back);
+            return Answer::Busy;
+        }
+        if stream.sender.is_known() {
+            if let Err(refusal) = self.remember(now, stream.sender, sequence) {
+                return refusal;
+            }
+        }
+        self.queue.push_back(Received {
+            letter,
+            via: Some(via),
+        });
+        Answer::Accepted
+    }
+
+    /// Whether there is room for a letter without a stream; for what has no way to wait.
+    pub(crate) fn push_unframed(&mut self, letter: Letter, via: Kind) -> bool {
+        if self.queue.len() - self.failures >= self.bound {
+            return false;
+        }
+        self.queue.push_back(Received {
+            letter,
+            via: Some(via),
+        });
+        true
+    }
+
+    /// Puts a failure message into the queue. There is always room for some: whoever does not
+    /// read cannot be told of all its failures.
+    pub(crate) fn push_failure(&mut self, letter: Letter) -> bool {
+        if self.failures >= MAX_FAILURES {
+            return false;
+        }
+        self.failures += 1;
+        self.queue.push_back(Received { letter, via: None });
+        true
+    }
+
+    pub(crate) fn take(&mut self) -> Option<Received> {
+        let received = self.queue.pop_front()?;
+        if received.via.is_none() {
+            self.failures -= 1;
+        }
+        Some(received)
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.queue.len()
+    }
+
+    /// Who may be told that there is room again: nobody before the queue is half empty, so that
+    /// a full queue does not cost a credit per letter.
+    pub(crate) fn credits(&mut self) -> impl Iterator<Item = (Stream, Location)> {
+        let used = self.queue.len() - self.failures;
+        let room = if used * 2 <= self.bound {
+            self.bound - used
+        } else {
+            0
+        };
+        self.waiting.drain(..room.min(self.waiting.len()))
+    }
+
+    /// Everybody who waits: the agent is going away.
+    pub(crate) fn all_waiting(&mut self) -> impl Iterator<Item = (Stream, Location)> {
+        self.waiting.drain(..)
+    }
+
+    fn wait(&mut self, stream: Stream, back: &Location) {
+        let waits_already = self.waiting.iter().any(|(other, _)| *other == stream);
+        if !waits_already && self.waiting.len() < MAX_WAITING {
+            self.waiting.push_back((stream, back.clone()));
+        }
+    }
+
+    fn remember(&mut self, now: Instant, sender: Incarnation, sequence: u64) -> Result<(), Answer> {
+        if self.senders.len() >= MAX_SENDERS && !self.senders.contains_key(&sender) {
+            self.forget_old(now);
+            if self.senders.len() >= MAX_SENDERS {
+                return Err(Answer::failed(
+                    FailureReason::Refused,
+                    format!("{MAX_SENDERS} senders have written within the longest deadline"),
+                ));
+            }
+        }
+        let taken = self.senders.entry(sender).or_insert_with(|| Taken {
+            last: 0,
+            recent: VecDeque::new(),
+            seen: now,
+        });
+        taken.last = sequence;
+        if taken.recent.len() >= RECENT {
+            taken.recent.pop_front();
+        }
+        taken.recent.push_back(sequence);
+        if self.next_sweep.is_none_or(|due| due <= now) {
+            self.forget_old(now);
+        }
+        Ok(())
+    }
+
+    /// Forgets senders of which nothing can still be under way.
+    fn forget_old(&mut self, now: Instant) {
+        // Twice, because a letter's remaining time does not count the time on the way.
+        let memory = MAX_DEADLINE * 2;
+        self.senders
+            .retain(|_, taken| now.saturating_duration_since(taken.seen) < memory);
+        self.next_sweep = Some(now + Duration::from_secs(60));
+    }
+}
+
+impl Taken {
+    fn answer_again(&self, sequence: u64) -> Answer {
+        if self.recent.contains(&sequence) {
+            return Answer::Accepted;
+        }
+        let forgotten = self.recent.len() >= RECENT && self.recent.front() > Some(&sequence);
+        if forgotten {
+            Answer::failed(FailureReason::Unconfirmed, "too long ago to tell")
+        } else {
+            Answer::failed(
+                FailureReason::Refused,
+                "later letters were taken before this one",
+            )
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use fipa_transport::Body;
+
+    fn parcel(sequence: u64, after: u64) -> Parcel {
+        Parcel {
+            receiver: "b".into(),
+            stream: Stream {
+                sender: Incarnation::from_u64(1),
+                receiver: Incarnation::from_u64(2),
+            },
+            sequence,
+            after,
+            remaining: Duration::from_secs(1),
+            hops: 0,
+            body: Body::Letter(Letter::default()),
+        }
+    }
+
+    fn back() -> Location {
+        "shm://1#0000000000000001".parse().unwrap()
+    }
+
+    fn offer(inbox: &mut Inbox, sequence: u64, after: u64) -> Answer {
+        let parcel = parcel(sequence, after);
+        inbox.accept(
+            Instant::now(),
+            &parcel,
+            Letter::default(),
+            Kind::Shm,
+            &back(),
+        )
+    }
+
+    #[test]
+    fn order_holds_and_copies_are_taken_once() {
+        let mut inbox = Inbox::new("b".into(), 10);
+        assert_eq!(offer(&mut inbox, 5, 3), Answer::OutOfOrder { last: 0 });
+        assert_eq!(offer(&mut inbox, 3, 0), Answer::Accepted);
+        assert_eq!(offer(&mut inbox, 9, 5), Answer::OutOfOrder { last: 3 });
+        assert_eq!(offer(&mut inbox, 5, 3), Answer::Accepted);
+        assert_eq!(offer(&mut inbox, 3, 0), Answer::Accepted);
+        assert_eq!(offer(&mut inbox, 9, 5), Answer::Accepted);
+        assert_eq!(inbox.len(), 3);
+    }
+
+    #[test]
+    fn what_was_left_out_is_not_taken_later_nor_called_delivered() {
+        let mut inbox = Inbox::new("b".into(), 10);
+        assert_eq!(offer(&mut inbox, 7, 0), Answer::Accepted);
+        let late = offer(&mut inbox, 6, 0);
+        assert!(
+            matches!(
+                late,
+                Answer::Failed {
+                    reason: FailureReason::Refused,
+                    ..
+                }
+            ),
+            "{late:?}"
+        );
+        assert_eq!(inbox.len(), 1);
+    }
+
+    #[test]
+    fn what_is_too_old_to_remember_is_not_called_delivered() {
+        let mut inbox = Inbox::new("b".into(), 1000);
+        for sequence in 1..=RECENT as u64 + 1 {
+            assert_eq!(offer(&mut inbox, sequence, sequence - 1), Answer::Accepted);
+        }
+        let old = offer(&mut inbox, 1, 0);
+        assert!(
+            matches!(
+                old,
+                Answer::Failed {
+                    reason: FailureReason::Unconfirmed,
+                    ..
+                }
+            ),
+            "{old:?}"
+        );
+    }
+
+    #[test]
+    fn a_full_queue_holds_back_and_gives_credit_when_half_empty() {
+        let mut inbox = Inbox::new("b".into(), 4);
+        for sequence in 1..=4 {
+            assert_eq!(offer(&mut inbox, sequence, 0), Answer::Accepted);
+        }
+        assert_eq!(offer(&mut inbox, 5, 4), Answer::Busy);
+        assert_eq!(offer(&mut inbox, 5, 4), Answer::Busy);
+        assert!(
+            inbox.push_failure(Letter::default()),
+            "a failure message always finds room"
+        );
+        inbox.take();
+        assert_eq!(inbox.credits().count(), 0);
+        inbox.take();
+        assert_eq!(
+            inbox.credits().count(),
+            1,
+            "one stream waits, however often it asked"
+        );
+        assert_eq!(inbox.credits().count(), 0);
+        assert_eq!(offer(&mut inbox, 5, 4), Answer::Accepted);
+    }
+
+    #[test]
+    fn failure_messages_are_bounded_too() {
+        let mut inbox = Inbox::new("b".into(), 1);
+        let taken = (0..1000)
+            .filter(|_| inbox.push_failure(Letter::default()))
+            .count();
+        assert_eq!(taken, MAX_FAILURES);
+        assert_eq!(offer(&mut inbox, 1, 0), Answer::Accepted);
+    }
+}

@@ -1,0 +1,701 @@
+//! The delivery core: what the promises of delivery hang on, without input and output.
+//!
+//! Everything that happens (a letter to be sent, a parcel that arrived, the end of an attempt, a
+//! change of the directory, time that passed) goes in with `now`; what is to be done comes out as
+//! [`Action`]s. The same core serves a robot process and, with leave to forward, the gateway; and
+//! the same core runs in simulations on virtual time.
+//!
+//! * [`lane`]: letters of one stream on their way, in order, one way at a time.
+//! * [`inbox`]: the receiving end, where letters are taken once and in order.
+//! * [`desk`]: what lanes share: attempts, health of ways, things to be done.
+//!
+//! A letter's order and identity are its *stream* (one life of the sender, one life of the
+//! receiver) and its sequence. Every letter names the one that must be taken before it, so that
+//! letters that failed leave no hole that would be waited for.
+
+mod config;
+mod desk;
+mod inbox;
+mod lane;
+
+use std::cmp::Reverse;
+use std::collections::{BinaryHeap, HashMap};
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use fipa_acl::Letter;
+use fipa_sds::{Directory, Reach, Resolution, Role};
+use fipa_transport::{
+    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind, Location,
+    Outcome, Parcel, Report, Stream, Verdict,
+};
+
+pub use config::{CoreConfig, MAX_DEADLINE};
+pub use desk::Action;
+use desk::{Desk, NOTE_TRIES, Note, Origin, Purpose, Undelivered};
+use inbox::Inbox;
+pub use inbox::Received;
+use lane::{Delivery, Lane, Moved};
+
+use crate::{failure, stamp};
+
+/// What time it is, by both clocks.
+#[derive(Debug, Clone, Copy)]
+pub struct Now {
+    /// The clock that never goes back: deadlines and pauses.
+    pub instant: Instant,
+    /// The calendar: dates in envelopes, for people.
+    pub utc: SystemTime,
+}
+
+impl Now {
+    /// Both clocks of this machine.
+    #[must_use]
+    pub fn read() -> Self {
+        Self {
+            instant: Instant::now(),
+            utc: SystemTime::now(),
+        }
+    }
+}
+
+/// One call of [`Core::send`]: outcomes name it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct SendId(pub u64);
+
+/// A letter that an agent of this process sends.
+#[derive(Debug, Clone)]
+pub struct Submission {
+    /// The sending agent's incarnation.
+    pub sender: Incarnation,
+    /// The letter, for all receivers.
+    pub letter: Letter,
+    /// Names or patterns of the receivers.
+    pub receivers: Vec<Arc<str>>,
+    /// How long delivery may take, at most [`MAX_DEADLINE`].
+    pub deadline: Duration,
+}
+
+/// How far from the network a letter may come before a gateway refuses to pass it on.
+const MAX_HOPS: u8 = 1;
+/// When the sender of a letter is told that it is in custody, if its outcome takes longer.
+const CUSTODY_AFTER: Duration = Duration::from_millis(200);
+/// How long a failure message to an old peer's agent may take.
+const FAILURE_DEADLINE: Duration = Duration::from_secs(5);
+/// Lanes that are empty are forgotten when there are more than this many.
+const IDLE_LANES: usize = 1024;
+/// How long an empty lane is remembered after that.
+const IDLE_TIME: Duration = Duration::from_secs(60);
+
+/// The delivery core. See the module's documentation.
+pub struct Core {
+    desk: Desk,
+    lanes: HashMap<Stream, Lane>,
+    agents: HashMap<Incarnation, Inbox>,
+    timers: BinaryHeap<Reverse<(Instant, Stream)>>,
+    notes: BinaryHeap<Reverse<LateNote>>,
+    next_send: u64,
+    /// Sequence of the letters that this service sends in its own name.
+    next_sequence: u64,
+    next_forget: Option<Instant>,
+}
+
+/// A report that is tried again later.
+struct LateNote(Instant, Note);
+
+impl Ord for LateNote {
+    fn cmp(&self, other: &Self) -> std::cmp::Ordering {
+        self.0.cmp(&other.0)
+    }
+}
+
+impl PartialOrd for LateNote {
+    fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl PartialEq for LateNote {
+    fn eq(&self, other: &Self) -> bool {
+        self.0 == other.0
+    }
+}
+
+impl Eq for LateNote {}
+
+impl Core {
+    /// A core that looks up receivers in this directory.
+    #[must_use]
+    pub fn new(config: CoreConfig, directory: Arc<dyn Directory>) -> Self {
+        Self {
+            desk: Desk::new(config, directory),
+            lanes: HashMap::new(),
+            agents: HashMap::new(),
+            timers: BinaryHeap::new(),
+            notes: BinaryHeap::new(),
+            next_send: 1,
+            next_sequence: 1,
+            next_forget: None,
+        }
+    }
+
+    /// What the core was told at its start.
+    #[must_use]
+    pub fn config(&self) -> &CoreConfig {
+        &self.desk.config
+    }
+
+    /// An agent of this process has been registered: letters for it are taken from now on.
+    pub fn register(&mut self, name: Arc<str>, incarnation: Incarnation) {
+        let bound = self.desk.config.queue;
+        self.agents.insert(incarnation, Inbox::new(name, bound));
+    }
+
+    /// An agent of this process goes away: its unread letters are dropped, its letters under way
+    /// end as failed or unconfirmed.
+    pub fn deregister(&mut self, incarnation: Incarnation) {
+        if let Some(mut inbox) = self.agents.remove(&incarnation) {
+            let receiver = Arc::clone(&inbox.name);
+            for (stream, back) in inbox.all_waiting() {
+                self.desk.credit(stream, Arc::clone(&receiver), back);
+            }
+        }
+        for lane in self.lanes.values_mut() {
+            if lane.sender() == incarnation {
+                lane.give_up(&mut self.desk);
+            }
+        }
+        self.desk.undelivered.clear();
+        self.lanes
+            .retain(|_, lane| !lane.is_idle() || lane.sender() != incarnation);
+    }
+
+    /// Sends a letter. Returns how many outcomes will follow under this number; outcomes that are
+    /// known at once are among the actions when this returns.
+    pub fn send(&mut self, now: Now, submission: Submission) -> (SendId, usize) {
+        let Submission {
+            sender,
+            letter,
+            receivers,
+            deadline,
+        } = submission;
+        let send = SendId(self.next_send);
+        self.next_send += 1;
+        let deadline = now.instant + deadline.min(MAX_DEADLINE);
+        let directory = Arc::clone(&self.desk.directory);
+        let sender_name = self
+            .agents
+            .get(&sender)
+            .map(|inbox| Arc::clone(&inbox.name));
+        let mut reached: Vec<Incarnation> = Vec::new();
+        let mut count = 0;
+        for receiver in receivers {
+            let own = sender_name.as_deref().unwrap_or_default();
+            let entries = match fipa_sds::resolve(&*directory, &receiver, own) {
+                Ok(Resolution::Exact(entry)) => vec![entry],
+                Ok(Resolution::Multicast(entries)) => entries,
+                Ok(Resolution::None) | Err(_) => Vec::new(),
+            };
+            if entries.is_empty() {
+                count += 1;
+                let stream = Stream {
+                    sender,
+                    receiver: Incarnation::UNKNOWN,
+                };
+                let reason = FailureReason::NoSuchAgent;
+                self.undeliverable(send, stream, receiver, letter.clone(), reason);
+            }
+            for entry in entries {
+                if !entry.incarnation.is_known() {
+                    // An old peer's agent: there is no way to it that this version can write.
+                    count += 1;
+                    let stream = Stream {
+                        sender,
+                        receiver: Incarnation::UNKNOWN,
+                    };
+                    let (name, reason) = (Arc::clone(&entry.name), FailureReason::Unreachable);
+                    self.undeliverable(send, stream, name, letter.clone(), reason);
+                    continue;
+                }
+                if reached.contains(&entry.incarnation) {
+                    continue;
+                }
+                reached.push(entry.incarnation);
+                count += 1;
+                let sequence = self.sequence_of(sender);
+                let origin = Origin::Local { send };
+                let delivery = Delivery::new(origin, letter.clone(), sequence, 0, deadline, 0);
+                let stream = Stream {
+                    sender,
+                    receiver: entry.incarnation,
+                };
+                self.put(now, stream, Arc::clone(&entry.name), delivery);
+            }
+        }
+        self.tell_failures(now);
+        (send, count)
+    }
+
+    fn sequence_of(&mut self, sender: Incarnation) -> u64 {
+        let counter = match self.agents.get_mut(&sender) {
+            Some(inbox) => &mut inbox.next_sequence,
+            None => &mut self.next_sequence,
+        };
+        *counter += 1;
+        *counter - 1
+    }
+
+    fn undeliverable(
+        &mut self,
+        send: SendId,
+        stream: Stream,
+        receiver: Arc<str>,
+        letter: Letter,
+        reason: FailureReason,
+    ) {
+        let outcome = Outcome::Failed {
+            reason,
+            attempts: Vec::new(),
+        };
+        self.desk.undelivered.push_back(Undelivered {
+            stream,
+            receiver: Arc::clone(&receiver),
+            letter,
+            reason,
+            detail: String::new(),
+        });
+        self.desk.actions.push_back(Action::Outcome {
+            send,
+            receiver,
+            outcome,
+        });
+    }
+
+    /// Puts a letter into its lane and gets it moving.
+    fn put(&mut self, now: Now, stream: Stream, receiver: Arc<str>, delivery: Delivery) {
+        let lane = self
+            .lanes
+            .entry(stream)
+            .or_insert_with(|| Lane::new(now.instant, stream, receiver));
+        lane.push(delivery);
+        self.with_lane(now, stream, |lane, desk, moved| {
+            lane.pump(now.instant, desk, moved)
+        });
+    }
+
+    /// Works on a lane, then takes care of what it could not decide alone and of its timer.
+    fn with_lane(
+        &mut self,
+        now: Now,
+        stream: Stream,
+        work: impl FnOnce(&mut Lane, &mut Desk, &mut Vec<Moved>),
+    ) {
+        let mut moved = Vec::new();
+        let Some(lane) = self.lanes.get_mut(&stream) else {
+            return;
+        };
+        work(lane, &mut self.desk, &mut moved);
+        if let Some(due) = lane.due() {
+            if lane.scheduled.is_none_or(|scheduled| due < scheduled) {
+                lane.scheduled = Some(due);
+                self.timers.push(Reverse((due, stream)));
+            }
+        }
+        for Moved::To(entry, delivery) in moved {
+            let stream = Stream {
+                sender: stream.sender,
+                receiver: entry.incarnation,
+            };
+            self.put(now, stream, Arc::clone(&entry.name), delivery);
+        }
+    }
+
+    /// The first way that a letter from here to this receiver would take now.
+    #[must_use]
+    pub fn first_way(&self, now: Now, receiver: &str) -> Option<Location> {
+        let entry = self.desk.directory.lookup(receiver)?;
+        self.desk.choose(now.instant, &entry, &[])
+    }
+
+    /// Takes the next letter out of an agent's queue.
+    pub fn take(&mut self, agent: Incarnation) -> Option<Received> {
+        let inbox = self.agents.get_mut(&agent)?;
+        let received = inbox.take()?;
+        let receiver = Arc::clone(&inbox.name);
+        for (stream, back) in inbox.credits() {
+            self.desk.credit(stream, Arc::clone(&receiver), back);
+        }
+        Some(received)
+    }
+
+    /// How many letters wait in an agent's queue.
+    #[must_use]
+    pub fn waiting(&self, agent: Incarnation) -> usize {
+        self.agents.get(&agent).map_or(0, Inbox::len)
+    }
+
+    /// A parcel arrived by the transport of this kind.
+    pub fn handle_arrival(
+        &mut self,
+        now: Now,
+        via: Kind,
+        answers_at_once: bool,
+        arrival: Arrival,
+    ) -> Verdict {
+        let Arrival {
+            mut parcel,
+            from,
+            ticket,
+        } = arrival;
+        match std::mem::replace(&mut parcel.body, Body::Credit) {
+            Body::Letter(letter) => {
+                if let Some(inbox) = self.inbox_for(&parcel) {
+                    let answer = inbox.accept(now.instant, &parcel, letter, via, &from.location);
+                    if answer == Answer::Accepted {
+                        let agent = parcel.stream.receiver;
+                        self.desk.actions.push_back(Action::Deliverable { agent });
+                    }
+                    return Verdict::Now(answer);
+                }
+                let unanswered = (!answers_at_once).then_some((via, ticket));
+                let verdict =
+                    self.forward(now, &parcel, letter, from.location, from.remote, unanswered);
+                self.tell_failures(now);
+                verdict
+            }
+            Body::Report(report) => {
+                self.handle_report(now, &parcel, report);
+                Verdict::Now(Answer::Accepted)
+            }
+            Body::Credit => {
+                self.with_lane(now, parcel.stream, |lane, desk, moved| {
+                    lane.resume(now.instant, desk, moved)
+                });
+                self.tell_failures(now);
+                Verdict::Now(Answer::Accepted)
+            }
+        }
+    }
+
+    fn inbox_for(&mut self, parcel: &Parcel) -> Option<&mut Inbox> {
+        self.agents.get_mut(&parcel.stream.receiver)
+    }
+
+    fn handle_report(&mut self, now: Now, parcel: &Parcel, report: Report) {
+        self.with_lane(now, parcel.stream, |lane, desk, moved| {
+            lane.reported(now.instant, parcel.sequence, report, desk, moved);
+        });
+        self.tell_failures(now);
+    }
+
+    /// Takes a letter for somebody else into custody, or says why not.
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "the parts of one arrival, taken apart once"
+    )]
+    fn forward(
+        &mut self,
+        now: Now,
+        parcel: &Parcel,
+        letter: Letter,
+        back: Location,
+        remote: bool,
+        unanswered: Option<(Kind, fipa_transport::Ticket)>,
+    ) -> Verdict {
+        let refuse = |reason, detail: &str| Verdict::Now(Answer::failed(reason, detail));
+        if !self.desk.config.forwards {
+            return refuse(
+                FailureReason::NoSuchAgent,
+                "the agent is not in this process any more",
+            );
+        }
+        let Some(entry) = self.desk.directory.by_incarnation(parcel.stream.receiver) else {
+            return refuse(
+                FailureReason::NoSuchAgent,
+                "the agent is not known to the gateway",
+            );
+        };
+        if entry.role == Role::Gateway {
+            return refuse(
+                FailureReason::Refused,
+                "a gateway takes no letters for itself",
+            );
+        }
+        let onwards = entry.reach != Reach::Local;
+        if remote && (onwards || parcel.hops > MAX_HOPS) {
+            return refuse(
+                FailureReason::NoSuchAgent,
+                "the agent is not on the gateway's host",
+            );
+        }
+        let config = &self.desk.config;
+        match stamp::carries(&letter, &config.name, config.incarnation) {
+            Ok(false) => {}
+            Ok(true) => return refuse(FailureReason::Loop, &config.name),
+            Err(error) => return refuse(FailureReason::Refused, &error.to_string()),
+        }
+        let stamped = match stamp::put(letter, &config.name, config.incarnation, now.utc) {
+            Ok(stamped) => stamped,
+            Err(error) => return refuse(FailureReason::Refused, &error.to_string()),
+        };
+        let (bound, stream) = (config.lane, parcel.stream);
+        let receiver = Arc::clone(&entry.name);
+        let lane = self
+            .lanes
+            .entry(stream)
+            .or_insert_with(|| Lane::new(now.instant, stream, receiver));
+        let origin = Origin::Forwarded {
+            back: back.clone(),
+            unanswered,
+        };
+        let Some(mut origin) = lane.adopt(parcel.sequence, origin, &mut self.desk) else {
+            return if unanswered.is_some() {
+                Verdict::Later
+            } else {
+                Verdict::Now(Answer::Custody)
+            };
+        };
+        if lane.len() >= bound {
+            lane.wait_for_credit(back);
+            return Verdict::Now(Answer::Busy);
+        }
+        if let Origin::Forwarded {
+            unanswered: slot, ..
+        } = &mut origin
+        {
+            *slot = None;
+        }
+        let hops = parcel.hops.saturating_add(u8::from(onwards));
+        let deadline = now.instant + parcel.remaining.min(MAX_DEADLINE);
+        let delivery = Delivery::new(
+            origin,
+            stamped,
+            parcel.sequence,
+            parcel.after,
+            deadline,
+            hops,
+        )
+        .answer_by(unanswered, now.instant + CUSTODY_AFTER);
+        self.put(now, stream, Arc::clone(&entry.name), delivery);
+        if unanswered.is_some() {
+            Verdict::Later
+        } else {
+            Verdict::Now(Answer::Custody)
+        }
+    }
+
+    /// An old peer's letter arrived, for the agents of this host that its envelope names.
+    pub fn handle_unframed(&mut self, now: Now, deadline: Duration, letter: Letter, via: Kind) {
+        let receivers = match stamp::receivers(&letter) {
+            Ok(receivers) => receivers,
+            Err(error) => {
+                tracing::warn!(%error, "an unframed letter with a malformed envelope was dropped");
+                return;
+            }
+        };
+        let directory = Arc::clone(&self.desk.directory);
+        let sender = stamp::sender(&letter).unwrap_or_default();
+        let stream_sender = self.desk.config.incarnation;
+        for receiver in receivers {
+            let entries = match fipa_sds::resolve(&*directory, &receiver, &sender) {
+                Ok(Resolution::Exact(entry)) => vec![entry],
+                Ok(Resolution::Multicast(entries)) => entries,
+                Ok(Resolution::None) | Err(_) => Vec::new(),
+            };
+            let here = entries
+                .into_iter()
+                .filter(|entry| entry.reach == Reach::Local);
+            let mut found = false;
+            for entry in here {
+                found = true;
+                if let Some(inbox) = self.agents.get_mut(&entry.incarnation) {
+                    if inbox.push_unframed(letter.clone(), via) {
+                        let agent = entry.incarnation;
+                        self.desk.actions.push_back(Action::Deliverable { agent });
+                        continue;
+                    }
+                }
+                let sequence = self.sequence_of(stream_sender);
+                let origin = Origin::Nobody;
+                let until = now.instant + deadline.min(MAX_DEADLINE);
+                let delivery = Delivery::new(origin, letter.clone(), sequence, 0, until, 1);
+                let stream = Stream {
+                    sender: stream_sender,
+                    receiver: entry.incarnation,
+                };
+                self.put(now, stream, Arc::clone(&entry.name), delivery);
+            }
+            if !found {
+                tracing::info!(%receiver, %sender, "an unframed letter names nobody of this host");
+                self.desk.undelivered.push_back(Undelivered {
+                    stream: Stream {
+                        sender: stream_sender,
+                        receiver: Incarnation::UNKNOWN,
+                    },
+                    receiver: receiver.as_str().into(),
+                    letter: letter.clone(),
+                    reason: FailureReason::NoSuchAgent,
+                    detail: String::new(),
+                });
+            }
+        }
+        self.tell_failures(now);
+    }
+
+    /// An attempt has ended, or was refused by its transport at once.
+    pub fn handle_conclusion(&mut self, now: Now, attempt: AttemptId, conclusion: Conclusion) {
+        match self.desk.attempts.remove(&attempt) {
+            Some(Purpose::Letter { stream, sequence }) => {
+                let mut way = None;
+                self.with_lane(now, stream, |lane, desk, moved| {
+                    way = lane.way_of(sequence).cloned();
+                    lane.concluded(now.instant, sequence, attempt, conclusion, desk, moved);
+                });
+                // Whatever has ended has made room.
+                if let Some(stream) = way.and_then(|way| self.desk.room_for(&way)) {
+                    self.with_lane(now, stream, |lane, desk, moved| {
+                        lane.resume(now.instant, desk, moved)
+                    });
+                }
+            }
+            Some(Purpose::Note(note)) => self.note_concluded(now, note, conclusion),
+            None => {}
+        }
+        self.tell_failures(now);
+    }
+
+    fn note_concluded(&mut self, now: Now, note: Note, conclusion: Conclusion) {
+        let arrived = matches!(conclusion, Conclusion::Answered(_) | Conclusion::Handed);
+        // A credit that is lost is made up for by the sender's own pause.
+        let again = matches!(note.parcel.body, Body::Report(_)) && note.tries < NOTE_TRIES;
+        if !arrived && again {
+            let pause = Duration::from_millis(20) * (1 << note.tries);
+            self.notes
+                .push(Reverse(LateNote(now.instant + pause, note)));
+        }
+    }
+
+    /// Something in the directory has changed.
+    pub fn handle_directory_change(&mut self, now: Now) {
+        let streams: Vec<Stream> = self.lanes.keys().copied().collect();
+        for stream in streams {
+            self.with_lane(now, stream, |lane, desk, moved| {
+                if !lane.is_empty() {
+                    lane.directory_changed(now.instant, desk, moved);
+                }
+            });
+        }
+        self.tell_failures(now);
+    }
+
+    /// Time has passed: call this when [`poll_timeout`](Self::poll_timeout) says so.
+    pub fn handle_timeout(&mut self, now: Now) {
+        while let Some(Reverse((due, stream))) = self.timers.peek().copied() {
+            if due > now.instant {
+                break;
+            }
+            self.timers.pop();
+            if let Some(lane) = self.lanes.get_mut(&stream) {
+                if lane.scheduled == Some(due) {
+                    lane.scheduled = None;
+                }
+            }
+            self.with_lane(now, stream, |lane, desk, moved| {
+                lane.pump(now.instant, desk, moved)
+            });
+        }
+        while self
+            .notes
+            .peek()
+            .is_some_and(|Reverse(late)| late.0 <= now.instant)
+        {
+            if let Some(Reverse(LateNote(_, note))) = self.notes.pop() {
+                self.desk.note(note);
+            }
+        }
+        self.tell_failures(now);
+        self.forget_idle_lanes(now);
+    }
+
+    fn forget_idle_lanes(&mut self, now: Now) {
+        if self.lanes.len() <= IDLE_LANES || self.next_forget.is_some_and(|due| due > now.instant) {
+            return;
+        }
+        self.next_forget = Some(now.instant + IDLE_TIME / 4);
+        self.lanes.retain(|_, lane| {
+            let quiet = now.instant.saturating_duration_since(lane.active) > IDLE_TIME;
+            !lane.is_idle() || (lane.remembers() && !quiet)
+        });
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) wants to be called next.
+    #[must_use]
+    pub fn poll_timeout(&self) -> Option<Instant> {
+        let lanes = self.timers.peek().map(|Reverse((due, _))| *due);
+        let notes = self.notes.peek().map(|Reverse(late)| late.0);
+        [lanes, notes].into_iter().flatten().min()
+    }
+
+    /// The next thing to be done.
+    pub fn poll_action(&mut self) -> Option<Action> {
+        self.desk.actions.pop_front()
+    }
+
+    /// Whether any letter sent or taken into custody here still has no outcome.
+    #[must_use]
+    pub fn has_open_letters(&self) -> bool {
+        self.lanes.values().any(|lane| !lane.is_empty())
+    }
+
+    /// Gives up everything that is under way: the service ends. Outcomes are among the actions.
+    pub fn give_up(&mut self) {
+        for lane in self.lanes.values_mut() {
+            lane.give_up(&mut self.desk);
+        }
+        self.desk.undelivered.clear();
+    }
+
+    /// Tells senders of what failed, in the form of FIPA `failure` messages.
+    fn tell_failures(&mut self, now: Now) {
+        while let Some(undelivered) = self.desk.undelivered.pop_front() {
+            let Undelivered {
+                stream,
+                receiver,
+                letter,
+                reason,
+                detail,
+            } = undelivered;
+            let name = &self.desk.config.name;
+            let Some(report) = failure::compose(name, &letter, &receiver, reason, &detail, now.utc)
+            else {
+                continue;
+            };
+            if let Some(inbox) = self.agents.get_mut(&stream.sender) {
+                if inbox.push_failure(report.letter) {
+                    let agent = stream.sender;
+                    self.desk.actions.push_back(Action::Deliverable { agent });
+                }
+                continue;
+            }
+            // An old peer's letter: its sender may be known by name.
+            let Some(entry) = self.desk.directory.lookup(&report.to) else {
+                tracing::info!(to = %report.to, %reason, "nobody to send a failure message to");
+                continue;
+            };
+            if entry.role == Role::Gateway {
+                continue;
+            }
+            let sequence = self.next_sequence;
+            self.next_sequence += 1;
+            let deadline = now.instant + FAILURE_DEADLINE;
+            let hops = u8::from(entry.reach != Reach::Local);
+            let delivery =
+                Delivery::new(Origin::Nobody, report.letter, sequence, 0, deadline, hops);
+            let stream = Stream {
+                sender: self.desk.config.incarnation,
+                receiver: entry.incarnation,
+            };
+            self.put(now, stream, Arc::clone(&entry.name), delivery);
+        }
+    }
+}

@@ -1,0 +1,14 @@
+//! The message transport service: how letters get to agents, once, in order, or back as failed.
+//!
+//! [`core`] decides, without input and output; the runtime drives it with transports, a directory
+//! and a clock. The same service runs in every robot process and, with leave to forward, as the
+//! gateway between hosts.
+
+pub mod core;
+mod failure;
+mod post;
+mod runtime;
+mod stamp;
+
+pub use post::{PostError, letter_around, letter_for};
+pub use runtime::{Mts, RuntimeConfig, Sending, Started};

@@ -1,0 +1,540 @@
+//! The runtime: drives the delivery core with real transports, a directory and the clocks.
+//!
+//! A thin shell. Everything happens under one lock around the core: what comes in is handed to
+//! it, and what it wants done is done before the lock is let go, so that parcels leave in the
+//! order in which the core decided. Transports never call back from within a dispatch, so this
+//! cannot dead-lock.
+//!
+//! Whoever waits, for an outcome or a letter, first drives the transports for a short while on
+//! its own thread, and then sleeps until it is woken.
+
+use std::collections::HashMap;
+use std::future::Future;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Weak};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use fipa_acl::Letter;
+use fipa_sds::Directory;
+use fipa_transport::{
+    Arrival, AttemptId, Conclusion, Incarnation, Kind, ListenError, LoanedContent, Location,
+    Outcome, Sink, Transport, Verdict,
+};
+use parking_lot::{Mutex, MutexGuard};
+use tokio::runtime::Handle;
+use tokio::sync::Notify;
+use tokio::task::JoinHandle;
+
+use crate::core::{Action, Core, CoreConfig, Now, Received, SendId, Submission};
+
+/// What the runtime is told at its start, besides the core's configuration.
+#[derive(Debug, Clone)]
+pub struct RuntimeConfig {
+    /// How long somebody who waits looks for something to do before going to sleep. Zero saves
+    /// the battery.
+    pub spin: Duration,
+    /// The deadline of letters that old peers throw at the gateway: theirs have none.
+    pub unframed_deadline: Duration,
+}
+
+/// A running message transport service.
+///
+/// Cheap to clone; all clones are the same service. It runs until [`close`](Self::close).
+#[derive(Clone)]
+pub struct Mts {
+    shared: Arc<Shared>,
+}
+
+struct Shared {
+    state: Mutex<State>,
+    transports: Vec<Arc<dyn Transport>>,
+    config: RuntimeConfig,
+    /// Wakes the timer when something is due earlier than it thinks, or the service is gone.
+    timer: Arc<Notify>,
+    closed: AtomicBool,
+    tasks: Mutex<Vec<JoinHandle<()>>>,
+}
+
+struct State {
+    core: Core,
+    /// Until when the timer sleeps.
+    armed: Option<Instant>,
+    sends: HashMap<SendId, Arc<Slot>>,
+    agents: HashMap<Incarnation, Arc<Notify>>,
+}
+
+/// Where the outcomes of one letter are gathered.
+#[derive(Default)]
+struct Slot {
+    outcomes: Mutex<Gathered>,
+    complete: Notify,
+}
+
+#[derive(Default)]
+struct Gathered {
+    expected: usize,
+    known: Vec<(Arc<str>, Outcome)>,
+}
+
+impl Slot {
+    fn taken_if_complete(&self) -> Option<Vec<(Arc<str>, Outcome)>> {
+        let mut gathered = self.outcomes.lock();
+        let complete = gathered.known.len() >= gathered.expected;
+        complete.then(|| std::mem::take(&mut gathered.known))
+    }
+}
+
+/// A service that has started, and what did not.
+pub struct Started {
+    /// The service.
+    pub mts: Mts,
+    /// Where it can be reached, in the order of its transports.
+    pub locations: Vec<Location>,
+    /// Transports that could not be opened; the service runs without them.
+    pub failed: Vec<(Kind, ListenError)>,
+}
+
+impl Mts {
+    /// Starts the service: opens the transports and keeps time. Transports that cannot be opened
+    /// are left out and told.
+    pub fn start(
+        core: CoreConfig,
+        config: RuntimeConfig,
+        directory: Arc<dyn Directory>,
+        transports: Vec<Arc<dyn Transport>>,
+        handle: &Handle,
+    ) -> Started {
+        let state = State {
+            core: Core::new(core, Arc::clone(&directory)),
+            armed: None,
+            sends: HashMap::new(),
+            agents: HashMap::new(),
+        };
+        let shared = Arc::new(Shared {
+            state: Mutex::new(state),
+            transports: transports.clone(),
+            config,
+            timer: Arc::default(),
+            closed: AtomicBool::new(false),
+            tasks: Mutex::default(),
+        });
+        let (mut locations, mut failed) = (Vec::new(), Vec::new());
+        for transport in &transports {
+            let sink = Arc::new(Receiving {
+                shared: Arc::downgrade(&shared),
+                kind: transport.kind(),
+                answers_at_once: transport.answers_at_once(),
+            });
+            match transport.listen(sink) {
+                Ok(found) => locations.extend(found),
+                Err(error) => failed.push((transport.kind(), error)),
+            }
+        }
+        let tasks = [
+            handle.spawn(keep_time(
+                Arc::downgrade(&shared),
+                Arc::clone(&shared.timer),
+            )),
+            handle.spawn(watch_directory(Arc::downgrade(&shared), directory)),
+        ];
+        shared.tasks.lock().extend(tasks);
+        Started {
+            mts: Self { shared },
+            locations,
+            failed,
+        }
+    }
+
+    /// Letters for this agent are taken from now on. It must be in the directory, or about to be.
+    pub fn register(&self, name: Arc<str>, incarnation: Incarnation) {
+        let mut state = self.shared.state.lock();
+        state.agents.insert(incarnation, Arc::default());
+        state.core.register(name, incarnation);
+    }
+
+    /// The agent goes away; see [`Core::deregister`].
+    pub fn deregister(&self, incarnation: Incarnation) {
+        let mut state = self.shared.state.lock();
+        state.core.deregister(incarnation);
+        if let Some(notify) = state.agents.remove(&incarnation) {
+            notify.notify_waiters();
+        }
+        self.shared.carry_out(state);
+    }
+
+    /// Sends a letter. The outcomes, one per receiver, come with the future; the letter is on its
+    /// way when this returns, whether the future is awaited or not.
+    pub fn send(&self, submission: Submission) -> Sending {
+        let slot = Arc::new(Slot::default());
+        let mut state = self.shared.state.lock();
+        let (id, expected) = state.core.send(Now::read(), submission);
+        slot.outcomes.lock().expected = expected;
+        state.sends.insert(id, Arc::clone(&slot));
+        self.shared.carry_out(state);
+        Sending {
+            shared: Arc::clone(&self.shared),
+            slot,
+        }
+    }
+
+    /// The next letter for this agent, or none when the agent was deregistered or the service
+    /// closed.
+    pub async fn receive(&self, agent: Incarnation) -> Option<Received> {
+        let notify = Arc::clone(self.shared.state.lock().agents.get(&agent)?);
+        self.shared
+            .wait(&notify, || match self.try_receive(agent) {
+                Some(received) => Some(Some(received)),
+                None if self.is_gone(agent) => Some(None),
+                None => None,
+            })
+            .await
+    }
+
+    /// The next letter for this agent, if there is one now.
+    pub fn try_receive(&self, agent: Incarnation) -> Option<Received> {
+        let mut state = self.shared.state.lock();
+        let received = state.core.take(agent)?;
+        if state.core.waiting(agent) > 0 {
+            // Another task may be waiting for the same agent's letters.
+            if let Some(notify) = state.agents.get(&agent) {
+                notify.notify_one();
+            }
+        }
+        self.shared.carry_out(state);
+        Some(received)
+    }
+
+    fn is_gone(&self, agent: Incarnation) -> bool {
+        self.shared.closed.load(Ordering::Acquire)
+            || !self.shared.state.lock().agents.contains_key(&agent)
+    }
+
+    /// Memory for the content of a letter to this receiver, to be filled in place: shared memory
+    /// when that is the way a letter would go now, else the heap. `head_room` and `tail_room` are
+    /// the lengths of what will stand in front of the content and behind it.
+    pub fn loan(
+        &self,
+        receiver: &str,
+        head_room: usize,
+        len: usize,
+        tail_room: usize,
+    ) -> Box<dyn LoanedContent> {
+        let way = self
+            .shared
+            .state
+            .lock()
+            .core
+            .first_way(Now::read(), receiver);
+        let loaned = way.and_then(|way| {
+            let transport = self.shared.transport(way.kind())?;
+            match transport.loan(&way, head_room, len, tail_room) {
+                Ok(loaned) => loaned,
+                Err(error) => {
+                    tracing::debug!(%error, %way, "no loan; the heap serves instead");
+                    None
+                }
+            }
+        });
+        loaned.unwrap_or_else(|| Box::new(OnTheHeap(vec![0; len])))
+    }
+
+    /// The way a letter to this receiver would take first, now.
+    #[must_use]
+    pub fn first_way(&self, receiver: &str) -> Option<Location> {
+        self.shared
+            .state
+            .lock()
+            .core
+            .first_way(Now::read(), receiver)
+    }
+
+    /// Does what can be done now on the calling thread; see [`Transport::drive`].
+    pub fn drive(&self) -> bool {
+        self.shared.drive()
+    }
+
+    /// Ends the service: gives what is under way up to `patience` to end, then gives it up, and
+    /// closes the transports.
+    pub async fn close(&self, patience: Duration) {
+        let until = Instant::now() + patience;
+        while self.shared.state.lock().core.has_open_letters() && Instant::now() < until {
+            if !self.shared.drive() {
+                tokio::time::sleep(Duration::from_millis(1)).await;
+            }
+        }
+        self.abort();
+    }
+
+    /// Ends the service at once: what is under way is given up.
+    pub fn abort(&self) {
+        if self.shared.closed.swap(true, Ordering::AcqRel) {
+            return;
+        }
+        for task in self.shared.tasks.lock().drain(..) {
+            task.abort();
+        }
+        let mut state = self.shared.state.lock();
+        state.core.give_up();
+        for notify in state.agents.values() {
+            notify.notify_waiters();
+            notify.notify_one();
+        }
+        self.shared.carry_out(state);
+        for transport in &self.shared.transports {
+            transport.close();
+        }
+    }
+}
+
+impl Shared {
+    fn transport(&self, kind: Kind) -> Option<&Arc<dyn Transport>> {
+        self.transports
+            .iter()
+            .find(|transport| transport.kind() == kind)
+    }
+
+    fn drive(&self) -> bool {
+        let mut did_something = false;
+        for transport in &self.transports {
+            did_something |= transport.drive();
+        }
+        did_something
+    }
+
+    /// Does everything the core wants done, then lets go of the lock.
+    fn carry_out(&self, mut guard: MutexGuard<'_, State>) {
+        let state = &mut *guard;
+        while let Some(action) = state.core.poll_action() {
+            match action {
+                Action::Dispatch {
+                    attempt,
+                    location,
+                    parcel,
+                } => {
+                    let result = match self.transport(location.kind()) {
+                        Some(transport) => transport.dispatch(attempt, &location, parcel),
+                        None => Err(no_such_transport(location.kind())),
+                    };
+                    if let Err(error) = result {
+                        let conclusion = Conclusion::NotSent(error);
+                        state
+                            .core
+                            .handle_conclusion(Now::read(), attempt, conclusion);
+                    }
+                }
+                Action::Abandon { kind, attempt } => {
+                    if let Some(transport) = self.transport(kind) {
+                        transport.abandon(attempt);
+                    }
+                }
+                Action::Answer {
+                    kind,
+                    ticket,
+                    answer,
+                } => {
+                    if let Some(transport) = self.transport(kind) {
+                        transport.answer(ticket, answer);
+                    }
+                }
+                Action::Outcome {
+                    send,
+                    receiver,
+                    outcome,
+                } => {
+                    state.outcome(send, receiver, outcome);
+                }
+                Action::Deliverable { agent } => {
+                    if let Some(notify) = state.agents.get(&agent) {
+                        notify.notify_one();
+                    }
+                }
+            }
+        }
+        let due = state.core.poll_timeout();
+        let earlier = due.is_some_and(|due| state.armed.is_none_or(|armed| due < armed));
+        drop(guard);
+        if earlier {
+            self.timer.notify_one();
+        }
+    }
+
+    /// Waits until there is something: driving the transports for a while, then asleep.
+    async fn wait<T>(&self, notify: &Notify, mut look: impl FnMut() -> Option<T>) -> T {
+        let started = Instant::now();
+        loop {
+            if let Some(found) = look() {
+                return found;
+            }
+            if self.drive() {
+                continue;
+            }
+            if started.elapsed() < self.config.spin {
+                std::hint::spin_loop();
+                continue;
+            }
+            notify.notified().await;
+        }
+    }
+}
+
+impl Drop for Shared {
+    fn drop(&mut self) {
+        self.timer.notify_one();
+    }
+}
+
+impl State {
+    fn outcome(&mut self, send: SendId, receiver: Arc<str>, outcome: Outcome) {
+        let Some(slot) = self.sends.get(&send) else {
+            return;
+        };
+        let complete = {
+            let mut gathered = slot.outcomes.lock();
+            if outcome.attempts().is_empty() {
+                tracing::trace!(%receiver, %outcome, "letter");
+            } else {
+                tracing::info!(%receiver, %outcome, "letter");
+            }
+            gathered.known.push((receiver, outcome));
+            gathered.known.len() >= gathered.expected
+        };
+        if complete {
+            slot.complete.notify_one();
+            self.sends.remove(&send);
+        }
+    }
+}
+
+fn no_such_transport(kind: Kind) -> fipa_transport::WayError {
+    let text = format!("this process does not use {kind}");
+    fipa_transport::WayError::new(fipa_transport::WayFault::Closed, text)
+}
+
+/// The outcomes of one letter, to be awaited.
+#[must_use = "await it to learn what became of the letter"]
+pub struct Sending {
+    shared: Arc<Shared>,
+    slot: Arc<Slot>,
+}
+
+impl Sending {
+    /// One outcome per receiver, in the order in which they became known.
+    pub async fn outcomes(self) -> Vec<(Arc<str>, Outcome)> {
+        self.shared
+            .wait(&self.slot.complete, || self.slot.taken_if_complete())
+            .await
+    }
+}
+
+impl IntoFuture for Sending {
+    type Output = Vec<(Arc<str>, Outcome)>;
+    type IntoFuture = std::pin::Pin<Box<dyn Future<Output = Self::Output> + Send>>;
+
+    fn into_future(self) -> Self::IntoFuture {
+        Box::pin(self.outcomes())
+    }
+}
+
+/// What a transport sees of the service.
+struct Receiving {
+    shared: Weak<Shared>,
+    kind: Kind,
+    answers_at_once: bool,
+}
+
+impl Sink for Receiving {
+    fn arrived(&self, arrival: Arrival) -> Verdict {
+        let Some(shared) = self.shared.upgrade() else {
+            return closing();
+        };
+        let mut state = shared.state.lock();
+        if shared.closed.load(Ordering::Acquire) {
+            return closing();
+        }
+        let at_once = self.answers_at_once;
+        let verdict = state
+            .core
+            .handle_arrival(Now::read(), self.kind, at_once, arrival);
+        shared.carry_out(state);
+        verdict
+    }
+
+    fn arrived_unframed(&self, letter: Letter, via: Kind) {
+        let Some(shared) = self.shared.upgrade() else {
+            return;
+        };
+        let mut state = shared.state.lock();
+        let deadline = shared.config.unframed_deadline;
+        state
+            .core
+            .handle_unframed(Now::read(), deadline, letter, via);
+        shared.carry_out(state);
+    }
+
+    fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {
+        let Some(shared) = self.shared.upgrade() else {
+            return;
+        };
+        let mut state = shared.state.lock();
+        state
+            .core
+            .handle_conclusion(Now::read(), attempt, conclusion);
+        shared.carry_out(state);
+    }
+}
+
+fn closing() -> Verdict {
+    let reason = fipa_transport::FailureReason::NoSuchAgent;
+    Verdict::Now(fipa_transport::Answer::failed(
+        reason,
+        "the process is ending",
+    ))
+}
+
+/// Calls the core when something is due by the clock.
+async fn keep_time(shared: Weak<Shared>, timer: Arc<Notify>) {
+    loop {
+        let due = {
+            let Some(shared) = shared.upgrade() else {
+                return;
+            };
+            let mut state = shared.state.lock();
+            state.core.handle_timeout(Now::read());
+            state.armed = state.core.poll_timeout();
+            let due = state.armed;
+            shared.carry_out(state);
+            due
+        };
+        match due {
+            // Whether it was the time or a call, there is something to look at.
+            Some(due) => drop(tokio::time::timeout_at(due.into(), timer.notified()).await),
+            None => timer.notified().await,
+        }
+    }
+}
+
+/// Tells the core when the directory has changed.
+async fn watch_directory(shared: Weak<Shared>, directory: Arc<dyn Directory>) {
+    let mut watch = directory.watch();
+    while watch.next().await.is_some() {
+        let Some(shared) = shared.upgrade() else {
+            return;
+        };
+        let mut state = shared.state.lock();
+        state.core.handle_directory_change(Now::read());
+        shared.carry_out(state);
+    }
+}
+
+struct OnTheHeap(Vec<u8>);
+
+impl LoanedContent for OnTheHeap {
+    fn content_mut(&mut self) -> &mut [u8] {
+        &mut self.0
+    }
+
+    fn freeze(self: Box<Self>) -> Bytes {
+        self.0.into()
+    }
+}

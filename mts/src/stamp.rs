@@ -1,0 +1,79 @@
+//! Stamps, and what else a message transport service reads of an envelope.
+//!
+//! A stamp is an extension envelope with a `received` parameter (FIPA00067, FIPA00088): `by` is
+//! the name of the service, `id` its incarnation. Two robots may give their gateways one name, so
+//! a service recognises only a stamp with its own incarnation.
+
+use std::time::SystemTime;
+
+use fipa_acl::{
+    DecodeError, EncodeError, Envelope, EnvelopeParams, EnvelopeView, Letter, Received, Time,
+    TimeError,
+};
+use fipa_transport::Incarnation;
+
+/// Why a letter could not be stamped.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub(crate) enum StampError {
+    /// The clock of this host is beyond what an envelope can say.
+    #[error("cannot date the stamp: {0}")]
+    Time(#[from] TimeError),
+    /// The stamp cannot be encoded.
+    #[error("cannot encode the stamp: {0}")]
+    Encode(#[from] EncodeError),
+}
+
+/// Whether the letter carries the stamp of this service.
+pub(crate) fn carries(
+    letter: &Letter,
+    name: &str,
+    incarnation: Incarnation,
+) -> Result<bool, DecodeError> {
+    let envelope = letter.envelope();
+    let view = EnvelopeView::parse(&envelope)?;
+    let id = incarnation.to_string();
+    let mut stamps = view.stamps();
+    Ok(stamps
+        .any(|stamp| stamp.by().as_str() == name && stamp.id().is_some_and(|it| it.as_str() == id)))
+}
+
+/// The letter with the stamp of this service in front.
+pub(crate) fn put(
+    letter: Letter,
+    name: &str,
+    incarnation: Incarnation,
+    utc: SystemTime,
+) -> Result<Letter, StampError> {
+    let received = Received {
+        by: name.to_owned(),
+        date: Time::from_system_time(utc)?,
+        from: None,
+        id: Some(incarnation.to_string()),
+        via: None,
+        user_defined: Vec::new(),
+    };
+    let params = EnvelopeParams {
+        received: Some(received),
+        ..EnvelopeParams::default()
+    };
+    let stamp = Envelope::encode_extension(&params)?;
+    Ok(letter.stamped(stamp))
+}
+
+/// The names in the letter's effective intended-receiver parameter, or `to` when it has none.
+pub(crate) fn receivers(letter: &Letter) -> Result<Vec<String>, DecodeError> {
+    let envelope = letter.envelope();
+    let view = EnvelopeView::parse(&envelope)?;
+    Ok(view
+        .receivers()
+        .map(|name| name.as_str().into_owned())
+        .collect())
+}
+
+/// The name in the letter's effective from parameter.
+pub(crate) fn sender(letter: &Letter) -> Option<String> {
+    let envelope = letter.envelope();
+    let view = EnvelopeView::parse(&envelope).ok()?;
+    view.from_name().map(|name| name.as_str().into_owned())
+}

@@ -1,0 +1,97 @@
+//! The delivery core on virtual time: hosts with processes and gateways, links that lose, delay
+//! and break, processes that die and come back. The promises of delivery are checked as
+//! invariants in every run; when one breaks, the seed is printed.
+//!
+//! The core is the very one that the runtime drives. What is simulated is everything around it:
+//! transports, clocks, the directory.
+
+mod world;
+
+use world::{Weather, World};
+
+/// `FIPA_SIM_SEEDS=100000 cargo test -p fipa-mts --test simulation` runs more of them, and
+/// `FIPA_SIM_SEED=17` one.
+fn seeds() -> Vec<u64> {
+    let number = |name: &str| {
+        std::env::var(name)
+            .ok()
+            .and_then(|text| text.parse::<u64>().ok())
+    };
+    if let Some(seed) = number("FIPA_SIM_SEED") {
+        return vec![seed];
+    }
+    (0..number("FIPA_SIM_SEEDS").unwrap_or(300)).collect()
+}
+
+fn run(weather: Weather) {
+    let mut letters = 0;
+    for seed in seeds() {
+        let mut world = World::new(seed, weather);
+        if let Err(breach) = world.run() {
+            panic!("seed {seed}, {weather:?}: {breach}");
+        }
+        letters += world.letters();
+    }
+    println!("{letters} letters, every promise kept");
+}
+
+#[test]
+fn in_calm_weather_everything_is_delivered() {
+    run(Weather::calm());
+}
+
+#[test]
+fn losses_and_delays_break_no_promise() {
+    run(Weather {
+        loss: 0.05,
+        answer_loss: 0.05,
+        refusal: 0.05,
+        silence: 0.02,
+        ..Weather::calm()
+    });
+}
+
+#[test]
+fn heavy_losses_break_no_promise() {
+    run(Weather {
+        loss: 0.3,
+        answer_loss: 0.2,
+        refusal: 0.1,
+        silence: 0.1,
+        ..Weather::calm()
+    });
+}
+
+#[test]
+fn slow_receivers_hold_senders_back() {
+    run(Weather {
+        reading_pause_ms: 300,
+        queue: 4,
+        ..Weather::calm()
+    });
+}
+
+#[test]
+fn deaths_and_rebirths_break_no_promise() {
+    run(Weather {
+        deaths: 8,
+        loss: 0.02,
+        answer_loss: 0.02,
+        ..Weather::calm()
+    });
+}
+
+#[test]
+fn everything_at_once_breaks_no_promise() {
+    run(Weather {
+        loss: 0.1,
+        answer_loss: 0.1,
+        refusal: 0.1,
+        silence: 0.05,
+        deaths: 10,
+        reading_pause_ms: 50,
+        queue: 8,
+        outages: 6,
+        ..Weather::calm()
+    });
+}
