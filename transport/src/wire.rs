@@ -48,8 +48,8 @@ const LETTER: u8 = 1;
 const REPORT: u8 = 2;
 const CREDIT: u8 = 3;
 
-/// Longest deadline that travels: one day. What a peer writes beyond is cut to it.
-pub const MAX_REMAINING: Duration = Duration::from_secs(24 * 60 * 60);
+/// Longest deadline that travels: one hour. What a peer writes beyond is cut to it.
+pub const MAX_REMAINING: Duration = Duration::from_secs(60 * 60);
 
 /// Bytes that are not a parcel.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

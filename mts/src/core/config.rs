@@ -30,6 +30,9 @@ pub struct CoreConfig {
     /// Letters that wait for one receiver from one sender, on their way or not, before more are
     /// held back.
     pub lane: usize,
+    /// Bytes of letters of others that a gateway has in custody before more are held back. One
+    /// letter is always taken.
+    pub custody_bytes: usize,
     /// How long an attempt may go without an answer, for a small letter.
     pub attempt_timeout: Duration,
 }
@@ -47,6 +50,7 @@ impl CoreConfig {
             queue: 256,
             window: 16,
             lane: 1024,
+            custody_bytes: 256 << 20,
             attempt_timeout: Duration::from_secs(1),
         }
     }

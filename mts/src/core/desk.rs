@@ -16,6 +16,10 @@ use super::{CoreConfig, SendId};
 
 /// Something the runtime has to do for the delivery core.
 #[derive(Debug)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "most are dispatches, and none is kept"
+)]
 pub enum Action {
     /// Give this parcel to the transport of the location's kind. When the transport refuses at
     /// once, the core is told as of any other conclusion.
@@ -90,7 +94,7 @@ pub(crate) enum Purpose {
     /// A letter of a lane.
     Letter { stream: Stream, sequence: u64 },
     /// A report or a credit.
-    Note(Note),
+    Note(Box<Note>),
 }
 
 /// A report or a credit on its way.
@@ -111,6 +115,8 @@ pub(crate) struct Desk {
     pub(crate) actions: VecDeque<Action>,
     pub(crate) attempts: HashMap<AttemptId, Purpose>,
     pub(crate) undelivered: VecDeque<Undelivered>,
+    /// Bytes of all letters in lanes.
+    pub(crate) held: usize,
     health: HashMap<Location, Health>,
     /// Lanes that found no room on the way to a location, in order.
     waiting_for_room: HashMap<Location, VecDeque<Stream>>,
@@ -137,6 +143,7 @@ impl Desk {
             actions: VecDeque::new(),
             attempts: HashMap::new(),
             undelivered: VecDeque::new(),
+            held: 0,
             health: HashMap::new(),
             waiting_for_room: HashMap::new(),
             next_attempt: 1,
@@ -170,7 +177,7 @@ impl Desk {
     pub(crate) fn note(&mut self, mut note: Note) {
         note.tries += 1;
         let (location, parcel) = (note.location.clone(), note.parcel.clone());
-        self.dispatch(Purpose::Note(note), location, parcel);
+        self.dispatch(Purpose::Note(Box::new(note)), location, parcel);
     }
 
     pub(crate) fn credit(&mut self, stream: Stream, receiver: Arc<str>, back: Location) {

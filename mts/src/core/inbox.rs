@@ -93,10 +93,10 @@ impl Inbox {
             self.wait(stream, back);
             return Answer::Busy;
         }
-        if stream.sender.is_known() {
-            if let Err(refusal) = self.remember(now, stream.sender, sequence) {
-                return refusal;
-            }
+        if stream.sender.is_known()
+            && let Err(refusal) = self.remember(now, stream.sender, sequence)
+        {
+            return refusal;
         }
         self.queue.push_back(Received {
             letter,

@@ -7,6 +7,7 @@
 //!
 //! * [`lane`]: letters of one stream on their way, in order, one way at a time.
 //! * [`inbox`]: the receiving end, where letters are taken once and in order.
+//! * [`forward`]: letters for somebody else.
 //! * [`desk`]: what lanes share: attempts, health of ways, things to be done.
 //!
 //! A letter's order and identity are its *stream* (one life of the sender, one life of the
@@ -15,6 +16,7 @@
 
 mod config;
 mod desk;
+mod forward;
 mod inbox;
 mod lane;
 
@@ -24,7 +26,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::Letter;
-use fipa_sds::{Directory, Reach, Resolution, Role};
+use fipa_sds::{Directory, Resolution};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind, Location,
     Outcome, Parcel, Report, Stream, Verdict,
@@ -36,8 +38,6 @@ use desk::{Desk, NOTE_TRIES, Note, Origin, Purpose, Undelivered};
 use inbox::Inbox;
 pub use inbox::Received;
 use lane::{Delivery, Lane, Moved};
-
-use crate::{failure, stamp};
 
 /// What time it is, by both clocks.
 #[derive(Debug, Clone, Copy)]
@@ -76,12 +76,6 @@ pub struct Submission {
     pub deadline: Duration,
 }
 
-/// How far from the network a letter may come before a gateway refuses to pass it on.
-const MAX_HOPS: u8 = 1;
-/// When the sender of a letter is told that it is in custody, if its outcome takes longer.
-const CUSTODY_AFTER: Duration = Duration::from_millis(200);
-/// How long a failure message to an old peer's agent may take.
-const FAILURE_DEADLINE: Duration = Duration::from_secs(5);
 /// Lanes that are empty are forgotten when there are more than this many.
 const IDLE_LANES: usize = 1024;
 /// How long an empty lane is remembered after that.
@@ -222,13 +216,19 @@ impl Core {
                 }
                 reached.push(entry.incarnation);
                 count += 1;
-                let sequence = self.sequence_of(sender);
-                let origin = Origin::Local { send };
-                let delivery = Delivery::new(origin, letter.clone(), sequence, 0, deadline, 0);
                 let stream = Stream {
                     sender,
                     receiver: entry.incarnation,
                 };
+                let waiting = self.lanes.get(&stream).map_or(0, Lane::len);
+                if waiting >= self.desk.config.lane {
+                    let (name, reason) = (Arc::clone(&entry.name), FailureReason::QueueFull);
+                    self.undeliverable(send, stream, name, letter.clone(), reason);
+                    continue;
+                }
+                let sequence = self.sequence_of(sender);
+                let origin = Origin::Local { send };
+                let delivery = Delivery::new(origin, letter.clone(), sequence, deadline);
                 self.put(now, stream, Arc::clone(&entry.name), delivery);
             }
         }
@@ -277,7 +277,7 @@ impl Core {
             .lanes
             .entry(stream)
             .or_insert_with(|| Lane::new(now.instant, stream, receiver));
-        lane.push(delivery);
+        lane.push(delivery, &mut self.desk);
         self.with_lane(now, stream, |lane, desk, moved| {
             lane.pump(now.instant, desk, moved)
         });
@@ -295,11 +295,11 @@ impl Core {
             return;
         };
         work(lane, &mut self.desk, &mut moved);
-        if let Some(due) = lane.due() {
-            if lane.scheduled.is_none_or(|scheduled| due < scheduled) {
-                lane.scheduled = Some(due);
-                self.timers.push(Reverse((due, stream)));
-            }
+        if let Some(due) = lane.due()
+            && lane.scheduled.is_none_or(|scheduled| due < scheduled)
+        {
+            lane.scheduled = Some(due);
+            self.timers.push(Reverse((due, stream)));
         }
         for Moved::To(entry, delivery) in moved {
             let stream = Stream {
@@ -358,8 +358,7 @@ impl Core {
                     return Verdict::Now(answer);
                 }
                 let unanswered = (!answers_at_once).then_some((via, ticket));
-                let verdict =
-                    self.forward(now, &parcel, letter, from.location, from.remote, unanswered);
+                let verdict = self.forward(now, &parcel, letter, from, unanswered);
                 self.tell_failures(now);
                 verdict
             }
@@ -388,160 +387,6 @@ impl Core {
         self.tell_failures(now);
     }
 
-    /// Takes a letter for somebody else into custody, or says why not.
-    #[expect(
-        clippy::too_many_arguments,
-        reason = "the parts of one arrival, taken apart once"
-    )]
-    fn forward(
-        &mut self,
-        now: Now,
-        parcel: &Parcel,
-        letter: Letter,
-        back: Location,
-        remote: bool,
-        unanswered: Option<(Kind, fipa_transport::Ticket)>,
-    ) -> Verdict {
-        let refuse = |reason, detail: &str| Verdict::Now(Answer::failed(reason, detail));
-        if !self.desk.config.forwards {
-            return refuse(
-                FailureReason::NoSuchAgent,
-                "the agent is not in this process any more",
-            );
-        }
-        let Some(entry) = self.desk.directory.by_incarnation(parcel.stream.receiver) else {
-            return refuse(
-                FailureReason::NoSuchAgent,
-                "the agent is not known to the gateway",
-            );
-        };
-        if entry.role == Role::Gateway {
-            return refuse(
-                FailureReason::Refused,
-                "a gateway takes no letters for itself",
-            );
-        }
-        let onwards = entry.reach != Reach::Local;
-        if remote && (onwards || parcel.hops > MAX_HOPS) {
-            return refuse(
-                FailureReason::NoSuchAgent,
-                "the agent is not on the gateway's host",
-            );
-        }
-        let config = &self.desk.config;
-        match stamp::carries(&letter, &config.name, config.incarnation) {
-            Ok(false) => {}
-            Ok(true) => return refuse(FailureReason::Loop, &config.name),
-            Err(error) => return refuse(FailureReason::Refused, &error.to_string()),
-        }
-        let stamped = match stamp::put(letter, &config.name, config.incarnation, now.utc) {
-            Ok(stamped) => stamped,
-            Err(error) => return refuse(FailureReason::Refused, &error.to_string()),
-        };
-        let (bound, stream) = (config.lane, parcel.stream);
-        let receiver = Arc::clone(&entry.name);
-        let lane = self
-            .lanes
-            .entry(stream)
-            .or_insert_with(|| Lane::new(now.instant, stream, receiver));
-        let origin = Origin::Forwarded {
-            back: back.clone(),
-            unanswered,
-        };
-        let Some(mut origin) = lane.adopt(parcel.sequence, origin, &mut self.desk) else {
-            return if unanswered.is_some() {
-                Verdict::Later
-            } else {
-                Verdict::Now(Answer::Custody)
-            };
-        };
-        if lane.len() >= bound {
-            lane.wait_for_credit(back);
-            return Verdict::Now(Answer::Busy);
-        }
-        if let Origin::Forwarded {
-            unanswered: slot, ..
-        } = &mut origin
-        {
-            *slot = None;
-        }
-        let hops = parcel.hops.saturating_add(u8::from(onwards));
-        let deadline = now.instant + parcel.remaining.min(MAX_DEADLINE);
-        let delivery = Delivery::new(
-            origin,
-            stamped,
-            parcel.sequence,
-            parcel.after,
-            deadline,
-            hops,
-        )
-        .answer_by(unanswered, now.instant + CUSTODY_AFTER);
-        self.put(now, stream, Arc::clone(&entry.name), delivery);
-        if unanswered.is_some() {
-            Verdict::Later
-        } else {
-            Verdict::Now(Answer::Custody)
-        }
-    }
-
-    /// An old peer's letter arrived, for the agents of this host that its envelope names.
-    pub fn handle_unframed(&mut self, now: Now, deadline: Duration, letter: Letter, via: Kind) {
-        let receivers = match stamp::receivers(&letter) {
-            Ok(receivers) => receivers,
-            Err(error) => {
-                tracing::warn!(%error, "an unframed letter with a malformed envelope was dropped");
-                return;
-            }
-        };
-        let directory = Arc::clone(&self.desk.directory);
-        let sender = stamp::sender(&letter).unwrap_or_default();
-        let stream_sender = self.desk.config.incarnation;
-        for receiver in receivers {
-            let entries = match fipa_sds::resolve(&*directory, &receiver, &sender) {
-                Ok(Resolution::Exact(entry)) => vec![entry],
-                Ok(Resolution::Multicast(entries)) => entries,
-                Ok(Resolution::None) | Err(_) => Vec::new(),
-            };
-            let here = entries
-                .into_iter()
-                .filter(|entry| entry.reach == Reach::Local);
-            let mut found = false;
-            for entry in here {
-                found = true;
-                if let Some(inbox) = self.agents.get_mut(&entry.incarnation) {
-                    if inbox.push_unframed(letter.clone(), via) {
-                        let agent = entry.incarnation;
-                        self.desk.actions.push_back(Action::Deliverable { agent });
-                        continue;
-                    }
-                }
-                let sequence = self.sequence_of(stream_sender);
-                let origin = Origin::Nobody;
-                let until = now.instant + deadline.min(MAX_DEADLINE);
-                let delivery = Delivery::new(origin, letter.clone(), sequence, 0, until, 1);
-                let stream = Stream {
-                    sender: stream_sender,
-                    receiver: entry.incarnation,
-                };
-                self.put(now, stream, Arc::clone(&entry.name), delivery);
-            }
-            if !found {
-                tracing::info!(%receiver, %sender, "an unframed letter names nobody of this host");
-                self.desk.undelivered.push_back(Undelivered {
-                    stream: Stream {
-                        sender: stream_sender,
-                        receiver: Incarnation::UNKNOWN,
-                    },
-                    receiver: receiver.as_str().into(),
-                    letter: letter.clone(),
-                    reason: FailureReason::NoSuchAgent,
-                    detail: String::new(),
-                });
-            }
-        }
-        self.tell_failures(now);
-    }
-
     /// An attempt has ended, or was refused by its transport at once.
     pub fn handle_conclusion(&mut self, now: Now, attempt: AttemptId, conclusion: Conclusion) {
         match self.desk.attempts.remove(&attempt) {
@@ -558,7 +403,7 @@ impl Core {
                     });
                 }
             }
-            Some(Purpose::Note(note)) => self.note_concluded(now, note, conclusion),
+            Some(Purpose::Note(note)) => self.note_concluded(now, *note, conclusion),
             None => {}
         }
         self.tell_failures(now);
@@ -595,10 +440,10 @@ impl Core {
                 break;
             }
             self.timers.pop();
-            if let Some(lane) = self.lanes.get_mut(&stream) {
-                if lane.scheduled == Some(due) {
-                    lane.scheduled = None;
-                }
+            if let Some(lane) = self.lanes.get_mut(&stream)
+                && lane.scheduled == Some(due)
+            {
+                lane.scheduled = None;
             }
             self.with_lane(now, stream, |lane, desk, moved| {
                 lane.pump(now.instant, desk, moved)
@@ -653,49 +498,5 @@ impl Core {
             lane.give_up(&mut self.desk);
         }
         self.desk.undelivered.clear();
-    }
-
-    /// Tells senders of what failed, in the form of FIPA `failure` messages.
-    fn tell_failures(&mut self, now: Now) {
-        while let Some(undelivered) = self.desk.undelivered.pop_front() {
-            let Undelivered {
-                stream,
-                receiver,
-                letter,
-                reason,
-                detail,
-            } = undelivered;
-            let name = &self.desk.config.name;
-            let Some(report) = failure::compose(name, &letter, &receiver, reason, &detail, now.utc)
-            else {
-                continue;
-            };
-            if let Some(inbox) = self.agents.get_mut(&stream.sender) {
-                if inbox.push_failure(report.letter) {
-                    let agent = stream.sender;
-                    self.desk.actions.push_back(Action::Deliverable { agent });
-                }
-                continue;
-            }
-            // An old peer's letter: its sender may be known by name.
-            let Some(entry) = self.desk.directory.lookup(&report.to) else {
-                tracing::info!(to = %report.to, %reason, "nobody to send a failure message to");
-                continue;
-            };
-            if entry.role == Role::Gateway {
-                continue;
-            }
-            let sequence = self.next_sequence;
-            self.next_sequence += 1;
-            let deadline = now.instant + FAILURE_DEADLINE;
-            let hops = u8::from(entry.reach != Reach::Local);
-            let delivery =
-                Delivery::new(Origin::Nobody, report.letter, sequence, 0, deadline, hops);
-            let stream = Stream {
-                sender: self.desk.config.incarnation,
-                receiver: entry.incarnation,
-            };
-            self.put(now, stream, Arc::clone(&entry.name), delivery);
-        }
     }
 }

@@ -1,6 +1,11 @@
 //! A simulated world: hosts, processes, links, time.
 
 use std::cmp::Reverse;
+mod checks;
+mod links;
+mod view;
+mod weather;
+
 use std::collections::{BTreeMap, BinaryHeap, HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -8,56 +13,14 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, SendId, Submission};
 use fipa_mts::letter_for;
-use fipa_sds::{Directory, Entry, Mts, Reach, Role, Source, Subscriber};
+use fipa_sds::{Directory, Role};
 use fipa_transport::{
-    Arrival, AttemptId, Conclusion, FailureReason, Hop, Incarnation, Kind, Location, Outcome,
-    Parcel, Ticket, Verdict, WayError, WayFault,
+    AttemptId, Conclusion, Incarnation, Kind, Outcome, Parcel, Ticket, WayError, WayFault,
 };
 use parking_lot::Mutex;
 
-/// What goes wrong, and how often.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Weather {
-    /// A parcel is lost on the way; its sender hears that it is unconfirmed.
-    pub loss: f64,
-    /// A parcel arrives, its answer is lost.
-    pub answer_loss: f64,
-    /// Nothing leaves, and that is known.
-    pub refusal: f64,
-    /// A parcel is lost, and nothing is ever heard of it.
-    pub silence: f64,
-    /// How many processes die in the course of the run. Most come back as a new life.
-    pub deaths: u32,
-    /// How often one kind of transport stops working on one host for a while.
-    pub outages: u32,
-    /// How long agents wait between two letters they read.
-    pub reading_pause_ms: u64,
-    /// Bound of each agent's queue.
-    pub queue: usize,
-}
-
-impl Weather {
-    /// Nothing goes wrong.
-    pub(crate) fn calm() -> Self {
-        Self {
-            loss: 0.0,
-            answer_loss: 0.0,
-            refusal: 0.0,
-            silence: 0.0,
-            deaths: 0,
-            outages: 0,
-            reading_pause_ms: 1,
-            queue: 64,
-        }
-    }
-
-    fn is_calm(&self) -> bool {
-        self.loss + self.answer_loss + self.refusal + self.silence == 0.0
-            && self.deaths == 0
-            && self.outages == 0
-            && self.queue >= 64
-    }
-}
+use self::view::{Registered, Registry, View};
+pub(crate) use self::weather::Weather;
 
 const HOSTS: usize = 2;
 const PROCESSES: usize = 3;
@@ -109,7 +72,9 @@ enum Event {
         at: usize,
         agent: Incarnation,
     },
-    Deadline { number: u64 },
+    Deadline {
+        number: u64,
+    },
     Die,
     Forgotten {
         process: usize,
@@ -131,105 +96,8 @@ enum Event {
 struct Sent {
     process: usize,
     sender: Incarnation,
-    at: Instant,
     expected: usize,
     outcomes: BTreeMap<Arc<str>, Outcome>,
-}
-
-/// What everybody knows of everybody, as a directory seen from one process.
-#[derive(Default)]
-struct Registry {
-    entries: Vec<Registered>,
-}
-
-struct Registered {
-    name: Arc<str>,
-    incarnation: Incarnation,
-    host: usize,
-    mts: Incarnation,
-    role: Role,
-}
-
-struct View {
-    registry: Arc<Mutex<Registry>>,
-    host: usize,
-    gateway: bool,
-}
-
-impl View {
-    fn entry(&self, registry: &Registry, registered: &Registered) -> Option<Arc<Entry>> {
-        let gateway_of = |host: usize| {
-            let mut all = registry.entries.iter();
-            all.find(|e| e.role == Role::Gateway && e.host == host)
-                .map(|e| e.mts)
-        };
-        let (locations, reach) = if registered.host == self.host {
-            (
-                vec![
-                    way(Kind::Shm, registered.mts),
-                    way(Kind::Tcp, registered.mts),
-                ],
-                Reach::Local,
-            )
-        } else if self.gateway {
-            let gateway = gateway_of(registered.host)?;
-            let ways = vec![way(Kind::Udp, gateway), way(Kind::Tcp, gateway)];
-            (ways, Reach::Remote { gateway })
-        } else {
-            let gateway = gateway_of(self.host)?;
-            let ways = vec![way(Kind::Shm, gateway), way(Kind::Tcp, gateway)];
-            (ways, Reach::Remote { gateway })
-        };
-        Some(Arc::new(Entry {
-            name: Arc::clone(&registered.name),
-            agent_type: String::new(),
-            incarnation: registered.incarnation,
-            locations,
-            mts: Mts::new("mts", registered.mts),
-            description: String::new(),
-            registered: SystemTime::UNIX_EPOCH,
-            source: Source::Host,
-            reach,
-            role: registered.role,
-        }))
-    }
-
-    fn find(&self, matches: impl Fn(&Registered) -> bool) -> Option<Arc<Entry>> {
-        let registry = self.registry.lock();
-        let found = registry.entries.iter().find(|entry| matches(entry))?;
-        self.entry(&registry, found)
-    }
-}
-
-impl Directory for View {
-    fn known(&self, name: &str) -> Option<Arc<Entry>> {
-        self.find(|entry| *entry.name == *name)
-    }
-
-    fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
-        self.find(|entry| entry.incarnation == incarnation)
-    }
-
-    fn entries(&self) -> Arc<[Arc<Entry>]> {
-        let registry = self.registry.lock();
-        registry
-            .entries
-            .iter()
-            .filter_map(|entry| self.entry(&registry, entry))
-            .collect()
-    }
-
-    fn generation(&self) -> u64 {
-        0
-    }
-
-    fn subscribe(&self, _: &Subscriber) {}
-}
-
-fn way(kind: Kind, mts: Incarnation) -> Location {
-    Location::new(kind, &mts.to_string())
-        .expect("an address")
-        .with_incarnation(mts)
 }
 
 pub(crate) struct World {
@@ -529,14 +397,12 @@ impl World {
             let now = self.clocks();
             let (send, expected) = self.processes[at].core.send(now, submission);
             self.sends.insert((at, send), number);
-            let at_time = self.now;
             let outcomes = BTreeMap::new();
             self.sent.insert(
                 number,
                 Sent {
                     process: at,
                     sender,
-                    at: at_time,
                     expected,
                     outcomes,
                 },
@@ -595,153 +461,13 @@ impl World {
             }
         }
         let due = self.processes[at].core.poll_timeout();
-        if let Some(due) = due {
-            if self.processes[at].wake.is_none_or(|wake| due < wake) {
-                self.processes[at].wake = Some(due);
-                self.at(due.max(self.now), Event::Timer { at });
-            }
+        if let Some(due) = due
+            && self.processes[at].wake.is_none_or(|wake| due < wake)
+        {
+            self.processes[at].wake = Some(due);
+            self.at(due.max(self.now), Event::Timer { at });
         }
         Ok(())
-    }
-
-    fn dispatch(&mut self, at: usize, attempt: AttemptId, to: &Location, parcel: Parcel) {
-        let kind = to.kind();
-        let host = self.processes[at].host;
-        let living = (0..self.processes.len()).find(|&p| {
-            self.processes[p].incarnation == to.incarnation() && self.processes[p].alive
-        });
-        let error = |fault| WayError::new(fault, "simulated");
-        let down = self.down.contains(&(host, kind))
-            || living.is_some_and(|p| self.down.contains(&(self.processes[p].host, kind)));
-        self.processes[at]
-            .open
-            .insert(attempt, living.unwrap_or(usize::MAX));
-        let Some(receiver) = living.filter(|_| !down) else {
-            let conclusion = Conclusion::NotSent(error(WayFault::Unreachable));
-            return self.after_ms(
-                3,
-                Event::Conclude {
-                    at,
-                    attempt,
-                    conclusion,
-                },
-            );
-        };
-        let mut luck = self.random.f64();
-        let mut happens = |rate: f64| {
-            luck -= rate;
-            luck < 0.0
-        };
-        let w = self.weather;
-        if happens(w.refusal) {
-            let conclusion = Conclusion::NotSent(error(WayFault::Unreachable));
-            return self.after_ms(
-                3,
-                Event::Conclude {
-                    at,
-                    attempt,
-                    conclusion,
-                },
-            );
-        }
-        if happens(w.loss) {
-            let conclusion = Conclusion::Unconfirmed(error(WayFault::Broken));
-            return self.after_ms(
-                50,
-                Event::Conclude {
-                    at,
-                    attempt,
-                    conclusion,
-                },
-            );
-        }
-        if happens(w.silence) {
-            return;
-        }
-        let mute = happens(w.answer_loss);
-        let delay = Duration::from_micros(self.random.u64(20..5000));
-        let link = self.links.entry((at, receiver, kind)).or_insert(self.now);
-        *link = (*link).max(self.now + delay);
-        let arrives = *link;
-        self.at(
-            arrives,
-            Event::Arrive {
-                from: at,
-                to: receiver,
-                kind,
-                attempt,
-                parcel,
-                mute,
-            },
-        );
-    }
-
-    fn arrive(
-        &mut self,
-        from: usize,
-        to: usize,
-        kind: Kind,
-        attempt: AttemptId,
-        parcel: Parcel,
-        mute: bool,
-    ) -> Result<(), Breach> {
-        let broken = || Conclusion::Unconfirmed(WayError::new(WayFault::Broken, "simulated"));
-        if !self.processes[to].alive {
-            self.after_ms(
-                5,
-                Event::Conclude {
-                    at: from,
-                    attempt,
-                    conclusion: broken(),
-                },
-            );
-            return Ok(());
-        }
-        let now = self.clocks();
-        let location = way(kind, self.processes[from].incarnation);
-        let remote = self.processes[from].host != self.processes[to].host;
-        let process = &mut self.processes[to];
-        process.next_ticket += 1;
-        let ticket = Ticket(process.next_ticket);
-        let arrival = Arrival {
-            parcel,
-            from: Hop { location, remote },
-            ticket,
-        };
-        let at_once = kind == Kind::Shm;
-        let verdict = process.core.handle_arrival(now, kind, at_once, arrival);
-        match verdict {
-            Verdict::Now(answer) => {
-                let conclusion = if mute {
-                    broken()
-                } else {
-                    Conclusion::Answered(answer)
-                };
-                self.after_ms(
-                    2,
-                    Event::Conclude {
-                        at: from,
-                        attempt,
-                        conclusion,
-                    },
-                );
-            }
-            Verdict::Later if at_once => return Err("a late answer over shared memory".into()),
-            Verdict::Later if mute => {
-                self.after_ms(
-                    60,
-                    Event::Conclude {
-                        at: from,
-                        attempt,
-                        conclusion: broken(),
-                    },
-                );
-            }
-            Verdict::Later => {
-                process.tickets.insert(ticket, (from, attempt));
-            }
-        }
-        self.carry_out(to)
     }
 
     fn read(&mut self, at: usize, agent: Incarnation) -> Result<(), Breach> {
@@ -749,7 +475,11 @@ impl World {
             return Ok(());
         }
         // All at once when there is no pause to keep, so that queues do not fill in calm weather.
-        let most = if self.weather.reading_pause_ms > 1 { 1 } else { usize::MAX };
+        let most = if self.weather.reading_pause_ms > 1 {
+            1
+        } else {
+            usize::MAX
+        };
         let mut read = 0;
         while read < most && self.take(at, agent)? {
             read += 1;
@@ -841,55 +571,6 @@ impl World {
         if self.random.f64() < 0.8 {
             let delay = Duration::from_millis(self.random.u64(210..600));
             self.at(self.now + delay, Event::Reborn { process: dead });
-        }
-        Ok(())
-    }
-
-    fn check_deadline(&mut self, number: u64) -> Result<(), Breach> {
-        let sent = &self.sent[&number];
-        let (known, expected) = (sent.outcomes.len(), sent.expected);
-        if known < expected && self.processes[sent.process].alive {
-            return Err(format!(
-                "letter {number} has {known} of {expected} outcomes after its deadline"
-            ));
-        }
-        Ok(())
-    }
-
-    fn check_end(&mut self) -> Result<(), Breach> {
-        let mut failed = 0;
-        for (number, sent) in &self.sent {
-            for (receiver, outcome) in &sent.outcomes {
-                let was_taken = self
-                    .taken
-                    .iter()
-                    .any(|(life, all)| self.names[life] == *receiver && all.contains(number));
-                match outcome {
-                    Outcome::Delivered { .. } if !was_taken => {
-                        return Err(format!("letter {number} to {receiver} is lost: {outcome}"));
-                    }
-                    Outcome::Failed { reason, .. }
-                        if was_taken && *reason != FailureReason::Unconfirmed =>
-                    {
-                        return Err(format!("letter {number} was delivered, but {outcome}"));
-                    }
-                    Outcome::Failed { reason, .. } => {
-                        failed += 1;
-                        if self.weather.is_calm() && *reason != FailureReason::NoSuchAgent {
-                            return Err(format!("letter {number} in calm weather: {outcome}"));
-                        }
-                    }
-                    _ => {}
-                }
-            }
-        }
-        if self.weather.is_calm() && failed != self.failures_told {
-            return Err(format!("{failed} failures, {} told", self.failures_told));
-        }
-        for process in self.processes.iter().filter(|process| process.alive) {
-            if process.core.has_open_letters() {
-                return Err("letters are still open at the end".into());
-            }
         }
         Ok(())
     }

@@ -1,0 +1,23 @@
+//! Any bytes are a parcel or give an error; a parcel that was read survives being written.
+
+#![no_main]
+
+use bytes::Bytes;
+use fipa_transport::Body;
+use fipa_transport::wire::{HEADER_LEN, ParcelHeader};
+use libfuzzer_sys::fuzz_target;
+use zerocopy::FromBytes;
+
+fuzz_target!(|bytes: &[u8]| {
+    let Ok((header, body)) = ParcelHeader::read_from_prefix(bytes) else {
+        assert!(bytes.len() < HEADER_LEN);
+        return;
+    };
+    let Ok(parcel) = header.parcel(Bytes::copy_from_slice(body)) else { return };
+    let (again, pieces) = ParcelHeader::of(&parcel).expect("what was read can be written");
+    let read = again.parcel(pieces.concat().into()).expect("what was written can be read");
+    match (&read.body, &parcel.body) {
+        (Body::Letter(one), Body::Letter(other)) => assert_eq!(one.to_bytes(), other.to_bytes()),
+        (one, other) => assert_eq!(one, other),
+    }
+});

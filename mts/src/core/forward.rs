@@ -1,0 +1,217 @@
+//! Letters for somebody else: the gateway's role, old peers' letters, and failure messages.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use fipa_acl::Letter;
+use fipa_sds::{Entry, Reach, Resolution, Role};
+use fipa_transport::{
+    Answer, FailureReason, Hop, Incarnation, Kind, Parcel, Stream, Ticket, Verdict,
+};
+
+use super::desk::{Action, Origin, Undelivered};
+use super::lane::{Delivery, Lane};
+use super::{Core, MAX_DEADLINE, Now};
+use crate::{failure, stamp};
+
+/// How far from the network a letter may come before a gateway refuses to pass it on.
+const MAX_HOPS: u8 = 1;
+/// When the sender of a letter is told that it is in custody, if its outcome takes longer.
+const CUSTODY_AFTER: Duration = Duration::from_millis(200);
+/// How long a failure message to an old peer's agent may take.
+const FAILURE_DEADLINE: Duration = Duration::from_secs(5);
+
+impl Core {
+    /// Takes a letter for somebody else into custody, or says why not. `unanswered` is the arrival
+    /// that may be answered later.
+    pub(super) fn forward(
+        &mut self,
+        now: Now,
+        parcel: &Parcel,
+        letter: Letter,
+        from: Hop,
+        unanswered: Option<(Kind, Ticket)>,
+    ) -> Verdict {
+        let (entry, stamped) = match self.admit(now, parcel, letter, &from) {
+            Ok(admitted) => admitted,
+            Err(refusal) => return Verdict::Now(refusal),
+        };
+        let (bound, stream) = (self.desk.config.lane, parcel.stream);
+        let bytes = self.desk.held.saturating_add(stamped.len());
+        let too_many_bytes = self.desk.held > 0 && bytes > self.desk.config.custody_bytes;
+        let new_lane = || Lane::new(now.instant, stream, Arc::clone(&entry.name));
+        let lane = self.lanes.entry(stream).or_insert_with(new_lane);
+        let taken = match unanswered {
+            Some(_) => Verdict::Later,
+            None => Verdict::Now(Answer::Custody),
+        };
+        let back = from.location.clone();
+        let origin = Origin::Forwarded { back, unanswered };
+        let Some(origin) = lane.adopt(parcel.sequence, origin, &mut self.desk) else {
+            return taken;
+        };
+        if too_many_bytes || lane.len() >= bound {
+            lane.wait_for_credit(from.location);
+            return Verdict::Now(Answer::Busy);
+        }
+        let onwards = entry.reach != Reach::Local;
+        let deadline = now.instant + parcel.remaining.min(MAX_DEADLINE);
+        let mut delivery = Delivery::new(origin, stamped, parcel.sequence, deadline);
+        delivery.after = parcel.after;
+        delivery.hops = parcel.hops.saturating_add(u8::from(onwards));
+        delivery.custody_due = unanswered.map(|_| now.instant + CUSTODY_AFTER);
+        self.put(now, stream, Arc::clone(&entry.name), delivery);
+        taken
+    }
+
+    /// Whether this service passes the letter on: to whom, and the letter with its stamp.
+    fn admit(
+        &self,
+        now: Now,
+        parcel: &Parcel,
+        letter: Letter,
+        from: &Hop,
+    ) -> Result<(Arc<Entry>, Letter), Answer> {
+        let config = &self.desk.config;
+        let unknown = |why: &str| Answer::failed(FailureReason::NoSuchAgent, why);
+        let refused = |why: String| Answer::failed(FailureReason::Refused, why);
+        if !config.forwards {
+            return Err(unknown("the agent is not in this process any more"));
+        }
+        let entry = self.desk.directory.by_incarnation(parcel.stream.receiver);
+        let entry = entry.ok_or_else(|| unknown("the agent is not known to the gateway"))?;
+        if entry.role == Role::Gateway {
+            return Err(refused("a gateway takes no letters for itself".to_owned()));
+        }
+        // Never between strangers: what comes from the network is for this host.
+        if from.remote && (entry.reach != Reach::Local || parcel.hops > MAX_HOPS) {
+            return Err(unknown("the agent is not on the gateway's host"));
+        }
+        match stamp::carries(&letter, &config.name, config.incarnation) {
+            Ok(true) => return Err(Answer::failed(FailureReason::Loop, &*config.name)),
+            Ok(false) => {}
+            Err(error) => return Err(refused(error.to_string())),
+        }
+        let stamped = stamp::put(letter, &config.name, config.incarnation, now.utc)
+            .map_err(|error| refused(error.to_string()))?;
+        Ok((entry, stamped))
+    }
+
+    /// Whether a letter that has nobody who could be held back finds room.
+    fn has_room(&self, stream: Stream, len: usize) -> bool {
+        let lane = self.lanes.get(&stream).map_or(0, Lane::len);
+        let bytes = self.desk.held.saturating_add(len);
+        lane < self.desk.config.lane && bytes <= self.desk.config.custody_bytes
+    }
+
+    /// An old peer's letter arrived, for the agents of this host that its envelope names.
+    pub fn handle_unframed(&mut self, now: Now, deadline: Duration, letter: Letter, via: Kind) {
+        let receivers = match stamp::receivers(&letter) {
+            Ok(receivers) => receivers,
+            Err(error) => {
+                tracing::warn!(%error, "an unframed letter with a malformed envelope was dropped");
+                return;
+            }
+        };
+        let directory = Arc::clone(&self.desk.directory);
+        let sender = stamp::sender(&letter).unwrap_or_default();
+        let stream_sender = self.desk.config.incarnation;
+        for receiver in receivers {
+            let entries = match fipa_sds::resolve(&*directory, &receiver, &sender) {
+                Ok(Resolution::Exact(entry)) => vec![entry],
+                Ok(Resolution::Multicast(entries)) => entries,
+                Ok(Resolution::None) | Err(_) => Vec::new(),
+            };
+            let here = entries
+                .into_iter()
+                .filter(|entry| entry.reach == Reach::Local);
+            let mut found = false;
+            for entry in here {
+                found = true;
+                if let Some(inbox) = self.agents.get_mut(&entry.incarnation)
+                    && inbox.push_unframed(letter.clone(), via)
+                {
+                    let agent = entry.incarnation;
+                    self.desk.actions.push_back(Action::Deliverable { agent });
+                    continue;
+                }
+                let stream = Stream {
+                    sender: stream_sender,
+                    receiver: entry.incarnation,
+                };
+                if !self.has_room(stream, letter.len()) {
+                    self.desk.undelivered.push_back(Undelivered {
+                        stream,
+                        receiver: Arc::clone(&entry.name),
+                        letter: letter.clone(),
+                        reason: FailureReason::QueueFull,
+                        detail: String::new(),
+                    });
+                    continue;
+                }
+                let sequence = self.sequence_of(stream_sender);
+                let until = now.instant + deadline.min(MAX_DEADLINE);
+                let mut delivery = Delivery::new(Origin::Nobody, letter.clone(), sequence, until);
+                delivery.hops = 1;
+                self.put(now, stream, Arc::clone(&entry.name), delivery);
+            }
+            if !found {
+                tracing::info!(%receiver, %sender, "an unframed letter names nobody of this host");
+                self.desk.undelivered.push_back(Undelivered {
+                    stream: Stream {
+                        sender: stream_sender,
+                        receiver: Incarnation::UNKNOWN,
+                    },
+                    receiver: receiver.as_str().into(),
+                    letter: letter.clone(),
+                    reason: FailureReason::NoSuchAgent,
+                    detail: String::new(),
+                });
+            }
+        }
+        self.tell_failures(now);
+    }
+
+    /// Tells senders of what failed, in the form of FIPA `failure` messages.
+    pub(super) fn tell_failures(&mut self, now: Now) {
+        while let Some(undelivered) = self.desk.undelivered.pop_front() {
+            let Undelivered {
+                stream,
+                receiver,
+                letter,
+                reason,
+                detail,
+            } = undelivered;
+            let name = &self.desk.config.name;
+            let Some(report) = failure::compose(name, &letter, &receiver, reason, &detail, now.utc)
+            else {
+                continue;
+            };
+            if let Some(inbox) = self.agents.get_mut(&stream.sender) {
+                if inbox.push_failure(report.letter) {
+                    let agent = stream.sender;
+                    self.desk.actions.push_back(Action::Deliverable { agent });
+                }
+                continue;
+            }
+            // An old peer's letter: its sender may be known by name.
+            let Some(entry) = self.desk.directory.lookup(&report.to) else {
+                tracing::info!(to = %report.to, %reason, "nobody to send a failure message to");
+                continue;
+            };
+            if entry.role == Role::Gateway {
+                continue;
+            }
+            let sequence = self.next_sequence;
+            self.next_sequence += 1;
+            let deadline = now.instant + FAILURE_DEADLINE;
+            let mut delivery = Delivery::new(Origin::Nobody, report.letter, sequence, deadline);
+            delivery.hops = u8::from(entry.reach != Reach::Local);
+            let stream = Stream {
+                sender: self.desk.config.incarnation,
+                receiver: entry.incarnation,
+            };
+            self.put(now, stream, Arc::clone(&entry.name), delivery);
+        }
+    }
+}

@@ -1,0 +1,70 @@
+//! What a lane does because time has passed.
+
+use std::time::Instant;
+
+use fipa_transport::{WayError, WayFault};
+
+use super::super::desk::Desk;
+use super::Lane;
+use super::delivery::State;
+
+impl Lane {
+    /// What is due by the clock: deadlines, attempts without an answer, custody to be told.
+    pub(super) fn expire(&mut self, now: Instant, desk: &mut Desk) {
+        if self.due.is_none_or(|due| due > now) {
+            return;
+        }
+        let mut index = 0;
+        while index < self.letters.len() {
+            let delivery = &mut self.letters[index];
+            if delivery.deadline <= now {
+                let reason = delivery.reason_at_deadline();
+                if let State::UnderWay {
+                    attempt, location, ..
+                } = &delivery.progress.state
+                {
+                    let (attempt, location) = (*attempt, location.clone());
+                    desk.abandon(location.kind(), attempt);
+                    self.under_way -= 1;
+                    self.recovering = true;
+                    let text = "the letter's deadline passed";
+                    delivery.failed_at(&location, WayError::new(WayFault::TimedOut, text));
+                }
+                self.fail(index, reason, desk);
+                continue;
+            }
+            if delivery.custody_due.is_some_and(|due| due <= now) {
+                delivery.custody_taken(desk);
+            }
+            if let State::UnderWay {
+                attempt,
+                location,
+                times_out,
+            } = &delivery.progress.state
+                && *times_out <= now
+            {
+                let (attempt, location) = (*attempt, location.clone());
+                desk.abandon(location.kind(), attempt);
+                self.under_way -= 1;
+                delivery.progress.state = State::Waiting;
+                delivery.progress.unconfirmed = true;
+                let error = WayError::new(WayFault::TimedOut, "");
+                self.came_back(now, index, &location, error, desk);
+            }
+            index += 1;
+        }
+        self.due = self.next_due(now);
+    }
+
+    fn next_due(&self, now: Instant) -> Option<Instant> {
+        let letters = self.letters.iter().flat_map(|delivery| {
+            let times_out = match &delivery.progress.state {
+                State::UnderWay { times_out, .. } => Some(*times_out),
+                _ => None,
+            };
+            [Some(delivery.deadline), delivery.custody_due, times_out]
+        });
+        let paused = self.paused_until.filter(|until| *until > now);
+        letters.chain([paused]).flatten().min()
+    }
+}

@@ -1,0 +1,407 @@
+//! The gateway's role, step by step: custody, late answers, reports, stamps and loops.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use fipa_acl::{AgentId, Letter, Message, Performative};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
+use fipa_mts::letter_for;
+use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+use fipa_transport::{
+    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
+    Outcome, Parcel, Stream, Ticket, Verdict,
+};
+
+const GATEWAY: Incarnation = Incarnation::from_u64(0x6a7e);
+const ROVER: Incarnation = Incarnation::from_u64(0x50e4);
+const ARM: Incarnation = Incarnation::from_u64(0xa53);
+
+struct Gateway {
+    core: Core,
+    start: Instant,
+}
+
+impl Gateway {
+    /// A gateway whose directory knows one agent, `arm`, in a process of its host.
+    fn new(forwards: bool) -> Self {
+        let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(0x9)));
+        let arm = Registration::new("arm", ARM, vec![shm(0x9)]);
+        directory.register(arm).unwrap();
+        let order = vec![Kind::Shm, Kind::Tcp];
+        let config = CoreConfig {
+            forwards,
+            ..CoreConfig::new("gateway", GATEWAY, order)
+        };
+        Self {
+            core: Core::new(config, Arc::new(directory)),
+            start: Instant::now(),
+        }
+    }
+
+    fn at(&self, ms: u64) -> Now {
+        let since = Duration::from_millis(ms);
+        Now {
+            instant: self.start + since,
+            utc: SystemTime::UNIX_EPOCH + since,
+        }
+    }
+
+    fn arrive(&mut self, ms: u64, via: Kind, parcel: Parcel) -> Verdict {
+        let from = Hop {
+            location: tcp(0x1),
+            remote: via == Kind::Tcp,
+        };
+        let arrival = Arrival {
+            parcel,
+            from,
+            ticket: Ticket(7),
+        };
+        let now = self.at(ms);
+        self.core
+            .handle_arrival(now, via, via == Kind::Shm, arrival)
+    }
+
+    fn conclude(&mut self, ms: u64, attempt: AttemptId, answer: Answer) {
+        let now = self.at(ms);
+        self.core
+            .handle_conclusion(now, attempt, Conclusion::Answered(answer));
+    }
+
+    fn time(&mut self, ms: u64) {
+        let now = self.at(ms);
+        self.core.handle_timeout(now);
+    }
+
+    fn dispatched(&mut self) -> (AttemptId, Location, Parcel) {
+        match self.core.poll_action() {
+            Some(Action::Dispatch {
+                attempt,
+                location,
+                parcel,
+            }) => (attempt, location, parcel),
+            other => panic!("a dispatch was expected, not {other:?}"),
+        }
+    }
+
+    fn answered(&mut self) -> Answer {
+        match self.core.poll_action() {
+            Some(Action::Answer {
+                kind: Kind::Tcp,
+                ticket: Ticket(7),
+                answer,
+            }) => answer,
+            other => panic!("an answer was expected, not {other:?}"),
+        }
+    }
+
+    fn nothing_to_do(&mut self) {
+        let action = self.core.poll_action();
+        assert!(action.is_none(), "{action:?}");
+    }
+}
+
+fn shm(of: u64) -> Location {
+    let incarnation = Incarnation::from_u64(of);
+    Location::new(Kind::Shm, &incarnation.to_string())
+        .unwrap()
+        .with_incarnation(incarnation)
+}
+
+fn tcp(of: u64) -> Location {
+    let at = Location::new(Kind::Tcp, "192.0.2.1:7788").unwrap();
+    at.with_incarnation(Incarnation::from_u64(of))
+}
+
+fn letter() -> Letter {
+    let message = Message::builder(Performative::Inform)
+        .sender(AgentId::new("rover").unwrap())
+        .receiver(AgentId::new("arm").unwrap())
+        .content("hello")
+        .build()
+        .unwrap();
+    letter_for(&message, SystemTime::UNIX_EPOCH).unwrap()
+}
+
+fn parcel(sequence: u64, letter: Letter) -> Parcel {
+    Parcel {
+        receiver: "arm".into(),
+        stream: Stream {
+            sender: ROVER,
+            receiver: ARM,
+        },
+        sequence,
+        after: 0,
+        remaining: Duration::from_secs(2),
+        hops: 1,
+        body: Body::Letter(letter),
+    }
+}
+
+#[test]
+fn the_answer_to_a_peer_waits_for_the_outcome() {
+    let mut gateway = Gateway::new(true);
+    assert_eq!(
+        gateway.arrive(0, Kind::Tcp, parcel(1, letter())),
+        Verdict::Later
+    );
+    let (attempt, location, passed_on) = gateway.dispatched();
+    assert_eq!(location, shm(0x9));
+    assert_eq!((passed_on.sequence, passed_on.hops), (1, 1));
+    assert!(
+        passed_on.remaining < Duration::from_secs(2),
+        "those further down give up earlier"
+    );
+    gateway.nothing_to_do();
+    gateway.conclude(1, attempt, Answer::Accepted);
+    assert_eq!(gateway.answered(), Answer::Accepted);
+    gateway.nothing_to_do();
+}
+
+#[test]
+fn a_slow_receiver_makes_it_custody_and_a_report() {
+    let mut gateway = Gateway::new(true);
+    assert_eq!(
+        gateway.arrive(0, Kind::Tcp, parcel(1, letter())),
+        Verdict::Later
+    );
+    let (attempt, ..) = gateway.dispatched();
+    gateway.conclude(1, attempt, Answer::Busy);
+    assert_eq!(gateway.answered(), Answer::Custody);
+    gateway.time(500);
+    let (attempt, ..) = gateway.dispatched();
+    gateway.conclude(501, attempt, Answer::Accepted);
+    let (_, back, report) = gateway.dispatched();
+    assert_eq!(back, tcp(0x1));
+    assert_eq!(report.sequence, 1);
+    match report.body {
+        Body::Report(report) => assert_eq!(report.outcome.via(), Some(Kind::Shm)),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn over_shared_memory_custody_is_answered_at_once() {
+    let mut gateway = Gateway::new(true);
+    let verdict = gateway.arrive(0, Kind::Shm, parcel(1, letter()));
+    assert_eq!(verdict, Verdict::Now(Answer::Custody));
+    let (attempt, ..) = gateway.dispatched();
+    gateway.conclude(1, attempt, Answer::failed(FailureReason::Refused, "no"));
+    let (attempt, _, report) = gateway.dispatched();
+    match report.body {
+        Body::Report(report) => assert!(matches!(
+            report.outcome,
+            Outcome::Failed {
+                reason: FailureReason::Refused,
+                ..
+            }
+        )),
+        other => panic!("{other:?}"),
+    }
+    // A report that is lost is sent again.
+    let broken = fipa_transport::WayError::new(fipa_transport::WayFault::Broken, "");
+    let now = gateway.at(2);
+    gateway
+        .core
+        .handle_conclusion(now, attempt, Conclusion::Unconfirmed(broken));
+    gateway.nothing_to_do();
+    gateway.time(200);
+    assert!(matches!(gateway.dispatched().2.body, Body::Report(_)));
+}
+
+#[test]
+fn a_copy_of_a_letter_in_custody_is_not_a_second_letter() {
+    let mut gateway = Gateway::new(true);
+    assert_eq!(
+        gateway.arrive(0, Kind::Shm, parcel(1, letter())),
+        Verdict::Now(Answer::Custody)
+    );
+    let (attempt, ..) = gateway.dispatched();
+    assert_eq!(
+        gateway.arrive(1, Kind::Shm, parcel(1, letter())),
+        Verdict::Now(Answer::Custody)
+    );
+    gateway.nothing_to_do();
+    gateway.conclude(2, attempt, Answer::Accepted);
+    assert!(matches!(gateway.dispatched().2.body, Body::Report(_)));
+    gateway.nothing_to_do();
+}
+
+#[test]
+fn what_passes_is_stamped_and_what_comes_back_is_a_loop() {
+    let mut gateway = Gateway::new(true);
+    assert_eq!(
+        gateway.arrive(0, Kind::Tcp, parcel(1, letter())),
+        Verdict::Later
+    );
+    let (_, _, passed_on) = gateway.dispatched();
+    let Body::Letter(stamped) = passed_on.body else {
+        panic!("no letter")
+    };
+    assert!(stamped.envelope_len() > letter().envelope_len());
+    assert_eq!(stamped.payload(), letter().payload());
+    match gateway.arrive(1, Kind::Tcp, parcel(2, stamped.clone())) {
+        Verdict::Now(Answer::Failed {
+            reason: FailureReason::Loop,
+            ..
+        }) => {}
+        other => panic!("{other:?}"),
+    }
+    // Another gateway of the same name is another gateway.
+    let mut namesake = Gateway::new(true);
+    let order = vec![Kind::Shm];
+    let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(0x9)));
+    directory
+        .register(Registration::new("arm", ARM, vec![shm(0x9)]))
+        .unwrap();
+    let config = CoreConfig {
+        forwards: true,
+        ..CoreConfig::new("gateway", Incarnation::from_u64(0x6a7f), order)
+    };
+    namesake.core = Core::new(config, Arc::new(directory));
+    assert_eq!(
+        namesake.arrive(1, Kind::Tcp, parcel(2, stamped)),
+        Verdict::Later
+    );
+}
+
+#[test]
+fn a_malformed_envelope_is_refused() {
+    let mut gateway = Gateway::new(true);
+    let nonsense = Letter::new(bytes::Bytes::from_static(b"\xfe\x00"), bytes::Bytes::new());
+    match gateway.arrive(0, Kind::Tcp, parcel(1, nonsense)) {
+        Verdict::Now(Answer::Failed {
+            reason: FailureReason::Refused,
+            detail,
+        }) => {
+            assert!(!detail.is_empty());
+        }
+        other => panic!("{other:?}"),
+    }
+    gateway.nothing_to_do();
+}
+
+#[test]
+fn a_robot_process_passes_nothing_on() {
+    let mut process = Gateway::new(false);
+    match process.arrive(0, Kind::Tcp, parcel(1, letter())) {
+        Verdict::Now(Answer::Failed {
+            reason: FailureReason::NoSuchAgent,
+            ..
+        }) => {}
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn a_lane_that_is_full_holds_back_and_gives_credit() {
+    let mut gateway = Gateway::new(true);
+    let bound = gateway.core.config().lane as u64;
+    for sequence in 1..=bound {
+        assert_eq!(
+            gateway.arrive(0, Kind::Shm, parcel(sequence, letter())),
+            Verdict::Now(Answer::Custody)
+        );
+    }
+    assert_eq!(
+        gateway.arrive(0, Kind::Shm, parcel(bound + 1, letter())),
+        Verdict::Now(Answer::Busy)
+    );
+    let mut credits = 0;
+    let mut delivered = 0;
+    while delivered < bound {
+        let (attempt, _, parcel) = gateway.dispatched();
+        match parcel.body {
+            Body::Letter(_) => delivered += 1,
+            Body::Credit => credits += 1,
+            Body::Report(_) => {}
+        }
+        gateway.conclude(1, attempt, Answer::Accepted);
+    }
+    assert_eq!(credits, 1);
+}
+
+#[test]
+fn an_old_peers_letter_is_for_whom_its_envelope_names() {
+    let mut gateway = Gateway::new(true);
+    let now = gateway.at(0);
+    gateway
+        .core
+        .handle_unframed(now, Duration::from_secs(2), letter(), Kind::Tcp);
+    let (attempt, location, parcel) = gateway.dispatched();
+    assert_eq!(location, shm(0x9));
+    assert_eq!(&*parcel.receiver, "arm");
+    assert_eq!(
+        parcel.stream.sender, GATEWAY,
+        "the gateway vouches for order and duplicates"
+    );
+    gateway.conclude(1, attempt, Answer::Accepted);
+    gateway.nothing_to_do();
+}
+
+#[test]
+fn a_way_that_failed_is_left_alone_for_a_while() {
+    let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(0x9)));
+    directory
+        .register(Registration::new("arm", ARM, vec![shm(0x9), tcp(0x9)]))
+        .unwrap();
+    let order = vec![Kind::Shm, Kind::Tcp];
+    let config = CoreConfig::new("process", Incarnation::from_u64(0x8), order);
+    let mut core = Core::new(config, Arc::new(directory));
+    core.register("rover".into(), ROVER);
+    let start = Instant::now();
+    let at = |ms: u64| Now {
+        instant: start + Duration::from_millis(ms),
+        utc: SystemTime::UNIX_EPOCH,
+    };
+    let send = |core: &mut Core, ms| {
+        let receivers = vec!["arm".into()];
+        let deadline = Duration::from_secs(2);
+        let letter = letter();
+        core.send(
+            at(ms),
+            Submission {
+                sender: ROVER,
+                letter,
+                receivers,
+                deadline,
+            },
+        );
+        match core.poll_action() {
+            Some(Action::Dispatch {
+                attempt, location, ..
+            }) => (attempt, location.kind()),
+            other => panic!("{other:?}"),
+        }
+    };
+    let accepted = || Conclusion::Answered(Answer::Accepted);
+    let (attempt, first) = send(&mut core, 0);
+    assert_eq!(first, Kind::Shm);
+    let error = fipa_transport::WayError::new(fipa_transport::WayFault::Broken, "");
+    core.handle_conclusion(at(1), attempt, Conclusion::NotSent(error));
+    let Some(Action::Dispatch {
+        attempt, location, ..
+    }) = core.poll_action()
+    else {
+        panic!()
+    };
+    assert_eq!(location.kind(), Kind::Tcp);
+    core.handle_conclusion(at(2), attempt, accepted());
+    match core.poll_action() {
+        Some(Action::Outcome {
+            outcome: Outcome::Delivered { via, attempts },
+            ..
+        }) => {
+            assert_eq!(via, Kind::Tcp);
+            assert_eq!(attempts.len(), 1);
+        }
+        other => panic!("{other:?}"),
+    }
+    let (attempt, next) = send(&mut core, 10);
+    assert_eq!(next, Kind::Tcp, "nobody waits for a broken way twice");
+    core.handle_conclusion(at(11), attempt, accepted());
+    core.poll_action();
+    let (_, later) = send(&mut core, 1000);
+    assert_eq!(later, Kind::Shm, "and it is tried again");
+}

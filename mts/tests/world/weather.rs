@@ -1,0 +1,48 @@
+//! What goes wrong in a simulated world.
+
+/// What goes wrong, and how often.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Weather {
+    /// A parcel is lost on the way; its sender hears that it is unconfirmed.
+    pub loss: f64,
+    /// A parcel arrives, its answer is lost.
+    pub answer_loss: f64,
+    /// Nothing leaves, and that is known.
+    pub refusal: f64,
+    /// A parcel is lost, and nothing is ever heard of it.
+    pub silence: f64,
+    /// How many processes die in the course of the run. Most come back as a new life.
+    pub deaths: u32,
+    /// How often one kind of transport stops working on one host for a while.
+    pub outages: u32,
+    /// How long agents wait between two letters they read.
+    pub reading_pause_ms: u64,
+    /// How long an answer may be on its way back.
+    pub(crate) answering_ms: u64,
+    /// Bound of each agent's queue.
+    pub queue: usize,
+}
+
+impl Weather {
+    /// Nothing goes wrong.
+    pub(crate) fn calm() -> Self {
+        Self {
+            loss: 0.0,
+            answer_loss: 0.0,
+            refusal: 0.0,
+            silence: 0.0,
+            deaths: 0,
+            outages: 0,
+            reading_pause_ms: 1,
+            answering_ms: 2,
+            queue: 64,
+        }
+    }
+
+    pub(super) fn is_calm(&self) -> bool {
+        self.loss + self.answer_loss + self.refusal + self.silence == 0.0
+            && self.deaths == 0
+            && self.outages == 0
+            && self.queue >= 64
+    }
+}

@@ -1,0 +1,301 @@
+//! What arrives, in which order, and what its sender is told.
+
+use std::time::Duration;
+
+use bytes::Bytes;
+use fipa_acl::{Letter, Payload};
+
+use super::Fixture;
+use super::party::{Party, accepted, assert_same, concluded, letter, parcel, pattern, until};
+use crate::{
+    Answer, Attempt, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind, Outcome,
+    Parcel, Report, Stream, Verdict, WayError, WayFault,
+};
+
+/// Letters, reports and credits arrive with everything that was said about them.
+pub fn every_field_and_kind_arrives(fixture: &dyn Fixture) {
+    let (a, b) = (Party::new(fixture), Party::new(fixture));
+    let attempts = vec![Attempt {
+        via: Kind::Tcp,
+        location: "tcp://192.0.2.1:7#00000000000000aa"
+            .parse()
+            .expect("a location"),
+        error: WayError::new(WayFault::TimedOut, "no answer in 250 ms"),
+    }];
+    let outcome = Outcome::Failed {
+        reason: FailureReason::Unreachable,
+        attempts,
+    };
+    let bodies = [
+        letter("content"),
+        Body::Report(Report { outcome }),
+        Body::Credit,
+    ];
+    for (index, body) in bodies.into_iter().enumerate() {
+        let sent = Parcel {
+            receiver: "ärm.of [the] robot".into(),
+            stream: Stream {
+                sender: Incarnation::from_u64(u64::MAX),
+                receiver: Incarnation::UNKNOWN,
+            },
+            sequence: u64::MAX - 1,
+            after: 1 << 40,
+            remaining: Duration::from_micros(1_234_567),
+            hops: 2,
+            body,
+        };
+        a.send(index as u64, &b, sent.clone());
+        assert_eq!(concluded(&[&a, &b], &a, index as u64), accepted());
+        assert_same(&b.arrived(index), &sent);
+    }
+}
+
+/// Whatever the receiving sink says is what the sender is told.
+pub fn answers_come_back_as_given(fixture: &dyn Fixture) {
+    let answers = [
+        Answer::Accepted,
+        Answer::Custody,
+        Answer::Busy,
+        Answer::OutOfOrder { last: u64::MAX },
+        Answer::failed(FailureReason::NoSuchAgent, "arm_1 left"),
+        Answer::failed(FailureReason::Loop, ""),
+    ];
+    let given = answers.clone();
+    let a = Party::new(fixture);
+    let b = Party::judging(fixture, move |arrival| {
+        Verdict::Now(given[arrival.parcel.sequence as usize].clone())
+    });
+    for (index, answer) in answers.into_iter().enumerate() {
+        a.send(index as u64, &b, parcel(index as u64, letter("x")));
+        assert_eq!(
+            concluded(&[&a, &b], &a, index as u64),
+            Conclusion::Answered(answer)
+        );
+    }
+    // A long detail is cut, at a character boundary, and does no harm.
+    let c = Party::judging(fixture, |_| {
+        Verdict::Now(Answer::failed(FailureReason::Refused, "é".repeat(5000)))
+    });
+    a.send(100, &c, parcel(1, letter("x")));
+    match concluded(&[&a, &c], &a, 100) {
+        Conclusion::Answered(Answer::Failed {
+            reason: FailureReason::Refused,
+            detail,
+        }) => {
+            assert!(
+                detail.starts_with('é') && detail.len() <= Answer::MAX_DETAIL,
+                "{detail}"
+            );
+        }
+        other => panic!("{other:?}"),
+    }
+}
+
+/// Nothing is confirmed before the receiving sink has it.
+pub fn the_letter_is_the_sinks_before_it_is_confirmed(fixture: &dyn Fixture) {
+    let (a, b) = (Party::new(fixture), Party::new(fixture));
+    for attempt in 0..50 {
+        a.send(attempt, &b, parcel(attempt, letter("x")));
+        until(&[&a, &b], "a confirmation", || {
+            let concluded = a.conclusion(attempt);
+            if concluded.is_some() {
+                assert!(
+                    b.arrivals() > attempt as usize,
+                    "confirmed before it arrived"
+                );
+            }
+            concluded
+        });
+    }
+}
+
+/// Where late answers are allowed, they find their parcel, in any order.
+pub fn a_late_answer_reaches_its_own_parcel(fixture: &dyn Fixture) {
+    let a = Party::new(fixture);
+    if a.transport.answers_at_once() {
+        return;
+    }
+    let b = Party::judging(fixture, |_| Verdict::Later);
+    for attempt in 0..3 {
+        a.send(attempt, &b, parcel(attempt, letter("x")));
+    }
+    until(&[&a, &b], "three arrivals", || {
+        (b.arrivals() == 3).then_some(())
+    });
+    for attempt in [2_u64, 0, 1] {
+        assert_eq!(a.conclusion(attempt), None);
+        let ticket = b.sink.record.lock().arrivals[attempt as usize].2;
+        b.transport
+            .answer(ticket, Answer::OutOfOrder { last: attempt });
+        assert_eq!(
+            concluded(&[&a, &b], &a, attempt),
+            Conclusion::Answered(Answer::OutOfOrder { last: attempt })
+        );
+        b.transport.answer(ticket, Answer::Accepted);
+    }
+}
+
+/// Parcels to one location arrive in the order in which they were dispatched.
+pub fn order_is_kept(fixture: &dyn Fixture) {
+    let (a, b) = (Party::new(fixture), Party::new(fixture));
+    let total = 500;
+    for sequence in 0..total {
+        // Alternating sizes: a transport may treat small and large ones differently.
+        let content = pattern(if sequence % 7 == 0 { 40_000 } else { 20 });
+        until(&[&a, &b], "room for the next parcel", || {
+            match a.transport.dispatch(
+                AttemptId(sequence),
+                &b.location,
+                parcel(sequence, letter(content.clone())),
+            ) {
+                Ok(()) => Some(()),
+                Err(error) if error.fault == WayFault::Congested => None,
+                Err(error) => panic!("{error}"),
+            }
+        });
+    }
+    for attempt in 0..total {
+        assert_eq!(concluded(&[&a, &b], &a, attempt), accepted());
+    }
+    let record = b.sink.record.lock();
+    let order: Vec<u64> = record
+        .arrivals
+        .iter()
+        .map(|(parcel, ..)| parcel.sequence)
+        .collect();
+    assert_eq!(order, (0..total).collect::<Vec<_>>());
+}
+
+/// A letter may lie in pieces in the sender's memory; empty pieces are fine.
+pub fn pieces_arrive_as_one_letter(fixture: &dyn Fixture) {
+    let (a, b) = (Party::new(fixture), Party::new(fixture));
+    let base = Bytes::from_static(b"base envelope");
+    let whole = Letter::new(base.clone(), Bytes::from_static(b"whole message"));
+    let letters = [
+        whole.clone(),
+        whole
+            .clone()
+            .stamped(Bytes::from_static(b"one"))
+            .stamped(Bytes::from_static(b"two")),
+        Letter::new(base.clone(), Payload::default()),
+        Letter::new(
+            base,
+            Payload {
+                head: Bytes::new(),
+                content: pattern(9),
+                tail: Bytes::from_static(b"t"),
+            },
+        ),
+    ];
+    for (index, letter) in letters.into_iter().enumerate() {
+        let sent = parcel(index as u64, Body::Letter(letter));
+        a.send(index as u64, &b, sent.clone());
+        assert_eq!(concluded(&[&a, &b], &a, index as u64), accepted());
+        assert_same(&b.arrived(index), &sent);
+    }
+}
+
+/// Content from nothing to a few megabytes arrives unchanged, also while earlier content is held.
+pub fn content_of_many_sizes_arrives(fixture: &dyn Fixture) {
+    let (a, b) = (Party::new(fixture), Party::new(fixture));
+    let largest = a.transport.max_letter().saturating_sub(200).min(4 << 20);
+    let sizes = [
+        0,
+        1,
+        7,
+        8,
+        255,
+        256,
+        4095,
+        4096,
+        65_535,
+        65_536,
+        1 << 20,
+        4 << 20,
+    ];
+    let mut index = 0;
+    for size in sizes.into_iter().filter(|size| *size <= largest) {
+        for _ in 0..2 {
+            let sent = parcel(index, letter(pattern(size)));
+            a.send(index, &b, sent.clone());
+            assert_eq!(concluded(&[&a, &b], &a, index), accepted(), "{size} bytes");
+            assert_same(&b.arrived(index as usize), &sent);
+            index += 1;
+        }
+    }
+}
+
+/// A letter above the limit is refused as too large, and nothing of it arrives.
+pub fn what_is_too_large_is_not_sent(fixture: &dyn Fixture) {
+    let (a, b) = (Party::new(fixture), Party::new(fixture));
+    let limit = a.transport.max_letter();
+    assert!(
+        limit < 1 << 30,
+        "the suite cannot make a letter above {limit} bytes"
+    );
+    let error = a
+        .transport
+        .dispatch(
+            AttemptId(1),
+            &b.location,
+            parcel(1, letter(vec![0; limit + 1])),
+        )
+        .expect_err("too large");
+    assert_eq!(error.fault, WayFault::TooLarge, "{error}");
+    a.send(2, &b, parcel(2, letter("small")));
+    assert_eq!(concluded(&[&a, &b], &a, 2), accepted());
+    assert_eq!(b.arrivals(), 1);
+}
+
+/// Where nobody is, nothing was sent, and that is said.
+pub fn nobody_is_nowhere(fixture: &dyn Fixture) {
+    let a = Party::new(fixture);
+    match a
+        .transport
+        .dispatch(AttemptId(1), &fixture.nowhere(), parcel(1, letter("x")))
+    {
+        Err(error) => assert_eq!(error.fault, WayFault::Unreachable, "{error}"),
+        Ok(()) => match concluded(&[&a], &a, 1) {
+            Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Unreachable, "{error}"),
+            other => panic!("{other:?}"),
+        },
+    }
+}
+
+/// A letter for a service that is gone is not given to the one that took its place.
+pub fn another_incarnation_is_somebody_else(fixture: &dyn Fixture) {
+    let (a, b) = (Party::new(fixture), Party::new(fixture));
+    let stale = b
+        .location
+        .clone()
+        .with_incarnation(Incarnation::from_u64(0xdead));
+    let fault = match a
+        .transport
+        .dispatch(AttemptId(1), &stale, parcel(1, letter("x")))
+    {
+        Err(error) => error.fault,
+        Ok(()) => match concluded(&[&a, &b], &a, 1) {
+            Conclusion::NotSent(error) => error.fault,
+            other => panic!("{other:?}"),
+        },
+    };
+    assert!(
+        matches!(fault, WayFault::WrongIncarnation | WayFault::Unreachable),
+        "{fault:?}"
+    );
+    assert_eq!(b.arrivals(), 0);
+}
+
+/// Reports and credits find their way back to whoever handed a parcel over.
+pub fn a_hop_can_be_answered(fixture: &dyn Fixture) {
+    let (a, b) = (Party::new(fixture), Party::new(fixture));
+    a.send(1, &b, parcel(1, letter("x")));
+    assert_eq!(concluded(&[&a, &b], &a, 1), accepted());
+    let hop = b.sink.record.lock().arrivals[0].1.clone();
+    assert_eq!(hop.location.incarnation(), a.location.incarnation());
+    b.transport
+        .dispatch(AttemptId(1), &hop.location, parcel(1, Body::Credit))
+        .expect("the way back is open");
+    assert_eq!(concluded(&[&a, &b], &b, 1), accepted());
+    assert_eq!(a.arrived(0).body, Body::Credit);
+}

@@ -1,0 +1,211 @@
+//! Endpoints under test, and what their sinks have heard.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use fipa_acl::{Letter, Payload};
+use parking_lot::Mutex;
+
+use super::Fixture;
+use crate::{
+    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel, Sink,
+    Stream, Ticket, Transport, Verdict,
+};
+
+/// How long the suite waits before it calls a transport broken.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+type Judge = Box<dyn Fn(&Arrival) -> Verdict + Send + Sync>;
+
+#[derive(Default)]
+pub(super) struct Record {
+    pub(super) arrivals: Vec<(Parcel, Hop, Ticket)>,
+    pub(super) concluded: HashMap<AttemptId, Vec<Conclusion>>,
+}
+
+pub(super) struct Recorder {
+    pub(super) record: Mutex<Record>,
+    judge: Judge,
+}
+
+impl Sink for Recorder {
+    fn arrived(&self, arrival: Arrival) -> Verdict {
+        let verdict = (self.judge)(&arrival);
+        let Arrival {
+            parcel,
+            from,
+            ticket,
+        } = arrival;
+        self.record.lock().arrivals.push((parcel, from, ticket));
+        verdict
+    }
+
+    fn arrived_unframed(&self, _: Letter, _: Kind) {
+        panic!("nobody sent an unframed letter");
+    }
+
+    fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {
+        self.record
+            .lock()
+            .concluded
+            .entry(attempt)
+            .or_default()
+            .push(conclusion);
+    }
+}
+
+/// An endpoint that listens, and what its sink has heard.
+pub(super) struct Party {
+    pub(super) transport: Arc<dyn Transport>,
+    pub(super) sink: Arc<Recorder>,
+    pub(super) location: Location,
+}
+
+impl Party {
+    pub(super) fn new(fixture: &dyn Fixture) -> Self {
+        Self::judging(fixture, |_| Verdict::Now(Answer::Accepted))
+    }
+
+    pub(super) fn judging(
+        fixture: &dyn Fixture,
+        judge: impl Fn(&Arrival) -> Verdict + Send + Sync + 'static,
+    ) -> Self {
+        let transport = fixture.endpoint();
+        let sink = Arc::new(Recorder {
+            record: Mutex::default(),
+            judge: Box::new(judge),
+        });
+        let locations = transport
+            .listen(Arc::clone(&sink) as Arc<dyn Sink>)
+            .expect("listens");
+        let location = locations.first().expect("a location").clone();
+        assert_eq!(location.kind(), transport.kind());
+        assert!(
+            location.incarnation().is_known(),
+            "{location} has no incarnation"
+        );
+        Self {
+            transport,
+            sink,
+            location,
+        }
+    }
+
+    pub(super) fn send(&self, attempt: u64, to: &Party, parcel: Parcel) {
+        self.transport
+            .dispatch(AttemptId(attempt), &to.location, parcel)
+            .unwrap_or_else(|error| panic!("dispatch {attempt}: {error}"));
+    }
+
+    pub(super) fn conclusion(&self, attempt: u64) -> Option<Conclusion> {
+        self.sink
+            .record
+            .lock()
+            .concluded
+            .get(&AttemptId(attempt))?
+            .first()
+            .cloned()
+    }
+
+    pub(super) fn arrivals(&self) -> usize {
+        self.sink.record.lock().arrivals.len()
+    }
+
+    pub(super) fn arrived(&self, index: usize) -> Parcel {
+        self.sink.record.lock().arrivals[index].0.clone()
+    }
+
+    /// Nobody was told twice about one attempt.
+    fn check_single_conclusions(&self) {
+        for (attempt, conclusions) in &self.sink.record.lock().concluded {
+            assert_eq!(conclusions.len(), 1, "{attempt:?}: {conclusions:?}");
+        }
+    }
+}
+
+impl Drop for Party {
+    fn drop(&mut self) {
+        self.transport.close();
+        if !std::thread::panicking() {
+            self.check_single_conclusions();
+        }
+    }
+}
+
+pub(super) fn until<T>(parties: &[&Party], what: &str, condition: impl Fn() -> Option<T>) -> T {
+    let started = Instant::now();
+    loop {
+        let driven = parties
+            .iter()
+            .filter(|party| party.transport.drive())
+            .count();
+        if let Some(value) = condition() {
+            return value;
+        }
+        assert!(started.elapsed() < PATIENCE, "gave up waiting for: {what}");
+        if driven == 0 {
+            std::thread::sleep(Duration::from_micros(200));
+        }
+    }
+}
+
+pub(super) fn concluded(parties: &[&Party], sender: &Party, attempt: u64) -> Conclusion {
+    until(parties, "the conclusion of an attempt", || {
+        sender.conclusion(attempt)
+    })
+}
+
+pub(super) fn accepted() -> Conclusion {
+    Conclusion::Answered(Answer::Accepted)
+}
+
+pub(super) fn letter(content: impl Into<Bytes>) -> Body {
+    let payload = Payload {
+        head: Bytes::from_static(b"head of the message"),
+        content: content.into(),
+        tail: Bytes::from_static(b"\x01"),
+    };
+    Body::Letter(Letter::new(Bytes::from_static(b"envelope"), payload))
+}
+
+pub(super) fn parcel(sequence: u64, body: Body) -> Parcel {
+    Parcel {
+        receiver: "arm_1".into(),
+        stream: Stream {
+            sender: Incarnation::from_u64(0x5e4d),
+            receiver: Incarnation::from_u64(0x4ec3),
+        },
+        sequence,
+        after: 0,
+        remaining: Duration::from_millis(2500),
+        hops: 0,
+        body,
+    }
+}
+
+pub(super) fn assert_same(arrived: &Parcel, sent: &Parcel) {
+    match (&arrived.body, &sent.body) {
+        (Body::Letter(arrived), Body::Letter(sent)) => {
+            assert_eq!(arrived.envelope(), sent.envelope());
+            assert!(
+                arrived.payload().to_bytes() == sent.payload().to_bytes(),
+                "payload differs"
+            );
+        }
+        (arrived, sent) => assert_eq!(arrived, sent),
+    }
+    let header = |parcel: &Parcel| Parcel {
+        body: Body::Credit,
+        ..parcel.clone()
+    };
+    assert_eq!(header(arrived), header(sent));
+}
+
+pub(super) fn pattern(len: usize) -> Bytes {
+    (0..len)
+        .map(|i| (i ^ (i >> 8)) as u8)
+        .collect::<Vec<_>>()
+        .into()
+}
