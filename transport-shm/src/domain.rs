@@ -1,0 +1,349 @@
+//! The traces of a domain in the file system: making them, and removing those of the dead.
+//!
+//! When a process is killed, somebody has to remove its mailbox and its side of every connection.
+//! That must wait until its last letters have been taken by those who are alive: iceoryx2 0.10
+//! never lets go of memory for requests that it finds in the mailbox after their sender has been
+//! cleaned up. So whoever cleans up first rings all bells, then waits for [`GRACE`].
+
+use std::os::fd::OwnedFd;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use fipa_transport::Incarnation;
+use iceoryx2::node::{Node, NodeState, NodeView};
+use iceoryx2::prelude::{CallbackProgression, Config};
+use parking_lot::Mutex;
+use rustix::fs::{FlockOperation, Mode, OFlags, flock, open};
+
+use crate::layout::Svc;
+use crate::memory::SHM;
+use crate::presence::Names;
+use crate::{ShmConfig, ShmError};
+
+/// How long the living have to take the letters of the dead.
+pub(crate) const GRACE: Duration = Duration::from_millis(100);
+
+/// What [`cleanup_dead`] did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[non_exhaustive]
+pub struct Cleaned {
+    /// Processes that are there.
+    pub alive: usize,
+    /// Dead processes whose traces were removed.
+    pub removed: usize,
+    /// Dead processes whose traces could not be removed, or are being removed by somebody else.
+    pub failed: usize,
+}
+
+/// Removes what killed processes of a domain left behind. For tools: an endpoint does this by
+/// itself when it starts, when it closes, and when it notices that a process it talks to is gone.
+///
+/// Blocks for about a tenth of a second when processes are alive. The configuration's
+/// incarnation is not used; it must only be a known one.
+///
+/// # Errors
+/// When the configuration makes no sense, or files cannot be listed.
+pub fn cleanup_dead(config: &ShmConfig) -> Result<Cleaned, ShmError> {
+    let domain = Domain::new(config)?;
+    if !config.root.exists() {
+        return Ok(Cleaned::default());
+    }
+    if domain.ring_all()? > 0 {
+        std::thread::sleep(GRACE);
+    }
+    domain.clean(false)
+}
+
+/// A domain's place in the file system.
+#[derive(Debug)]
+pub(crate) struct Domain {
+    /// Whether this is an endpoint's, which ends with it.
+    member: bool,
+    /// Somebody of this process is cleaning.
+    cleaning: Mutex<()>,
+    /// The endpoint closes: whoever is cleaning should come to an end.
+    closing: AtomicBool,
+    ice: Config,
+    names: Names,
+    config: ShmConfig,
+}
+
+impl Domain {
+    pub(crate) fn new(config: &ShmConfig) -> Result<Self, ShmError> {
+        Ok(Self {
+            member: false,
+            cleaning: Mutex::default(),
+            closing: AtomicBool::new(false),
+            ice: config.iceoryx()?,
+            names: Names::new(&config.root, &config.prefix),
+            config: config.clone(),
+        })
+    }
+
+    /// The same, of an endpoint.
+    pub(crate) fn joined(mut self) -> Self {
+        self.member = true;
+        self
+    }
+
+    /// The last cleaning up of an endpoint.
+    pub(crate) fn leave(&self) -> Result<Cleaned, ShmError> {
+        self.closing.store(true, Ordering::SeqCst);
+        self.clean(true)
+    }
+
+    pub(crate) fn iceoryx(&self) -> &Config {
+        &self.ice
+    }
+
+    pub(crate) fn names(&self) -> &Names {
+        &self.names
+    }
+
+    /// Makes the directories, and checks that they are nobody else's.
+    pub(crate) fn prepare(&self) -> Result<(), ShmError> {
+        for directory in [self.config.root.as_path(), self.names.directory()] {
+            make_private(directory)?;
+        }
+        Ok(())
+    }
+
+    /// Excludes others from starting and cleaning until the result is dropped. The lock is on the
+    /// directory itself, so that there is no file to be left behind.
+    pub(crate) fn lock(&self) -> Result<OwnedFd, ShmError> {
+        self.locked(FlockOperation::LockExclusive)
+    }
+
+    /// Excludes others from cleaning, but not from doing the same, until the result is dropped.
+    /// For whoever is about to make files outside of [`Domain::lock`].
+    pub(crate) fn lock_shared(&self) -> Result<OwnedFd, ShmError> {
+        self.locked(FlockOperation::LockShared)
+    }
+
+    fn locked(&self, how: FlockOperation) -> Result<OwnedFd, ShmError> {
+        let root = &self.config.root;
+        let flags = OFlags::DIRECTORY | OFlags::RDONLY | OFlags::CLOEXEC;
+        open(root, flags, Mode::empty())
+            .and_then(|fd| flock(&fd, how).map(|()| fd))
+            .map_err(|e| file_error("cannot lock", root, e))
+    }
+
+    /// Rings at every process, and says how many are there.
+    pub(crate) fn ring_all(&self) -> Result<usize, ShmError> {
+        let all = self.all()?;
+        let alive = all.into_iter().filter(|one| self.names.is_alive(*one));
+        Ok(alive.map(|one| self.names.ring_once(one)).count())
+    }
+
+    fn all(&self) -> Result<Vec<Incarnation>, ShmError> {
+        self.names
+            .all()
+            .map_err(|e| file_error("cannot list", self.names.directory(), e))
+    }
+
+    /// Removes the traces of dead processes, and when nobody is left, those of the domain. With
+    /// `if_alone` nothing more is done when somebody is left: they notice the dead by themselves.
+    pub(crate) fn clean(&self, if_alone: bool) -> Result<Cleaned, ShmError> {
+        let mut cleaned = Cleaned::default();
+        // Waits for another thread of this process, which comes to an end when the endpoint closes.
+        let Some(_cleaning) = self.cleaning.try_lock_for(PATIENCE) else {
+            return Ok(cleaned);
+        };
+        let lock = self.lock()?;
+        for one in self.all()? {
+            if self.names.is_alive(one) {
+                cleaned.alive += 1;
+            } else {
+                self.names.remove(one);
+                cleaned.removed += 1;
+            }
+        }
+        let nodes = self.nodes()?;
+        let is_dead = |node: &NodeState<Svc>| matches!(node, NodeState::Dead(_));
+        if cleaned.alive == 0 && nodes.iter().all(is_dead) {
+            self.remove_all();
+            return Ok(cleaned);
+        }
+        self.remove_empty(&nodes);
+        // Who starts must not wait for what follows: iceoryx2 waits in vain, and for long, for
+        // whatever a dead process was making when it was killed.
+        drop(lock);
+        if if_alone {
+            return Ok(cleaned);
+        }
+        let mut nameless = Vec::new();
+        for node in nodes {
+            if self.closing.load(Ordering::SeqCst) {
+                break;
+            }
+            match node {
+                NodeState::Dead(dead) if dead.details().is_some() => {
+                    let removed = dead.blocking_remove_stale_resources(PATIENCE);
+                    cleaned.failed += usize::from(removed.is_err());
+                }
+                NodeState::Dead(dead) => nameless.push(*dead.id()),
+                _ => {}
+            }
+        }
+        if !nameless.is_empty() {
+            // Killed while it was being made, or while somebody removed it: iceoryx2 does not know
+            // any more what it was. Looked at again, while nobody can be making one.
+            let _lock = self.lock()?;
+            for node in self.nodes()? {
+                if let NodeState::Dead(dead) = node
+                    && dead.details().is_none()
+                    && nameless.contains(dead.id())
+                {
+                    self.remove_node(&dead.id().value().to_string());
+                }
+            }
+        }
+        Ok(cleaned)
+    }
+
+    fn nodes(&self) -> Result<Vec<NodeState<Svc>>, ShmError> {
+        let mut nodes = Vec::new();
+        let listed = Node::<Svc>::list(&self.ice, |node| {
+            nodes.push(node);
+            CallbackProgression::Continue
+        });
+        listed.map_err(|e| ShmError::Iceoryx {
+            what: "cannot list the nodes",
+            reason: format!("{e:?}"),
+            prefix: self.config.prefix.clone(),
+        })?;
+        Ok(nodes)
+    }
+
+    /// Removes the empty files that processes leave which are killed between making a file and
+    /// giving it a length. iceoryx2 0.10 waits for such a file to become longer, without end. To
+    /// be called under the lock, under which nobody else makes connections or services.
+    fn remove_empty(&self, nodes: &[NodeState<Svc>]) {
+        let prefix = self.prefix();
+        let mut ports = Vec::new();
+        for node in nodes {
+            let NodeState::Dead(dead) = node else {
+                continue;
+            };
+            let directory = self.config.root.join("nodes");
+            let files = std::fs::read_dir(directory.join(dead.id().value().to_string()));
+            for file in files.into_iter().flatten().flatten() {
+                let name = file.file_name();
+                let name = name.to_string_lossy();
+                let port = name.strip_prefix(&prefix);
+                let port = port.and_then(|name| name.strip_suffix(".port_tag"));
+                ports.extend(port.map(str::to_owned));
+            }
+        }
+        for file in std::fs::read_dir(SHM).into_iter().flatten().flatten() {
+            let name = file.file_name();
+            let name = name.to_string_lossy();
+            let is_empty = || file.metadata().is_ok_and(|metadata| metadata.len() == 0);
+            let nobody_makes_it = [".connection", ".dynamic", ".global_mgmt"]
+                .iter()
+                .any(|end| name.ends_with(end))
+                || ports.iter().any(|port| name.contains(port));
+            if name.starts_with(&prefix) && nobody_makes_it && is_empty() {
+                // Met again next time if it fails.
+                let _ = std::fs::remove_file(file.path());
+            }
+        }
+    }
+
+    /// Removes a node of which iceoryx2 has lost the details.
+    fn remove_node(&self, id: &str) {
+        let nodes = self.config.root.join("nodes");
+        let name = format!("{}{id}.", self.prefix());
+        remove_files(&nodes, &name);
+        remove_files(&nodes.join(id), &self.prefix());
+        let _ = std::fs::remove_dir(nodes.join(id));
+    }
+
+    /// Nobody is there, and nobody can come while the lock is held: what has the domain's prefix
+    /// can go. That is what iceoryx2 leaves for the next process, when there may never be one,
+    /// and what it could not make sense of after a process was killed.
+    fn remove_all(&self) {
+        let prefix = self.prefix();
+        remove_files(Path::new(SHM), &prefix);
+        for directory in ["nodes", "services", "processes"] {
+            let directory = self.config.root.join(directory);
+            for node in std::fs::read_dir(&directory)
+                .into_iter()
+                .flatten()
+                .flatten()
+            {
+                remove_files(&node.path(), &prefix);
+                // Fails when it is a file, or has files of another prefix.
+                let _ = std::fs::remove_dir(node.path());
+            }
+            remove_files(&directory, &prefix);
+            let _ = std::fs::remove_dir(&directory);
+        }
+    }
+
+    fn prefix(&self) -> String {
+        self.ice.global.prefix.to_string()
+    }
+}
+
+/// How long to wait for somebody else who is removing the traces of the same process.
+const PATIENCE: Duration = Duration::from_secs(1);
+
+/// Removes the files with this prefix. What cannot be removed is met again next time.
+fn remove_files(directory: &Path, prefix: &str) {
+    for file in std::fs::read_dir(directory).into_iter().flatten().flatten() {
+        if file.file_name().to_string_lossy().starts_with(prefix) {
+            let _ = std::fs::remove_file(file.path());
+        }
+    }
+}
+
+impl Drop for Domain {
+    /// Whoever goes last removes what is left, also when it held content for longer than its
+    /// endpoint was open.
+    fn drop(&mut self) {
+        if self.member && self.config.root.exists() {
+            // Nobody to report to; what cannot be removed is removed by the next who starts.
+            let _ = self.clean(true);
+        }
+    }
+}
+
+fn make_private(directory: &Path) -> Result<(), ShmError> {
+    let mut builder = std::fs::DirBuilder::new();
+    builder
+        .recursive(true)
+        .mode(0o700)
+        .create(directory)
+        .map_err(|e| file_error("cannot make the directory", directory, e))?;
+    let metadata = std::fs::symlink_metadata(directory)
+        .map_err(|e| file_error("cannot look at the directory", directory, e))?;
+    let me = rustix::process::geteuid().as_raw();
+    let problem = if !metadata.is_dir() {
+        "is not a directory".to_owned()
+    } else if metadata.uid() != me {
+        format!("belongs to user {}, and this is user {me}", metadata.uid())
+    } else if metadata.mode() & 0o077 != 0 {
+        format!("has mode {:04o}", metadata.mode() & 0o7777)
+    } else {
+        return Ok(());
+    };
+    Err(ShmError::NotPrivate {
+        path: directory.to_owned(),
+        problem,
+    })
+}
+
+pub(crate) fn file_error(
+    what: &'static str,
+    path: &Path,
+    source: impl Into<std::io::Error>,
+) -> ShmError {
+    ShmError::File {
+        what,
+        path: path.to_owned(),
+        source: source.into(),
+    }
+}

@@ -1,0 +1,418 @@
+//! An endpoint: who is known, and who does what when.
+
+use std::collections::HashMap;
+use std::io::ErrorKind;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
+
+use fipa_transport::{
+    AttemptId, Conclusion, Incarnation, Location, Parcel, Sink, WayError, WayFault,
+};
+use iceoryx2::node::{Node, NodeBuilder};
+use iceoryx2::prelude::{ServiceName, SignalHandlingMode};
+use parking_lot::{Mutex, RwLock};
+use tokio::runtime::Handle;
+
+use crate::counters::{Tally, count};
+use crate::domain::{Domain, GRACE, file_error};
+use crate::inbox::{Inbox, mailbox_name};
+use crate::layout::Svc;
+use crate::loan::ShmLoan;
+use crate::memory::Budget;
+use crate::outbox::{Opening, Outbox, Posted};
+use crate::peers::Peer;
+use crate::presence::{Bell, Neighbour, Presence};
+use crate::{ShmConfig, ShmError};
+
+/// What a transport and its tasks share.
+pub(crate) struct Endpoint {
+    config: ShmConfig,
+    runtime: Handle,
+    sink: OnceLock<Arc<dyn Sink>>,
+    closed: AtomicBool,
+    /// Somebody wants the mailbox and the answers to be looked at.
+    wanted: AtomicBool,
+    /// The mailbox; whoever has the lock does the work.
+    inbox: Mutex<Option<Inbox>>,
+    peers: RwLock<HashMap<Incarnation, Arc<Peer>>>,
+    /// Counts uses of peers, to find the one not used for longest.
+    uses: AtomicU64,
+    node: Mutex<Option<Node<Svc>>>,
+    presence: RwLock<Option<Presence>>,
+    bell: Arc<Bell>,
+    /// How often cleaning up was asked for.
+    dirty: AtomicU64,
+    cleaning: AtomicBool,
+    budget: Arc<Budget>,
+    tally: Arc<Tally>,
+    // Last: ends with the process's last trace.
+    domain: Arc<Domain>,
+}
+
+impl Endpoint {
+    pub(crate) fn open(config: ShmConfig, runtime: Handle) -> Result<Arc<Self>, ShmError> {
+        let domain = Domain::new(&config)?;
+        let budget = Arc::new(Budget::new(&config.prefix, config.capacity));
+        budget.check_start()?;
+        domain.prepare()?;
+        // Under the lock, so that nobody takes what is half made for the traces of the dead.
+        let lock = domain.lock()?;
+        domain.prepare()?;
+        let domain = Arc::new(domain.joined());
+        let opened = Self::open_locked(config, runtime, budget, domain);
+        drop(lock);
+        let endpoint = opened?;
+        endpoint.clean_soon();
+        Ok(endpoint)
+    }
+
+    fn open_locked(
+        config: ShmConfig,
+        runtime: Handle,
+        budget: Arc<Budget>,
+        domain: Arc<Domain>,
+    ) -> Result<Arc<Self>, ShmError> {
+        let tally = Arc::new(Tally::default());
+        let presence = Presence::create(domain.names().clone(), config.incarnation)
+            .map_err(|e| file_error("cannot make files in", domain.names().directory(), e))?;
+        let bell = presence.bell().clone();
+        let failed = |what: &'static str, reason: String| ShmError::Iceoryx {
+            what,
+            reason,
+            prefix: config.prefix.clone(),
+        };
+        let node = NodeBuilder::new()
+            .config(domain.iceoryx())
+            .signal_handling_mode(SignalHandlingMode::Disabled)
+            .create::<Svc>()
+            .map_err(|e| failed("cannot make a node", format!("{e:?}")))?;
+        let inbox = Inbox::create(&config, &node, bell.clone(), tally.clone(), domain.clone())
+            .map_err(|reason| failed("cannot make the mailbox", reason))?;
+        Ok(Arc::new(Self {
+            config,
+            runtime,
+            sink: OnceLock::new(),
+            closed: AtomicBool::new(false),
+            wanted: AtomicBool::new(false),
+            inbox: Mutex::new(Some(inbox)),
+            peers: RwLock::default(),
+            uses: AtomicU64::new(0),
+            node: Mutex::new(Some(node)),
+            presence: RwLock::new(Some(presence)),
+            bell,
+            dirty: AtomicU64::new(0),
+            cleaning: AtomicBool::new(false),
+            budget,
+            tally,
+            domain,
+        }))
+    }
+
+    pub(crate) fn config(&self) -> &ShmConfig {
+        &self.config
+    }
+
+    pub(crate) fn runtime(&self) -> &Handle {
+        &self.runtime
+    }
+
+    pub(crate) fn bell(&self) -> &Arc<Bell> {
+        &self.bell
+    }
+
+    pub(crate) fn tally(&self) -> &Tally {
+        &self.tally
+    }
+
+    pub(crate) fn is_closed(&self) -> bool {
+        self.closed.load(Ordering::SeqCst)
+    }
+
+    /// Who is told from now on; `false` if somebody is already, or nobody may any more.
+    pub(crate) fn tell_to(&self, sink: Arc<dyn Sink>) -> bool {
+        !self.is_closed() && self.sink.set(sink).is_ok()
+    }
+
+    /// Works on the calling thread; meanwhile nobody needs to ring.
+    pub(crate) fn drive(self: &Arc<Self>) -> bool {
+        let presence = self.presence.read();
+        presence
+            .as_ref()
+            .is_some_and(|presence| presence.look(|| self.work()))
+    }
+
+    /// Looks into the mailbox and after answers. Says whether there was anything.
+    ///
+    /// One thread does it at a time. Whoever comes meanwhile leaves word, and whoever is at it
+    /// looks again before leaving for good; so nothing is overlooked, and nobody waits.
+    pub(crate) fn work(self: &Arc<Self>) -> bool {
+        let mut found = false;
+        self.wanted.store(true, Ordering::SeqCst);
+        while self.wanted.load(Ordering::SeqCst) {
+            let Some(mut inbox) = self.inbox.try_lock() else {
+                return found;
+            };
+            self.wanted.store(false, Ordering::SeqCst);
+            if let (Some(inbox), Some(sink)) = (&mut *inbox, self.sink.get()) {
+                found |= self.work_once(inbox, &**sink);
+            }
+        }
+        found
+    }
+
+    fn work_once(self: &Arc<Self>, inbox: &mut Inbox, sink: &dyn Sink) -> bool {
+        let mut answered = Vec::new();
+        let mut found = inbox.drain(sink, &mut answered);
+        for sender in answered {
+            self.wake(sender);
+        }
+        let mut concluded = Vec::new();
+        let mut ended = Vec::new();
+        for peer in self.peers.read().values() {
+            if peer.collect(&mut concluded) {
+                ended.push(peer.incarnation());
+            }
+        }
+        for incarnation in ended {
+            self.peers.write().remove(&incarnation);
+        }
+        found |= !concluded.is_empty();
+        tell(sink, concluded);
+        found
+    }
+
+    /// Makes a process look after its answers.
+    fn wake(self: &Arc<Self>, sender: Incarnation) {
+        let rung = match self.peer(sender) {
+            Ok(peer) => peer.wake(),
+            // It has ended and needs no answer, or too many are known already.
+            Err(_) => {
+                self.domain.names().ring_once(sender);
+                true
+            }
+        };
+        if rung {
+            count(&self.tally.rung);
+        }
+    }
+
+    pub(crate) fn post(
+        self: &Arc<Self>,
+        attempt: AttemptId,
+        to: &Location,
+        parcel: &Parcel,
+    ) -> Result<(), WayError> {
+        if self.sink.get().is_none() {
+            return Err(closed());
+        }
+        // A second try when the outbox takes nothing any more.
+        for _ in 0..2 {
+            let peer = self.peer_at(to)?;
+            match self.outbox(&peer)?.post(attempt, parcel)? {
+                Posted::Yes => {
+                    count(&self.tally.sent);
+                    if peer.wake() {
+                        count(&self.tally.rung);
+                    }
+                    return Ok(());
+                }
+                Posted::Retired => peer.renew(),
+            }
+        }
+        Err(WayError::new(
+            WayFault::Congested,
+            "the connection is being renewed",
+        ))
+    }
+
+    pub(crate) fn abandon(&self, attempt: AttemptId) {
+        let peers = self.peers.read();
+        let _known = peers.values().any(|peer| peer.abandon(attempt));
+    }
+
+    pub(crate) fn loan(
+        self: &Arc<Self>,
+        to: &Location,
+        head_room: usize,
+        len: usize,
+        tail_room: usize,
+    ) -> Result<ShmLoan, WayError> {
+        let peer = self.peer_at(to)?;
+        self.outbox(&peer)?.loan(head_room, len, tail_room)
+    }
+
+    /// Opens a mailbox if that was not done before.
+    fn outbox(&self, peer: &Peer) -> Result<Arc<Outbox>, WayError> {
+        peer.outbox(|| {
+            let node = self.node.lock();
+            let name = mailbox_name(peer.incarnation());
+            let service = ServiceName::new(&name)
+                .map_err(|e| WayError::new(WayFault::Unreachable, format_args!("{e:?}")))?;
+            Outbox::open(Opening {
+                node: node.as_ref().ok_or_else(closed)?,
+                service: &service,
+                own: self.config.incarnation,
+                max_loans: self.config.max_loans,
+                budget: self.budget.clone(),
+                tally: self.tally.clone(),
+                domain: self.domain.clone(),
+            })
+        })
+    }
+
+    fn peer_at(self: &Arc<Self>, to: &Location) -> Result<Arc<Peer>, WayError> {
+        let incarnation: Incarnation = to.address().parse().map_err(|e| {
+            WayError::new(WayFault::Unreachable, format_args!("not a mailbox: {e}"))
+        })?;
+        if to.incarnation().is_known() && to.incarnation() != incarnation {
+            return Err(WayError::new(
+                WayFault::WrongIncarnation,
+                format_args!("the mailbox is that of {incarnation}"),
+            ));
+        }
+        self.peer(incarnation)
+    }
+
+    /// A process, looked for if it was not known before.
+    fn peer(self: &Arc<Self>, incarnation: Incarnation) -> Result<Arc<Peer>, WayError> {
+        let now = self.uses.fetch_add(1, Ordering::Relaxed);
+        if let Some(peer) = self.peers.read().get(&incarnation) {
+            peer.mark_used(now);
+            return Ok(peer.clone());
+        }
+        let mut peers = self.peers.write();
+        if self.is_closed() {
+            return Err(closed());
+        }
+        if let Some(peer) = peers.get(&incarnation) {
+            return Ok(peer.clone());
+        }
+        if peers.len() >= self.config.max_peers {
+            let idle = peers.values().filter(|peer| peer.is_idle());
+            let oldest = idle.min_by_key(|peer| peer.last_used());
+            let oldest = oldest.map(|peer| peer.incarnation()).ok_or_else(|| {
+                WayError::new(
+                    WayFault::Congested,
+                    format_args!(
+                        "letters to {} processes are without an answer (max_peers)",
+                        self.config.max_peers
+                    ),
+                )
+            })?;
+            if let Some(oldest) = peers.remove(&oldest) {
+                oldest.end();
+            }
+        }
+        let names = self.domain.names();
+        let neighbour = Neighbour::open(names, incarnation).map_err(|e| match e.kind() {
+            ErrorKind::NotFound => WayError::new(
+                WayFault::Unreachable,
+                format_args!(
+                    "no process {incarnation} in {}",
+                    names.directory().display()
+                ),
+            ),
+            _ => WayError::new(
+                WayFault::Congested,
+                format_args!("the files of process {incarnation} cannot be opened: {e}"),
+            ),
+        })?;
+        let peer = Arc::new(Peer::new(incarnation, neighbour));
+        let endpoint = Arc::downgrade(self);
+        let ended = move || {
+            if let Some(endpoint) = endpoint.upgrade() {
+                endpoint.peer_ended(incarnation);
+            }
+        };
+        peer.watch(&self.runtime, ended).map_err(|e| {
+            WayError::new(
+                WayFault::Congested,
+                format_args!("the process {incarnation} cannot be watched: {e}"),
+            )
+        })?;
+        peer.mark_used(now);
+        peers.insert(incarnation, peer.clone());
+        Ok(peer)
+    }
+
+    /// A process has ended: concludes what waits for it, and removes its traces.
+    pub(crate) fn peer_ended(self: &Arc<Self>, incarnation: Incarnation) {
+        let peer = self.peers.read().get(&incarnation).cloned();
+        if let Some(peer) = peer {
+            peer.end();
+            count(&self.tally.peers_gone);
+        }
+        // Its last letters are taken, and its answers.
+        self.work();
+        self.clean_soon();
+    }
+
+    /// Removes the traces of dead processes, after the living have taken their letters.
+    pub(crate) fn clean_soon(self: &Arc<Self>) {
+        self.dirty.fetch_add(1, Ordering::SeqCst);
+        if self.is_closed() || self.cleaning.swap(true, Ordering::SeqCst) {
+            return;
+        }
+        let endpoint = Arc::downgrade(self);
+        // On a thread of its own: it takes milliseconds of file system calls, and waits.
+        self.runtime.spawn_blocking(move || {
+            loop {
+                let Some(now) = endpoint.upgrade() else {
+                    return;
+                };
+                let seen = now.dirty.load(Ordering::SeqCst);
+                let rung = now.domain.ring_all();
+                drop(now);
+                if rung.is_ok_and(|alive| alive > 0) {
+                    std::thread::sleep(GRACE);
+                }
+                let Some(now) = endpoint.upgrade().filter(|now| !now.is_closed()) else {
+                    return;
+                };
+                // What fails is tried again at the next occasion, by this process or another.
+                let _ = now.domain.clean(false);
+                now.cleaning.store(false, Ordering::SeqCst);
+                let more = now.dirty.load(Ordering::SeqCst) != seen;
+                if !more || now.cleaning.swap(true, Ordering::SeqCst) {
+                    return;
+                }
+            }
+        });
+    }
+
+    /// Closes the endpoint. Must not be called by the sink while it is told something.
+    pub(crate) fn close(&self) {
+        if self.closed.swap(true, Ordering::SeqCst) {
+            return;
+        }
+        let mut concluded = Vec::new();
+        let peers = {
+            let mut inbox = self.inbox.lock();
+            // First nothing more is taken, then others are told, then our own letters end.
+            *inbox = None;
+            *self.presence.write() = None;
+            let peers = std::mem::take(&mut *self.peers.write());
+            for peer in peers.values() {
+                peer.close(&mut concluded);
+            }
+            peers
+        };
+        drop(peers);
+        *self.node.lock() = None;
+        if let Some(sink) = self.sink.get() {
+            tell(&**sink, concluded);
+        }
+        // Nobody to report to; what cannot be removed is removed by the next who starts.
+        let _ = self.domain.leave();
+    }
+}
+
+fn tell(sink: &dyn Sink, concluded: Vec<(AttemptId, Conclusion)>) {
+    for (attempt, conclusion) in concluded {
+        sink.concluded(attempt, conclusion);
+    }
+}
+
+fn closed() -> WayError {
+    WayError::new(WayFault::Closed, "")
+}

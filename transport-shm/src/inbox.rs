@@ -1,0 +1,374 @@
+//! The receiving side: this process's mailbox.
+
+use std::collections::HashMap;
+use std::ptr::NonNull;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use bytes::Bytes;
+use fipa_transport::{
+    Answer, Arrival, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Sink, Ticket, Verdict,
+};
+use iceoryx2::port::{DegradationAction, ReceiveError};
+use iceoryx2::prelude::{BackpressureStrategy, Node, ServiceName};
+use parking_lot::Mutex;
+
+use crate::ShmConfig;
+use crate::counters::{Tally, count};
+use crate::domain::Domain;
+use crate::layout::{Ack, Active, BlankAck, Header, MailServer, Places, Svc};
+use crate::memory::populate;
+use crate::presence::Bell;
+
+/// How many parcels are taken before anything else is looked at.
+const BATCH: usize = 64;
+
+/// How many answers may be on their way to all senders together.
+const ANSWERS: usize = 1024;
+
+/// The name of the mailbox of a process.
+pub(crate) fn mailbox_name(of: Incarnation) -> String {
+    format!("fipa/mail/{of}")
+}
+
+/// The location of the mailbox of a process.
+pub(crate) fn location_of(of: Incarnation) -> Location {
+    let address = of.to_string();
+    match Location::new(Kind::Shm, &address) {
+        Ok(location) => location.with_incarnation(of),
+        Err(_) => unreachable!("16 hexadecimal digits are an address"),
+    }
+}
+
+/// The server of this process's mailbox. Used by one thread at a time.
+pub(crate) struct Inbox {
+    server: MailServer,
+    lending: Arc<Lending>,
+    tally: Arc<Tally>,
+    max_letter: usize,
+    copy_below: usize,
+    tickets: u64,
+    answers_ready: bool,
+    last_sender: Option<Location>,
+}
+
+impl Inbox {
+    /// Makes the mailbox.
+    pub(crate) fn create(
+        config: &ShmConfig,
+        node: &Node<Svc>,
+        bell: Arc<Bell>,
+        tally: Arc<Tally>,
+        domain: Arc<Domain>,
+    ) -> Result<Self, String> {
+        let name = ServiceName::new(&mailbox_name(config.incarnation)).map_err(debug)?;
+        let service = node
+            .service_builder(&name)
+            .request_response::<[u8], Ack>()
+            .request_user_header::<Header>()
+            .max_servers(1)
+            .max_clients(config.max_clients)
+            .max_nodes(config.max_clients + 1)
+            .max_active_requests_per_client(config.window)
+            .max_loaned_requests(config.max_loans + 1)
+            .max_response_buffer_size(1)
+            .max_borrowed_responses_per_pending_response(1)
+            // A full mailbox refuses; nothing that was put in is pushed out.
+            .enable_safe_overflow_for_requests(false)
+            // An answer that nobody waits for any more gives way.
+            .enable_safe_overflow_for_responses(true)
+            // What the sender has abandoned is not delivered.
+            .enable_fire_and_forget_requests(false)
+            .create()
+            .map_err(debug)?;
+        let server = service
+            .server_builder()
+            .max_loaned_responses_per_request(1)
+            .override_response_preallocation(|most| most.min(ANSWERS))
+            .backpressure_strategy(BackpressureStrategy::DiscardData)
+            .set_request_degradation_handler(|_, _| DegradationAction::Ignore)
+            .set_response_degradation_handler(|_, _| DegradationAction::Ignore)
+            .create()
+            .map_err(debug)?;
+        Ok(Self {
+            server,
+            lending: Arc::new(Lending {
+                per_sender: config.window - 1,
+                total: config.max_borrowed,
+                held: Mutex::default(),
+                waiting: AtomicBool::new(false),
+                bell,
+                tally: tally.clone(),
+                _domain: domain,
+            }),
+            tally,
+            max_letter: config.max_letter,
+            copy_below: config.copy_below,
+            tickets: 0,
+            answers_ready: false,
+            last_sender: None,
+        })
+    }
+
+    /// Takes what is in the mailbox and answers it. Says whether there was anything, and adds
+    /// who should look for an answer.
+    pub(crate) fn drain(&mut self, sink: &dyn Sink, answered: &mut Vec<Incarnation>) -> bool {
+        for done in 0..BATCH {
+            match self.server.receive() {
+                Ok(Some(active)) => {
+                    if let Some(sender) = self.take(active, sink)
+                        && !answered.contains(&sender)
+                    {
+                        answered.push(sender);
+                    }
+                }
+                Ok(None) => return done > 0,
+                Err(ReceiveError::ExceedsMaxBorrows) => {
+                    // Cannot happen as long as iceoryx2 counts as `Lending` does. Nothing is
+                    // lost: the next content given back rings the bell.
+                    self.lending.waiting.store(true, Ordering::SeqCst);
+                    return done > 0;
+                }
+                Err(ReceiveError::ConnectionFailure(_)) => {
+                    count(&self.tally.refused);
+                    return done > 0;
+                }
+            }
+        }
+        // There may be more; others get their turn first.
+        self.lending.bell.ring();
+        true
+    }
+
+    fn take(&mut self, active: Active, sink: &dyn Sink) -> Option<Incarnation> {
+        count(&self.tally.arrived);
+        // A copy in private memory: the sender could still change the original.
+        let header: Header = *active.user_header();
+        let sender = header.sender();
+        // Before the parcel is handed over: without an answer it must not be accepted. The sender
+        // of what is dropped here is told that it was.
+        let Ok(answer) = active.loan_uninit() else {
+            count(&self.tally.refused);
+            return Some(sender);
+        };
+        if !self.prepare_answers(&answer) {
+            count(&self.tally.refused);
+            return Some(sender);
+        }
+        let (parcel, owner) = self.read(&header, active);
+        let parcel = match parcel {
+            Ok(parcel) => parcel,
+            Err(refusal) => {
+                count(&self.tally.refused);
+                self.reply(answer, &refusal, &header);
+                drop(owner);
+                return sender.is_known().then_some(sender);
+            }
+        };
+        self.tickets += 1;
+        let arrival = Arrival {
+            parcel,
+            from: Hop {
+                location: self.location_of_sender(sender),
+                remote: false,
+            },
+            ticket: Ticket(self.tickets),
+        };
+        let verdict = match sink.arrived(arrival) {
+            Verdict::Now(answer) => answer,
+            Verdict::Later => Answer::failed(
+                FailureReason::Refused,
+                "answered later, which this transport does not allow",
+            ),
+        };
+        self.reply(answer, &verdict, &header);
+        // Only now: dropping the request closes the way back.
+        drop(owner);
+        Some(sender)
+    }
+
+    /// The location of a sender, who is mostly the one before.
+    fn location_of_sender(&mut self, sender: Incarnation) -> Location {
+        match &self.last_sender {
+            Some(location) if location.incarnation() == sender => location.clone(),
+            _ => self.last_sender.insert(location_of(sender)).clone(),
+        }
+    }
+
+    fn reply(&self, blank: BlankAck, answer: &Answer, header: &Header) {
+        // It fails when the sender is gone, who then has no use for it.
+        let _ = blank.write_payload(Ack::new(answer, header.token())).send();
+    }
+
+    /// Takes the pages of the answers, at the first one.
+    fn prepare_answers(&mut self, first: &BlankAck) -> bool {
+        if !self.answers_ready {
+            let chunk = std::ptr::from_ref(first.header()) as usize;
+            let ack = first.payload().as_ptr() as usize;
+            let stride = (ack - chunk + size_of::<Ack>()).next_multiple_of(8);
+            // What lies behind the end of the segment is an error without harm, so the error is
+            // looked at only for the part that is there for certain.
+            self.answers_ready = populate(chunk as *const u8, stride).is_ok();
+            let mut rest = stride;
+            while self.answers_ready && rest < ANSWERS * stride {
+                if populate((chunk + rest) as *const u8, stride).is_err() {
+                    break;
+                }
+                rest += 4096;
+            }
+        }
+        self.answers_ready
+    }
+
+    /// The parcel or the refusal, and what owns the memory that its content may lie in.
+    fn read(&self, header: &Header, active: Active) -> (Result<Parcel, Answer>, Owner) {
+        let refused = |active, reason, detail: &str| {
+            let refusal = Answer::failed(reason, detail);
+            (Err(refusal), Owner::Unshared(active))
+        };
+        let Some(parcel) = header.parcel() else {
+            return refused(active, FailureReason::Refused, "malformed header");
+        };
+        let payload = active.payload();
+        let Some(places) = Places::announced(header.start(), &parcel, payload.len()) else {
+            let detail = "the lengths do not add up";
+            return refused(active, FailureReason::Refused, detail);
+        };
+        let most = self.max_letter.saturating_add(Parcel::MAX_NAME) as u64;
+        if parcel.body_len() > most {
+            let detail = format!("{} bytes are the most here", self.max_letter);
+            return refused(active, FailureReason::TooLarge, &detail);
+        }
+        let front = Bytes::copy_from_slice(&payload[places.start..places.content]);
+        let tail = Bytes::copy_from_slice(&payload[places.tail..places.end]);
+        let content = &payload[places.content..places.tail];
+        let (content, owner) = self.lend(NonNull::from(content), active);
+        let parcel = parcel.parcel_of_pieces(front, content, tail);
+        let parcel = parcel.map_err(|e| Answer::failed(FailureReason::Refused, e.to_string()));
+        (parcel, owner)
+    }
+
+    /// Content, in place if that is allowed, else copied. `content` must lie in the payload of
+    /// `active`.
+    fn lend(&self, content: NonNull<[u8]>, active: Active) -> (Bytes, Owner) {
+        let sender = active.origin().value();
+        if content.len() >= self.copy_below && self.lending.begin(sender) {
+            count(&self.tally.in_place);
+            let held = Arc::new(Held {
+                active: Mutex::new(Some(active)),
+                sender,
+                lending: self.lending.clone(),
+            });
+            let bytes = Bytes::from_owner(Content {
+                bytes: content,
+                _held: held.clone(),
+            });
+            return (bytes, Owner::Shared(held));
+        }
+        if !content.is_empty() {
+            count(if content.len() < self.copy_below {
+                &self.tally.copied_small
+            } else {
+                &self.tally.copied_full
+            });
+        }
+        // SAFETY: the range is in the payload of `active`, which keeps it mapped and is alive.
+        let copied = Bytes::copy_from_slice(unsafe { content.as_ref() });
+        (copied, Owner::Unshared(active))
+    }
+}
+
+fn debug(error: impl std::fmt::Debug) -> String {
+    format!("{error:?}")
+}
+
+/// Who keeps a request: this side alone, or together with whoever has the content.
+#[expect(dead_code, reason = "owned until it is dropped")]
+enum Owner {
+    Unshared(Active),
+    Shared(Arc<Held>),
+}
+
+/// A request whose content is read in place.
+struct Held {
+    active: Mutex<Option<Active>>,
+    sender: u128,
+    lending: Arc<Lending>,
+}
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        // First the memory, then the count: what is counted as free must be free.
+        drop(self.active.get_mut().take());
+        self.lending.end(self.sender);
+    }
+}
+
+/// Content in a sender's memory.
+struct Content {
+    bytes: NonNull<[u8]>,
+    _held: Arc<Held>,
+}
+
+// SAFETY: the memory is shared memory of the process, mapped for reading, not bound to a thread;
+// the owner that keeps it mapped is itself Send and Sync.
+unsafe impl Send for Content {}
+
+impl AsRef<[u8]> for Content {
+    fn as_ref(&self) -> &[u8] {
+        // SAFETY: the range lies in the payload of the request in `_held`, which stays mapped as
+        // long as that lives: the server keeps connections of senders that are gone while content
+        // is held there, and never more of them than it can (`Lending::begin`). An honest sender
+        // does not write there after sending; see the crate's documentation on trust.
+        unsafe { self.bytes.as_ref() }
+    }
+}
+
+/// How much content is read in place.
+struct Lending {
+    per_sender: usize,
+    total: usize,
+    held: Mutex<HashMap<u128, usize>>,
+    /// The mailbox could not be drained until something is given back.
+    waiting: AtomicBool,
+    bell: Arc<Bell>,
+    tally: Arc<Tally>,
+    // Last: whoever held content longest removes the domain's traces.
+    _domain: Arc<Domain>,
+}
+
+impl Lending {
+    /// One more content of this sender, if that leaves a slot free for its next letter.
+    fn begin(&self, sender: u128) -> bool {
+        let mut held = self.held.lock();
+        let total: usize = held.values().sum();
+        let senders = held.len();
+        let of_sender = held.get(&sender).copied().unwrap_or(0);
+        let allowed = of_sender < self.per_sender
+            && total < self.total
+            && (of_sender > 0 || senders < ShmConfig::MAX_LENDERS);
+        if allowed {
+            held.insert(sender, of_sender + 1);
+            self.tally
+                .borrowed
+                .store(total as u64 + 1, Ordering::Relaxed);
+        }
+        allowed
+    }
+
+    fn end(&self, sender: u128) {
+        let mut held = self.held.lock();
+        if let Some(of_sender) = held.get_mut(&sender) {
+            *of_sender -= 1;
+            if *of_sender == 0 {
+                held.remove(&sender);
+            }
+        }
+        let total: usize = held.values().sum();
+        self.tally.borrowed.store(total as u64, Ordering::Relaxed);
+        drop(held);
+        if self.waiting.swap(false, Ordering::SeqCst) {
+            self.bell.ring();
+        }
+    }
+}

@@ -1,0 +1,256 @@
+//! What lies in shared memory: the header of a request, the answer, and the types of the ports.
+
+use std::mem::MaybeUninit;
+
+use fipa_transport::wire::{HEADER_LEN, ParcelHeader, reason_code, reason_of_code, truncated};
+use fipa_transport::{Answer, Incarnation};
+use iceoryx2::active_request::ActiveRequest;
+use iceoryx2::pending_response::PendingResponse;
+use iceoryx2::port::client::Client;
+use iceoryx2::port::server::Server;
+use iceoryx2::prelude::{ZeroCopySend, ipc_threadsafe};
+use iceoryx2::request_mut::RequestMut;
+use iceoryx2::request_mut_uninit::RequestMutUninit;
+use iceoryx2::response_mut_uninit::ResponseMutUninit;
+use zerocopy::{FromBytes, IntoBytes};
+
+pub(crate) type Svc = ipc_threadsafe::Service;
+pub(crate) type MailClient = Client<Svc, [u8], Header, Ack, ()>;
+pub(crate) type MailServer = Server<Svc, [u8], Header, Ack, ()>;
+pub(crate) type Blank = RequestMutUninit<Svc, [MaybeUninit<u8>], Header, Ack, ()>;
+pub(crate) type Filled = RequestMut<Svc, [u8], Header, Ack, ()>;
+pub(crate) type Pending = PendingResponse<Svc, [u8], Header, Ack, ()>;
+pub(crate) type Active = ActiveRequest<Svc, [u8], Header, Ack, ()>;
+pub(crate) type BlankAck = ResponseMutUninit<Svc, MaybeUninit<Ack>, ()>;
+
+/// Contents begin at multiples of this.
+pub(crate) const ALIGNMENT: usize = 8;
+
+/// The version of this layout. Another one is another type to iceoryx2, and refused there.
+const VERSION: u32 = 1;
+
+/// What stands in front of every parcel.
+///
+/// The payload behind it is: `start` bytes of nothing, so that the content is aligned; then the
+/// parcel's body.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, ZeroCopySend)]
+#[type_name("fipa-mail-header-1")]
+pub(crate) struct Header {
+    version: u32,
+    start: u32,
+    sender: u64,
+    token: u64,
+    parcel: [u8; HEADER_LEN],
+}
+
+impl Default for Header {
+    fn default() -> Self {
+        Self {
+            version: 0,
+            start: 0,
+            sender: 0,
+            token: 0,
+            parcel: [0; HEADER_LEN],
+        }
+    }
+}
+
+impl Header {
+    /// `token` comes back in the answer.
+    pub(crate) fn new(parcel: &ParcelHeader, start: u32, sender: Incarnation, token: u64) -> Self {
+        let mut bytes = [0; HEADER_LEN];
+        bytes.copy_from_slice(parcel.as_bytes());
+        Self {
+            version: VERSION,
+            start,
+            sender: sender.as_u64(),
+            token,
+            parcel: bytes,
+        }
+    }
+
+    pub(crate) fn sender(&self) -> Incarnation {
+        Incarnation::from_u64(self.sender)
+    }
+
+    pub(crate) fn token(&self) -> u64 {
+        self.token
+    }
+
+    pub(crate) fn start(&self) -> usize {
+        self.start as usize
+    }
+
+    /// The parcel's header, when this is one of ours.
+    pub(crate) fn parcel(&self) -> Option<ParcelHeader> {
+        if self.version != VERSION || !self.sender().is_known() {
+            return None;
+        }
+        ParcelHeader::read_from_bytes(&self.parcel).ok()
+    }
+}
+
+/// The answer to a parcel.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, ZeroCopySend)]
+#[type_name("fipa-mail-ack-1")]
+pub(crate) struct Ack {
+    code: u8,
+    reason: u8,
+    detail_len: u8,
+    reserved: [u8; 5],
+    token: u64,
+    last: u64,
+    detail: [u8; Answer::MAX_DETAIL],
+}
+
+const ACCEPTED: u8 = 1;
+const CUSTODY: u8 = 2;
+const BUSY: u8 = 3;
+const OUT_OF_ORDER: u8 = 4;
+const FAILED: u8 = 5;
+
+impl Ack {
+    /// The answer to the parcel with this token.
+    pub(crate) fn new(answer: &Answer, token: u64) -> Self {
+        let mut ack = Self {
+            code: 0,
+            reason: 0,
+            detail_len: 0,
+            reserved: [0; 5],
+            token,
+            last: 0,
+            detail: [0; Answer::MAX_DETAIL],
+        };
+        match answer {
+            Answer::Accepted => ack.code = ACCEPTED,
+            Answer::Custody => ack.code = CUSTODY,
+            Answer::Busy => ack.code = BUSY,
+            Answer::OutOfOrder { last } => {
+                ack.code = OUT_OF_ORDER;
+                ack.last = *last;
+            }
+            Answer::Failed { reason, detail } => {
+                ack.code = FAILED;
+                ack.reason = reason_code(*reason);
+                let detail = truncated(detail, Answer::MAX_DETAIL).as_bytes();
+                ack.detail[..detail.len()].copy_from_slice(detail);
+                ack.detail_len = detail.len() as u8;
+            }
+            // Answers that this version does not know: the sender learns that there was one.
+            _ => {}
+        }
+        ack
+    }
+
+    /// The answer, when it makes sense and is about the parcel with this token.
+    pub(crate) fn answer(&self, token: u64) -> Option<Answer> {
+        if self.token != token {
+            return None;
+        }
+        Some(match self.code {
+            ACCEPTED => Answer::Accepted,
+            CUSTODY => Answer::Custody,
+            BUSY => Answer::Busy,
+            OUT_OF_ORDER => Answer::OutOfOrder { last: self.last },
+            FAILED => {
+                let detail = self.detail.get(..usize::from(self.detail_len))?;
+                Answer::failed(
+                    reason_of_code(self.reason)?,
+                    String::from_utf8_lossy(detail),
+                )
+            }
+            _ => return None,
+        })
+    }
+}
+
+/// Where the pieces of a body lie in a payload.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Places {
+    pub(crate) start: usize,
+    pub(crate) content: usize,
+    pub(crate) tail: usize,
+    pub(crate) end: usize,
+}
+
+impl Places {
+    /// The places for pieces of these lengths, the content aligned. `None` when they are more
+    /// than memory can hold.
+    pub(crate) fn for_lengths(front: usize, content: usize, tail: usize) -> Option<Self> {
+        let at = front.checked_next_multiple_of(ALIGNMENT)?;
+        let tail_at = at.checked_add(content)?;
+        Some(Self {
+            start: at - front,
+            content: at,
+            tail: tail_at,
+            end: tail_at.checked_add(tail)?,
+        })
+    }
+
+    /// The places that a received header announces, when they fit a payload of this length.
+    pub(crate) fn announced(start: usize, parcel: &ParcelHeader, payload: usize) -> Option<Self> {
+        let front = usize::try_from(parcel.front_len()).ok()?;
+        let content_len = usize::try_from(parcel.content_len()).ok()?;
+        let body = usize::try_from(parcel.body_len()).ok()?;
+        let content = start.checked_add(front)?;
+        let tail = content.checked_add(content_len)?;
+        let end = start.checked_add(body)?;
+        (tail <= end && end <= payload).then_some(Self {
+            start,
+            content,
+            tail,
+            end,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use fipa_transport::FailureReason;
+
+    use super::*;
+
+    #[test]
+    fn answers_survive_and_foreign_ones_are_refused() {
+        let long = "é".repeat(200);
+        for answer in [
+            Answer::Accepted,
+            Answer::Custody,
+            Answer::Busy,
+            Answer::OutOfOrder { last: u64::MAX },
+            Answer::failed(FailureReason::Loop, "seen before"),
+        ] {
+            assert_eq!(Ack::new(&answer, 7).answer(7), Some(answer.clone()));
+            assert_eq!(Ack::new(&answer, 7).answer(8), None);
+        }
+        let cut = Ack::new(&Answer::failed(FailureReason::Refused, long), 1);
+        match cut.answer(1) {
+            Some(Answer::Failed { detail, .. }) => assert_eq!(detail, "é".repeat(80)),
+            other => panic!("{other:?}"),
+        }
+        for (code, reason, detail_len) in [(0, 0, 0), (9, 0, 0), (FAILED, 200, 0), (FAILED, 0, 255)]
+        {
+            let mut ack = Ack::new(&Answer::Accepted, 1);
+            (ack.code, ack.reason, ack.detail_len) = (code, reason, detail_len);
+            assert_eq!(ack.answer(1), None);
+        }
+    }
+
+    #[test]
+    fn places_are_aligned_and_bounded() {
+        let places = Places::for_lengths(13, 100, 1).expect("fits");
+        assert_eq!(
+            places,
+            Places {
+                start: 3,
+                content: 16,
+                tail: 116,
+                end: 117
+            }
+        );
+        assert_eq!(Places::for_lengths(usize::MAX, 1, 1), None);
+        assert_eq!(Places::for_lengths(8, usize::MAX, 1), None);
+    }
+}

@@ -1,0 +1,599 @@
+//! The sending side of one other process's mailbox.
+
+use std::collections::{HashMap, VecDeque};
+use std::ptr::NonNull;
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Weak};
+
+use bytes::Bytes;
+use fipa_transport::wire::{ParcelHeader, WireError};
+use fipa_transport::{AttemptId, Body, Conclusion, Incarnation, Parcel, WayError, WayFault};
+use iceoryx2::port::client::RequestSendError;
+use iceoryx2::port::{DegradationAction, LoanError};
+use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, PortFactory, ServiceName};
+use iceoryx2::service::builder::request_response::RequestResponseOpenError;
+use iceoryx2::service::port_factory::client::ClientCreateError;
+use parking_lot::Mutex;
+
+use crate::counters::{Tally, count};
+use crate::domain::Domain;
+use crate::layout::{ALIGNMENT, Ack, Blank, Filled, Header, MailClient, Pending, Places, Svc};
+use crate::loan::{Loan, ShmLoan};
+use crate::memory::{Budget, populate};
+
+/// Bytes of the first, small memory segment's chunks, headers included.
+const FIRST_CHUNK: usize = 4096;
+
+/// What creating a client and its connection takes at most, with a window of 128.
+const OPENING: u64 = 1 << 20;
+
+/// A client of another process's mailbox, and what was sent there and not answered yet.
+///
+/// # Memory
+/// A request's memory comes from segments that iceoryx2 makes larger ones of when needed, each
+/// with room for as many chunks as can be in use. Only pages that were asked for are written
+/// ([`populate`]): of a new segment those with the chunks' headers, which iceoryx2 writes, and of
+/// each chunk as far as it was ever used.
+///
+/// # Sending never takes memory back
+/// `RequestMut::send` drops the request when it fails, and the memory with it. That must not
+/// happen to loaned memory, which others read. With the settings chosen here it cannot fail:
+/// back-pressure is `DiscardData` without a handler and without overflow, so a full or closed
+/// mailbox is `Ok` with nobody reached; degradation is ignored; and the number of active requests
+/// is checked before. Should it ever fail all the same, [`Outbox::send_loan`] retires the outbox.
+#[derive(Debug)]
+pub(crate) struct Outbox {
+    client: MailClient,
+    own: Incarnation,
+    window: usize,
+    max_loans: usize,
+    chunks: usize,
+    state: Mutex<State>,
+    waiting: AtomicUsize,
+    loans: AtomicUsize,
+    retired: AtomicBool,
+    token: AtomicU64,
+    budget: Arc<Budget>,
+    tally: Arc<Tally>,
+    // After the client: the last of the process to go removes the domain's traces.
+    _domain: Arc<Domain>,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    queue: VecDeque<Sent>,
+    loans: HashMap<usize, Weak<Loan>>,
+    segment: Segment,
+}
+
+/// What is known of the current memory segment.
+#[derive(Debug, Default)]
+struct Segment {
+    /// Counts the segments.
+    number: u64,
+    /// Address of the first chunk.
+    base: usize,
+    /// Distance of chunks.
+    stride: usize,
+    /// Longest payload that fits a chunk.
+    room: usize,
+    /// By address of a payload, how many of its bytes have their pages.
+    ready: HashMap<usize, usize>,
+}
+
+#[derive(Debug)]
+struct Sent {
+    attempt: AttemptId,
+    token: u64,
+    memory: Memory,
+}
+
+#[derive(Debug)]
+enum Memory {
+    Own(Pending),
+    Loaned(Arc<Loan>),
+}
+
+/// What became of a dispatch.
+pub(crate) enum Posted {
+    /// It is in the mailbox.
+    Yes,
+    /// This outbox takes nothing any more.
+    Retired,
+}
+
+/// The shared parts that an outbox is opened with.
+pub(crate) struct Opening<'a> {
+    pub(crate) node: &'a Node<Svc>,
+    pub(crate) service: &'a ServiceName,
+    pub(crate) own: Incarnation,
+    pub(crate) max_loans: usize,
+    pub(crate) budget: Arc<Budget>,
+    pub(crate) tally: Arc<Tally>,
+    pub(crate) domain: Arc<Domain>,
+}
+
+impl Outbox {
+    pub(crate) fn open(opening: Opening<'_>) -> Result<Self, WayError> {
+        opening.budget.check(OPENING)?;
+        let _lock = opening
+            .domain
+            .lock_shared()
+            .map_err(|e| WayError::new(WayFault::Congested, e))?;
+        let service = opening
+            .node
+            .service_builder(opening.service)
+            .request_response::<[u8], Ack>()
+            .request_user_header::<Header>()
+            .open()
+            .map_err(open_error)?;
+        let settings = service.static_config();
+        let window = settings.max_active_requests_per_client();
+        let most_loans = settings.max_loaned_requests();
+        let client = service
+            .client_builder()
+            .initial_max_slice_len(FIRST_CHUNK - header_len())
+            .allocation_strategy(AllocationStrategy::PowerOfTwo)
+            .backpressure_strategy(BackpressureStrategy::DiscardData)
+            .set_request_degradation_handler(|_, _| DegradationAction::Ignore)
+            .set_response_degradation_handler(|_, _| DegradationAction::Ignore)
+            .create()
+            .map_err(create_error)?;
+        let start = getrandom::u64()
+            .map_err(|e| WayError::new(WayFault::Closed, format_args!("no random numbers: {e}")))?;
+        let outbox = Self {
+            client,
+            own: opening.own,
+            window,
+            // One is left for letters that were not loaned.
+            max_loans: opening
+                .max_loans
+                .min(most_loans.saturating_sub(1))
+                .min(window - 1),
+            chunks: 2 * window + most_loans,
+            state: Mutex::default(),
+            waiting: AtomicUsize::new(0),
+            loans: AtomicUsize::new(0),
+            retired: AtomicBool::new(false),
+            token: AtomicU64::new(start),
+            budget: opening.budget,
+            tally: opening.tally,
+            _domain: opening.domain,
+        };
+        // Takes the pages of the first segment.
+        drop(outbox.take(&mut outbox.state.lock(), 1)?);
+        Ok(outbox)
+    }
+
+    /// How many parcels have no answer yet.
+    pub(crate) fn waiting(&self) -> usize {
+        self.waiting.load(Ordering::Acquire)
+    }
+
+    /// Whether nothing would be lost by closing it.
+    pub(crate) fn is_idle(&self) -> bool {
+        self.waiting() == 0 && self.loans.load(Ordering::Acquire) == 0
+    }
+
+    /// From now on it takes no letters. What waits still waits.
+    pub(crate) fn retire(&self) {
+        // Under the lock that letters are put in under: when this returns, none is on its way.
+        let _state = self.state.lock();
+        self.retired.store(true, Ordering::Release);
+    }
+
+    pub(crate) fn is_retired(&self) -> bool {
+        self.retired.load(Ordering::Acquire)
+    }
+
+    /// Puts a parcel into the mailbox.
+    pub(crate) fn post(&self, attempt: AttemptId, parcel: &Parcel) -> Result<Posted, WayError> {
+        let (header, pieces) = ParcelHeader::of(parcel).map_err(wire_error)?;
+        let content = match &parcel.body {
+            Body::Letter(letter) => letter.payload().content.clone(),
+            _ => Bytes::new(),
+        };
+        let front = usize::try_from(header.front_len()).unwrap_or(usize::MAX);
+        let body: usize = pieces.iter().map(Bytes::len).sum();
+        let tail = body - front - content.len();
+        let places = Places::for_lengths(front, content.len(), tail).ok_or_else(too_large)?;
+        let token = self.token.fetch_add(1, Ordering::Relaxed);
+
+        let mut state = self.state.lock();
+        if self.is_retired() {
+            return Ok(Posted::Retired);
+        }
+        if let Some(loan) = self.loan_of(&mut state, &content) {
+            let fits = loan.has_room(front, tail) && loan.segment == state.segment.number;
+            match fits
+                .then(|| self.ready_loan(&state, &loan))
+                .transpose()?
+                .flatten()
+            {
+                Some(blank) => {
+                    let start = loan.front() - front;
+                    let header = Header::new(&header, offset(start)?, self.own, token);
+                    if !self.send_loan(&loan, blank, header, start, &pieces, &content)? {
+                        return Ok(Posted::Retired);
+                    }
+                    count(&self.tally.loans_sent);
+                    self.queue(&mut state, attempt, token, Memory::Loaned(loan));
+                    return Ok(Posted::Yes);
+                }
+                None => count(&self.tally.loans_copied),
+            }
+        }
+        let mut blank = self.take(&mut state, places.end)?;
+        *blank.user_header_mut() = Header::new(&header, offset(places.start)?, self.own, token);
+        let payload = NonNull::from(blank.payload_mut()).cast();
+        // SAFETY: the pieces are as long as `places.end - places.start` says (they are what the
+        // places were computed from), and the payload has `places.end` bytes. Nothing refers to
+        // the payload of a request just taken.
+        unsafe { write(payload, places.start, &pieces) };
+        // SAFETY: all bytes from `start` on were just written, and those before are memory of a
+        // shared mapping, filled by the kernel or by earlier requests.
+        let filled = unsafe { blank.assume_init() };
+        let pending = filled.send().map_err(send_error)?;
+        if pending.number_of_server_connections() == 0 {
+            return Err(self.nobody_reached(&pending));
+        }
+        self.queue(&mut state, attempt, token, Memory::Own(pending));
+        Ok(Posted::Yes)
+    }
+
+    fn queue(&self, state: &mut State, attempt: AttemptId, token: u64, memory: Memory) {
+        state.queue.push_back(Sent {
+            attempt,
+            token,
+            memory,
+        });
+        self.waiting.store(state.queue.len(), Ordering::Release);
+    }
+
+    fn nobody_reached(&self, pending: &Pending) -> WayError {
+        if pending.is_connected() {
+            WayError::new(
+                WayFault::Congested,
+                "the mailbox of the other process is full",
+            )
+        } else {
+            WayError::new(
+                WayFault::Unreachable,
+                "the other process has closed its mailbox",
+            )
+        }
+    }
+
+    /// The loan that this is the content of.
+    fn loan_of(&self, state: &mut State, content: &Bytes) -> Option<Arc<Loan>> {
+        if content.is_empty() || state.loans.is_empty() {
+            return None;
+        }
+        let loan = state.loans.get(&(content.as_ptr() as usize))?.upgrade()?;
+        loan.is(content).then_some(loan)
+    }
+
+    /// Takes the request out of a loan if it can be sent now for certain.
+    fn ready_loan(&self, state: &State, loan: &Loan) -> Result<Option<Blank>, WayError> {
+        let kept = |loan: &Weak<Loan>| {
+            loan.upgrade()
+                .is_some_and(|loan| loan.is_kept_after_sending())
+        };
+        let active = state.queue.len() + state.loans.values().filter(|loan| kept(loan)).count();
+        if active >= self.window {
+            return Err(window_full(self.window));
+        }
+        Ok(loan.take())
+    }
+
+    /// Sends loaned memory. `false` when iceoryx2 refuses against all expectation, and has taken
+    /// the memory back. Others may still read it, so this outbox then loans nothing any more:
+    /// nobody overwrites the memory, no larger segment replaces the one it lies in (which is the
+    /// current one: the caller has made sure), and the loan keeps the outbox with the segment.
+    fn send_loan(
+        &self,
+        loan: &Arc<Loan>,
+        mut blank: Blank,
+        header: Header,
+        start: usize,
+        pieces: &[Bytes],
+        content: &Bytes,
+    ) -> Result<bool, WayError> {
+        *blank.user_header_mut() = header;
+        let behind = content.as_ptr() as usize + content.len() - loan.payload().as_ptr() as usize;
+        let (front, tail) = around(pieces, content);
+        // SAFETY: the loan has room for the front (which ends where the content begins) and for
+        // the tail, as the caller has checked. Neither range overlaps the content, which is all
+        // that anybody else refers to, and whoever has taken the request is the only one to write
+        // to them.
+        unsafe { write(loan.payload(), start, front) };
+        // SAFETY: as above.
+        unsafe { write(loan.payload(), behind, tail) };
+        // SAFETY: front, content and tail are written; the rest is memory of a shared mapping.
+        let filled: Filled = unsafe { blank.assume_init() };
+        match filled.send() {
+            Ok(pending) if pending.number_of_server_connections() > 0 => {
+                loan.sent(pending);
+                loan.queued.store(true, Ordering::Relaxed);
+                Ok(true)
+            }
+            Ok(pending) => {
+                let error = self.nobody_reached(&pending);
+                loan.sent(pending);
+                Err(error)
+            }
+            Err(_) => {
+                self.retired.store(true, Ordering::Release);
+                Ok(false)
+            }
+        }
+    }
+
+    /// Loans memory for content of this length.
+    pub(crate) fn loan(
+        self: &Arc<Self>,
+        head_room: usize,
+        len: usize,
+        tail_room: usize,
+    ) -> Result<ShmLoan, WayError> {
+        let places = Places::for_lengths(head_room, len, tail_room).ok_or_else(too_large)?;
+        let mut state = self.state.lock();
+        if self.is_retired() {
+            return Err(retired());
+        }
+        if self.loans.load(Ordering::Acquire) >= self.max_loans {
+            return Err(WayError::new(
+                WayFault::Congested,
+                format_args!(
+                    "{} loans to this process are out already: send or drop one, or raise max_loans",
+                    self.max_loans
+                ),
+            ));
+        }
+        let blank = self.take(&mut state, places.end)?;
+        self.loans.fetch_add(1, Ordering::AcqRel);
+        let loan = Loan::new(
+            blank,
+            places.content,
+            len,
+            state.segment.number,
+            self.clone(),
+        );
+        Ok(ShmLoan(Arc::new(loan)))
+    }
+
+    /// From now on the content of this loan is recognised.
+    pub(crate) fn register(&self, loan: &Arc<Loan>) {
+        let mut state = self.state.lock();
+        state.loans.retain(|_, loan| loan.strong_count() > 0);
+        state.loans.insert(loan.address(), Arc::downgrade(loan));
+    }
+
+    pub(crate) fn loan_ended(&self) {
+        self.loans.fetch_sub(1, Ordering::AcqRel);
+    }
+
+    /// A request with a payload of this length, all of whose pages are there.
+    fn take(&self, state: &mut State, len: usize) -> Result<Blank, WayError> {
+        let segment = &mut state.segment;
+        let grows = len > segment.room;
+        if grows {
+            let headers = self.chunks.saturating_mul(FIRST_CHUNK) as u64;
+            self.budget.check((len as u64).saturating_add(headers))?;
+        }
+        let mut blank = self.client.loan_slice_uninit(len).map_err(loan_error)?;
+        let chunk = std::ptr::from_ref(blank.header()) as usize;
+        let payload = blank.payload_mut().as_ptr().cast::<u8>();
+        let head = payload as usize - chunk;
+        let known = !grows
+            && chunk >= segment.base
+            && (chunk - segment.base).is_multiple_of(segment.stride)
+            && (chunk - segment.base) / segment.stride < self.chunks;
+        if !known {
+            segment.number += 1;
+            segment.base = chunk;
+            segment.stride = (head + len).max(FIRST_CHUNK).next_power_of_two();
+            segment.room = segment.stride - head;
+            segment.ready.clear();
+            for number in 0..self.chunks {
+                let header = segment.base + number * segment.stride;
+                populate(header as *const u8, head)?;
+            }
+        }
+        let ready = segment.ready.entry(payload as usize).or_insert(0);
+        if *ready < len {
+            let missing = len - *ready;
+            if missing > 2 * FIRST_CHUNK && !grows {
+                self.budget.check(missing as u64)?;
+            }
+            populate(payload.wrapping_add(*ready), missing)?;
+            *ready = len;
+        }
+        Ok(blank)
+    }
+
+    /// Takes the answers that are there. `ended` says that the other process is gone, so that no
+    /// further answer comes.
+    pub(crate) fn collect(&self, ended: bool, concluded: &mut Vec<(AttemptId, Conclusion)>) {
+        if self.waiting() == 0 {
+            return;
+        }
+        let mut done = Vec::new();
+        {
+            let mut state = self.state.lock();
+            // The receiver answers in order, or drops what it does not answer.
+            while let Some(sent) = state.queue.front() {
+                let Some(conclusion) = sent.conclusion(ended) else {
+                    break;
+                };
+                let sent = state.queue.pop_front();
+                done.extend(sent.map(|sent| (sent, conclusion)));
+            }
+            self.waiting.store(state.queue.len(), Ordering::Release);
+        }
+        // Dropped only here: the last owner of a letter may be among them.
+        for (sent, conclusion) in done {
+            sent.forget();
+            concluded.push((sent.attempt, conclusion));
+        }
+    }
+
+    /// Forgets an attempt, and says whether it was here.
+    pub(crate) fn abandon(&self, attempt: AttemptId) -> bool {
+        if self.waiting() == 0 {
+            return false;
+        }
+        let mut state = self.state.lock();
+        let place = state.queue.iter().position(|sent| sent.attempt == attempt);
+        let sent = place.and_then(|place| state.queue.remove(place));
+        self.waiting.store(state.queue.len(), Ordering::Release);
+        drop(state);
+        sent.inspect(Sent::forget).is_some()
+    }
+}
+
+impl Sent {
+    fn conclusion(&self, ended: bool) -> Option<Conclusion> {
+        let look = |pending: &Pending| self.conclusion_of(pending, ended);
+        match &self.memory {
+            Memory::Own(pending) => look(pending),
+            Memory::Loaned(loan) => loan.with_pending(look).flatten(),
+        }
+    }
+
+    fn conclusion_of(&self, pending: &Pending, ended: bool) -> Option<Conclusion> {
+        let broken = |detail: String| {
+            Some(Conclusion::Unconfirmed(WayError::new(
+                WayFault::Broken,
+                detail,
+            )))
+        };
+        // Asked before the answer is looked for: an answer that came in between is found then.
+        let connected = pending.is_connected();
+        match pending.receive() {
+            Ok(Some(ack)) => Some(match ack.answer(self.token) {
+                Some(answer) => Conclusion::Answered(answer),
+                None => Conclusion::Unconfirmed(WayError::new(
+                    WayFault::Incompatible,
+                    "the answer makes no sense",
+                )),
+            }),
+            Ok(None) if ended => broken("the other process ended before it answered".into()),
+            Ok(None) if !connected => broken("the other process dropped it unanswered".into()),
+            Ok(None) => None,
+            Err(e) => broken(format!("the answer cannot be received: {e:?}")),
+        }
+    }
+
+    fn forget(&self) {
+        if let Memory::Loaned(loan) = &self.memory {
+            loan.queued.store(false, Ordering::Relaxed);
+        }
+    }
+}
+
+/// Writes pieces behind each other, `at` bytes behind `start`.
+///
+/// # Safety
+/// There must be room, and nothing else may refer to it.
+unsafe fn write(start: NonNull<u8>, at: usize, pieces: &[Bytes]) {
+    let mut at = at;
+    for piece in pieces {
+        let place = start.as_ptr().wrapping_add(at);
+        // SAFETY: the caller vouches for the room; a piece is not in it, because nothing else
+        // refers to it.
+        unsafe { place.copy_from_nonoverlapping(piece.as_ptr(), piece.len()) };
+        at += piece.len();
+    }
+}
+
+/// The pieces in front of the content and those behind it.
+fn around<'a>(pieces: &'a [Bytes], content: &Bytes) -> (&'a [Bytes], &'a [Bytes]) {
+    let place = pieces
+        .iter()
+        .position(|piece| piece.as_ptr() == content.as_ptr() && piece.len() == content.len());
+    match place {
+        Some(place) => (&pieces[..place], &pieces[place + 1..]),
+        None => (pieces, &[]),
+    }
+}
+
+/// iceoryx2's header, ours, and the payload's alignment.
+fn header_len() -> usize {
+    use iceoryx2::service::header::request_response::RequestHeader;
+    (size_of::<RequestHeader>() + size_of::<Header>()).next_multiple_of(ALIGNMENT)
+}
+
+fn offset(start: usize) -> Result<u32, WayError> {
+    u32::try_from(start).map_err(|_| too_large())
+}
+
+fn too_large() -> WayError {
+    WayError::new(WayFault::TooLarge, "")
+}
+
+fn retired() -> WayError {
+    WayError::new(WayFault::Congested, "the connection is being renewed")
+}
+
+fn window_full(window: usize) -> WayError {
+    WayError::new(
+        WayFault::Congested,
+        format_args!("{window} letters to this process are without an answer"),
+    )
+}
+
+fn wire_error(error: WireError) -> WayError {
+    let fault = match error {
+        WireError::BodyLength { .. } => WayFault::TooLarge,
+        _ => WayFault::Refused,
+    };
+    WayError::new(fault, error)
+}
+
+fn open_error(error: RequestResponseOpenError) -> WayError {
+    use RequestResponseOpenError as E;
+    let fault = match error {
+        E::DoesNotExist | E::IsMarkedForDestruction => WayFault::Unreachable,
+        E::ExceedsMaxNumberOfNodes => WayFault::Congested,
+        E::IncompatibleRequestOrResponseType
+        | E::IncompatibleAttributes
+        | E::IncompatibleMessagingPattern => WayFault::Incompatible,
+        _ => WayFault::Unreachable,
+    };
+    WayError::new(
+        fault,
+        format_args!("the mailbox cannot be opened: {error:?}"),
+    )
+}
+
+fn create_error(error: ClientCreateError) -> WayError {
+    let hint = match error {
+        ClientCreateError::ExceedsMaxSupportedClients => {
+            ": too many processes have it open (max_clients of the other process)"
+        }
+        _ => ": often the limit of open files is too low, or shared memory is full",
+    };
+    WayError::new(
+        WayFault::Congested,
+        format_args!("the mailbox cannot be connected to ({error:?}){hint}"),
+    )
+}
+
+fn loan_error(error: LoanError) -> WayError {
+    let hint = match error {
+        LoanError::ExceedsMaxLoans => "too many letters are with this process",
+        _ => "no shared memory could be had: enlarge /dev/shm, or raise the limit of open files",
+    };
+    WayError::new(WayFault::Congested, format_args!("{hint} ({error:?})"))
+}
+
+fn send_error(error: RequestSendError) -> WayError {
+    let hint = match error {
+        RequestSendError::ExceedsMaxActiveRequests => {
+            "too many letters to this process are without an answer"
+        }
+        _ => "the mailbox does not take it",
+    };
+    WayError::new(WayFault::Congested, format_args!("{hint} ({error:?})"))
+}

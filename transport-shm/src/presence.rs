@@ -1,0 +1,361 @@
+//! How processes wake each other, and notice each other's end.
+//!
+//! Every process has three files of its own, named after its incarnation:
+//! * `live`, a FIFO that it keeps open for writing. Whoever has it open for reading is told by the
+//!   kernel when the last writer ends, however it ends. Nothing is ever written to it.
+//! * `bell`, a FIFO that it reads. A byte means: look into your mailbox, and after your answers.
+//! * a page of shared memory that says whether it is looking already, so that nobody needs to
+//!   ring. The page and the bell work together as described at [`Presence::look`].
+
+use std::fs::File;
+use std::io::{self, ErrorKind, Read, Write};
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering, fence};
+
+use fipa_transport::Incarnation;
+use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
+use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
+use tokio::io::Interest;
+use tokio::io::unix::AsyncFd;
+
+use crate::memory::SHM;
+
+const PAGE_LEN: usize = 4096;
+
+/// Names of the files of processes.
+#[derive(Debug, Clone)]
+pub(crate) struct Names {
+    directory: PathBuf,
+    prefix: String,
+}
+
+impl Names {
+    pub(crate) fn new(root: &Path, prefix: &str) -> Self {
+        Self {
+            directory: root.join("processes"),
+            prefix: format!("{prefix}_"),
+        }
+    }
+
+    pub(crate) fn directory(&self) -> &Path {
+        &self.directory
+    }
+
+    pub(crate) fn live(&self, of: Incarnation) -> PathBuf {
+        self.directory.join(format!("{}{of}.live", self.prefix))
+    }
+
+    pub(crate) fn bell(&self, of: Incarnation) -> PathBuf {
+        self.directory.join(format!("{}{of}.bell", self.prefix))
+    }
+
+    pub(crate) fn page(&self, of: Incarnation) -> PathBuf {
+        Path::new(SHM).join(format!("{}{of}.page", self.prefix))
+    }
+
+    pub(crate) fn remove(&self, of: Incarnation) {
+        // What is not there need not be removed, and `live` goes last: as long as it is there,
+        // whoever cleans up comes back for the others.
+        for path in [self.page(of), self.bell(of), self.live(of)] {
+            let _ = std::fs::remove_file(path);
+        }
+    }
+
+    /// The processes that have files here.
+    pub(crate) fn all(&self) -> io::Result<Vec<Incarnation>> {
+        let mut found = Vec::new();
+        for directory in [self.directory.as_path(), Path::new(SHM)] {
+            let files = match std::fs::read_dir(directory) {
+                Ok(files) => files,
+                Err(e) if e.kind() == ErrorKind::NotFound => continue,
+                Err(e) => return Err(e),
+            };
+            for file in files {
+                let name = file?.file_name();
+                let incarnation: Option<Incarnation> = name
+                    .to_str()
+                    .and_then(|name| name.strip_prefix(&self.prefix))
+                    .and_then(|name| name.split_once('.'))
+                    .filter(|(_, kind)| matches!(*kind, "live" | "bell" | "page"))
+                    .and_then(|(digits, _)| digits.parse().ok());
+                found.extend(incarnation);
+            }
+        }
+        found.sort_unstable();
+        found.dedup();
+        Ok(found)
+    }
+
+    /// Whether this process is there. To be asked under the domain's lock, or of a process that
+    /// is known to have been there.
+    pub(crate) fn is_alive(&self, of: Incarnation) -> bool {
+        open_live(&self.live(of)).is_ok_and(|live| !has_ended(&live))
+    }
+
+    /// Wakes a process without keeping anything open.
+    pub(crate) fn ring_once(&self, of: Incarnation) {
+        if let Ok(bell) = open_bell(&self.bell(of)) {
+            ring(&bell);
+        }
+    }
+}
+
+/// This process, as others see it.
+#[derive(Debug)]
+pub(crate) struct Presence {
+    names: Names,
+    own: Incarnation,
+    bell: Arc<Bell>,
+    page: Page,
+    // Last: the other files are there as long as this one is open.
+    _live: File,
+}
+
+impl Presence {
+    /// Makes the files. To be called under the domain's lock.
+    pub(crate) fn create(names: Names, own: Incarnation) -> io::Result<Self> {
+        let created = Self::create_files(&names, own);
+        if created.is_err() {
+            names.remove(own);
+        }
+        created
+    }
+
+    fn create_files(names: &Names, own: Incarnation) -> io::Result<Self> {
+        let private = Mode::RUSR | Mode::WUSR;
+        let live = names.live(own);
+        mknodat(CWD, &live, FileType::Fifo, private, 0)?;
+        let _live = fifo(true).open(&live)?;
+        let bell = names.bell(own);
+        mknodat(CWD, &bell, FileType::Fifo, private, 0)?;
+        let bell = open_bell(&bell)?;
+        let mut page = File::options()
+            .read(true)
+            .write(true)
+            .create_new(true)
+            .mode(0o600)
+            .open(names.page(own))?;
+        // Written, not just made longer: a full file system is an error here, and not a signal
+        // later.
+        page.write_all(&[0; PAGE_LEN])?;
+        Ok(Self {
+            names: names.clone(),
+            own,
+            bell: Arc::new(Bell(bell)),
+            page: Page::map(&page, ProtFlags::READ | ProtFlags::WRITE)?,
+            _live,
+        })
+    }
+
+    pub(crate) fn bell(&self) -> &Arc<Bell> {
+        &self.bell
+    }
+
+    /// Looks, through `work`, without others having to ring meanwhile.
+    ///
+    /// Whoever has put something where `work` looks then reads the page, and rings if nobody is
+    /// looking ([`Neighbour::wake`]). Between their write and read, and between our write and last
+    /// look, stands a sequentially consistent fence: so either they see that nobody looks, and
+    /// ring, or the last look finds what they put there.
+    pub(crate) fn look(&self, mut work: impl FnMut() -> bool) -> bool {
+        let lookers = self.page.lookers();
+        lookers.fetch_add(1, Ordering::SeqCst);
+        // Several times, so that in a caller's loop the page says "looking" most of the time.
+        let mut found = false;
+        for _ in 0..LOOKS {
+            found = work();
+            if found {
+                break;
+            }
+            std::hint::spin_loop();
+        }
+        lookers.fetch_sub(1, Ordering::SeqCst);
+        fence(Ordering::SeqCst);
+        work() || found
+    }
+}
+
+/// How often [`Presence::look`] looks: a microsecond or two.
+const LOOKS: usize = 8;
+
+/// How often [`Neighbour::wake`] reads the page before it rings: a few hundred nanoseconds.
+const GLANCES: usize = 256;
+
+impl Drop for Presence {
+    fn drop(&mut self) {
+        self.names.remove(self.own);
+    }
+}
+
+/// The FIFO that is read by its process and written by others.
+#[derive(Debug)]
+pub(crate) struct Bell(File);
+
+impl Bell {
+    /// Takes all bytes out; `WouldBlock` when there are none.
+    pub(crate) fn silence(&self) -> io::Result<()> {
+        let mut bytes = [0; 512];
+        match (&self.0).read(&mut bytes)? {
+            0 => Err(ErrorKind::WouldBlock.into()),
+            _ => Ok(()),
+        }
+    }
+
+    pub(crate) fn ring(&self) {
+        ring(&self.0);
+    }
+}
+
+impl AsFd for Bell {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.0.as_fd()
+    }
+}
+
+/// A shared descriptor that tokio waits for.
+#[derive(Debug)]
+pub(crate) struct Watched<T>(Arc<T>);
+
+impl<T: AsFd> Watched<T> {
+    /// To be called in the context of a runtime.
+    pub(crate) fn readable(shared: Arc<T>) -> io::Result<AsyncFd<Self>> {
+        // SAFETY: an `AsFd` of this crate (a `Bell` or an `OwnedFd`) always lends the same
+        // descriptor, which it owns and does not close before it is dropped; the `Arc` keeps it.
+        let registered =
+            unsafe { AsyncFd::register_with_interest(Self(shared), Interest::READABLE) };
+        registered.map_err(Into::into)
+    }
+
+    pub(crate) fn get(&self) -> &T {
+        &self.0
+    }
+}
+
+impl<T: AsFd> AsRawFd for Watched<T> {
+    fn as_raw_fd(&self) -> RawFd {
+        self.0.as_fd().as_raw_fd()
+    }
+}
+
+/// Another process, as this one sees it.
+#[derive(Debug)]
+pub(crate) struct Neighbour {
+    live: Arc<OwnedFd>,
+    bell: File,
+    page: Page,
+}
+
+impl Neighbour {
+    /// Opens the files of a process; `NotFound` when it is not there.
+    pub(crate) fn open(names: &Names, of: Incarnation) -> io::Result<Self> {
+        let live = open_live(&names.live(of))?;
+        if has_ended(&live) {
+            return Err(ErrorKind::NotFound.into());
+        }
+        let page = File::open(names.page(of))?;
+        if page.metadata()?.len() < PAGE_LEN as u64 {
+            return Err(io::Error::new(
+                ErrorKind::InvalidData,
+                "the page is too short",
+            ));
+        }
+        Ok(Self {
+            live: Arc::new(live.into()),
+            bell: open_bell(&names.bell(of))?,
+            page: Page::map(&page, ProtFlags::READ)?,
+        })
+    }
+
+    /// What becomes readable when the process ends.
+    pub(crate) fn live(&self) -> &Arc<OwnedFd> {
+        &self.live
+    }
+
+    /// Makes the process look, unless it is looking. Says whether the bell was rung.
+    pub(crate) fn wake(&self) -> bool {
+        fence(Ordering::SeqCst);
+        // For a moment, because who has just sent something may be about to look for the answer,
+        // and a bell costs both sides more than that moment.
+        for _ in 0..GLANCES {
+            if self.page.lookers().load(Ordering::SeqCst) != 0 {
+                return false;
+            }
+        }
+        ring(&self.bell);
+        true
+    }
+}
+
+/// Whether all writers of a FIFO are gone.
+pub(crate) fn has_ended(live: impl AsFd) -> bool {
+    let mut byte = [0];
+    // Nobody writes, so there is either nothing yet (an error) or nothing any more.
+    matches!(rustix::io::read(live, &mut byte), Ok(0))
+}
+
+fn fifo(write: bool) -> std::fs::OpenOptions {
+    let mut options = File::options();
+    options
+        .read(true)
+        .write(write)
+        .custom_flags((OFlags::NONBLOCK | OFlags::NOFOLLOW).bits() as i32);
+    options
+}
+
+fn open_live(path: &Path) -> io::Result<File> {
+    fifo(false).open(path)
+}
+
+/// For reading too, also by those who ring: then there is always a reader, and no SIGPIPE.
+fn open_bell(path: &Path) -> io::Result<File> {
+    fifo(true).open(path)
+}
+
+fn ring(mut bell: &File) {
+    // A full FIFO has been rung often enough.
+    let _ = bell.write(&[1]);
+}
+
+/// A mapped page: how many threads of a process are looking.
+#[derive(Debug)]
+struct Page(*mut AtomicU32);
+
+// SAFETY: the page is memory of this process's address space, not of a thread, and is only
+// accessed atomically.
+unsafe impl Send for Page {}
+// SAFETY: as above.
+unsafe impl Sync for Page {}
+
+impl Page {
+    fn map(file: &File, protection: ProtFlags) -> io::Result<Self> {
+        // SAFETY: the kernel chooses where to map, so no memory in use is touched.
+        let start = unsafe {
+            mmap(
+                std::ptr::null_mut(),
+                PAGE_LEN,
+                protection,
+                MapFlags::SHARED,
+                file,
+                0,
+            )
+        }?;
+        Ok(Self(start.cast()))
+    }
+
+    fn lookers(&self) -> &AtomicU32 {
+        // SAFETY: the mapping lives as long as self, is aligned to a page, and every process
+        // accesses this word atomically only. Neighbours map it for reading and only load.
+        unsafe { &*self.0 }
+    }
+}
+
+impl Drop for Page {
+    fn drop(&mut self) {
+        // SAFETY: mapped by `map` with this length, and nothing refers to it any more: `lookers`
+        // lends for the life of self only.
+        let _ = unsafe { munmap(self.0.cast(), PAGE_LEN) };
+    }
+}

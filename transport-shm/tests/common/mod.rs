@@ -1,0 +1,189 @@
+//! What the tests share: a domain of their own, endpoints, and a sink that remembers.
+
+// Every test binary uses a part of this.
+#![allow(dead_code)]
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on says so")]
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use fipa_acl::{Letter, Payload};
+use fipa_transport::{
+    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel, Sink,
+    Stream, Transport, Verdict,
+};
+use fipa_transport_shm::{ShmConfig, ShmTransport};
+use std::sync::Mutex;
+use tokio::runtime::Runtime;
+
+/// A domain of its own, removed in the end.
+pub(crate) struct Place {
+    pub(crate) directory: tempfile::TempDir,
+    pub(crate) prefix: String,
+    pub(crate) runtime: Runtime,
+}
+
+impl Place {
+    pub(crate) fn new() -> Self {
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()
+            .unwrap();
+        Self {
+            directory: tempfile::tempdir().unwrap(),
+            prefix: format!("fipatest-{}", Incarnation::random()),
+            runtime,
+        }
+    }
+
+    pub(crate) fn config(&self) -> ShmConfig {
+        let root = self.directory.path().join("domain");
+        ShmConfig::new(root, &self.prefix, Incarnation::random())
+    }
+
+    pub(crate) fn endpoint(&self) -> ShmTransport {
+        self.endpoint_with(self.config())
+    }
+
+    pub(crate) fn endpoint_with(&self, config: ShmConfig) -> ShmTransport {
+        ShmTransport::new(config, self.runtime.handle().clone()).unwrap()
+    }
+
+    /// An endpoint that listens, with what it was told.
+    pub(crate) fn listening(&self) -> (Arc<ShmTransport>, Arc<Told>) {
+        self.listening_with(self.config())
+    }
+
+    pub(crate) fn listening_with(&self, config: ShmConfig) -> (Arc<ShmTransport>, Arc<Told>) {
+        let endpoint = Arc::new(self.endpoint_with(config));
+        let told = Arc::new(Told::default());
+        endpoint.listen(told.clone()).unwrap();
+        (endpoint, told)
+    }
+
+    /// All files of this domain.
+    pub(crate) fn traces(&self) -> Vec<String> {
+        traces(self.directory.path(), &self.prefix)
+    }
+}
+
+pub(crate) fn traces(root: &Path, prefix: &str) -> Vec<String> {
+    let mut found = Vec::new();
+    let mut directories = vec![root.to_owned()];
+    while let Some(directory) = directories.pop() {
+        for entry in std::fs::read_dir(&directory)
+            .into_iter()
+            .flatten()
+            .flatten()
+        {
+            if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+                directories.push(entry.path());
+            } else {
+                found.push(entry.path().display().to_string());
+            }
+        }
+    }
+    for entry in std::fs::read_dir("/dev/shm").unwrap().flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        if name.starts_with(prefix) {
+            found.push(format!("/dev/shm/{name}"));
+        }
+    }
+    found
+}
+
+pub(crate) fn location_of(incarnation: Incarnation) -> Location {
+    Location::new(Kind::Shm, &incarnation.to_string())
+        .unwrap()
+        .with_incarnation(incarnation)
+}
+
+/// A sink that accepts everything and remembers what it was told.
+#[derive(Default)]
+pub(crate) struct Told {
+    pub(crate) arrived: Mutex<Vec<(Parcel, Hop)>>,
+    pub(crate) concluded: Mutex<Vec<(AttemptId, Conclusion)>>,
+}
+
+impl Sink for Told {
+    fn arrived(&self, arrival: Arrival) -> Verdict {
+        let mut arrived = self.arrived.lock().unwrap();
+        arrived.push((arrival.parcel, arrival.from));
+        Verdict::Now(Answer::Accepted)
+    }
+
+    fn arrived_unframed(&self, _letter: Letter, _via: Kind) {
+        panic!("shared memory has no letters without a frame");
+    }
+
+    fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {
+        self.concluded.lock().unwrap().push((attempt, conclusion));
+    }
+}
+
+impl Told {
+    pub(crate) fn arrivals(&self) -> usize {
+        self.arrived.lock().unwrap().len()
+    }
+
+    pub(crate) fn conclusions(&self) -> usize {
+        self.concluded.lock().unwrap().len()
+    }
+
+    pub(crate) fn conclusion_of(&self, attempt: AttemptId) -> Option<Conclusion> {
+        let concluded = self.concluded.lock().unwrap();
+        let found = concluded.iter().find(|(one, _)| *one == attempt);
+        found.map(|(_, conclusion)| conclusion.clone())
+    }
+
+    /// The content of the letter that arrived at this place.
+    pub(crate) fn content(&self, place: usize) -> Bytes {
+        match &self.arrived.lock().unwrap()[place].0.body {
+            Body::Letter(letter) => letter.payload().content.clone(),
+            other => panic!("{other:?}"),
+        }
+    }
+}
+
+/// Waits for something that must happen.
+pub(crate) fn wait_for(what: &str, mut condition: impl FnMut() -> bool) {
+    let begin = Instant::now();
+    while !condition() {
+        assert!(begin.elapsed() < Duration::from_secs(60), "no {what}");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+pub(crate) fn attempt() -> AttemptId {
+    static NEXT: AtomicU64 = AtomicU64::new(1);
+    AttemptId(NEXT.fetch_add(1, Ordering::Relaxed))
+}
+
+/// A letter whose content is split off.
+pub(crate) fn parcel(content: Bytes) -> Parcel {
+    let payload = Payload {
+        head: Bytes::from_static(b"message up to its content"),
+        content,
+        tail: Bytes::from_static(b"\x01"),
+    };
+    Parcel {
+        receiver: "arm_left".into(),
+        stream: Stream {
+            sender: Incarnation::from_u64(1),
+            receiver: Incarnation::from_u64(2),
+        },
+        sequence: 1,
+        after: 0,
+        remaining: Duration::from_secs(5),
+        hops: 0,
+        body: Body::Letter(Letter::new(Bytes::from_static(b"envelope"), payload)),
+    }
+}
+
+/// Length of everything in front of the content of [`parcel`].
+pub(crate) const FRONT: usize =
+    "arm_left".len() + "envelope".len() + "message up to its content".len();

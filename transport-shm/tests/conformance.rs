@@ -1,0 +1,23 @@
+//! The rules of every transport.
+
+mod common;
+
+use std::sync::Arc;
+
+use common::Place;
+use fipa_transport::conformance::Fixture;
+use fipa_transport::{Incarnation, Location, Transport};
+
+struct Shm(Place);
+
+impl Fixture for Shm {
+    fn endpoint(&self) -> Arc<dyn Transport> {
+        Arc::new(self.0.endpoint())
+    }
+
+    fn nowhere(&self) -> Location {
+        common::location_of(Incarnation::random())
+    }
+}
+
+fipa_transport::conformance_tests!(Shm(Place::new()));

@@ -1,0 +1,143 @@
+//! An endpoint's life: opening, driving, closing.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on says so")]
+
+mod common;
+
+use std::os::unix::fs::PermissionsExt;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use bytes::Bytes;
+use common::{Place, attempt, parcel, wait_for};
+use fipa_transport::{Incarnation, Transport, WayFault};
+use fipa_transport_shm::{ShmConfig, ShmError, ShmTransport};
+
+#[test]
+fn nothing_is_left_behind() {
+    let place = Place::new();
+    let (one, told) = place.listening();
+    let (other, got) = place.listening();
+    one.dispatch(attempt(), &other.location(), parcel(vec![1; 9000].into()))
+        .unwrap();
+    wait_for("answer", || told.conclusions() == 1);
+    assert!(!place.traces().is_empty());
+    // Content that is held keeps what it lies in.
+    got.arrived.lock().unwrap().clear();
+    one.close();
+    other.close();
+    assert_eq!(place.traces(), Vec::<String>::new());
+    one.close();
+}
+
+#[test]
+fn domains_do_not_meet() {
+    let (here, there) = (Place::new(), Place::new());
+    let (one, _) = here.listening();
+    let (other, _) = there.listening();
+    let refused = one
+        .dispatch(attempt(), &other.location(), parcel(Bytes::new()))
+        .unwrap_err();
+    assert_eq!(refused.fault, WayFault::Unreachable);
+}
+
+#[test]
+fn many_threads_drive_one_endpoint() {
+    let place = Place::new();
+    let (one, told) = place.listening();
+    let (other, got) = place.listening();
+    let done = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        for endpoint in [&one, &one, &other, &other] {
+            scope.spawn(|| {
+                while !done.load(Ordering::Relaxed) {
+                    endpoint.drive();
+                }
+            });
+        }
+        for number in 0..2000 {
+            let mut parcel = parcel(Bytes::new());
+            parcel.sequence = number + 1;
+            // Full at times.
+            wait_for("room", || {
+                one.dispatch(attempt(), &other.location(), parcel.clone())
+                    .is_ok()
+            });
+        }
+        wait_for("answers", || told.conclusions() == 2000);
+        done.store(true, Ordering::Relaxed);
+    });
+    let arrived = got.arrived.lock().unwrap();
+    let sequence: Vec<u64> = arrived.iter().map(|(parcel, _)| parcel.sequence).collect();
+    assert_eq!(sequence, (1..=2000).collect::<Vec<u64>>());
+}
+
+#[test]
+fn a_full_window_is_an_error() {
+    let place = Place::new();
+    let (sender, _) = place.listening();
+    // Not listening, so it answers nothing.
+    let receiver = place.endpoint();
+    let window = place.config().window;
+    for _ in 0..window {
+        sender
+            .dispatch(attempt(), &receiver.location(), parcel(Bytes::new()))
+            .unwrap();
+    }
+    let refused = sender.dispatch(attempt(), &receiver.location(), parcel(Bytes::new()));
+    assert_eq!(refused.unwrap_err().fault, WayFault::Congested);
+}
+
+#[test]
+fn peers_are_bounded_and_the_oldest_forgotten() {
+    let place = Place::new();
+    let mut config = place.config();
+    config.max_peers = 2;
+    let (sender, told) = place.listening_with(config);
+    let receivers: Vec<_> = (0..4).map(|_| place.listening()).collect();
+    for (sent, (receiver, _)) in receivers.iter().chain(&receivers).enumerate() {
+        sender
+            .dispatch(
+                attempt(),
+                &receiver.location(),
+                parcel(vec![3; 2000].into()),
+            )
+            .unwrap();
+        wait_for("answer", || told.conclusions() == sent + 1);
+    }
+    for (_, got) in &receivers {
+        assert_eq!(got.arrivals(), 2);
+        assert_eq!(got.content(0), vec![3; 2000]);
+    }
+}
+
+#[test]
+fn wrong_configurations_and_open_directories_are_refused() {
+    let place = Place::new();
+    let handle = place.runtime.handle();
+    let refused = |config: ShmConfig| ShmTransport::new(config, handle.clone()).unwrap_err();
+    for prefix in ["", "with/slash", "ümlaut", &"x".repeat(65)] {
+        let config = ShmConfig::new(place.directory.path(), prefix, Incarnation::random());
+        assert!(
+            matches!(refused(config), ShmError::Configuration(_)),
+            "{prefix}"
+        );
+    }
+    let config = ShmConfig::new("relative", "fine", Incarnation::random());
+    assert!(matches!(refused(config), ShmError::Configuration(_)));
+
+    let open = place.directory.path().join("open");
+    std::fs::create_dir(&open).unwrap();
+    std::fs::set_permissions(&open, std::fs::Permissions::from_mode(0o755)).unwrap();
+    let config = ShmConfig::new(&open, &place.prefix, Incarnation::random());
+    assert!(matches!(refused(config), ShmError::NotPrivate { .. }));
+
+    let outside = tempfile::tempdir().unwrap();
+    let link = outside.path().join("link");
+    let private = place.directory.path().join("private");
+    std::fs::create_dir(&private).unwrap();
+    std::fs::set_permissions(&private, std::fs::Permissions::from_mode(0o700)).unwrap();
+    std::os::unix::fs::symlink(&private, &link).unwrap();
+    let config = ShmConfig::new(&link, &place.prefix, Incarnation::random());
+    assert!(matches!(refused(config), ShmError::NotPrivate { .. }));
+    assert_eq!(place.traces(), Vec::<String>::new());
+}

@@ -1,0 +1,306 @@
+//! Whose memory content lies in, and how much of it there is.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on says so")]
+
+mod common;
+
+use std::fs;
+
+use bytes::Bytes;
+use common::{FRONT, Place, attempt, parcel, wait_for};
+use fipa_transport::{Answer, Conclusion, Transport, WayFault};
+
+/// The file that a piece of this process's memory is mapped from, if any.
+fn mapped_from(bytes: &[u8]) -> Option<String> {
+    let address = bytes.as_ptr() as usize;
+    let maps = fs::read_to_string("/proc/self/maps").unwrap();
+    let line = maps.lines().find(|line| {
+        let range = line.split(' ').next().unwrap();
+        let (start, end) = range.split_once('-').unwrap();
+        let start = usize::from_str_radix(start, 16).unwrap();
+        let end = usize::from_str_radix(end, 16).unwrap();
+        (start..end).contains(&address) && address + bytes.len() <= end
+    });
+    let file = line.unwrap().split_whitespace().nth(5);
+    file.filter(|file| file.starts_with('/')).map(str::to_owned)
+}
+
+/// Position of a piece of memory in the file it is mapped from.
+fn position(bytes: &[u8]) -> usize {
+    let address = bytes.as_ptr() as usize;
+    let maps = fs::read_to_string("/proc/self/maps").unwrap();
+    let mut places = maps.lines().filter_map(|line| {
+        let mut fields = line.split_whitespace();
+        let (start, end) = fields.next()?.split_once('-')?;
+        let start = usize::from_str_radix(start, 16).ok()?;
+        let end = usize::from_str_radix(end, 16).ok()?;
+        let offset = usize::from_str_radix(fields.nth(1)?, 16).ok()?;
+        (start..end)
+            .contains(&address)
+            .then(|| address - start + offset)
+    });
+    places.next().unwrap()
+}
+
+fn pattern(len: usize) -> Bytes {
+    (0..len)
+        .map(|at| (at % 251) as u8)
+        .collect::<Vec<u8>>()
+        .into()
+}
+
+#[test]
+fn loaned_content_is_never_copied() {
+    let place = Place::new();
+    let (sender, sent) = place.listening();
+    let (receiver, got) = place.listening();
+    for (number, len) in [2000, 4 << 20, 16 << 20].into_iter().enumerate() {
+        let loan = sender.loan(&receiver.location(), FRONT, len, 1);
+        let mut loan = loan.unwrap().expect("shared memory loans");
+        assert_eq!(loan.content_mut().len(), len);
+        loan.content_mut().copy_from_slice(&pattern(len));
+        let content = loan.freeze();
+        let from = mapped_from(&content).expect("loaned memory is shared");
+        assert!(
+            from.starts_with(&format!("/dev/shm/{}", place.prefix)),
+            "{from}"
+        );
+
+        sender
+            .dispatch(attempt(), &receiver.location(), parcel(content.clone()))
+            .unwrap();
+        wait_for("letter", || got.arrivals() == number + 1);
+        let received = got.content(number);
+        assert_eq!(received, pattern(len));
+        // The same bytes of the same file, mapped a second time: not a copy.
+        assert_ne!(received.as_ptr(), content.as_ptr());
+        assert_eq!(mapped_from(&received), Some(from));
+        assert_eq!(position(&received), position(&content));
+        assert_eq!(received.as_ptr() as usize % 8, 0);
+    }
+    wait_for("answers", || sent.conclusions() == 3);
+    assert_eq!(sender.counters().loans_sent, 3);
+    assert_eq!(sender.counters().loans_copied, 0);
+    assert_eq!(receiver.counters().in_place, 3);
+    assert_eq!(receiver.counters().copied_full, 0);
+}
+
+#[test]
+fn loaned_content_can_be_sent_again_and_elsewhere() {
+    let place = Place::new();
+    let (sender, sent) = place.listening();
+    let (first, got_first) = place.listening();
+    let (second, got_second) = place.listening();
+    let mut loan = sender
+        .loan(&first.location(), FRONT, 5000, 1)
+        .unwrap()
+        .unwrap();
+    loan.content_mut().copy_from_slice(&pattern(5000));
+    let content = loan.freeze();
+    for to in [&first, &first, &second] {
+        sender
+            .dispatch(attempt(), &to.location(), parcel(content.clone()))
+            .unwrap();
+    }
+    wait_for("letters", || {
+        got_first.arrivals() == 2 && got_second.arrivals() == 1
+    });
+    wait_for("answers", || sent.conclusions() == 3);
+    for received in [
+        got_first.content(0),
+        got_first.content(1),
+        got_second.content(0),
+    ] {
+        assert_eq!(received, pattern(5000));
+    }
+    assert_eq!(content, pattern(5000));
+    assert_eq!(sender.counters().loans_sent, 1);
+    assert_eq!(sender.counters().loans_copied, 1);
+}
+
+#[test]
+fn a_front_longer_than_announced_is_copied() {
+    let place = Place::new();
+    let (sender, _) = place.listening();
+    let (receiver, got) = place.listening();
+    let mut loan = sender
+        .loan(&receiver.location(), 8, 5000, 1)
+        .unwrap()
+        .unwrap();
+    loan.content_mut().copy_from_slice(&pattern(5000));
+    sender
+        .dispatch(attempt(), &receiver.location(), parcel(loan.freeze()))
+        .unwrap();
+    wait_for("letter", || got.arrivals() == 1);
+    assert_eq!(got.content(0), pattern(5000));
+    assert_eq!(sender.counters().loans_copied, 1);
+}
+
+#[test]
+fn a_loan_outlives_larger_ones_and_its_transport() {
+    let place = Place::new();
+    let (sender, _) = place.listening();
+    let (receiver, got) = place.listening();
+    let mut small = sender
+        .loan(&receiver.location(), FRONT, 2000, 1)
+        .unwrap()
+        .unwrap();
+    small.content_mut().copy_from_slice(&pattern(2000));
+    let small = small.freeze();
+    // Takes a new segment; what is sent from the old one is copied, see `Outbox::send_loan`.
+    let large = sender
+        .loan(&receiver.location(), FRONT, 1 << 20, 1)
+        .unwrap()
+        .unwrap();
+    sender
+        .dispatch(attempt(), &receiver.location(), parcel(small.clone()))
+        .unwrap();
+    wait_for("letter", || got.arrivals() == 1);
+    assert_eq!(got.content(0), pattern(2000));
+    drop(large);
+    sender.close();
+    drop(sender);
+    assert_eq!(small, pattern(2000));
+}
+
+#[test]
+fn loans_are_bounded_and_leave_room_for_letters() {
+    let place = Place::new();
+    let (sender, sent) = place.listening();
+    let (receiver, _) = place.listening();
+    let to = receiver.location();
+    let most = place.config().max_loans;
+    let loans: Vec<_> = (0..most)
+        .map(|_| sender.loan(&to, FRONT, 100, 1).unwrap().unwrap())
+        .collect();
+    let refused = sender.loan(&to, FRONT, 100, 1).err().expect("no more");
+    assert_eq!(refused.fault, WayFault::Congested);
+    sender
+        .dispatch(attempt(), &to, parcel(Bytes::new()))
+        .unwrap();
+    wait_for("answer", || sent.conclusions() == 1);
+    drop(loans);
+    assert!(sender.loan(&to, FRONT, 100, 1).is_ok());
+}
+
+#[test]
+fn held_content_is_bounded_and_then_copied() {
+    let place = Place::new();
+    let mut config = place.config();
+    config.max_borrowed = 5;
+    let (receiver, got) = place.listening_with(config);
+    let (sender, sent) = place.listening();
+    let to = receiver.location();
+    // More than a window: none of them may wait for content to be given back.
+    for number in 0..40 {
+        let one = attempt();
+        sender
+            .dispatch(one, &to, parcel(pattern(3000 + number)))
+            .unwrap();
+        wait_for("answer", || sent.conclusion_of(one).is_some());
+        assert_eq!(
+            sent.conclusion_of(one),
+            Some(Conclusion::Answered(Answer::Accepted))
+        );
+    }
+    let counters = receiver.counters();
+    assert_eq!(
+        (counters.in_place, counters.copied_full, counters.borrowed),
+        (5, 35, 5)
+    );
+    for number in 0..40 {
+        assert_eq!(got.content(number), pattern(3000 + number));
+    }
+    got.arrived.lock().unwrap().clear();
+    assert_eq!(receiver.counters().borrowed, 0);
+    sender
+        .dispatch(attempt(), &to, parcel(pattern(3000)))
+        .unwrap();
+    wait_for("letter", || got.arrivals() == 1);
+    assert_eq!(receiver.counters().in_place, 6);
+}
+
+#[test]
+fn one_slot_of_a_sender_stays_free() {
+    let place = Place::new();
+    let mut config = place.config();
+    config.window = 4;
+    config.max_loans = 2;
+    let (receiver, _got) = place.listening_with(config);
+    let (sender, sent) = place.listening();
+    for _ in 0..12 {
+        let one = attempt();
+        sender
+            .dispatch(one, &receiver.location(), parcel(pattern(2000)))
+            .unwrap();
+        wait_for("answer", || sent.conclusion_of(one).is_some());
+    }
+    let counters = receiver.counters();
+    assert_eq!((counters.in_place, counters.copied_full), (3, 9));
+}
+
+#[test]
+fn small_content_is_copied_and_holds_nothing() {
+    let place = Place::new();
+    let (receiver, got) = place.listening();
+    let (sender, _) = place.listening();
+    sender
+        .dispatch(attempt(), &receiver.location(), parcel(pattern(10)))
+        .unwrap();
+    wait_for("letter", || got.arrivals() == 1);
+    assert_eq!(got.content(0), pattern(10));
+    let counters = receiver.counters();
+    assert_eq!((counters.copied_small, counters.borrowed), (1, 0));
+}
+
+#[test]
+fn capacity_is_an_error_and_not_a_signal() {
+    let place = Place::new();
+    let mut config = place.config();
+    config.capacity = 8 << 20;
+    let (sender, sent) = place.listening_with(config);
+    let (receiver, _got) = place.listening();
+    let to = receiver.location();
+    let refused = sender
+        .dispatch(attempt(), &to, parcel(pattern(9 << 20)))
+        .unwrap_err();
+    assert_eq!(refused.fault, WayFault::TooLarge);
+    // The receiver keeps what it got, so every letter takes new memory.
+    let mut taken = 0;
+    let refused = loop {
+        match sender.dispatch(attempt(), &to, parcel(pattern(1 << 20))) {
+            Ok(()) => taken += 1,
+            Err(e) => break e,
+        }
+        wait_for("answer", || sent.conclusions() == taken);
+        assert!(taken < 10);
+    };
+    assert!(taken > 2, "{taken}");
+    assert_eq!(refused.fault, WayFault::Congested);
+    assert!(refused.detail.contains("capacity"), "{refused}");
+    sender
+        .dispatch(attempt(), &to, parcel(pattern(500)))
+        .unwrap();
+    wait_for("answer", || sent.conclusions() == taken + 1);
+}
+
+#[test]
+fn content_outlives_both_transports() {
+    let place = Place::new();
+    let (receiver, got) = place.listening();
+    let (sender, _) = place.listening();
+    sender
+        .dispatch(attempt(), &receiver.location(), parcel(pattern(100_000)))
+        .unwrap();
+    wait_for("letter", || got.arrivals() == 1);
+    let content = got.content(0);
+    got.arrived.lock().unwrap().clear();
+    assert!(mapped_from(&content).is_some());
+    sender.close();
+    receiver.close();
+    assert_eq!(content, pattern(100_000));
+    drop((sender, receiver));
+    let elsewhere = std::thread::spawn(move || content == pattern(100_000));
+    assert!(elsewhere.join().unwrap());
+    assert_eq!(place.traces(), Vec::<String>::new());
+}
