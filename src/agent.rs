@@ -1,0 +1,324 @@
+//! An agent: a name that sends and receives messages.
+
+use std::fmt;
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use bytes::Bytes;
+use fipa_acl::{AgentId, DecodeError, Letter, Message, MessageBuilder, Performative};
+use fipa_mts::core::Submission;
+use fipa_mts::{PostError, letter_around, letter_for};
+use fipa_sds::{DeregisterError, Directory};
+use fipa_transport::{Incarnation, Kind, LoanedContent, Outcome};
+
+use crate::domain::Domain;
+
+/// An agent of this process. Deregistered when dropped.
+pub struct Agent {
+    domain: Domain,
+    id: AgentId,
+    name: Arc<str>,
+    incarnation: Incarnation,
+    registered: bool,
+}
+
+impl Agent {
+    pub(crate) fn new(
+        domain: Domain,
+        id: AgentId,
+        name: Arc<str>,
+        incarnation: Incarnation,
+    ) -> Self {
+        Self { domain, id, name, incarnation, registered: true }
+    }
+
+    /// The agent's name.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The agent identifier under which it sends.
+    #[must_use]
+    pub fn id(&self) -> &AgentId {
+        &self.id
+    }
+
+    /// This registration.
+    #[must_use]
+    pub fn incarnation(&self) -> Incarnation {
+        self.incarnation
+    }
+
+    /// The domain it is registered in.
+    #[must_use]
+    pub fn domain(&self) -> &Domain {
+        &self.domain
+    }
+
+    /// A message from this agent, to be filled in.
+    #[must_use]
+    pub fn message(&self, performative: Performative) -> MessageBuilder {
+        Message::builder(performative).sender(self.id.clone())
+    }
+
+    /// An answer from this agent, as FIPA00037 has it: to whom the message wants answers, in the
+    /// same conversation.
+    #[must_use]
+    pub fn reply(&self, to: &Message, performative: Performative) -> MessageBuilder {
+        to.reply(performative).sender(self.id.clone())
+    }
+
+    /// Sends a message to its receivers, each an agent's name or a pattern of names, and waits
+    /// until every receiver has an outcome: within the deadline of the configuration.
+    ///
+    /// Letters leave in the order of the calls, whether the futures are awaited in that order or
+    /// not; a future that is dropped does not stop its letter.
+    ///
+    /// # Errors
+    /// When the message cannot be sent at all. What happened on the way is in the outcomes.
+    pub async fn send(&self, message: Message) -> Result<Deliveries, SendError> {
+        self.send_within(message, self.domain.inner.deadline).await
+    }
+
+    /// Sends a message with a deadline of its own.
+    ///
+    /// # Errors
+    /// See [`send`](Self::send).
+    pub async fn send_within(
+        &self,
+        message: Message,
+        deadline: Duration,
+    ) -> Result<Deliveries, SendError> {
+        let letter = letter_for(&message, SystemTime::now())?;
+        self.post(&message, letter, deadline).await
+    }
+
+    /// Memory for the content of a message to one agent of this host, in shared memory where
+    /// possible: the content is written once, by the application, and the receiver reads it in
+    /// place. A content of the message itself is ignored.
+    ///
+    /// Where shared memory cannot be used (several receivers, another host, no room), the memory
+    /// is on the heap, and [`send_loan`](Self::send_loan) works all the same.
+    ///
+    /// # Errors
+    /// When the message cannot be sent at all.
+    pub fn loan(&self, message: Message, len: usize) -> Result<Loan, SendError> {
+        self.check(&message)?;
+        // The lengths of all that stands around the content do not depend on when it is sent.
+        let empty = letter_around(&message, Bytes::new(), SystemTime::now())?;
+        let (head, tail) = message.around_content(len).map_err(PostError::from)?;
+        let receiver = match message.receivers() {
+            [only] => only.name(),
+            _ => "",
+        };
+        let head_room = receiver.len() + longest_envelope(&empty) + head.len();
+        let mts = &self.domain.inner.service.mts;
+        let content = mts.loan(receiver, head_room, len, tail.len());
+        Ok(Loan { message, content })
+    }
+
+    /// Sends a message with the content that was filled in.
+    ///
+    /// # Errors
+    /// See [`send`](Self::send).
+    pub async fn send_loan(&self, loan: Loan) -> Result<Deliveries, SendError> {
+        let Loan { message, content } = loan;
+        let letter = letter_around(&message, content.freeze(), SystemTime::now())?;
+        self.post(&message, letter, self.domain.inner.deadline).await
+    }
+
+    async fn post(
+        &self,
+        message: &Message,
+        letter: Letter,
+        deadline: Duration,
+    ) -> Result<Deliveries, SendError> {
+        self.check(message)?;
+        let receivers = message.receivers().iter().map(|id| id.name().into()).collect();
+        let submission = Submission { sender: self.incarnation, letter, receivers, deadline };
+        let outcomes = self.domain.inner.service.mts.send(submission).await;
+        let deliveries = outcomes.into_iter().map(|(receiver, outcome)| Delivery {
+            receiver,
+            outcome,
+        });
+        Ok(Deliveries(deliveries.collect()))
+    }
+
+    fn check(&self, message: &Message) -> Result<(), SendError> {
+        if message.receivers().is_empty() {
+            return Err(SendError::NoReceiver);
+        }
+        match message.sender() {
+            Some(sender) if sender.name() == &*self.name => Ok(()),
+            Some(sender) => Err(SendError::NotTheSender {
+                agent: self.name.to_string(),
+                sender: sender.name().to_owned(),
+            }),
+            None => Err(SendError::NoSender),
+        }
+    }
+
+    /// The next message for this agent; waits until there is one. Dropping the future loses
+    /// nothing.
+    ///
+    /// # Errors
+    /// When the domain was closed, or the letter that came holds no message that can be decoded.
+    pub async fn receive(&self) -> Result<Incoming, ReceiveError> {
+        let mts = &self.domain.inner.service.mts;
+        match mts.receive(self.incarnation).await {
+            Some(received) => Incoming::decode(received),
+            None => Err(ReceiveError::Closed),
+        }
+    }
+
+    /// The next message for this agent, if there is one now.
+    ///
+    /// # Errors
+    /// When the letter that came holds no message that can be decoded.
+    pub fn try_receive(&self) -> Result<Option<Incoming>, ReceiveError> {
+        let mts = &self.domain.inner.service.mts;
+        mts.drive();
+        mts.try_receive(self.incarnation).map(Incoming::decode).transpose()
+    }
+
+    /// Takes the name out of the directory. Letters that wait in the queue are dropped.
+    ///
+    /// # Errors
+    /// When the directory cannot be written; the agent receives nothing any more all the same.
+    pub fn deregister(mut self) -> Result<(), DeregisterError> {
+        self.leave()
+    }
+
+    fn leave(&mut self) -> Result<(), DeregisterError> {
+        self.registered = false;
+        let service = &self.domain.inner.service;
+        let result = service.host.deregister(&self.name, self.incarnation);
+        service.mts.deregister(self.incarnation);
+        result
+    }
+}
+
+impl Drop for Agent {
+    fn drop(&mut self) {
+        if self.registered {
+            match self.leave() {
+                // The domain was closed before, and has taken the name with it.
+                Ok(()) | Err(DeregisterError::Closed) => {}
+                Err(error) => tracing::warn!(%error, agent = %self.name, "not deregistered"),
+            }
+        }
+    }
+}
+
+/// The digits of the payload's length are the one thing in an envelope that depends on the
+/// content: 20 more are the most there can be, two to a byte.
+fn longest_envelope(letter: &Letter) -> usize {
+    letter.envelope_len() + 10
+}
+
+/// A message whose content is being written in place.
+pub struct Loan {
+    message: Message,
+    content: Box<dyn LoanedContent>,
+}
+
+impl Loan {
+    /// The content, to be written. It starts out as anything.
+    pub fn content_mut(&mut self) -> &mut [u8] {
+        self.content.content_mut()
+    }
+}
+
+/// What became of a message, one [`Delivery`] per receiver.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Deliveries(pub Vec<Delivery>);
+
+/// What became of a message at one receiver.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Delivery {
+    /// The receiver's name, or the name or pattern that matched nobody.
+    pub receiver: Arc<str>,
+    /// What became of it.
+    pub outcome: Outcome,
+}
+
+impl Deliveries {
+    /// Whether every receiver has got it, or it was handed to a peer that cannot confirm.
+    #[must_use]
+    pub fn all_succeeded(&self) -> bool {
+        self.0.iter().all(|delivery| delivery.outcome.is_success())
+    }
+}
+
+impl fmt::Display for Deliveries {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (index, Delivery { receiver, outcome }) in self.0.iter().enumerate() {
+            let newline = if index > 0 { "\n" } else { "" };
+            write!(f, "{newline}{receiver}: {outcome}")?;
+        }
+        Ok(())
+    }
+}
+
+/// A message that came.
+#[derive(Debug, Clone)]
+pub struct Incoming {
+    /// The message. Its content may lie in the sender's shared memory: it stays readable for as
+    /// long as it is held, and assumes an honest sender of the same user.
+    pub message: Message,
+    /// The letter it came in.
+    pub letter: Letter,
+    /// How it came on its last stretch; none for what this process itself told the agent.
+    pub via: Option<Kind>,
+}
+
+impl Incoming {
+    fn decode(received: fipa_mts::core::Received) -> Result<Self, ReceiveError> {
+        let fipa_mts::core::Received { letter, via } = received;
+        match Message::decode(letter.payload()) {
+            Ok(message) => Ok(Self { message, letter, via }),
+            Err(source) => Err(ReceiveError::Malformed { source, letter: Box::new(letter) }),
+        }
+    }
+}
+
+/// Why a message was not sent.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SendError {
+    /// It names no receiver.
+    #[error("the message has no receiver; give it one with MessageBuilder::receiver")]
+    NoReceiver,
+    /// It names no sender.
+    #[error("the message has no sender; begin it with Agent::message")]
+    NoSender,
+    /// It says that it is from somebody else.
+    #[error("the message is from {sender:?}, and {agent:?} sends only its own")]
+    NotTheSender {
+        /// The agent that was to send it.
+        agent: String,
+        /// Whom the message names.
+        sender: String,
+    },
+    /// It cannot be encoded.
+    #[error(transparent)]
+    Post(#[from] PostError),
+}
+
+/// Why no message was received.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ReceiveError {
+    /// The domain was closed.
+    #[error("the domain was closed")]
+    Closed,
+    /// A letter came whose message cannot be decoded.
+    #[error("a letter with a message that cannot be decoded: {source}")]
+    Malformed {
+        /// Why not.
+        source: DecodeError,
+        /// The letter.
+        letter: Box<Letter>,
+    },
+}

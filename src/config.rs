@@ -1,0 +1,236 @@
+//! The configuration: what one TOML file, `--set key=value` and the defaults say together.
+//!
+//! * [`Sources`] is where it is looked for; [`Config::load`] reads it, checks it and returns the
+//!   values. [`Effective`] is the same with the origin of every value, for `fipa config show`.
+//! * [`ConfigError`] says what is wrong: all mistakes at once, each with file, line and key, what
+//!   is allowed there and, for an unknown key, the nearest known one.
+//!
+//! The first of these files counts, and no other is read: the one given with `--config`, the one
+//! named by `$FIPA_CONFIG`, `./fipa.toml`, `~/.config/fipa/fipa.toml`. What no file says has its
+//! default:
+//!
+//! ```toml
+//! domain = "default"                  # processes of one domain on one host see each other
+//! [mts]
+//! name = "sherpa-mts"                 # default: <host name>-mts
+//! transports = ["shm", "tcp"]         # order of preference; what is not listed is off
+//! deadline = "5s"                     # per letter, unless the letter says otherwise
+//! queue = 256                         # letters waiting per agent before senders are held back
+//! [routes]                            # exceptions by receiver name or pattern, first match counts
+//! "camera_.*" = ["shm"]               # (none by default)
+//! [transport.shm]
+//! capacity = "256MiB"                 # of this domain on this host
+//! max_letter = "64MiB"
+//! spin = "50us"                       # before blocking; 0 on battery
+//! [transport.tcp]
+//! listen = ["127.0.0.1:0"]            # loopback unless the owner opens it
+//! [transport.udp]
+//! listen = ["127.0.0.1:0"]            # kept for later: this version has no udp
+//! [discovery]
+//! mdns = true
+//! interfaces = []                     # empty: all that listen; names or addresses otherwise
+//! static = { crex-mts = ["tcp://10.0.0.2:7788"] }   # (none by default)
+//! ```
+//!
+//! What must not live here: opening anything that the configuration names. A transport that this
+//! process was built without (`tcp` without the feature `net`) is no mistake here, because one
+//! file serves all processes of a robot.
+
+mod check;
+mod effective;
+mod error;
+mod keys;
+mod reader;
+mod sources;
+#[cfg(test)]
+mod tests;
+
+use std::fmt;
+use std::net::IpAddr;
+use std::time::Duration;
+
+use fipa_transport::{Kind, Location};
+
+pub use effective::{Effective, Setting, Value};
+pub use error::{ConfigError, Mistake, Origin};
+pub use sources::Sources;
+
+/// What the owner of a robot chooses, complete and checked.
+///
+/// A program that changes a value after loading calls [`Config::check`] before it uses it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Config {
+    /// `domain`: processes of one domain on one host see each other. Part of paths and of the
+    /// names of shared memory: 1 to 32 of `A-Z a-z 0-9 _ -`.
+    pub domain: String,
+    /// `[mts]`: the message transport service of this process.
+    pub mts: Mts,
+    /// `[routes]`: other orders of transports for some receivers. The first that matches counts;
+    /// those given with `--set` stand before those of the file.
+    pub routes: Vec<Route>,
+    /// `[transport.*]`: the transports themselves.
+    pub transport: Transports,
+    /// `[discovery]`: how other hosts are found.
+    pub discovery: Discovery,
+}
+
+/// `[mts]`: the message transport service of a process.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Mts {
+    /// `name`: the name of the gateway, 1 to 255 bytes without control characters.
+    pub name: String,
+    /// `transports`: in order of preference, none twice; what is not listed is off.
+    pub transports: Vec<Kind>,
+    /// `deadline`: of a letter that does not say its own; more than 0, at most 1 hour.
+    pub deadline: Duration,
+    /// `queue`: letters that wait in the queue of one agent before its senders are held back, 1 to
+    /// 65,536.
+    pub queue: usize,
+}
+
+/// One line of `[routes]`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Route {
+    /// A name, or a pattern matched against the whole of a name: a [`fipa_sds::Pattern`] that
+    /// compiles.
+    pub receiver: String,
+    /// The order for these receivers. What [`Mts::transports`] leaves out is off here too; at
+    /// least one of them is on.
+    pub transports: Vec<Kind>,
+}
+
+/// `[transport.*]`: the transports.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Transports {
+    /// `[transport.shm]`.
+    pub shm: Shm,
+    /// `[transport.tcp]`.
+    pub tcp: Listen,
+    /// `[transport.udp]`. Understood so that a file may have it already; this version has no udp.
+    pub udp: Listen,
+}
+
+/// `[transport.shm]`: shared memory.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Shm {
+    /// `capacity`: bytes of shared memory that this domain may take on this host, 1 MiB to 1 TiB.
+    pub capacity: u64,
+    /// `max_letter`: bytes of the largest letter, 4 KiB to the capacity.
+    pub max_letter: u64,
+    /// `spin`: how long a receiver spins before it blocks, at most 1 s. Zero: not at
+    /// all.
+    pub spin: Duration,
+}
+
+/// `[transport.tcp]` and `[transport.udp]`: where a network transport listens.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Listen {
+    /// `listen`: numeric addresses with port, for example `127.0.0.1:0`, `[::1]:7788` or
+    /// `[fe80::1%eth0]:7788`. Port 0 lets the system choose. Empty: nothing listens, and peers
+    /// answer over the connections made from here.
+    ///
+    /// Text, because the scope of an interface that is not there yet has no number.
+    pub listen: Vec<String>,
+}
+
+/// `[discovery]`: how other hosts are found.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Discovery {
+    /// `mdns`: whether agents are announced and looked for by multicast DNS.
+    pub mdns: bool,
+    /// `interfaces`: where; empty: on all.
+    pub interfaces: Vec<Interface>,
+    /// `static`: gateways known without being found.
+    pub peers: Vec<Peer>,
+}
+
+/// One line of `discovery.static`: a gateway that is known without being found.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Peer {
+    /// The name of the gateway.
+    pub name: String,
+    /// Where it listens, in order of preference; at least one.
+    pub locations: Vec<Location>,
+}
+
+/// A network interface, as the configuration names it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Interface {
+    /// By its name, for example `wlan0`.
+    Name(String),
+    /// By an address it has.
+    Address(IpAddr),
+}
+
+impl fmt::Display for Interface {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Name(name) => f.pad(name),
+            Self::Address(address) => fmt::Display::fmt(address, f),
+        }
+    }
+}
+
+impl Config {
+    /// Finds, reads and checks the configuration.
+    ///
+    /// # Errors
+    /// When a file cannot be read, or with all mistakes that were found.
+    pub fn load(sources: &Sources) -> Result<Self, ConfigError> {
+        Effective::load(sources).map(Effective::into_config)
+    }
+
+    /// The defaults on the host of this name.
+    #[must_use]
+    pub fn for_host(host_name: &str) -> Self {
+        let loopback = Listen {
+            listen: vec!["127.0.0.1:0".to_owned()],
+        };
+        Self {
+            domain: "default".to_owned(),
+            mts: Mts {
+                name: keys::default_mts_name(host_name),
+                transports: vec![Kind::Shm, Kind::Tcp],
+                deadline: Duration::from_secs(5),
+                queue: 256,
+            },
+            routes: Vec::new(),
+            transport: Transports {
+                shm: Shm {
+                    capacity: 256 << 20,
+                    max_letter: 64 << 20,
+                    spin: Duration::from_micros(50),
+                },
+                tcp: loopback.clone(),
+                udp: loopback,
+            },
+            discovery: Discovery {
+                mdns: true,
+                interfaces: Vec::new(),
+                peers: Vec::new(),
+            },
+        }
+    }
+
+    /// Checks what [`Config::load`] has checked already, for a program that changed something
+    /// since.
+    ///
+    /// # Errors
+    /// With all mistakes, by key.
+    pub fn check(&self) -> Result<(), ConfigError> {
+        let found = check::findings(self);
+        if found.is_empty() {
+            return Ok(());
+        }
+        let mistakes = found.into_iter().map(|finding| finding.at(None));
+        Err(ConfigError::Mistakes(mistakes.collect()))
+    }
+}

@@ -1,0 +1,375 @@
+//! What values are allowed, alone and together.
+
+use std::collections::HashSet;
+use std::fmt::Display;
+use std::hash::Hash;
+use std::ops::RangeInclusive;
+use std::time::Duration;
+
+use fipa_sds::{Pattern, check_name};
+use fipa_transport::wire::MAX_REMAINING;
+use fipa_transport::{Kind, Location};
+
+use super::keys::{is_interface_name, is_numeric_address};
+use super::reader::dotted;
+use super::{Config, Interface, Mistake, Origin, Peer, Route, Shm};
+
+/// Longest name of a domain, in bytes.
+const MAX_DOMAIN: usize = 32;
+/// Longest name of a message transport service, in bytes.
+const MAX_MTS_NAME: usize = 255;
+/// Longest deadline of a letter.
+const MAX_DEADLINE: Duration = MAX_REMAINING;
+/// Most letters in the queue of one agent.
+const MAX_QUEUE: usize = 65_536;
+/// Most lines of `[routes]`.
+const MAX_ROUTES: usize = 256;
+/// Shared memory of a domain, in bytes.
+const CAPACITY: RangeInclusive<u64> = 1 << 20..=1 << 40;
+/// Smallest largest letter, in bytes.
+const MIN_LETTER: u64 = 4 << 10;
+/// Longest spinning.
+const MAX_SPIN: Duration = Duration::from_secs(1);
+/// Most addresses a transport listens on, and most locations of a static gateway.
+const MAX_ADDRESSES: usize = 16;
+/// Most interfaces listed.
+const MAX_INTERFACES: usize = 64;
+/// Most static gateways.
+const MAX_PEERS: usize = 1024;
+
+/// The transports this version of fipa has.
+const BUILT: [Kind; 2] = [Kind::Shm, Kind::Tcp];
+
+/// A value that is not allowed.
+#[derive(Debug)]
+pub(super) struct Finding {
+    /// The key it is about.
+    pub(super) path: Vec<String>,
+    what: String,
+    help: String,
+}
+
+impl Finding {
+    pub(super) fn at(self, place: Option<Origin>) -> Mistake {
+        Mistake {
+            place,
+            what: self.what,
+            help: self.help,
+        }
+    }
+}
+
+/// Everything that is not allowed in a configuration whose values have the right types.
+pub(super) fn findings(config: &Config) -> Vec<Finding> {
+    let mut found = Findings(Vec::new());
+    found.domain(&config.domain);
+    found.mts(config);
+    found.routes(config);
+    found.shm(&config.transport.shm);
+    found.listen(
+        &["transport", "tcp", "listen"],
+        &config.transport.tcp.listen,
+    );
+    found.listen(
+        &["transport", "udp", "listen"],
+        &config.transport.udp.listen,
+    );
+    found.interfaces(&config.discovery.interfaces);
+    found.peers(&config.discovery.peers);
+    found.0
+}
+
+struct Findings(Vec<Finding>);
+
+impl Findings {
+    /// Adds a finding. `what` follows the name of the key in a sentence.
+    fn add(&mut self, path: &[&str], what: impl Display, help: impl Into<String>) {
+        self.0.push(Finding {
+            path: path.iter().map(|&part| part.to_owned()).collect(),
+            what: format!("`{}` {what}", dotted(path)),
+            help: help.into(),
+        });
+    }
+
+    fn domain(&mut self, domain: &str) {
+        let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
+        let fits = (1..=MAX_DOMAIN).contains(&domain.len());
+        if !fits || !domain.chars().all(allowed) {
+            self.add(
+                &["domain"],
+                format_args!("cannot be {domain:?}"),
+                format!(
+                    "it becomes part of file names: use 1 to {} of A-Z a-z 0-9 _ -",
+                    MAX_DOMAIN
+                ),
+            );
+        }
+    }
+
+    fn mts(&mut self, config: &Config) {
+        let mts = &config.mts;
+        self.name(&["mts", "name"], &mts.name);
+        self.kinds(&["mts", "transports"], &mts.transports);
+        if mts.deadline.is_zero() || mts.deadline > MAX_DEADLINE {
+            self.add(
+                &["mts", "deadline"],
+                format_args!("cannot be {}", humantime::format_duration(mts.deadline)),
+                format!(
+                    "a letter needs time to arrive: more than 0, at most {}",
+                    humantime::format_duration(MAX_DEADLINE)
+                ),
+            );
+        }
+        if !(1..=MAX_QUEUE).contains(&mts.queue) {
+            self.add(
+                &["mts", "queue"],
+                format_args!("cannot be {}", mts.queue),
+                format!("use 1 to {} letters", MAX_QUEUE),
+            );
+        }
+    }
+
+    fn name(&mut self, path: &[&str], name: &str) {
+        let help = format!(
+            "use 1 to {} bytes of UTF-8 without control characters",
+            MAX_MTS_NAME
+        );
+        if name.len() > MAX_MTS_NAME {
+            let what = format_args!("is a name of {} bytes", name.len());
+            self.add(path, what, help);
+        } else if check_name(name).is_err() {
+            self.add(path, format_args!("cannot be the name {name:?}"), help);
+        }
+    }
+
+    /// A list of transports; returns whether it is good.
+    fn kinds(&mut self, path: &[&str], kinds: &[Kind]) -> bool {
+        let before = self.0.len();
+        if kinds.is_empty() {
+            self.add(
+                path,
+                "is empty",
+                format!("list at least one of {}", built()),
+            );
+        }
+        if let Some(kind) = repeated(kinds) {
+            self.add(
+                path,
+                format_args!("lists {kind} twice"),
+                "list each transport once",
+            );
+        }
+        for kind in kinds.iter().filter(|kind| !BUILT.contains(kind)) {
+            self.add(
+                path,
+                format_args!("lists {kind}, which is not built yet"),
+                format!("take it out; this version of fipa has {}", built()),
+            );
+        }
+        self.0.len() == before
+    }
+
+    fn routes(&mut self, config: &Config) {
+        let on = &config.mts.transports;
+        if config.routes.len() > MAX_ROUTES {
+            // Each costs compiling a pattern.
+            self.too_many(&["routes"], config.routes.len(), MAX_ROUTES);
+            return;
+        }
+        for Route {
+            receiver,
+            transports,
+        } in &config.routes
+        {
+            let path = ["routes", receiver.as_str()];
+            if receiver.is_empty() {
+                self.add(
+                    &path,
+                    "has no receiver",
+                    "write the name of an agent, or a pattern",
+                );
+            } else if let Err(error) = Pattern::new(receiver) {
+                self.add(
+                    &path,
+                    format_args!("cannot be matched: {}", one_line(&error.to_string())),
+                    "write the name of an agent, or a regular expression for whole names",
+                );
+            }
+            if self.kinds(&path, transports) && !transports.iter().any(|kind| on.contains(kind)) {
+                self.add(
+                    &path,
+                    "lists only transports that are off",
+                    "list one of `mts.transports`, or turn one of these on there",
+                );
+            }
+        }
+    }
+
+    fn shm(&mut self, shm: &Shm) {
+        if !CAPACITY.contains(&shm.capacity) {
+            self.add(
+                &["transport", "shm", "capacity"],
+                format_args!("cannot be {} bytes", shm.capacity),
+                "use 1MiB to 1TiB, and what fits /dev/shm",
+            );
+        } else if shm.max_letter > shm.capacity {
+            self.add(
+                &["transport", "shm", "max_letter"],
+                format_args!(
+                    "is {} bytes, more than the {} of `transport.shm.capacity`",
+                    shm.max_letter, shm.capacity
+                ),
+                "make it smaller, or the capacity larger",
+            );
+        }
+        if shm.max_letter < MIN_LETTER {
+            self.add(
+                &["transport", "shm", "max_letter"],
+                format_args!("cannot be {} bytes", shm.max_letter),
+                "use at least 4KiB: an envelope and a message must fit",
+            );
+        }
+        if shm.spin > MAX_SPIN {
+            self.add(
+                &["transport", "shm", "spin"],
+                format_args!("cannot be {}", humantime::format_duration(shm.spin)),
+                "use 0 to 1s: spinning keeps a core busy",
+            );
+        }
+    }
+
+    fn listen(&mut self, path: &[&str], addresses: &[String]) {
+        if addresses.len() > MAX_ADDRESSES {
+            self.too_many(path, addresses.len(), MAX_ADDRESSES);
+        }
+        if let Some(wrong) = addresses.iter().find(|text| !is_numeric_address(text)) {
+            self.add(
+                path,
+                format_args!("lists {wrong:?}, not a numeric address with port"),
+                "write for example 127.0.0.1:0 or [fe80::1%eth0]:7788",
+            );
+        }
+        if let Some(address) = repeated(addresses.iter().filter(|text| !text.ends_with(":0"))) {
+            self.add(
+                path,
+                format_args!("lists {address} twice"),
+                "list each address once",
+            );
+        }
+    }
+
+    fn interfaces(&mut self, interfaces: &[Interface]) {
+        let path = ["discovery", "interfaces"];
+        if interfaces.len() > MAX_INTERFACES {
+            self.too_many(&path, interfaces.len(), MAX_INTERFACES);
+        }
+        for interface in interfaces {
+            if let Interface::Name(name) = interface
+                && !is_interface_name(name)
+            {
+                self.add(
+                    &path,
+                    format_args!("lists {name:?}, which no interface can be called"),
+                    "`ip link` lists the names",
+                );
+            }
+        }
+        if let Some(twice) = repeated(interfaces.iter().map(Interface::to_string)) {
+            self.add(
+                &path,
+                format_args!("lists {twice} twice"),
+                "list each interface once",
+            );
+        }
+    }
+
+    fn peers(&mut self, peers: &[Peer]) {
+        if peers.len() > MAX_PEERS {
+            self.too_many(&["discovery", "static"], peers.len(), MAX_PEERS);
+            return;
+        }
+        for Peer { name, locations } in peers {
+            let path = ["discovery", "static", name.as_str()];
+            self.name(&path, name);
+            if locations.is_empty() {
+                self.add(
+                    &path,
+                    "is empty",
+                    "list at least one location of this gateway",
+                );
+            }
+            if locations.len() > MAX_ADDRESSES {
+                self.too_many(&path, locations.len(), MAX_ADDRESSES);
+            }
+            if let Some(location) = repeated(locations) {
+                self.add(
+                    &path,
+                    format_args!("lists {location} twice"),
+                    "list each once",
+                );
+            }
+            for location in locations {
+                self.location(&path, location);
+            }
+        }
+    }
+
+    fn location(&mut self, path: &[&str], location: &Location) {
+        let kind = location.kind();
+        if kind == Kind::Shm {
+            self.add(
+                path,
+                format_args!("lists {location}, which leads to no other host"),
+                "write for example tcp://10.0.0.2:7788",
+            );
+        } else if !BUILT.contains(&kind) {
+            self.add(
+                path,
+                format_args!("lists {location}, but {kind} is not built yet"),
+                "write for example tcp://10.0.0.2:7788",
+            );
+        } else if !has_port(location.address()) {
+            self.add(
+                path,
+                format_args!("lists {location}, which has no port"),
+                "write for example tcp://10.0.0.2:7788 or tcp://[fe80::1%eth0]:7788",
+            );
+        }
+    }
+
+    fn too_many(&mut self, path: &[&str], count: usize, most: usize) {
+        self.add(
+            path,
+            format_args!("has {count} entries"),
+            format!("use at most {most}"),
+        );
+    }
+}
+
+/// Whether this is `host:port` with a port one can connect to.
+fn has_port(address: &str) -> bool {
+    if is_numeric_address(address) {
+        return !address.ends_with(":0");
+    }
+    address.rsplit_once(':').is_some_and(|(host, port)| {
+        !host.is_empty()
+            && !host.contains([':', '[', ']', '/'])
+            && port.bytes().all(|byte| byte.is_ascii_digit())
+            && port.parse::<u16>().is_ok_and(|port| port != 0)
+    })
+}
+
+fn repeated<T: Eq + Hash + Clone>(all: impl IntoIterator<Item = T>) -> Option<T> {
+    let mut seen = HashSet::new();
+    all.into_iter().find(|one| !seen.insert(one.clone()))
+}
+
+fn built() -> String {
+    BUILT.map(Kind::name).join(" and ")
+}
+
+/// Errors of `regex` draw a picture over several lines; the last line says what is wrong.
+fn one_line(text: &str) -> String {
+    let last = text.lines().last().unwrap_or_default().trim();
+    last.trim_start_matches("error: ").to_owned()
+}

@@ -1,0 +1,175 @@
+//! The configuration with the origin of every value.
+
+use std::collections::BTreeMap;
+use std::fmt::{Display, Write};
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+use toml_edit::Value as Toml;
+
+use super::keys::{KEYS, MAPS};
+use super::reader::{Reader, bare_or_quoted, dotted};
+use super::{Config, ConfigError, Origin, Sources};
+
+/// The configuration that counts, with the origin of every value.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Effective {
+    config: Config,
+    origins: BTreeMap<Vec<String>, Origin>,
+    file: Option<PathBuf>,
+}
+
+/// One value of the configuration.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[non_exhaustive]
+pub struct Setting {
+    /// The path to it, for example `["mts", "deadline"]` or `["routes", "camera_.*"]`.
+    pub path: Vec<String>,
+    /// What it is.
+    pub value: Value,
+    /// Where it comes from.
+    pub origin: Origin,
+}
+
+/// A value as it is written in the file. Sizes, durations and addresses are texts.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[serde(untagged)]
+#[non_exhaustive]
+pub enum Value {
+    /// `true` or `false`.
+    Truth(bool),
+    /// A number without unit.
+    Number(usize),
+    /// Text.
+    Text(String),
+    /// A list of texts.
+    List(Vec<String>),
+}
+
+impl Effective {
+    /// Finds, reads and checks the configuration.
+    ///
+    /// # Errors
+    /// When a file cannot be read, or with all mistakes that were found.
+    pub fn load(sources: &Sources) -> Result<Self, ConfigError> {
+        let found = sources.read()?;
+        let mut reader = Reader::new(&sources.host_name);
+        for assignment in sources.set.iter().rev() {
+            reader.set(assignment);
+        }
+        // So far from the last to the first, as the last one counts.
+        reader.mistakes.reverse();
+        if let Some(found) = &found {
+            reader.file(&found.path, &found.text);
+        }
+        // A value that could not be read has left its default, about which there is nothing to say.
+        if reader.mistakes.is_empty() {
+            reader.check();
+        }
+        if !reader.mistakes.is_empty() {
+            return Err(ConfigError::Mistakes(reader.mistakes));
+        }
+        Ok(Self::new(reader, found.map(|found| found.path)))
+    }
+
+    pub(super) fn new(reader: Reader, file: Option<PathBuf>) -> Self {
+        Self {
+            config: reader.config,
+            origins: reader.origins,
+            file,
+        }
+    }
+
+    /// The configuration.
+    #[must_use]
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
+    /// The configuration, without where it comes from.
+    #[must_use]
+    pub fn into_config(self) -> Config {
+        self.config
+    }
+
+    /// The file that was read, if any, as it was named.
+    #[must_use]
+    pub fn file(&self) -> Option<&Path> {
+        self.file.as_deref()
+    }
+
+    /// Every value, in the order of the file that [`Effective::render`] writes.
+    #[must_use]
+    pub fn settings(&self) -> Vec<Setting> {
+        let setting = |path: Vec<String>, value| {
+            let origin = self.origins.get(&path).cloned().unwrap_or(Origin::Default);
+            Setting {
+                path,
+                value,
+                origin,
+            }
+        };
+        let keys = KEYS.iter().map(|key| {
+            let path = key.path.iter().map(|&part| part.to_owned()).collect();
+            setting(path, (key.read)(&self.config))
+        });
+        let mut settings: Vec<Setting> = keys.collect();
+        for map in MAPS {
+            for (name, value) in (map.read)(&self.config) {
+                let names = map.path.iter().copied().chain([name]);
+                settings.push(setting(names.map(str::to_owned).collect(), value));
+            }
+        }
+        settings
+    }
+
+    /// The file that says all this by itself, every value followed by where it comes from:
+    /// `# default`, `# fipa.toml:12` or `# --set`.
+    #[must_use]
+    pub fn render(&self) -> String {
+        // Writing to a string cannot fail.
+        let mut text = String::new();
+        let mut section: Vec<String> = Vec::new();
+        for Setting {
+            path,
+            value,
+            origin,
+        } in self.settings()
+        {
+            let Some((name, parents)) = path.split_last() else {
+                continue;
+            };
+            if section != parents {
+                section = parents.to_vec();
+                let names: Vec<&str> = parents.iter().map(String::as_str).collect();
+                let _ = writeln!(text, "\n[{}]", dotted(&names));
+            }
+            let line = format!("{} = {}", bare_or_quoted(name), value.to_toml());
+            let origin = match origin {
+                Origin::Set { .. } => "--set".to_owned(),
+                other => other.to_string(),
+            };
+            let _ = writeln!(text, "{line:<36} # {origin}");
+        }
+        text
+    }
+}
+
+impl Value {
+    /// A list of things that are written as texts.
+    pub(super) fn list(items: &[impl Display]) -> Self {
+        Self::List(items.iter().map(ToString::to_string).collect())
+    }
+
+    fn to_toml(&self) -> String {
+        match self {
+            Self::Truth(truth) => truth.to_string(),
+            Self::Number(number) => number.to_string(),
+            Self::Text(text) => Toml::from(text).to_string(),
+            Self::List(items) => {
+                let items: Vec<String> = items.iter().map(|i| Toml::from(i).to_string()).collect();
+                format!("[{}]", items.join(", "))
+            }
+        }
+    }
+}

@@ -1,0 +1,349 @@
+//! The keys: how each is written in TOML, and where its value belongs.
+//!
+//! A new key is a field of [`Config`], its default, and one entry here. Bounds and everything that
+//! concerns several keys are the business of [`super::check`].
+
+use std::net::{IpAddr, Ipv6Addr, SocketAddr};
+use std::ops::Range;
+use std::time::Duration;
+
+use bytesize::ByteSize;
+use fipa_transport::{Kind, Location};
+use toml_edit::Value as Toml;
+
+use super::effective::Value;
+use super::{Config, Interface, Peer, Route};
+
+/// A key with one place in the configuration.
+pub(super) struct Key {
+    pub(super) path: &'static [&'static str],
+    /// What stands there, as `--set` needs to know.
+    pub(super) shape: Shape,
+    /// What is allowed, to end a sentence that begins with "expected".
+    pub(super) expected: &'static str,
+    pub(super) write: fn(&mut Config, &Toml) -> Result<(), Wrong>,
+    pub(super) read: fn(&Config) -> Value,
+}
+
+/// A table whose keys are names that the owner chooses; its values are lists.
+pub(super) struct Map {
+    pub(super) path: &'static [&'static str],
+    pub(super) expected: &'static str,
+    /// Adds an entry; the reader asks once per name.
+    pub(super) write: fn(&mut Config, &str, &Toml) -> Result<(), Wrong>,
+    pub(super) read: fn(&Config) -> Vec<(&str, Value)>,
+}
+
+/// What kind of value a key has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Shape {
+    /// Text, also where it means a size or a duration.
+    Text,
+    /// A Boolean or a number.
+    Plain,
+    List,
+}
+
+/// A value that is not what its key wants.
+#[derive(Debug)]
+pub(super) struct Wrong {
+    /// Where in the document, when that is known better than by the key.
+    pub(super) span: Option<Range<usize>>,
+    pub(super) reason: String,
+}
+
+const KINDS: &str = r#"a list of transports such as ["shm", "tcp"]"#;
+const SIZE: &str = r#"a size such as "64MiB""#;
+const ADDRESSES: &str = r#"a list of numeric addresses with port such as ["127.0.0.1:0"]"#;
+
+/// Every key, in the order in which `fipa config show` prints them, before the [`MAPS`].
+pub(super) const KEYS: &[Key] = &[
+    Key {
+        path: &["domain"],
+        shape: Shape::Text,
+        expected: "a name of 1 to 32 letters, digits, '_' or '-'",
+        write: |config, value| text(value).map(|domain| config.domain = domain),
+        read: |config| Value::Text(config.domain.clone()),
+    },
+    Key {
+        path: &["mts", "name"],
+        shape: Shape::Text,
+        expected: "a name of 1 to 255 bytes",
+        write: |config, value| text(value).map(|name| config.mts.name = name),
+        read: |config| Value::Text(config.mts.name.clone()),
+    },
+    Key {
+        path: &["mts", "transports"],
+        shape: Shape::List,
+        expected: KINDS,
+        write: |config, value| kinds(value).map(|kinds| config.mts.transports = kinds),
+        read: |config| Value::list(&config.mts.transports),
+    },
+    Key {
+        path: &["mts", "deadline"],
+        shape: Shape::Text,
+        expected: r#"a duration such as "5s" or "500ms""#,
+        write: |config, value| duration(value).map(|deadline| config.mts.deadline = deadline),
+        read: |config| duration_text(config.mts.deadline),
+    },
+    Key {
+        path: &["mts", "queue"],
+        shape: Shape::Plain,
+        expected: "a number of letters such as 256",
+        write: |config, value| number(value).map(|queue| config.mts.queue = queue),
+        read: |config| Value::Number(config.mts.queue),
+    },
+    Key {
+        path: &["transport", "shm", "capacity"],
+        shape: Shape::Text,
+        expected: SIZE,
+        write: |config, value| size(value).map(|size| config.transport.shm.capacity = size),
+        read: |config| size_text(config.transport.shm.capacity),
+    },
+    Key {
+        path: &["transport", "shm", "max_letter"],
+        shape: Shape::Text,
+        expected: SIZE,
+        write: |config, value| size(value).map(|size| config.transport.shm.max_letter = size),
+        read: |config| size_text(config.transport.shm.max_letter),
+    },
+    Key {
+        path: &["transport", "shm", "spin"],
+        shape: Shape::Text,
+        expected: r#"a duration such as "50us", or 0"#,
+        write: |config, value| duration(value).map(|spin| config.transport.shm.spin = spin),
+        read: |config| duration_text(config.transport.shm.spin),
+    },
+    Key {
+        path: &["transport", "tcp", "listen"],
+        shape: Shape::List,
+        expected: ADDRESSES,
+        write: |config, value| addresses(value).map(|all| config.transport.tcp.listen = all),
+        read: |config| Value::list(&config.transport.tcp.listen),
+    },
+    Key {
+        path: &["transport", "udp", "listen"],
+        shape: Shape::List,
+        expected: ADDRESSES,
+        write: |config, value| addresses(value).map(|all| config.transport.udp.listen = all),
+        read: |config| Value::list(&config.transport.udp.listen),
+    },
+    Key {
+        path: &["discovery", "mdns"],
+        shape: Shape::Plain,
+        expected: "true or false",
+        write: |config, value| truth(value).map(|mdns| config.discovery.mdns = mdns),
+        read: |config| Value::Truth(config.discovery.mdns),
+    },
+    Key {
+        path: &["discovery", "interfaces"],
+        shape: Shape::List,
+        expected: r#"a list of interface names or addresses such as ["wlan0", "10.0.0.7"]"#,
+        write: |config, value| items(value, interface).map(|all| config.discovery.interfaces = all),
+        read: |config| Value::list(&config.discovery.interfaces),
+    },
+];
+
+/// Every table of names.
+pub(super) const MAPS: &[Map] = &[
+    Map {
+        path: &["routes"],
+        expected: KINDS,
+        write: |config, receiver, value| {
+            let transports = kinds(value)?;
+            let receiver = receiver.to_owned();
+            config.routes.push(Route {
+                receiver,
+                transports,
+            });
+            Ok(())
+        },
+        read: |config| {
+            let routes = config.routes.iter();
+            routes
+                .map(|route| (route.receiver.as_str(), Value::list(&route.transports)))
+                .collect()
+        },
+    },
+    Map {
+        path: &["discovery", "static"],
+        expected: r#"a list of locations such as ["tcp://10.0.0.2:7788"]"#,
+        write: |config, name, value| {
+            let locations = items(value, location)?;
+            let name = name.to_owned();
+            config.discovery.peers.push(Peer { name, locations });
+            Ok(())
+        },
+        read: |config| {
+            let peers = config.discovery.peers.iter();
+            peers
+                .map(|peer| (peer.name.as_str(), Value::list(&peer.locations)))
+                .collect()
+        },
+    },
+];
+
+/// The default of `mts.name`: the host's name, with what a name cannot have replaced.
+pub(super) fn default_mts_name(host_name: &str) -> String {
+    let start: String = host_name.chars().take(60).collect();
+    let host = start.replace(|c: char| c.is_control() || c.is_whitespace(), "-");
+    let host = if host.is_empty() {
+        "localhost"
+    } else {
+        host.as_str()
+    };
+    format!("{host}-mts")
+}
+
+/// `value` in a message: as it stands in TOML, shortened.
+pub(super) fn quoted(value: &Toml) -> String {
+    let text = value.to_string();
+    let text = text.trim();
+    match text.char_indices().nth(80) {
+        Some((end, _)) => format!("{}…", &text[..end]),
+        None => text.to_owned(),
+    }
+}
+
+impl Wrong {
+    fn new(value: &Toml, reason: impl std::fmt::Display) -> Self {
+        Self {
+            span: value.span(),
+            reason: format!("{}: {reason}", quoted(value)),
+        }
+    }
+
+    fn kind_of_value(value: &Toml) -> Self {
+        let article = match value.type_name() {
+            name @ ("array" | "integer" | "inline table") => format!("an {name}"),
+            name => format!("a {name}"),
+        };
+        Self::new(value, format_args!("{article} cannot stand here"))
+    }
+}
+
+fn text(value: &Toml) -> Result<String, Wrong> {
+    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+    Ok(text.to_owned())
+}
+
+fn truth(value: &Toml) -> Result<bool, Wrong> {
+    value.as_bool().ok_or_else(|| Wrong::kind_of_value(value))
+}
+
+fn number(value: &Toml) -> Result<usize, Wrong> {
+    let number = value
+        .as_integer()
+        .ok_or_else(|| Wrong::kind_of_value(value))?;
+    usize::try_from(number).map_err(|_| Wrong::new(value, "a negative number cannot stand here"))
+}
+
+/// Text with a unit, or a plain number of bytes.
+fn size(value: &Toml) -> Result<u64, Wrong> {
+    if let Some(bytes) = value.as_integer() {
+        let negative = |_| Wrong::new(value, "a negative number cannot stand here");
+        return u64::try_from(bytes).map_err(negative);
+    }
+    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+    let size: Result<ByteSize, _> = text.parse();
+    size.map(|size| size.as_u64())
+        .map_err(|_| Wrong::new(value, "not a size"))
+}
+
+/// Text with units, or zero, which needs none.
+fn duration(value: &Toml) -> Result<Duration, Wrong> {
+    match value.as_integer() {
+        Some(0) => return Ok(Duration::ZERO),
+        Some(_) => return Err(Wrong::new(value, "the unit is missing")),
+        None => {}
+    }
+    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+    humantime::parse_duration(text).map_err(|error| Wrong::new(value, error))
+}
+
+fn items<T>(value: &Toml, one: fn(&Toml) -> Result<T, Wrong>) -> Result<Vec<T>, Wrong> {
+    let list = value
+        .as_array()
+        .ok_or_else(|| Wrong::kind_of_value(value))?;
+    list.iter().map(one).collect()
+}
+
+fn kinds(value: &Toml) -> Result<Vec<Kind>, Wrong> {
+    items(value, |value| {
+        let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+        text.parse().map_err(|error| Wrong::new(value, error))
+    })
+}
+
+fn location(value: &Toml) -> Result<Location, Wrong> {
+    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+    text.parse().map_err(|error| Wrong::new(value, error))
+}
+
+fn addresses(value: &Toml) -> Result<Vec<String>, Wrong> {
+    items(value, |value| {
+        let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+        if is_numeric_address(text) {
+            Ok(text.to_owned())
+        } else {
+            Err(Wrong::new(value, "not a numeric address with port"))
+        }
+    })
+}
+
+/// Whether this is `address:port`, where the scope of an IPv6 address may be the name of an
+/// interface (RFC 4007 section 11.2), which `std` does not read.
+pub(super) fn is_numeric_address(text: &str) -> bool {
+    if text.parse::<SocketAddr>().is_ok() {
+        return true;
+    }
+    let scoped = text
+        .strip_prefix('[')
+        .and_then(|rest| rest.split_once("]:"));
+    scoped.is_some_and(|(inner, port)| {
+        inner.split_once('%').is_some_and(|(address, scope)| {
+            address.parse::<Ipv6Addr>().is_ok() && is_interface_name(scope)
+        }) && port.bytes().all(|byte| byte.is_ascii_digit())
+            && port.parse::<u16>().is_ok()
+    })
+}
+
+/// Whether the kernel would allow this name: 1 to 15 bytes, no white space, no `/`
+/// (`dev_valid_name` of Linux). Nothing else is known about interfaces that may come later.
+pub(super) fn is_interface_name(text: &str) -> bool {
+    (1..=15).contains(&text.len())
+        && !matches!(text, "." | "..")
+        && !text
+            .chars()
+            .any(|c| c.is_whitespace() || c.is_control() || matches!(c, '/' | ':'))
+}
+
+fn interface(value: &Toml) -> Result<Interface, Wrong> {
+    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+    if let Ok(address) = text.parse::<IpAddr>() {
+        return Ok(Interface::Address(address));
+    }
+    if is_interface_name(text) {
+        return Ok(Interface::Name(text.to_owned()));
+    }
+    Err(Wrong::new(
+        value,
+        "neither the name of an interface nor an address",
+    ))
+}
+
+fn duration_text(duration: Duration) -> Value {
+    Value::Text(humantime::format_duration(duration).to_string())
+}
+
+/// The size in the largest unit that loses nothing. (`bytesize` rounds what it displays.)
+fn size_text(bytes: u64) -> Value {
+    let units = [(30, "GiB"), (20, "MiB"), (10, "KiB")];
+    let exact = units
+        .iter()
+        .find(|(bits, _)| bytes != 0 && bytes.trailing_zeros() >= *bits);
+    Value::Text(match exact {
+        Some((bits, unit)) => format!("{}{unit}", bytes >> bits),
+        None => format!("{bytes}B"),
+    })
+}

@@ -1,0 +1,372 @@
+//! What is read, from where, and what is shown.
+
+mod mistakes;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use fipa_transport::Kind;
+use proptest::prelude::*;
+
+use super::reader::Reader;
+use super::{Config, ConfigError, Effective, Interface, Origin, Peer, Route, Sources};
+
+/// Loads a text as if it stood in `./fipa.toml`.
+fn load(text: &str, set: &[&str]) -> Result<Effective, ConfigError> {
+    let directory = tempfile::tempdir().unwrap();
+    fs::write(directory.path().join("fipa.toml"), text).unwrap();
+    Effective::load(&Sources {
+        set: set.iter().map(|&one| one.to_owned()).collect(),
+        current_dir: Some(directory.path().to_owned()),
+        host_name: "sherpa".to_owned(),
+        ..Sources::default()
+    })
+}
+
+fn config(text: &str, set: &[&str]) -> Config {
+    load(text, set).unwrap().into_config()
+}
+
+fn error(text: &str, set: &[&str]) -> String {
+    load(text, set).unwrap_err().to_string()
+}
+
+#[test]
+fn nothing_said_gives_the_defaults() {
+    let sources = Sources {
+        host_name: "sherpa".to_owned(),
+        ..Sources::default()
+    };
+    let effective = Effective::load(&sources).unwrap();
+    assert_eq!(effective.file(), None);
+    assert_eq!(effective.config(), &Config::for_host("sherpa"));
+    assert_eq!(effective.config().mts.name, "sherpa-mts");
+    assert_eq!(effective.config().mts.transports, [Kind::Shm, Kind::Tcp]);
+    assert!(Config::load(&Sources::default()).unwrap().mts.name == "localhost-mts");
+}
+
+#[test]
+fn odd_host_names_still_give_a_name() {
+    for host in ["", "a b\n", &"é".repeat(300)] {
+        Config::for_host(host).check().unwrap();
+    }
+}
+
+/// The file in the documentation says what the defaults are, but for the two that have none.
+#[test]
+fn the_documented_file_is_the_default() {
+    let documentation = include_str!("../config.rs");
+    let block = documentation.split("```").nth(1).unwrap();
+    let sample: String = block
+        .lines()
+        .skip(1)
+        .map(|line| format!("{}\n", line.trim_start_matches("//!")))
+        .collect();
+    let mut documented = config(&sample, &[]);
+    assert_eq!(documented.routes.len(), 1);
+    assert_eq!(documented.discovery.peers.len(), 1);
+    documented.routes.clear();
+    documented.discovery.peers.clear();
+    assert_eq!(documented, Config::for_host("sherpa"));
+}
+
+#[test]
+fn every_key_is_read() {
+    let config = config(
+        r#"
+        domain = "lab_2"
+        mts = { name = "crex", transports = ["tcp"], deadline = "1m 30s", queue = 8 }
+        [routes]
+        "camera_.*" = ["shm", "tcp"]
+        'arm\..*' = ["tcp"]
+        [transport]
+        shm.capacity = "1.5GiB"
+        shm.max_letter = 65536
+        shm.spin = 0
+        tcp.listen = ["[fe80::1%eth0]:7788", "0.0.0.0:7788"]
+        udp.listen = []
+        [discovery]
+        mdns = false
+        interfaces = ["wlan0", "10.0.0.7", "fe80::1"]
+        [discovery.static]
+        sherpa-mts = ["tcp://10.0.0.2:7788", "tcp://sherpa.local:7788"]
+        "#,
+        &[],
+    );
+    assert_eq!(config.domain, "lab_2");
+    assert_eq!(config.mts.name, "crex");
+    assert_eq!(config.mts.transports, [Kind::Tcp]);
+    assert_eq!(config.mts.deadline, Duration::from_secs(90));
+    assert_eq!(config.mts.queue, 8);
+    let routes: Vec<&str> = config
+        .routes
+        .iter()
+        .map(|route| route.receiver.as_str())
+        .collect();
+    assert_eq!(routes, ["camera_.*", r"arm\..*"]);
+    assert_eq!(config.routes[0].transports, [Kind::Shm, Kind::Tcp]);
+    assert_eq!(config.transport.shm.capacity, 3 << 29);
+    assert_eq!(config.transport.shm.max_letter, 65_536);
+    assert_eq!(config.transport.shm.spin, Duration::ZERO);
+    assert_eq!(
+        config.transport.tcp.listen,
+        ["[fe80::1%eth0]:7788", "0.0.0.0:7788"]
+    );
+    assert!(config.transport.udp.listen.is_empty());
+    assert!(!config.discovery.mdns);
+    let addresses = ["10.0.0.7", "fe80::1"].map(|text| Interface::Address(text.parse().unwrap()));
+    let [first, second] = addresses;
+    assert_eq!(
+        config.discovery.interfaces,
+        [Interface::Name("wlan0".to_owned()), first, second]
+    );
+    let [peer] = config.discovery.peers.as_slice() else {
+        panic!("one gateway expected");
+    };
+    assert_eq!(peer.name, "sherpa-mts");
+    assert_eq!(peer.locations[1].to_string(), "tcp://sherpa.local:7788");
+}
+
+#[test]
+fn set_overrides_the_file() {
+    let set = [
+        "domain=42",
+        "mts.name = \"quoted name\"",
+        "mts.deadline=1s",
+        "mts.deadline=2s",
+        "mts.queue=7",
+        "mts.transports=tcp, shm",
+        "transport.shm.capacity=1GiB",
+        "transport.shm.spin=0",
+        "transport.tcp.listen=[\"[::1]:0\"]",
+        "transport.udp.listen=",
+        "discovery.mdns=false",
+        "discovery.static={ crex = [\"tcp://10.0.0.2:1\"] }",
+        "routes.\"a=b\"=tcp",
+        "routes.c.d=shm",
+        "routes.x=tcp",
+    ];
+    // The last line of each source has a mistake of its own.
+    let file = "domain = \"file\"\n[routes]\nx = [\"shm\"]\ny = [\"shm\"]\n";
+    assert_eq!(
+        error(file, &set),
+        "--set routes.c.d=shm: unknown key `routes.c.d`; known in [routes.c]: names of your choice"
+    );
+    let set: Vec<&str> = set.into_iter().filter(|one| !one.contains("c.d")).collect();
+    let config = config(file, &set);
+    assert_eq!(config.domain, "42");
+    assert_eq!(config.mts.name, "quoted name");
+    assert_eq!(config.mts.deadline, Duration::from_secs(2));
+    assert_eq!(config.mts.queue, 7);
+    assert_eq!(config.mts.transports, [Kind::Tcp, Kind::Shm]);
+    assert_eq!(config.transport.shm.capacity, 1 << 30);
+    assert_eq!(config.transport.shm.spin, Duration::ZERO);
+    assert_eq!(config.transport.tcp.listen, ["[::1]:0"]);
+    assert!(config.transport.udp.listen.is_empty());
+    assert!(!config.discovery.mdns);
+    assert_eq!(config.discovery.peers[0].name, "crex");
+    let routes: Vec<(&str, Kind)> = config
+        .routes
+        .iter()
+        .map(|route| (route.receiver.as_str(), route.transports[0]))
+        .collect();
+    assert_eq!(
+        routes,
+        [("x", Kind::Tcp), ("a=b", Kind::Tcp), ("y", Kind::Shm)]
+    );
+}
+
+#[test]
+fn the_first_file_counts() {
+    let directory = tempfile::tempdir().unwrap();
+    let write = |name: &str, domain: &str| {
+        let path = directory.path().join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(&path, format!("domain = \"{domain}\"\n")).unwrap();
+        path
+    };
+    let asked = write("asked.toml", "asked");
+    let variable = write("variable.toml", "variable");
+    let local = write("here/fipa.toml", "local");
+    let of_user = write("home/.config/fipa/fipa.toml", "user");
+    let mut sources = Sources {
+        file: Some(asked.clone()),
+        variable: Some(variable.clone()),
+        current_dir: Some(directory.path().join("here")),
+        home: Some(directory.path().join("home")),
+        ..Sources::default()
+    };
+    let loaded = |sources: &Sources| {
+        let effective = Effective::load(sources).unwrap();
+        let file = effective.file().map(Path::to_owned);
+        (effective.into_config().domain, file)
+    };
+    assert_eq!(loaded(&sources), ("asked".to_owned(), Some(asked)));
+    sources.file = Some(PathBuf::from("../asked.toml"));
+    assert_eq!(
+        loaded(&sources),
+        ("asked".to_owned(), Some("../asked.toml".into()))
+    );
+    sources.file = None;
+    assert_eq!(loaded(&sources), ("variable".to_owned(), Some(variable)));
+    sources.variable = Some(PathBuf::new());
+    assert_eq!(
+        loaded(&sources),
+        ("local".to_owned(), Some("fipa.toml".into()))
+    );
+    fs::remove_file(local).unwrap();
+    assert_eq!(loaded(&sources), ("user".to_owned(), Some(of_user.clone())));
+    fs::remove_file(of_user).unwrap();
+    assert_eq!(loaded(&sources), ("default".to_owned(), None));
+}
+
+#[test]
+fn shows_every_value_with_its_origin() {
+    let file = r#"
+domain = "lab"
+[mts]
+transports = [
+  "shm",
+  "tcp",
+]
+[routes]
+"camera_.*" = ["shm"]
+arm = ["tcp", "shm"]
+[discovery]
+static = { crex-mts = ["tcp://10.0.0.2:7788"] }
+"#;
+    let effective = load(file, &["mts.deadline=90s", "routes.'a b'=tcp"]).unwrap();
+    let expected = r#"domain = "lab"                       # fipa.toml:2
+
+[mts]
+name = "sherpa-mts"                  # default
+transports = ["shm", "tcp"]          # fipa.toml:4
+deadline = "1m 30s"                  # --set
+queue = 256                          # default
+
+[transport.shm]
+capacity = "256MiB"                  # default
+max_letter = "64MiB"                 # default
+spin = "50us"                        # default
+
+[transport.tcp]
+listen = ["127.0.0.1:0"]             # default
+
+[transport.udp]
+listen = ["127.0.0.1:0"]             # default
+
+[discovery]
+mdns = true                          # default
+interfaces = []                      # default
+
+[routes]
+"a b" = ["tcp"]                      # --set
+"camera_.*" = ["shm"]                # fipa.toml:9
+arm = ["tcp", "shm"]                 # fipa.toml:10
+
+[discovery.static]
+crex-mts = ["tcp://10.0.0.2:7788"]   # fipa.toml:12
+"#;
+    assert_eq!(effective.render(), expected);
+    assert_eq!(config(expected, &[]), effective.into_config());
+}
+
+/// A comment ends at the end of the line, and a file name may have one.
+#[test]
+fn no_file_name_breaks_what_is_shown() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("x\ndomain = \"evil\"\r.toml");
+    fs::write(&path, "mts.queue = 7\n").unwrap();
+    let sources = Sources {
+        file: Some(path.clone()),
+        ..Sources::default()
+    };
+    let effective = Effective::load(&sources).unwrap();
+    let setting = effective
+        .settings()
+        .into_iter()
+        .find(|setting| setting.path == ["mts", "queue"]);
+    let origin = Origin::File { path, line: 1 };
+    assert_eq!(setting.unwrap().origin, origin);
+    assert_eq!(origin.to_string().lines().count(), 1);
+    assert_eq!(config(&effective.render(), &[]), effective.into_config());
+}
+
+prop_compose! {
+    fn configs()(
+        domain in "[A-Za-z0-9_-]{1,32}",
+        name in "\\PC{1,40}",
+        transports in kinds(),
+        deadline in 1..=86_400_000_000_000_u64,
+        queue in 1..=65_536_usize,
+        routes in prop::collection::btree_map("[a-zé\"'#= .\n-]{1,12}(\\.\\*)?", kinds(), 0..5),
+        capacity in 1_u64 << 20..=1 << 40,
+        letter in 4096_u64..=1 << 20,
+        spin in 0..=1_000_000_000_u64,
+        ports in prop::collection::btree_set(1_u16.., 0..4),
+        mdns: bool,
+        interfaces in prop::collection::btree_set("[a-z]{1,9}[0-9]", 0..4),
+        peers in prop::collection::btree_map("[^\\p{Cc}]{1,20}", 1_u16.., 0..4),
+    ) -> Config {
+        let mut config = Config::for_host("sherpa");
+        config.domain = domain;
+        config.mts.name = name;
+        config.mts.transports = transports;
+        config.mts.deadline = Duration::from_nanos(deadline);
+        config.mts.queue = queue;
+        config.routes = routes
+            .into_iter()
+            .map(|(receiver, transports)| Route { receiver, transports })
+            .collect();
+        // As the text is checked with the transports that are on.
+        config.routes.retain(|route| {
+            route.transports.iter().any(|kind| config.mts.transports.contains(kind))
+        });
+        config.transport.shm.capacity = capacity;
+        config.transport.shm.max_letter = letter;
+        config.transport.shm.spin = Duration::from_nanos(spin);
+        config.transport.tcp.listen =
+            ports.iter().map(|port| format!("[fe80::1%eth0]:{port}")).collect();
+        config.discovery.mdns = mdns;
+        config.discovery.interfaces = interfaces.into_iter().map(Interface::Name).collect();
+        config.discovery.peers = peers
+            .into_iter()
+            .map(|(name, port)| Peer {
+                name,
+                locations: vec![format!("tcp://host:{port}").parse().unwrap()],
+            })
+            .collect();
+        config
+    }
+}
+
+fn kinds() -> impl Strategy<Value = Vec<Kind>> {
+    prop::sample::subsequence(vec![Kind::Shm, Kind::Tcp], 1..=2).prop_shuffle()
+}
+
+proptest! {
+    #[test]
+    fn what_is_shown_says_the_same(config in configs()) {
+        config.check().unwrap();
+        let mut reader = Reader::new("");
+        reader.config = config.clone();
+        let shown = Effective::new(reader, None).render();
+        let mut reader = Reader::new("elsewhere");
+        reader.file(Path::new("shown.toml"), &shown);
+        reader.check();
+        prop_assert_eq!(&reader.mistakes, &[], "{}", shown);
+        prop_assert_eq!(reader.config, config, "{}", shown);
+    }
+
+    #[test]
+    fn no_text_is_too_much(text in "\\PC*|([a-z.]{1,9}( = |=)[\\[\\]{}a-z0-9\", .]*\n){0,9}") {
+        let mut reader = Reader::new("");
+        reader.set(&text);
+        reader.file(Path::new("x"), &text);
+        reader.check();
+        for mistake in &reader.mistakes {
+            prop_assert!(!mistake.to_string().contains('\n'), "{}", mistake);
+        }
+    }
+}

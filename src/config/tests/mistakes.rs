@@ -1,0 +1,447 @@
+//! What is refused, and in which words.
+
+use std::fs;
+
+use super::{config, error};
+use crate::config::{Config, ConfigError, Interface, Sources};
+
+/// Each line: a file, and everything that is said about it.
+#[test]
+fn mistakes_are_named_with_line_and_key() {
+    let cases: &[(&str, &str)] = &[
+        // Unknown keys.
+        (
+            "domain = \"a\"\n[mts]\ndeadlin = \"5s\"\n",
+            "fipa.toml:3: unknown key `mts.deadlin`; did you mean `mts.deadline`? \
+             (known in [mts]: name, transports, deadline, queue)",
+        ),
+        (
+            "deadline = \"5s\"\n",
+            "fipa.toml:1: unknown key `deadline`; did you mean `mts.deadline`? \
+             (known at the top: domain, mts, transport, discovery, routes)",
+        ),
+        (
+            "[discover]\nmdns = true\n",
+            "fipa.toml:1: unknown key `discover`; did you mean `discovery`? \
+             (known at the top: domain, mts, transport, discovery, routes)",
+        ),
+        (
+            "[transport.quic]\nlisten = []\n",
+            "fipa.toml:1: unknown key `transport.quic`; known in [transport]: shm, tcp, udp",
+        ),
+        (
+            "[mts]\nname.first = \"x\"\n",
+            "fipa.toml:2: `mts.name` is wrong: a table cannot stand here (a name with dots needs \
+             quotes); expected a name of 1 to 255 bytes",
+        ),
+        (
+            "[routes]\ncamera.left = [\"shm\"]\n",
+            "fipa.toml:2: `routes.camera` is wrong: a table cannot stand here (a name with dots \
+             needs quotes); expected a list of transports such as [\"shm\", \"tcp\"]",
+        ),
+        (
+            "\nmts = 5\n",
+            "fipa.toml:2: `mts` is a section, not a value; \
+             write [mts], and below it its keys: name, transports, deadline, queue",
+        ),
+        (
+            "routes = \"x\"\n",
+            "fipa.toml:1: `routes` is a section, not a value; \
+             write [routes], and below it its keys: names of your choice",
+        ),
+        // Values of the wrong kind.
+        (
+            "domain = 5\n",
+            "fipa.toml:1: `domain` is wrong: 5: an integer cannot stand here; \
+             expected a name of 1 to 32 letters, digits, '_' or '-'",
+        ),
+        (
+            "[mts]\ntransports = \"shm\"\n",
+            "fipa.toml:2: `mts.transports` is wrong: \"shm\": a string cannot stand here; \
+             expected a list of transports such as [\"shm\", \"tcp\"]",
+        ),
+        (
+            "[mts]\ntransports = [\n  \"shm\",\n  \"tpc\",\n]\n",
+            "fipa.toml:4: `mts.transports` is wrong: \"tpc\": unknown transport \"tpc\" \
+             (known: shm, tcp, udp, quic); expected a list of transports such as [\"shm\", \"tcp\"]",
+        ),
+        (
+            "[mts]\nname = true\n",
+            "fipa.toml:2: `mts.name` is wrong: true: a boolean cannot stand here; \
+             expected a name of 1 to 255 bytes",
+        ),
+        (
+            "[mts]\ndeadline = 5\n",
+            "fipa.toml:2: `mts.deadline` is wrong: 5: the unit is missing; \
+             expected a duration such as \"5s\" or \"500ms\"",
+        ),
+        (
+            "[mts]\ndeadline = \"5 parsecs\"\n",
+            "fipa.toml:2: `mts.deadline` is wrong: \"5 parsecs\": unknown time unit \"parsecs\", \
+             supported units: ns, us/µs, ms, sec, min, hours, days, weeks, months, years \
+             (and few variations); expected a duration such as \"5s\" or \"500ms\"",
+        ),
+        (
+            "[mts]\nqueue = \"many\"\n",
+            "fipa.toml:2: `mts.queue` is wrong: \"many\": a string cannot stand here; \
+             expected a number of letters such as 256",
+        ),
+        (
+            "[mts]\nqueue = -1\n",
+            "fipa.toml:2: `mts.queue` is wrong: -1: a negative number cannot stand here; \
+             expected a number of letters such as 256",
+        ),
+        (
+            "[transport.shm]\ncapacity = \"256 buckets\"\n",
+            "fipa.toml:2: `transport.shm.capacity` is wrong: \"256 buckets\": not a size; \
+             expected a size such as \"64MiB\"",
+        ),
+        (
+            "[transport.shm]\nmax_letter = -5\n",
+            "fipa.toml:2: `transport.shm.max_letter` is wrong: -5: a negative number cannot stand \
+             here; expected a size such as \"64MiB\"",
+        ),
+        (
+            "[transport.shm]\nspin = 2.5\n",
+            "fipa.toml:2: `transport.shm.spin` is wrong: 2.5: a float cannot stand here; \
+             expected a duration such as \"50us\", or 0",
+        ),
+        (
+            "[transport.tcp]\nlisten = [\"localhost:7788\"]\n",
+            "fipa.toml:2: `transport.tcp.listen` is wrong: \"localhost:7788\": not a numeric \
+             address with port; expected a list of numeric addresses with port such as \
+             [\"127.0.0.1:0\"]",
+        ),
+        (
+            "[transport.udp]\nlisten = [7788]\n",
+            "fipa.toml:2: `transport.udp.listen` is wrong: 7788: an integer cannot stand here; \
+             expected a list of numeric addresses with port such as [\"127.0.0.1:0\"]",
+        ),
+        (
+            "[discovery]\nmdns = \"yes\"\n",
+            "fipa.toml:2: `discovery.mdns` is wrong: \"yes\": a string cannot stand here; \
+             expected true or false",
+        ),
+        (
+            "[discovery]\ninterfaces = [\"eth0/1\"]\n",
+            "fipa.toml:2: `discovery.interfaces` is wrong: \"eth0/1\": neither the name of an \
+             interface nor an address; expected a list of interface names or addresses such as \
+             [\"wlan0\", \"10.0.0.7\"]",
+        ),
+        (
+            "[discovery]\nstatic = { crex = [\n\"10.0.0.2:7788\"] }\n",
+            "fipa.toml:3: `discovery.static.crex` is wrong: \"10.0.0.2:7788\": not a location \
+             (expected for example tcp://10.0.0.2:7788): \"10.0.0.2:7788\"; \
+             expected a list of locations such as [\"tcp://10.0.0.2:7788\"]",
+        ),
+        // Values that are not allowed.
+        (
+            "\n\ndomain = \"../etc\"\n",
+            "fipa.toml:3: `domain` cannot be \"../etc\"; \
+             it becomes part of file names: use 1 to 32 of A-Z a-z 0-9 _ -",
+        ),
+        (
+            "domain = \"\"\n",
+            "fipa.toml:1: `domain` cannot be \"\"; \
+             it becomes part of file names: use 1 to 32 of A-Z a-z 0-9 _ -",
+        ),
+        (
+            "domain = \"abcdefghijabcdefghijabcdefghij123\"\n",
+            "fipa.toml:1: `domain` cannot be \"abcdefghijabcdefghijabcdefghij123\"; \
+             it becomes part of file names: use 1 to 32 of A-Z a-z 0-9 _ -",
+        ),
+        (
+            "[mts]\nname = \"a\\nb\"\n",
+            "fipa.toml:2: `mts.name` cannot be the name \"a\\nb\"; \
+             use 1 to 255 bytes of UTF-8 without control characters",
+        ),
+        (
+            "[mts]\ntransports = []\n",
+            "fipa.toml:2: `mts.transports` is empty; list at least one of shm and tcp",
+        ),
+        (
+            "[mts]\ntransports = [\"tcp\", \"shm\", \"tcp\"]\n",
+            "fipa.toml:2: `mts.transports` lists tcp twice; list each transport once",
+        ),
+        (
+            "[mts]\ntransports = [\"shm\", \"udp\", \"tcp\"]\n",
+            "fipa.toml:2: `mts.transports` lists udp, which is not built yet; \
+             take it out; this version of fipa has shm and tcp",
+        ),
+        (
+            "[mts]\ndeadline = \"0s\"\n",
+            "fipa.toml:2: `mts.deadline` cannot be 0s; \
+             a letter needs time to arrive: more than 0, at most 1h",
+        ),
+        (
+            "[mts]\ndeadline = \"1h 1ns\"\n",
+            "fipa.toml:2: `mts.deadline` cannot be 1h 1ns; \
+             a letter needs time to arrive: more than 0, at most 1h",
+        ),
+        (
+            "[mts]\nqueue = 0\n",
+            "fipa.toml:2: `mts.queue` cannot be 0; use 1 to 65536 letters",
+        ),
+        (
+            "[mts]\nqueue = 65537\n",
+            "fipa.toml:2: `mts.queue` cannot be 65537; use 1 to 65536 letters",
+        ),
+        (
+            "[routes]\n\"\" = [\"shm\"]\n",
+            "fipa.toml:2: `routes.\"\"` has no receiver; write the name of an agent, or a pattern",
+        ),
+        (
+            "[routes]\n\"camera_(\" = [\"shm\"]\n",
+            "fipa.toml:2: `routes.\"camera_(\"` cannot be matched: unclosed group; \
+             write the name of an agent, or a regular expression for whole names",
+        ),
+        (
+            "[routes]\na = []\n",
+            "fipa.toml:2: `routes.a` is empty; list at least one of shm and tcp",
+        ),
+        (
+            "[routes]\na = [\"shm\", \"quic\", \"shm\"]\n",
+            "fipa.toml:2: `routes.a` lists shm twice; list each transport once\n\
+             fipa.toml:2: `routes.a` lists quic, which is not built yet; \
+             take it out; this version of fipa has shm and tcp",
+        ),
+        (
+            "[routes]\na = [\"tcp\"]\n[mts]\ntransports = [\"shm\"]\n",
+            "fipa.toml:2: `routes.a` lists only transports that are off; \
+             list one of `mts.transports`, or turn one of these on there",
+        ),
+        (
+            "[transport.shm]\ncapacity = \"99999999EiB\"\n",
+            "fipa.toml:2: `transport.shm.capacity` cannot be 18446744073709551615 bytes; \
+             use 1MiB to 1TiB, and what fits /dev/shm",
+        ),
+        (
+            "[transport.shm]\nmax_letter = \"1GiB\"\n",
+            "fipa.toml:2: `transport.shm.max_letter` is 1073741824 bytes, more than the 268435456 \
+             of `transport.shm.capacity`; make it smaller, or the capacity larger",
+        ),
+        (
+            "[transport.shm]\nmax_letter = \"100 B\"\n",
+            "fipa.toml:2: `transport.shm.max_letter` cannot be 100 bytes; \
+             use at least 4KiB: an envelope and a message must fit",
+        ),
+        (
+            "[transport.shm]\nspin = \"2s\"\n",
+            "fipa.toml:2: `transport.shm.spin` cannot be 2s; \
+             use 0 to 1s: spinning keeps a core busy",
+        ),
+        (
+            "[transport.tcp]\nlisten = [\"127.0.0.1:0\", \"[::1]:7\", \"127.0.0.1:0\", \"[::1]:7\"]\n",
+            "fipa.toml:2: `transport.tcp.listen` lists [::1]:7 twice; list each address once",
+        ),
+        (
+            "[discovery]\ninterfaces = [\"eth0\", \"eth0\"]\n",
+            "fipa.toml:2: `discovery.interfaces` lists eth0 twice; list each interface once",
+        ),
+        (
+            "[discovery]\nstatic = { crex = [] }\n",
+            "fipa.toml:2: `discovery.static.crex` is empty; \
+             list at least one location of this gateway",
+        ),
+        (
+            "[discovery.static]\ncrex = [\"tcp://a:1\", \"tcp://a:1\"]\n",
+            "fipa.toml:2: `discovery.static.crex` lists tcp://a:1 twice; list each once",
+        ),
+        (
+            "[discovery.static]\ncrex = [\"shm://1\"]\n",
+            "fipa.toml:2: `discovery.static.crex` lists shm://1, which leads to no other host; \
+             write for example tcp://10.0.0.2:7788",
+        ),
+        (
+            "[discovery.static]\ncrex = [\"udp://10.0.0.2:7788\"]\n",
+            "fipa.toml:2: `discovery.static.crex` lists udp://10.0.0.2:7788, but udp is not built \
+             yet; write for example tcp://10.0.0.2:7788",
+        ),
+        (
+            "[discovery.static]\ncrex = [\"tcp://10.0.0.2\"]\n",
+            "fipa.toml:2: `discovery.static.crex` lists tcp://10.0.0.2, which has no port; \
+             write for example tcp://10.0.0.2:7788 or tcp://[fe80::1%eth0]:7788",
+        ),
+        // Not TOML at all.
+        (
+            "domain = \"a\"\n[mts\nname = 5\n",
+            "fipa.toml:2: not TOML: unclosed table, expected `]`; look at the line \"[mts\"",
+        ),
+        (
+            "domain = \"a\"\ndomain = \"b\"\n",
+            "fipa.toml:2: not TOML: duplicate key; look at the line \"domain = \\\"b\\\"\"",
+        ),
+    ];
+    for (text, expected) in cases {
+        assert_eq!(&error(text, &[]), expected, "{text}");
+    }
+}
+
+#[test]
+fn lists_are_bounded() {
+    let addresses = |count: usize| {
+        let all: Vec<String> = (1..=count)
+            .map(|port| format!("\"127.0.0.1:{port}\""))
+            .collect();
+        format!("[transport.tcp]\nlisten = [{}]\n", all.join(", "))
+    };
+    config(&addresses(16), &[]);
+    assert_eq!(
+        error(&addresses(17), &[]),
+        "fipa.toml:2: `transport.tcp.listen` has 17 entries; use at most 16"
+    );
+    let routes: String = (0..257).map(|n| format!("a{n} = [\"shm\"]\n")).collect();
+    assert_eq!(
+        error(&format!("[routes]\n{routes}"), &[]),
+        "fipa.toml:2: `routes` has 257 entries; use at most 256"
+    );
+    let interfaces: Vec<String> = (0..65).map(|n| format!("\"eth{n}\"")).collect();
+    assert_eq!(
+        error(
+            &format!("discovery.interfaces = [{}]", interfaces.join(",")),
+            &[]
+        ),
+        "fipa.toml:1: `discovery.interfaces` has 65 entries; use at most 64"
+    );
+    let peers: String = (0..1025)
+        .map(|n| format!("a{n} = [\"tcp://a:1\"]\n"))
+        .collect();
+    assert_eq!(
+        error(&format!("[discovery.static]\n{peers}"), &[]),
+        "fipa.toml:2: `discovery.static` has 1025 entries; use at most 1024"
+    );
+    let locations: Vec<String> = (1..=17).map(|port| format!("\"tcp://a:{port}\"")).collect();
+    assert_eq!(
+        error(
+            &format!("discovery.static.a = [{}]", locations.join(",")),
+            &[]
+        ),
+        "fipa.toml:1: `discovery.static.a` has 17 entries; use at most 16"
+    );
+    let name = "x".repeat(256);
+    assert_eq!(
+        error(&format!("mts.name = {name:?}"), &[]),
+        "fipa.toml:1: `mts.name` is a name of 256 bytes; \
+         use 1 to 255 bytes of UTF-8 without control characters"
+    );
+    let deep = format!("domain = {}1{}", "[".repeat(10_000), "]".repeat(10_000));
+    assert!(error(&deep, &[]).starts_with("fipa.toml:1: not TOML: "));
+}
+
+#[test]
+fn all_mistakes_are_told_at_once_in_order() {
+    assert_eq!(
+        error("domain = 1\nmts.queue = \"x\"\n", &["a", "b"]),
+        "--set a: not of the form key=value; write for example --set mts.deadline=9s\n\
+         --set b: not of the form key=value; write for example --set mts.deadline=9s\n\
+         fipa.toml:1: `domain` is wrong: 1: an integer cannot stand here; \
+         expected a name of 1 to 32 letters, digits, '_' or '-'\n\
+         fipa.toml:2: `mts.queue` is wrong: \"x\": a string cannot stand here; \
+         expected a number of letters such as 256"
+    );
+}
+
+#[test]
+fn mistakes_in_set_name_it() {
+    assert_eq!(
+        error("", &["mts.deadlin=5s"]),
+        "--set mts.deadlin=5s: unknown key `mts.deadlin`; did you mean `mts.deadline`? \
+         (known in [mts]: name, transports, deadline, queue)"
+    );
+    assert_eq!(
+        error("", &["mts.transports=shm,udp"]),
+        "--set mts.transports=shm,udp: `mts.transports` lists udp, which is not built yet; \
+         take it out; this version of fipa has shm and tcp"
+    );
+    assert_eq!(
+        error("", &["mts=5"]),
+        "--set mts=5: `mts` is a section, not a value; \
+         write [mts], and below it its keys: name, transports, deadline, queue"
+    );
+    assert_eq!(
+        error("", &["mts.queue=x\u{1b}[31m"]),
+        "--set mts.queue=x\\u{1b}[31m: `mts.queue` is wrong: \"x\\u001B[31m\": \
+         a string cannot stand here; expected a number of letters such as 256"
+    );
+    // What --set replaces is still looked at.
+    assert!(error("domain = 5\n", &["domain=a"]).starts_with("fipa.toml:1: `domain` is wrong"));
+}
+
+#[test]
+fn a_named_file_must_be_there() {
+    let directory = tempfile::tempdir().unwrap();
+    let sources = Sources {
+        file: Some("none.toml".into()),
+        current_dir: Some(directory.path().to_owned()),
+        ..Sources::default()
+    };
+    let missing = "none.toml (named by --config): No such file or directory (os error 2)";
+    assert_eq!(
+        Config::load(&sources).unwrap_err().to_string(),
+        format!("cannot read the configuration {missing}")
+    );
+    let sources = Sources {
+        variable: Some(directory.path().to_owned()),
+        ..Sources::default()
+    };
+    assert_eq!(
+        Config::load(&sources).unwrap_err().to_string(),
+        format!(
+            "cannot read the configuration {} (named by $FIPA_CONFIG): Is a directory (os error 21)",
+            directory.path().display()
+        )
+    );
+}
+
+#[test]
+fn a_found_file_must_be_readable_text() {
+    let directory = tempfile::tempdir().unwrap();
+    let sources = Sources {
+        current_dir: Some(directory.path().to_owned()),
+        ..Sources::default()
+    };
+    let refused = |bytes: &[u8]| {
+        fs::write(directory.path().join("fipa.toml"), bytes).unwrap();
+        Config::load(&sources).unwrap_err().to_string()
+    };
+    assert_eq!(
+        refused(b"domain = \"a\"\n# \xff\n"),
+        "cannot read the configuration fipa.toml (found in the current directory): \
+         line 2 is not UTF-8, as TOML must be"
+    );
+    assert_eq!(
+        refused(&[b'#'; (1 << 20) + 1]),
+        "cannot read the configuration fipa.toml (found in the current directory): \
+         larger than 1048576 bytes, so it is no configuration"
+    );
+}
+
+#[test]
+fn a_changed_configuration_is_checked_again() {
+    let mut config = Config::for_host("sherpa");
+    config.check().unwrap();
+    config.domain = "a/b".to_owned();
+    config.mts.queue = 0;
+    config.transport.tcp.listen.push("nowhere".to_owned());
+    config
+        .discovery
+        .interfaces
+        .push(Interface::Name("a b".to_owned()));
+    let ConfigError::Mistakes(mistakes) = config.check().unwrap_err() else {
+        panic!("mistakes expected");
+    };
+    let shown: Vec<String> = mistakes.iter().map(ToString::to_string).collect();
+    assert_eq!(
+        shown,
+        [
+            "`domain` cannot be \"a/b\"; \
+             it becomes part of file names: use 1 to 32 of A-Z a-z 0-9 _ -",
+            "`mts.queue` cannot be 0; use 1 to 65536 letters",
+            "`transport.tcp.listen` lists \"nowhere\", not a numeric address with port; \
+             write for example 127.0.0.1:0 or [fe80::1%eth0]:7788",
+            "`discovery.interfaces` lists \"a b\", which no interface can be called; \
+             `ip link` lists the names",
+        ]
+    );
+    assert!(mistakes.iter().all(|mistake| mistake.place.is_none()));
+}

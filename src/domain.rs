@@ -1,0 +1,156 @@
+//! A process's membership in a domain.
+
+use std::sync::Arc;
+
+use fipa_sds::{Directory, HostError, RegisterError, Registration};
+use fipa_transport::{Incarnation, Kind, ListenError};
+
+use crate::agent::Agent;
+use crate::config::ConfigError;
+use crate::place::PlaceError;
+use crate::service::{Role, Service};
+use crate::{AgentId, AgentIdError, Config};
+
+/// This process's membership in a domain: processes of one domain on one host see each other.
+///
+/// Cheap to clone; ends when [`close`](Self::close) is called or the last clone and the last
+/// agent are dropped.
+#[derive(Clone)]
+pub struct Domain {
+    pub(crate) inner: Arc<Inner>,
+}
+
+pub(crate) struct Inner {
+    pub(crate) service: Service,
+    pub(crate) deadline: std::time::Duration,
+}
+
+impl Drop for Inner {
+    fn drop(&mut self) {
+        self.service.abort();
+    }
+}
+
+/// Why a domain could not be joined.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum OpenError {
+    /// The configuration has mistakes.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// There is no tokio runtime with I/O and time; processes without one use
+    /// [`crate::blocking`].
+    #[error("no tokio runtime is running; call this from one, or use fipa::blocking")]
+    NoRuntime,
+    /// The domain's directory cannot be used.
+    #[error(transparent)]
+    Place(#[from] PlaceError),
+    /// The directory of the host cannot be used.
+    #[error(transparent)]
+    Directory(#[from] HostError),
+    /// A transport that the gateway needs cannot be opened.
+    #[error("{kind}: {source}")]
+    Listen {
+        /// Which transport.
+        kind: Kind,
+        /// Why.
+        source: ListenError,
+    },
+    /// None of the configured transports works.
+    #[error("no transport can be used: {0}")]
+    NoTransport(String),
+    /// The service's own name is taken, or not a name.
+    #[error("cannot register the gateway: {0}")]
+    Name(#[from] RegisterError),
+    /// There can be one gateway only.
+    #[error("the domain has a gateway already, {0:?}; end it, or name another domain")]
+    GatewayRunning(String),
+    /// Other hosts cannot be looked for.
+    #[error("discovery: {0}")]
+    Discovery(String),
+}
+
+/// What an agent says about itself when registering.
+#[derive(Debug, Clone, Default)]
+pub struct RegisterOptions {
+    /// What kind of agent it is, for searches; may be empty.
+    pub agent_type: String,
+    /// Free text; may be empty.
+    pub description: String,
+}
+
+impl Domain {
+    /// Joins the domain that the configuration names. Must be called within a tokio runtime,
+    /// which then does the work in the background.
+    ///
+    /// # Errors
+    /// When the configuration, the domain's directory or every transport cannot be used.
+    pub async fn open(config: &Config) -> Result<Self, OpenError> {
+        let host = gethostname::gethostname();
+        let name = format!("{}-{}", host.to_string_lossy(), std::process::id());
+        let service = Service::start(
+            config,
+            Role {
+                name: name.into(),
+                gateway: false,
+                // Another way than shared memory between processes of this host; never further.
+                listen: vec!["127.0.0.1:0".to_owned()],
+                view: &|host, _| Ok(host),
+            },
+        )?;
+        let deadline = config.mts.deadline;
+        Ok(Self { inner: Arc::new(Inner { service, deadline }) })
+    }
+
+    /// Registers an agent with nothing but a name.
+    ///
+    /// # Errors
+    /// See [`register_with`](Self::register_with).
+    pub fn register(&self, name: &str) -> Result<Agent, RegisterError> {
+        self.register_with(name, RegisterOptions::default())
+    }
+
+    /// Registers an agent. From now on it is found by its name, here and, when a gateway is
+    /// running, on other hosts; its letters wait in its queue until it receives them.
+    ///
+    /// # Errors
+    /// When somebody else has the name, or it is no name.
+    pub fn register_with(
+        &self,
+        name: &str,
+        options: RegisterOptions,
+    ) -> Result<Agent, RegisterError> {
+        let service = &self.inner.service;
+        let id = AgentId::new(name).map_err(|error: AgentIdError| {
+            RegisterError::Failed(Arc::new(error))
+        })?;
+        let incarnation = Incarnation::random();
+        let name: Arc<str> = name.into();
+        // The queue first: once the name is known, letters come.
+        service.mts.register(Arc::clone(&name), incarnation);
+        let registration = Registration {
+            agent_type: options.agent_type,
+            description: options.description,
+            ..Registration::new(Arc::clone(&name), incarnation, service.locations.clone())
+        };
+        match service.host.register(registration) {
+            Ok(_) => Ok(Agent::new(self.clone(), id, name, incarnation)),
+            Err(error) => {
+                service.mts.deregister(incarnation);
+                Err(error)
+            }
+        }
+    }
+
+    /// Who is there: the agents of this host and, when a gateway is running, those it knows of.
+    #[must_use]
+    pub fn directory(&self) -> &dyn Directory {
+        &*self.inner.service.host
+    }
+
+    /// Leaves the domain: gives letters under way a moment to arrive, then ends. All agents of
+    /// this process are deregistered.
+    pub async fn close(self) {
+        self.inner.service.close().await;
+    }
+}

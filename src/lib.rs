@@ -1,0 +1,58 @@
+//! Agent communication for robots, to the FIPA standards: what a robot process embeds.
+//!
+//! A process joins a [`Domain`], registers [`Agent`]s in it, and these exchange FIPA messages with
+//! all agents of the domain: through shared memory on one host, and through the host's gateway
+//! with those of other hosts.
+//!
+//! ```no_run
+//! use fipa::{AgentId, Config, Domain, Performative};
+//!
+//! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
+//! let domain = Domain::open(&Config::load(&fipa::config::Sources::from_environment())?).await?;
+//! let agent = domain.register("rover")?;
+//! let request = agent
+//!     .message(Performative::Request)
+//!     .receiver(AgentId::new("arm_1")?)
+//!     .content("(lift sample-3)")
+//!     .build()?;
+//! let deliveries = agent.send(request).await?;
+//! println!("{deliveries}");
+//! let letter = agent.receive().await?;
+//! println!("{}", letter.message);
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! * [`Domain`] is this process's membership, [`Agent`] one name in it.
+//! * [`config`] is what the owner of a robot chooses, in one TOML file.
+//! * [`blocking`] is for processes without an async runtime.
+//! * [`Gateway`] (feature `net`) is what `fipa up` runs; robot processes do not need it.
+//!
+//! What must not live here: delivery (that is `fipa-mts`), transports, terminals.
+
+mod agent;
+pub mod blocking;
+pub mod config;
+mod domain;
+#[cfg(feature = "net")]
+mod gateway;
+mod place;
+mod service;
+
+pub use agent::{Agent, Deliveries, Delivery, Incoming, Loan, ReceiveError, SendError};
+pub use config::Config;
+pub use domain::{Domain, OpenError, RegisterOptions};
+pub use fipa_acl::{
+    AgentId, AgentIdError, BuildError, DecodeError, Envelope, EnvelopeParams, Letter, Message,
+    MessageBuilder, Payload, Performative, Time,
+};
+pub use fipa_sds::{
+    Change, Directory, Entry, Matcher, Pattern, PatternError, Query, Reach, RegisterError, Role,
+    Watch, is_pattern,
+};
+pub use fipa_transport::{
+    Attempt, FailureReason, Incarnation, Kind, ListenError, Location, Outcome,
+};
+#[cfg(feature = "net")]
+pub use gateway::Gateway;
+pub use place::PlaceError;

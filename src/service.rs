@@ -1,0 +1,197 @@
+//! Puts a message transport service together: the transports that the configuration wants, the
+//! directory of the host, and the runtime over both.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use fipa_mts::core::CoreConfig;
+use fipa_mts::{Mts, RuntimeConfig, Started};
+use fipa_sds::{Directory, HostConfig, HostDirectory, Pattern};
+use fipa_transport::{Incarnation, Kind, Location, Transport};
+use tokio::runtime::Handle;
+
+use crate::Config;
+use crate::domain::OpenError;
+use crate::place::Place;
+
+/// How long a service that ends waits for what is under way.
+pub(crate) const CLOSING_PATIENCE: Duration = Duration::from_secs(1);
+
+/// A message transport service in one of its two roles.
+pub(crate) struct Service {
+    pub(crate) mts: Mts,
+    pub(crate) host: Arc<HostDirectory>,
+    pub(crate) locations: Vec<Location>,
+    pub(crate) incarnation: Incarnation,
+    pub(crate) name: Arc<str>,
+    place: Place,
+}
+
+/// What differs between a robot process and the gateway.
+pub(crate) struct Role<'a> {
+    /// The name of the service.
+    pub(crate) name: Arc<str>,
+    /// Leave to forward.
+    pub(crate) gateway: bool,
+    /// Where TCP listens.
+    #[cfg_attr(not(feature = "net"), expect(dead_code, reason = "nothing listens"))]
+    pub(crate) listen: Vec<String>,
+    /// Makes the view of the directory in which receivers are looked up.
+    pub(crate) view: &'a View<'a>,
+}
+
+/// From the directory of this host, and the service that looks up receivers, to its view.
+pub(crate) type View<'a> =
+    dyn Fn(Arc<HostDirectory>, &fipa_sds::Mts) -> Result<Arc<dyn Directory>, OpenError> + 'a;
+
+impl Service {
+    pub(crate) fn start(config: &Config, role: Role<'_>) -> Result<Self, OpenError> {
+        config.check()?;
+        let handle = Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
+        let place = Place::prepare(&config.domain)?;
+        let incarnation = Incarnation::random();
+        let own = fipa_sds::Mts::new(Arc::clone(&role.name), incarnation);
+        let host = Arc::new(HostDirectory::open(HostConfig {
+            dir: place.part("directory"),
+            mts: own.clone(),
+            gateway: role.gateway,
+        })?);
+        let view = (role.view)(Arc::clone(&host), &own)?;
+        let mut refused = Vec::new();
+        let transports = transports(config, &role, &place, incarnation, &handle, &mut refused);
+        let Started { mts, locations, failed } = Mts::start(
+            core_config(config, &role, incarnation),
+            RuntimeConfig {
+                spin: config.transport.shm.spin,
+                unframed_deadline: config.mts.deadline,
+            },
+            view,
+            transports,
+            &handle,
+        );
+        let service = Self { mts, host, locations, incarnation, name: role.name, place };
+        for (kind, error) in failed {
+            if role.gateway {
+                service.abort();
+                return Err(OpenError::Listen { kind, source: error });
+            }
+            refused.push((kind, error.to_string()));
+        }
+        if service.locations.is_empty() {
+            service.abort();
+            return Err(OpenError::NoTransport(told(&refused)));
+        }
+        for (kind, error) in &refused {
+            tracing::warn!(%kind, error, "a transport cannot be used; going on without it");
+        }
+        Ok(service)
+    }
+
+    /// Gives what is under way a moment to end, then ends.
+    pub(crate) async fn close(&self) {
+        self.mts.close(CLOSING_PATIENCE).await;
+        self.abort();
+    }
+
+    /// Ends at once and leaves nothing behind.
+    pub(crate) fn abort(&self) {
+        self.mts.abort();
+        if let Err(error) = self.host.close() {
+            tracing::warn!(%error, "could not leave the directory of this host in order");
+        }
+        self.place.leave();
+    }
+}
+
+fn told(refused: &[(Kind, String)]) -> String {
+    let texts: Vec<String> =
+        refused.iter().map(|(kind, error)| format!("{kind}: {error}")).collect();
+    texts.join("; ")
+}
+
+fn core_config(config: &Config, role: &Role<'_>, incarnation: Incarnation) -> CoreConfig {
+    let order = config.mts.transports.clone();
+    let routes = config.routes.iter().filter_map(|route| {
+        // Checked when the configuration was: what does not compile cannot be here.
+        let pattern = Pattern::new(&route.receiver).ok()?;
+        let used = route.transports.iter().filter(|kind| order.contains(kind));
+        Some((pattern, used.copied().collect()))
+    });
+    CoreConfig {
+        forwards: role.gateway,
+        routes: routes.collect(),
+        queue: config.mts.queue,
+        ..CoreConfig::new(Arc::clone(&role.name), incarnation, order.clone())
+    }
+}
+
+/// The transports that are wanted, built in, and work here.
+fn transports(
+    config: &Config,
+    role: &Role<'_>,
+    place: &Place,
+    incarnation: Incarnation,
+    handle: &Handle,
+    refused: &mut Vec<(Kind, String)>,
+) -> Vec<Arc<dyn Transport>> {
+    let mut transports: Vec<Arc<dyn Transport>> = Vec::new();
+    for kind in &config.mts.transports {
+        let made = match kind {
+            #[cfg(feature = "shm")]
+            Kind::Shm => shm(config, place, incarnation, handle),
+            #[cfg(feature = "net")]
+            Kind::Tcp => tcp(config, role, place, incarnation, handle),
+            // One configuration serves all processes of a robot, whatever they were built with.
+            other => {
+                tracing::debug!(kind = %other, "this program was built without it");
+                continue;
+            }
+        };
+        match made {
+            Ok(transport) => transports.push(transport),
+            Err(error) => refused.push((*kind, error)),
+        }
+    }
+    let _ = (role, place, incarnation, handle);
+    transports
+}
+
+#[cfg(feature = "shm")]
+fn shm(
+    config: &Config,
+    place: &Place,
+    incarnation: Incarnation,
+    handle: &Handle,
+) -> Result<Arc<dyn Transport>, String> {
+    use fipa_transport_shm::{ShmConfig, ShmTransport};
+    let settings = &config.transport.shm;
+    let config = ShmConfig {
+        capacity: settings.capacity,
+        max_letter: usize::try_from(settings.max_letter).unwrap_or(usize::MAX),
+        ..ShmConfig::new(place.part("shm"), place.prefix(), incarnation)
+    };
+    let transport = ShmTransport::new(config, handle.clone()).map_err(|error| error.to_string())?;
+    Ok(Arc::new(transport))
+}
+
+#[cfg(feature = "net")]
+fn tcp(
+    config: &Config,
+    role: &Role<'_>,
+    place: &Place,
+    incarnation: Incarnation,
+    handle: &Handle,
+) -> Result<Arc<dyn Transport>, String> {
+    use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport};
+    let host = place.host_id().map_err(|error| format!("cannot tell this host: {error}"))?;
+    let identity = Identity {
+        name: role.name.to_string(),
+        incarnation,
+        domain: config.domain.clone(),
+        host,
+    };
+    let max_letter = usize::try_from(config.transport.shm.max_letter).unwrap_or(usize::MAX);
+    let limits = Limits { max_letter, ..Limits::default() };
+    let config = TcpConfig { listen: role.listen.clone(), identity, limits };
+    Ok(Arc::new(TcpTransport::new(config, handle.clone())))
+}

@@ -1,0 +1,319 @@
+//! What a robot process can rely on: agents of several processes of one host (each with a
+//! membership of its own, here in one test process) exchange letters.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::collections::HashSet;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
+
+use fipa::config::Sources;
+use fipa::{
+    Agent, AgentId, Config, Deliveries, Domain, FailureReason, Kind, Message, Outcome,
+    Performative, RegisterError,
+};
+
+/// A configuration for a domain that no other test has.
+fn config(set: &[&str]) -> Config {
+    static NEXT: AtomicU32 = AtomicU32::new(0);
+    let number = NEXT.fetch_add(1, Ordering::Relaxed);
+    let mut all = vec![
+        format!("domain=test-{}-{number}", std::process::id()),
+        "discovery.mdns=false".to_owned(),
+    ];
+    all.extend(set.iter().map(|setting| (*setting).to_owned()));
+    Config::load(&Sources { set: all, ..Sources::default() }).unwrap()
+}
+
+fn inform(from: &Agent, to: &str, content: impl Into<Vec<u8>>) -> Message {
+    from.message(Performative::Inform)
+        .receiver(AgentId::new(to).unwrap())
+        .content(content.into())
+        .build()
+        .unwrap()
+}
+
+fn only(deliveries: &Deliveries) -> &Outcome {
+    assert_eq!(deliveries.0.len(), 1, "{deliveries}");
+    &deliveries.0[0].outcome
+}
+
+fn reason(deliveries: &Deliveries) -> FailureReason {
+    match only(deliveries) {
+        Outcome::Failed { reason, .. } => *reason,
+        other => panic!("{other}"),
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn letters_go_both_ways_and_say_by_which_way() {
+    for (transports, via) in [("shm,tcp", Kind::Shm), ("tcp", Kind::Tcp), ("tcp,shm", Kind::Tcp)] {
+        let config = config(&[&format!("mts.transports={transports}")]);
+        let (here, there) =
+            (Domain::open(&config).await.unwrap(), Domain::open(&config).await.unwrap());
+        let (rover, arm) = (here.register("rover").unwrap(), there.register("arm").unwrap());
+        let question = rover
+            .message(Performative::Request)
+            .receiver(arm.id().clone())
+            .content("lift")
+            .protocol("fipa-request")
+            .conversation_id("c-1")
+            .reply_with("q-1")
+            .build()
+            .unwrap();
+        let deliveries = rover.send(question).await.unwrap();
+        assert_eq!(only(&deliveries), &Outcome::Delivered { via, attempts: Vec::new() });
+        let asked = arm.receive().await.unwrap();
+        assert_eq!(asked.via, Some(via));
+        let answer = arm.reply(&asked.message, Performative::Agree).build().unwrap();
+        assert!(arm.send(answer).await.unwrap().all_succeeded());
+        let answered = rover.receive().await.unwrap();
+        assert_eq!(answered.message.in_reply_to(), Some("q-1"));
+        assert_eq!(answered.message.conversation_id(), Some("c-1"));
+        drop((rover, arm));
+        here.close().await;
+        there.close().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_name_belongs_to_one_at_a_time() {
+    let config = config(&[]);
+    let (here, there) = (Domain::open(&config).await.unwrap(), Domain::open(&config).await.unwrap());
+    let first = here.register("arm").unwrap();
+    for domain in [&here, &there] {
+        match domain.register("arm") {
+            Err(RegisterError::AlreadyRegistered { holder }) => {
+                assert_eq!(holder.incarnation, first.incarnation());
+            }
+            Err(other) => panic!("{other}"),
+            Ok(_) => panic!("two agents have one name"),
+        }
+    }
+    first.deregister().unwrap();
+    there.register("arm").unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_thousand_letters_arrive_in_order_and_once() {
+    let config = config(&["mts.queue=16"]);
+    let (here, there) = (Domain::open(&config).await.unwrap(), Domain::open(&config).await.unwrap());
+    let (rover, arm) = (here.register("rover").unwrap(), there.register("arm").unwrap());
+    let total = 1000_u32;
+    let reading = tokio::spawn(async move {
+        let mut seen = Vec::new();
+        while seen.len() < total as usize {
+            let incoming = arm.receive().await.unwrap();
+            let content = incoming.message.content().unwrap();
+            seen.push(u32::from_le_bytes(content[..].try_into().unwrap()));
+        }
+        seen
+    });
+    let rover = std::sync::Arc::new(rover);
+    let mut sending = Vec::new();
+    for number in 0..total {
+        // Polled once here, so that the letters leave in this order; awaited later.
+        let rover = std::sync::Arc::clone(&rover);
+        let message = inform(&rover, "arm", number.to_le_bytes());
+        let mut send = Box::pin(async move { rover.send(message).await.unwrap() });
+        let first = futures_poll_once(&mut send).await;
+        sending.push((first, send));
+    }
+    for (first, send) in sending {
+        let deliveries = match first {
+            Some(deliveries) => deliveries,
+            None => send.await,
+        };
+        assert!(deliveries.all_succeeded(), "{deliveries}");
+    }
+    assert_eq!(reading.await.unwrap(), (0..total).collect::<Vec<_>>());
+}
+
+/// Polls a future once.
+async fn futures_poll_once<T>(future: &mut std::pin::Pin<Box<impl Future<Output = T>>>) -> Option<T> {
+    std::future::poll_fn(|context| match future.as_mut().poll(context) {
+        std::task::Poll::Ready(value) => std::task::Poll::Ready(Some(value)),
+        std::task::Poll::Pending => std::task::Poll::Ready(None),
+    })
+    .await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_full_queue_fails_late_and_harms_nobody_else() {
+    let config = config(&["mts.queue=2"]);
+    let (here, there) = (Domain::open(&config).await.unwrap(), Domain::open(&config).await.unwrap());
+    let rover = here.register("rover").unwrap();
+    let (slow, quick) = (there.register("slow").unwrap(), there.register("quick").unwrap());
+    for _ in 0..2 {
+        assert!(rover.send(inform(&rover, "slow", "x")).await.unwrap().all_succeeded());
+    }
+    let short = Duration::from_millis(300);
+    let blocked = rover.send_within(inform(&rover, "slow", "too much"), short);
+    let meanwhile = async {
+        for _ in 0..20 {
+            assert!(rover.send(inform(&rover, "quick", "x")).await.unwrap().all_succeeded());
+            quick.receive().await.unwrap();
+        }
+    };
+    let (blocked, ()) = tokio::join!(blocked, meanwhile);
+    assert_eq!(reason(&blocked.unwrap()), FailureReason::QueueFull);
+    // The sender reads its failure message; the next letter waits for the reader, not in vain.
+    let told = rover.receive().await.unwrap();
+    assert_eq!(*told.message.performative(), Performative::Failure);
+    let waiting = rover.send(inform(&rover, "slow", "in time"));
+    let reading = async {
+        let mut seen = Vec::new();
+        for _ in 0..3 {
+            seen.push(slow.receive().await.unwrap().message.content().unwrap().to_vec());
+        }
+        seen
+    };
+    let (waiting, seen) = tokio::join!(waiting, reading);
+    assert!(waiting.unwrap().all_succeeded());
+    assert_eq!(seen, [b"x".to_vec(), b"x".to_vec(), b"in time".to_vec()]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_pattern_reaches_all_but_the_sender() {
+    let config = config(&[]);
+    let (here, there) = (Domain::open(&config).await.unwrap(), Domain::open(&config).await.unwrap());
+    let sender = here.register("arm_0").unwrap();
+    let others: Vec<Agent> =
+        (1..4).map(|number| there.register(&format!("arm_{number}")).unwrap()).collect();
+    let stranger = there.register("camera").unwrap();
+    let deliveries = sender.send(inform(&sender, "arm_.*", "stop")).await.unwrap();
+    let reached: HashSet<&str> = deliveries.0.iter().map(|delivery| &*delivery.receiver).collect();
+    assert_eq!(reached, HashSet::from(["arm_1", "arm_2", "arm_3"]));
+    assert!(deliveries.all_succeeded(), "{deliveries}");
+    for arm in &others {
+        assert_eq!(arm.receive().await.unwrap().message.content().unwrap(), "stop");
+    }
+    assert!(stranger.try_receive().unwrap().is_none());
+    assert!(sender.try_receive().unwrap().is_none());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nobody_of_that_name_is_a_failure_told_once() {
+    let domain = Domain::open(&config(&[])).await.unwrap();
+    let rover = domain.register("rover").unwrap();
+    for to in ["nobody", "nobody_.*", "broken("] {
+        let deliveries = rover.send(inform(&rover, to, "hello")).await.unwrap();
+        assert_eq!(reason(&deliveries), FailureReason::NoSuchAgent);
+        let told = rover.receive().await.unwrap().message;
+        assert_eq!(*told.performative(), Performative::Failure);
+        assert_eq!(told.ontology(), Some("fipa-agent-management"));
+        let content = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
+        assert!(content.contains("no such agent") && content.contains(to), "{content}");
+        // A failure about a failure is never sent.
+        let failure = rover
+            .message(Performative::Failure)
+            .receiver(AgentId::new(to).unwrap())
+            .build()
+            .unwrap();
+        assert_eq!(reason(&rover.send(failure).await.unwrap()), FailureReason::NoSuchAgent);
+        assert!(rover.try_receive().unwrap().is_none());
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn loaned_content_is_not_copied() {
+    let config = config(&[]);
+    let (here, there) = (Domain::open(&config).await.unwrap(), Domain::open(&config).await.unwrap());
+    let (rover, arm) = (here.register("rover").unwrap(), there.register("arm").unwrap());
+    for len in [100_000, 4 << 20] {
+        let mut loan = rover.loan(inform(&rover, "arm", []), len).unwrap();
+        for (index, byte) in loan.content_mut().iter_mut().enumerate() {
+            *byte = index as u8;
+        }
+        assert!(rover.send_loan(loan).await.unwrap().all_succeeded());
+        let incoming = arm.receive().await.unwrap();
+        let content = incoming.message.content().unwrap();
+        assert_eq!(content.len(), len);
+        assert!(content.iter().enumerate().all(|(index, byte)| *byte == index as u8));
+        assert!(is_shared_memory(content), "{len} bytes were copied");
+    }
+    // To several receivers the heap serves, and everything else is the same.
+    let other = there.register("arm_2").unwrap();
+    let mut loan = rover.loan(inform(&rover, "arm.*", []), 5000).unwrap();
+    loan.content_mut().fill(7);
+    assert!(rover.send_loan(loan).await.unwrap().all_succeeded());
+    for receiver in [&arm, &other] {
+        let incoming = receiver.receive().await.unwrap();
+        assert_eq!(incoming.message.content().unwrap(), &vec![7; 5000]);
+    }
+}
+
+fn is_shared_memory(bytes: &[u8]) -> bool {
+    let address = bytes.as_ptr() as usize;
+    let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
+    maps.lines().filter(|line| line.contains("/dev/shm/fipa_")).any(|line| {
+        let (from, to) = line.split(' ').next().unwrap().split_once('-').unwrap();
+        let number = |text| usize::from_str_radix(text, 16).unwrap();
+        (number(from)..number(to)).contains(&address)
+    })
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_too_large_says_so() {
+    let config = config(&["transport.shm.max_letter=64KiB"]);
+    let domain = Domain::open(&config).await.unwrap();
+    let (rover, arm) = (domain.register("rover").unwrap(), domain.register("arm").unwrap());
+    let deliveries = rover.send(inform(&rover, "arm", vec![0; 100_000])).await.unwrap();
+    assert_eq!(reason(&deliveries), FailureReason::TooLarge);
+    assert_eq!(only(&deliveries).attempts().len(), 2, "{deliveries}");
+    assert!(rover.send(inform(&rover, "arm", "small")).await.unwrap().all_succeeded());
+    assert_eq!(arm.receive().await.unwrap().message.content().unwrap(), "small");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_agent_that_left_is_gone_and_its_successor_is_reached() {
+    let config = config(&[]);
+    let (here, there) = (Domain::open(&config).await.unwrap(), Domain::open(&config).await.unwrap());
+    let rover = here.register("rover").unwrap();
+    let arm = there.register("arm").unwrap();
+    assert!(rover.send(inform(&rover, "arm", "first life")).await.unwrap().all_succeeded());
+    arm.deregister().unwrap();
+    let gone = rover.send(inform(&rover, "arm", "between")).await.unwrap();
+    assert_eq!(reason(&gone), FailureReason::NoSuchAgent);
+    let arm = there.register("arm").unwrap();
+    assert!(rover.send(inform(&rover, "arm", "second life")).await.unwrap().all_succeeded());
+    assert_eq!(arm.receive().await.unwrap().message.content().unwrap(), "second life");
+}
+
+#[test]
+fn processes_without_a_runtime_have_the_same_calls() {
+    let config = config(&[]);
+    let here = fipa::blocking::Domain::open(&config).unwrap();
+    let there = fipa::blocking::Domain::open(&config).unwrap();
+    let (rover, arm) = (here.register("rover").unwrap(), there.register("arm").unwrap());
+    assert!(rover.receive_within(Duration::from_millis(1)).unwrap().is_none());
+    let message =
+        rover.message(Performative::Inform).receiver(arm.id().clone()).content("hello");
+    // Nobody is receiving yet: the letter is taken in all the same.
+    assert!(rover.send(message.build().unwrap()).unwrap().all_succeeded());
+    assert_eq!(arm.receive().unwrap().message.content().unwrap(), "hello");
+    drop((rover, arm));
+    here.close();
+    there.close();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nothing_is_left_behind() {
+    let config = config(&[]);
+    let names = || {
+        let shm = std::fs::read_dir("/dev/shm").unwrap();
+        let names = shm.map(|file| file.unwrap().file_name().to_string_lossy().into_owned());
+        names.filter(|name| name.contains(&config.domain)).collect::<Vec<_>>()
+    };
+    let user = std::os::unix::fs::MetadataExt::uid(&std::fs::metadata("/proc/self").unwrap());
+    let place = format!("/tmp/fipa-{user}/{}", config.domain);
+    let domain = Domain::open(&config).await.unwrap();
+    let (rover, arm) = (domain.register("rover").unwrap(), domain.register("arm").unwrap());
+    assert!(rover.send(inform(&rover, "arm", vec![0; 50_000])).await.unwrap().all_succeeded());
+    let held = arm.receive().await.unwrap();
+    assert!(!names().is_empty());
+    drop((held, rover, arm));
+    domain.close().await;
+    assert_eq!(names(), Vec::<String>::new());
+    assert!(!std::path::Path::new(&place).exists());
+}

@@ -1,0 +1,191 @@
+//! Two domains, standing for two hosts, and their gateways, which find each other by mDNS on the
+//! loopback interface.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use fipa::config::Sources;
+use fipa::{
+    Agent, AgentId, Config, Deliveries, Domain, FailureReason, Gateway, Kind, Message, OpenError,
+    Outcome, Performative,
+};
+
+/// A host that no other test has, and names that nobody else announces.
+struct Host {
+    config: Config,
+    mark: String,
+}
+
+impl Host {
+    fn new(set: &[&str]) -> Self {
+        static NEXT: AtomicU32 = AtomicU32::new(0);
+        let number = NEXT.fetch_add(1, Ordering::Relaxed);
+        let mark = format!("{}-{number}", std::process::id());
+        let mut all = vec![
+            format!("domain=gw-{mark}"),
+            format!("mts.name=gateway-{mark}"),
+            "discovery.interfaces=lo".to_owned(),
+        ];
+        all.extend(set.iter().map(|setting| (*setting).to_owned()));
+        let config = Config::load(&Sources { set: all, ..Sources::default() }).unwrap();
+        Self { config, mark }
+    }
+
+    fn name(&self, agent: &str) -> String {
+        format!("{agent}-{}", self.mark)
+    }
+}
+
+async fn known(domain: &Domain, name: &str) {
+    let started = Instant::now();
+    while domain.directory().lookup(name).is_none() {
+        assert!(started.elapsed() < Duration::from_secs(60), "{name} was not found");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+async fn forgotten(domain: &Domain, name: &str) {
+    let started = Instant::now();
+    while domain.directory().lookup(name).is_some() {
+        assert!(started.elapsed() < Duration::from_secs(60), "{name} was not forgotten");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+fn inform(from: &Agent, to: &str, content: &str) -> Message {
+    from.message(Performative::Inform)
+        .receiver(AgentId::new(to).unwrap())
+        .content(content.to_owned())
+        .build()
+        .unwrap()
+}
+
+fn via(deliveries: &Deliveries) -> Option<Kind> {
+    assert_eq!(deliveries.0.len(), 1, "{deliveries}");
+    assert!(deliveries.all_succeeded(), "{deliveries}");
+    deliveries.0[0].outcome.via()
+}
+
+fn reason(deliveries: &Deliveries) -> FailureReason {
+    match deliveries.0.as_slice() {
+        [delivery] => match &delivery.outcome {
+            Outcome::Failed { reason, .. } => *reason,
+            other => panic!("{other}"),
+        },
+        other => panic!("{other:?}"),
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn hosts_find_each_other_and_exchange_letters() {
+    let (here, there) = (Host::new(&[]), Host::new(&[]));
+    let (_near, _far) =
+        (Gateway::open(&here.config).await.unwrap(), Gateway::open(&there.config).await.unwrap());
+    let (at_home, abroad) =
+        (Domain::open(&here.config).await.unwrap(), Domain::open(&there.config).await.unwrap());
+    let rover = at_home.register(&here.name("rover")).unwrap();
+    let arm = abroad.register(&there.name("arm")).unwrap();
+    known(&at_home, arm.name()).await;
+    known(&abroad, rover.name()).await;
+
+    for number in 0..20 {
+        let sent = rover.send(inform(&rover, arm.name(), &number.to_string())).await.unwrap();
+        assert_eq!(via(&sent), Some(Kind::Tcp));
+    }
+    for number in 0..20 {
+        let incoming = arm.receive().await.unwrap();
+        assert_eq!(incoming.message.content().unwrap(), &number.to_string());
+        assert!(incoming.letter.parse_envelope().unwrap().extensions.len() >= 2, "two stamps");
+    }
+    // Through both gateways at once, loaned content included.
+    let message = inform(&arm, rover.name(), "");
+    let mut loan = arm.loan(message, 1 << 20).unwrap();
+    loan.content_mut().fill(3);
+    assert_eq!(via(&arm.send_loan(loan).await.unwrap()), Some(Kind::Tcp));
+    assert_eq!(rover.receive().await.unwrap().message.content().unwrap(), &vec![3; 1 << 20]);
+
+    // What happens to the agent there is known here.
+    arm.deregister().unwrap();
+    forgotten(&at_home, &there.name("arm")).await;
+    let gone = rover.send(inform(&rover, &there.name("arm"), "?")).await.unwrap();
+    assert_eq!(reason(&gone), FailureReason::NoSuchAgent);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_slow_agent_abroad_holds_its_sender_back() {
+    let (here, there) = (Host::new(&[]), Host::new(&["mts.queue=2"]));
+    let (_near, _far) =
+        (Gateway::open(&here.config).await.unwrap(), Gateway::open(&there.config).await.unwrap());
+    let (at_home, abroad) =
+        (Domain::open(&here.config).await.unwrap(), Domain::open(&there.config).await.unwrap());
+    let rover = at_home.register(&here.name("rover")).unwrap();
+    let arm = abroad.register(&there.name("arm")).unwrap();
+    known(&at_home, arm.name()).await;
+    for _ in 0..2 {
+        via(&rover.send(inform(&rover, arm.name(), "x")).await.unwrap());
+    }
+    let short = Duration::from_secs(1);
+    let late = rover.send_within(inform(&rover, arm.name(), "late"), short).await.unwrap();
+    assert_eq!(reason(&late), FailureReason::QueueFull, "{late}");
+    let waiting = rover.send(inform(&rover, arm.name(), "in time"));
+    let reading = async {
+        for _ in 0..3 {
+            arm.receive().await.unwrap();
+        }
+    };
+    let (waiting, ()) = tokio::join!(waiting, reading);
+    via(&waiting.unwrap());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn without_its_gateway_a_host_still_talks_to_itself() {
+    let (here, there) = (Host::new(&["mts.deadline=2s"]), Host::new(&[]));
+    let near = Gateway::open(&here.config).await.unwrap();
+    let _far = Gateway::open(&there.config).await.unwrap();
+    let (at_home, next_door, abroad) = (
+        Domain::open(&here.config).await.unwrap(),
+        Domain::open(&here.config).await.unwrap(),
+        Domain::open(&there.config).await.unwrap(),
+    );
+    let rover = at_home.register(&here.name("rover")).unwrap();
+    let camera = next_door.register(&here.name("camera")).unwrap();
+    let arm = abroad.register(&there.name("arm")).unwrap();
+    known(&at_home, arm.name()).await;
+    via(&rover.send(inform(&rover, arm.name(), "before")).await.unwrap());
+
+    near.close().await;
+    forgotten(&at_home, arm.name()).await;
+    let lost = rover.send(inform(&rover, arm.name(), "while it is gone")).await.unwrap();
+    assert_eq!(reason(&lost), FailureReason::NoSuchAgent);
+    let sent = rover.send(inform(&rover, camera.name(), "we two")).await.unwrap();
+    assert_eq!(via(&sent), Some(Kind::Shm));
+
+    let _near = Gateway::open(&here.config).await.unwrap();
+    known(&at_home, arm.name()).await;
+    via(&rover.send(inform(&rover, arm.name(), "after")).await.unwrap());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_domain_has_one_gateway_and_a_port_one_owner() {
+    let host = Host::new(&["discovery.mdns=false"]);
+    let gateway = Gateway::open(&host.config).await.unwrap();
+    match Gateway::open(&host.config).await {
+        Err(OpenError::GatewayRunning(name)) => assert_eq!(name, gateway.name()),
+        Err(other) => panic!("{other}"),
+        Ok(_) => panic!("two gateways"),
+    }
+    let mut ways = gateway.locations().iter();
+    let address = ways.find(|way| way.kind() == Kind::Tcp).unwrap().address();
+    let taken = format!("transport.tcp.listen={address}");
+    let other = Host::new(&["discovery.mdns=false", &taken]);
+    match Gateway::open(&other.config).await {
+        Err(error @ OpenError::Listen { .. }) => {
+            assert!(error.to_string().contains(address), "{error}");
+        }
+        Err(other) => panic!("{other}"),
+        Ok(_) => panic!("two on one port"),
+    }
+    gateway.close().await;
+}
