@@ -29,7 +29,13 @@ impl Agent {
         name: Arc<str>,
         incarnation: Incarnation,
     ) -> Self {
-        Self { domain, id, name, incarnation, registered: true }
+        Self {
+            domain,
+            id,
+            name,
+            incarnation,
+            registered: true,
+        }
     }
 
     /// The agent's name.
@@ -57,14 +63,12 @@ impl Agent {
     }
 
     /// A message from this agent, to be filled in.
-    #[must_use]
     pub fn message(&self, performative: Performative) -> MessageBuilder {
         Message::builder(performative).sender(self.id.clone())
     }
 
     /// An answer from this agent, as FIPA00037 has it: to whom the message wants answers, in the
     /// same conversation.
-    #[must_use]
     pub fn reply(&self, to: &Message, performative: Performative) -> MessageBuilder {
         to.reply(performative).sender(self.id.clone())
     }
@@ -125,7 +129,8 @@ impl Agent {
     pub async fn send_loan(&self, loan: Loan) -> Result<Deliveries, SendError> {
         let Loan { message, content } = loan;
         let letter = letter_around(&message, content.freeze(), SystemTime::now())?;
-        self.post(&message, letter, self.domain.inner.deadline).await
+        self.post(&message, letter, self.domain.inner.deadline)
+            .await
     }
 
     async fn post(
@@ -135,13 +140,21 @@ impl Agent {
         deadline: Duration,
     ) -> Result<Deliveries, SendError> {
         self.check(message)?;
-        let receivers = message.receivers().iter().map(|id| id.name().into()).collect();
-        let submission = Submission { sender: self.incarnation, letter, receivers, deadline };
+        let receivers = message
+            .receivers()
+            .iter()
+            .map(|id| id.name().into())
+            .collect();
+        let submission = Submission {
+            sender: self.incarnation,
+            letter,
+            receivers,
+            deadline,
+        };
         let outcomes = self.domain.inner.service.mts.send(submission).await;
-        let deliveries = outcomes.into_iter().map(|(receiver, outcome)| Delivery {
-            receiver,
-            outcome,
-        });
+        let deliveries = outcomes
+            .into_iter()
+            .map(|(receiver, outcome)| Delivery { receiver, outcome });
         Ok(Deliveries(deliveries.collect()))
     }
 
@@ -179,7 +192,9 @@ impl Agent {
     pub fn try_receive(&self) -> Result<Option<Incoming>, ReceiveError> {
         let mts = &self.domain.inner.service.mts;
         mts.drive();
-        mts.try_receive(self.incarnation).map(Incoming::decode).transpose()
+        mts.try_receive(self.incarnation)
+            .map(Incoming::decode)
+            .transpose()
     }
 
     /// Takes the name out of the directory. Letters that wait in the queue are dropped.
@@ -277,8 +292,15 @@ impl Incoming {
     fn decode(received: fipa_mts::core::Received) -> Result<Self, ReceiveError> {
         let fipa_mts::core::Received { letter, via } = received;
         match Message::decode(letter.payload()) {
-            Ok(message) => Ok(Self { message, letter, via }),
-            Err(source) => Err(ReceiveError::Malformed { source, letter: Box::new(letter) }),
+            Ok(message) => Ok(Self {
+                message,
+                letter,
+                via,
+            }),
+            Err(source) => Err(ReceiveError::Malformed {
+                source,
+                letter: Box::new(letter),
+            }),
         }
     }
 }

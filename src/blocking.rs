@@ -44,10 +44,16 @@ impl Domain {
     /// # Errors
     /// See [`crate::Domain::open`].
     pub fn open(config: &Config) -> Result<Self, OpenError> {
-        let runtime =
-            Builder::new_multi_thread().worker_threads(1).thread_name("fipa").enable_all().build()?;
+        let runtime = Builder::new_multi_thread()
+            .worker_threads(1)
+            .thread_name("fipa")
+            .enable_all()
+            .build()?;
         let domain = runtime.block_on(crate::Domain::open(config))?;
-        Ok(Self { domain, runtime: Arc::new(runtime) })
+        Ok(Self {
+            domain,
+            runtime: Arc::new(runtime),
+        })
     }
 
     /// Registers an agent.
@@ -68,7 +74,10 @@ impl Domain {
         options: crate::RegisterOptions,
     ) -> Result<Agent, RegisterError> {
         let agent = self.domain.register_with(name, options)?;
-        Ok(Agent { agent, runtime: Arc::clone(&self.runtime) })
+        Ok(Agent {
+            agent,
+            runtime: Arc::clone(&self.runtime),
+        })
     }
 
     /// Who is there; see [`crate::Domain::directory`].
@@ -97,13 +106,11 @@ impl Agent {
     }
 
     /// A message from this agent, to be filled in.
-    #[must_use]
     pub fn message(&self, performative: Performative) -> MessageBuilder {
         self.agent.message(performative)
     }
 
     /// An answer from this agent; see [`crate::Agent::reply`].
-    #[must_use]
     pub fn reply(&self, to: &Message, performative: Performative) -> MessageBuilder {
         self.agent.reply(to, performative)
     }
@@ -120,8 +127,13 @@ impl Agent {
     ///
     /// # Errors
     /// See [`crate::Agent::send`].
-    pub fn send_within(&self, message: Message, deadline: Duration) -> Result<Deliveries, SendError> {
-        self.runtime.block_on(self.agent.send_within(message, deadline))
+    pub fn send_within(
+        &self,
+        message: Message,
+        deadline: Duration,
+    ) -> Result<Deliveries, SendError> {
+        self.runtime
+            .block_on(self.agent.send_within(message, deadline))
     }
 
     /// Memory for the content of a message; see [`crate::Agent::loan`].

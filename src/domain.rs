@@ -99,7 +99,9 @@ impl Domain {
             },
         )?;
         let deadline = config.mts.deadline;
-        Ok(Self { inner: Arc::new(Inner { service, deadline }) })
+        Ok(Self {
+            inner: Arc::new(Inner { service, deadline }),
+        })
     }
 
     /// Registers an agent with nothing but a name.
@@ -121,9 +123,8 @@ impl Domain {
         options: RegisterOptions,
     ) -> Result<Agent, RegisterError> {
         let service = &self.inner.service;
-        let id = AgentId::new(name).map_err(|error: AgentIdError| {
-            RegisterError::Failed(Arc::new(error))
-        })?;
+        let id = AgentId::new(name)
+            .map_err(|error: AgentIdError| RegisterError::Failed(Arc::new(error)))?;
         let incarnation = Incarnation::random();
         let name: Arc<str> = name.into();
         // The queue first: once the name is known, letters come.

@@ -55,8 +55,15 @@ impl Gateway {
                 },
             },
         )?;
-        let Some((network, view)) = made.into_inner() else { return Err(OpenError::NoRuntime) };
-        let mut gateway = Self { service, network, view, task: None };
+        let Some((network, view)) = made.into_inner() else {
+            return Err(OpenError::NoRuntime);
+        };
+        let mut gateway = Self {
+            service,
+            network,
+            view,
+            task: None,
+        };
         if let Err(error) = gateway.enter() {
             gateway.abort();
             return Err(error);
@@ -77,7 +84,10 @@ impl Gateway {
     fn enter(&self) -> Result<(), OpenError> {
         let service = &self.service;
         let entries = service.host.entries();
-        if let Some(other) = entries.iter().find(|entry| entry.role == EntryRole::Gateway) {
+        if let Some(other) = entries
+            .iter()
+            .find(|entry| entry.role == EntryRole::Gateway)
+        {
             return Err(OpenError::GatewayRunning(other.name.to_string()));
         }
         service.host.register(Registration {
@@ -85,8 +95,8 @@ impl Gateway {
             agent_type: "fipa-mts".to_owned(),
             description: "message transport service".to_owned(),
             ..Registration::new(
-                Arc::clone(&service.name),
-                service.incarnation,
+                Arc::clone(&service.own.name),
+                service.own.incarnation,
                 service.locations.clone(),
             )
         })?;
@@ -96,13 +106,13 @@ impl Gateway {
     /// The name of the gateway.
     #[must_use]
     pub fn name(&self) -> &str {
-        &self.service.name
+        &self.service.own.name
     }
 
     /// This life of it.
     #[must_use]
     pub fn incarnation(&self) -> Incarnation {
-        self.service.incarnation
+        self.service.own.incarnation
     }
 
     /// Where it can be reached.
@@ -174,16 +184,20 @@ impl Network for fipa_sds::MdnsDirectory {
 }
 
 #[cfg(feature = "mdns")]
-fn network(
-    config: &Config,
-    mts: &fipa_sds::Mts,
-) -> Result<Option<Arc<dyn Network>>, OpenError> {
+fn network(config: &Config, mts: &fipa_sds::Mts) -> Result<Option<Arc<dyn Network>>, OpenError> {
     if !config.discovery.mdns {
         return Ok(None);
     }
-    let interfaces = config.discovery.interfaces.iter().map(ToString::to_string).collect();
-    let config =
-        fipa_sds::MdnsConfig { interfaces, ..fipa_sds::MdnsConfig::new(mts.clone()) };
+    let interfaces = config
+        .discovery
+        .interfaces
+        .iter()
+        .map(ToString::to_string)
+        .collect();
+    let config = fipa_sds::MdnsConfig {
+        interfaces,
+        ..fipa_sds::MdnsConfig::new(mts.clone())
+    };
     let directory = fipa_sds::MdnsDirectory::open(config)
         .map_err(|error| OpenError::Discovery(error.to_string()))?;
     Ok(Some(Arc::new(directory)))
@@ -232,14 +246,15 @@ impl Exchange {
             .collect();
         self.announced.retain(|name, entry| {
             let stays = mine.get(name).is_some_and(|now| ***now == **entry);
-            if !stays {
-                if let Err(error) = network.deregister(name, entry.incarnation) {
-                    tracing::debug!(%name, %error, "was not announced any more");
-                }
+            if !stays && let Err(error) = network.deregister(name, entry.incarnation) {
+                tracing::debug!(%name, %error, "was not announced any more");
             }
             stays
         });
-        let locations = self.locations.iter().filter(|location| location.kind() != Kind::Shm);
+        let locations = self
+            .locations
+            .iter()
+            .filter(|location| location.kind() != Kind::Shm);
         let locations: Vec<Location> = locations.cloned().collect();
         for (name, entry) in mine {
             if self.announced.contains_key(&name) {
@@ -265,9 +280,13 @@ impl Exchange {
     /// Tells the processes of this host who is on others, as reachable through this gateway.
     fn publish(&self, network: &dyn Directory) {
         let entries = network.entries();
-        let through_here = entries.iter().filter(|entry| entry.role == EntryRole::Agent);
-        let through_here = through_here
-            .map(|entry| Entry { locations: self.locations.clone(), ..Entry::clone(entry) });
+        let through_here = entries
+            .iter()
+            .filter(|entry| entry.role == EntryRole::Agent);
+        let through_here = through_here.map(|entry| Entry {
+            locations: self.locations.clone(),
+            ..Entry::clone(entry)
+        });
         if let Err(error) = self.host.publish_remote(through_here.collect()) {
             tracing::warn!(%error, "the processes of this host are not told of all other hosts");
         }

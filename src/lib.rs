@@ -30,6 +30,9 @@
 //!
 //! What must not live here: delivery (that is `fipa-mts`), transports, terminals.
 
+#[cfg(not(any(feature = "shm", feature = "net")))]
+compile_error!("fipa needs a transport: enable the feature \"shm\" or \"net\"");
+
 mod agent;
 pub mod blocking;
 pub mod config;

@@ -53,7 +53,10 @@ impl Place {
             Some(base) => PathBuf::from(base),
             None => PathBuf::from(format!("/tmp/fipa-{}", rustix::process::geteuid().as_raw())),
         };
-        let place = Self { base, domain: domain.to_owned() };
+        let place = Self {
+            base,
+            domain: domain.to_owned(),
+        };
         make_private(&place.base)?;
         make_private(&place.path())?;
         Ok(place)
@@ -71,21 +74,43 @@ impl Place {
 
     /// What the names of this domain's shared memory begin with: other users' domains, and those
     /// in other places, have other names.
+    #[cfg_attr(
+        not(feature = "shm"),
+        expect(dead_code, reason = "there is no shared memory")
+    )]
     pub(crate) fn prefix(&self) -> String {
-        format!("fipa_{}_{:08x}_", self.domain, fnv(self.path().as_os_str().as_encoded_bytes()))
+        format!(
+            "fipa_{}_{:08x}_",
+            self.domain,
+            fnv(self.path().as_os_str().as_encoded_bytes())
+        )
     }
 
     /// What tells this host from others: the running kernel and the directory itself, so that
     /// containers and network namespaces with places of their own count as hosts.
+    #[cfg_attr(
+        not(feature = "net"),
+        expect(dead_code, reason = "there are no other hosts")
+    )]
     pub(crate) fn host_id(&self) -> io::Result<String> {
         let boot = fs::read_to_string("/proc/sys/kernel/random/boot_id")?;
         let directory = fs::metadata(self.path())?;
-        Ok(format!("{}:{:x}:{:x}", boot.trim(), directory.dev(), directory.ino()))
+        Ok(format!(
+            "{}:{:x}:{:x}",
+            boot.trim(),
+            directory.dev(),
+            directory.ino()
+        ))
     }
 
     /// Removes what is empty. Not an error when somebody is still there.
     pub(crate) fn leave(&self) {
-        for path in [self.part("directory"), self.part("shm"), self.path(), self.base.clone()] {
+        for path in [
+            self.part("directory"),
+            self.part("shm"),
+            self.path(),
+            self.base.clone(),
+        ] {
             // Fails when it is not empty or gone: then there is nothing to do here.
             let _ = fs::remove_dir(path);
         }
@@ -99,7 +124,10 @@ fn fnv(bytes: &[u8]) -> u32 {
 }
 
 fn make_private(path: &Path) -> Result<(), PlaceError> {
-    let io_error = |source| PlaceError::Io { path: path.to_owned(), source };
+    let io_error = |source| PlaceError::Io {
+        path: path.to_owned(),
+        source,
+    };
     match DirBuilder::new().mode(0o700).create(path) {
         Err(error) if error.kind() != io::ErrorKind::AlreadyExists => return Err(io_error(error)),
         _ => {}
@@ -116,7 +144,10 @@ fn make_private(path: &Path) -> Result<(), PlaceError> {
     } else {
         return Ok(());
     };
-    Err(PlaceError::NotPrivate { path: path.to_owned(), problem })
+    Err(PlaceError::NotPrivate {
+        path: path.to_owned(),
+        problem,
+    })
 }
 
 #[cfg(test)]
@@ -134,9 +165,11 @@ mod tests {
         symlink(home.path(), &link).unwrap();
         let file = home.path().join("file");
         fs::write(&file, "").unwrap();
-        for (path, problem) in
-            [(&open, "its mode is 755"), (&link, "a symbolic link"), (&file, "a file")]
-        {
+        for (path, problem) in [
+            (&open, "its mode is 755"),
+            (&link, "a symbolic link"),
+            (&file, "a file"),
+        ] {
             let error = make_private(path).unwrap_err().to_string();
             assert!(error.contains(problem), "{error}");
         }
@@ -148,7 +181,10 @@ mod tests {
 
     #[test]
     fn prefixes_differ_by_domain_and_place() {
-        let place = |base: &str, domain: &str| Place { base: base.into(), domain: domain.into() };
+        let place = |base: &str, domain: &str| Place {
+            base: base.into(),
+            domain: domain.into(),
+        };
         let all = [place("/a", "x"), place("/a", "y"), place("/b", "x")].map(|p| p.prefix());
         assert!(all[0] != all[1] && all[0] != all[2] && all[1] != all[2]);
         assert!(place("/a", &"d".repeat(32)).prefix().len() <= 64);

@@ -22,8 +22,12 @@ pub(crate) struct Service {
     pub(crate) mts: Mts,
     pub(crate) host: Arc<HostDirectory>,
     pub(crate) locations: Vec<Location>,
-    pub(crate) incarnation: Incarnation,
-    pub(crate) name: Arc<str>,
+    /// The service as the directory names it.
+    #[cfg_attr(
+        not(feature = "net"),
+        expect(dead_code, reason = "only a gateway says it")
+    )]
+    pub(crate) own: fipa_sds::Mts,
     place: Place,
 }
 
@@ -59,7 +63,11 @@ impl Service {
         let view = (role.view)(Arc::clone(&host), &own)?;
         let mut refused = Vec::new();
         let transports = transports(config, &role, &place, incarnation, &handle, &mut refused);
-        let Started { mts, locations, failed } = Mts::start(
+        let Started {
+            mts,
+            locations,
+            failed,
+        } = Mts::start(
             core_config(config, &role, incarnation),
             RuntimeConfig {
                 spin: config.transport.shm.spin,
@@ -69,11 +77,20 @@ impl Service {
             transports,
             &handle,
         );
-        let service = Self { mts, host, locations, incarnation, name: role.name, place };
+        let service = Self {
+            mts,
+            host,
+            locations,
+            own,
+            place,
+        };
         for (kind, error) in failed {
             if role.gateway {
                 service.abort();
-                return Err(OpenError::Listen { kind, source: error });
+                return Err(OpenError::Listen {
+                    kind,
+                    source: error,
+                });
             }
             refused.push((kind, error.to_string()));
         }
@@ -104,8 +121,10 @@ impl Service {
 }
 
 fn told(refused: &[(Kind, String)]) -> String {
-    let texts: Vec<String> =
-        refused.iter().map(|(kind, error)| format!("{kind}: {error}")).collect();
+    let texts: Vec<String> = refused
+        .iter()
+        .map(|(kind, error)| format!("{kind}: {error}"))
+        .collect();
     texts.join("; ")
 }
 
@@ -128,6 +147,10 @@ fn core_config(config: &Config, role: &Role<'_>, incarnation: Incarnation) -> Co
 /// The transports that are wanted, built in, and work here.
 fn transports(
     config: &Config,
+    #[cfg_attr(
+        not(feature = "net"),
+        expect(unused_variables, reason = "nothing listens")
+    )]
     role: &Role<'_>,
     place: &Place,
     incarnation: Incarnation,
@@ -152,7 +175,6 @@ fn transports(
             Err(error) => refused.push((*kind, error)),
         }
     }
-    let _ = (role, place, incarnation, handle);
     transports
 }
 
@@ -183,7 +205,9 @@ fn tcp(
     handle: &Handle,
 ) -> Result<Arc<dyn Transport>, String> {
     use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport};
-    let host = place.host_id().map_err(|error| format!("cannot tell this host: {error}"))?;
+    let host = place
+        .host_id()
+        .map_err(|error| format!("cannot tell this host: {error}"))?;
     let identity = Identity {
         name: role.name.to_string(),
         incarnation,
@@ -191,7 +215,14 @@ fn tcp(
         host,
     };
     let max_letter = usize::try_from(config.transport.shm.max_letter).unwrap_or(usize::MAX);
-    let limits = Limits { max_letter, ..Limits::default() };
-    let config = TcpConfig { listen: role.listen.clone(), identity, limits };
+    let limits = Limits {
+        max_letter,
+        ..Limits::default()
+    };
+    let config = TcpConfig {
+        listen: role.listen.clone(),
+        identity,
+        limits,
+    };
     Ok(Arc::new(TcpTransport::new(config, handle.clone())))
 }

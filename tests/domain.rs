@@ -22,7 +22,11 @@ fn config(set: &[&str]) -> Config {
         "discovery.mdns=false".to_owned(),
     ];
     all.extend(set.iter().map(|setting| (*setting).to_owned()));
-    Config::load(&Sources { set: all, ..Sources::default() }).unwrap()
+    Config::load(&Sources {
+        set: all,
+        ..Sources::default()
+    })
+    .unwrap()
 }
 
 fn inform(from: &Agent, to: &str, content: impl Into<Vec<u8>>) -> Message {
@@ -47,11 +51,20 @@ fn reason(deliveries: &Deliveries) -> FailureReason {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn letters_go_both_ways_and_say_by_which_way() {
-    for (transports, via) in [("shm,tcp", Kind::Shm), ("tcp", Kind::Tcp), ("tcp,shm", Kind::Tcp)] {
+    for (transports, via) in [
+        ("shm,tcp", Kind::Shm),
+        ("tcp", Kind::Tcp),
+        ("tcp,shm", Kind::Tcp),
+    ] {
         let config = config(&[&format!("mts.transports={transports}")]);
-        let (here, there) =
-            (Domain::open(&config).await.unwrap(), Domain::open(&config).await.unwrap());
-        let (rover, arm) = (here.register("rover").unwrap(), there.register("arm").unwrap());
+        let (here, there) = (
+            Domain::open(&config).await.unwrap(),
+            Domain::open(&config).await.unwrap(),
+        );
+        let (rover, arm) = (
+            here.register("rover").unwrap(),
+            there.register("arm").unwrap(),
+        );
         let question = rover
             .message(Performative::Request)
             .receiver(arm.id().clone())
@@ -62,10 +75,19 @@ async fn letters_go_both_ways_and_say_by_which_way() {
             .build()
             .unwrap();
         let deliveries = rover.send(question).await.unwrap();
-        assert_eq!(only(&deliveries), &Outcome::Delivered { via, attempts: Vec::new() });
+        assert_eq!(
+            only(&deliveries),
+            &Outcome::Delivered {
+                via,
+                attempts: Vec::new()
+            }
+        );
         let asked = arm.receive().await.unwrap();
         assert_eq!(asked.via, Some(via));
-        let answer = arm.reply(&asked.message, Performative::Agree).build().unwrap();
+        let answer = arm
+            .reply(&asked.message, Performative::Agree)
+            .build()
+            .unwrap();
         assert!(arm.send(answer).await.unwrap().all_succeeded());
         let answered = rover.receive().await.unwrap();
         assert_eq!(answered.message.in_reply_to(), Some("q-1"));
@@ -79,7 +101,10 @@ async fn letters_go_both_ways_and_say_by_which_way() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_name_belongs_to_one_at_a_time() {
     let config = config(&[]);
-    let (here, there) = (Domain::open(&config).await.unwrap(), Domain::open(&config).await.unwrap());
+    let (here, there) = (
+        Domain::open(&config).await.unwrap(),
+        Domain::open(&config).await.unwrap(),
+    );
     let first = here.register("arm").unwrap();
     for domain in [&here, &there] {
         match domain.register("arm") {
@@ -97,8 +122,14 @@ async fn a_name_belongs_to_one_at_a_time() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_thousand_letters_arrive_in_order_and_once() {
     let config = config(&["mts.queue=16"]);
-    let (here, there) = (Domain::open(&config).await.unwrap(), Domain::open(&config).await.unwrap());
-    let (rover, arm) = (here.register("rover").unwrap(), there.register("arm").unwrap());
+    let (here, there) = (
+        Domain::open(&config).await.unwrap(),
+        Domain::open(&config).await.unwrap(),
+    );
+    let (rover, arm) = (
+        here.register("rover").unwrap(),
+        there.register("arm").unwrap(),
+    );
     let total = 1000_u32;
     let reading = tokio::spawn(async move {
         let mut seen = Vec::new();
@@ -130,7 +161,9 @@ async fn a_thousand_letters_arrive_in_order_and_once() {
 }
 
 /// Polls a future once.
-async fn futures_poll_once<T>(future: &mut std::pin::Pin<Box<impl Future<Output = T>>>) -> Option<T> {
+async fn futures_poll_once<T>(
+    future: &mut std::pin::Pin<Box<impl Future<Output = T>>>,
+) -> Option<T> {
     std::future::poll_fn(|context| match future.as_mut().poll(context) {
         std::task::Poll::Ready(value) => std::task::Poll::Ready(Some(value)),
         std::task::Poll::Pending => std::task::Poll::Ready(None),
@@ -141,17 +174,35 @@ async fn futures_poll_once<T>(future: &mut std::pin::Pin<Box<impl Future<Output 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_full_queue_fails_late_and_harms_nobody_else() {
     let config = config(&["mts.queue=2"]);
-    let (here, there) = (Domain::open(&config).await.unwrap(), Domain::open(&config).await.unwrap());
+    let (here, there) = (
+        Domain::open(&config).await.unwrap(),
+        Domain::open(&config).await.unwrap(),
+    );
     let rover = here.register("rover").unwrap();
-    let (slow, quick) = (there.register("slow").unwrap(), there.register("quick").unwrap());
+    let (slow, quick) = (
+        there.register("slow").unwrap(),
+        there.register("quick").unwrap(),
+    );
     for _ in 0..2 {
-        assert!(rover.send(inform(&rover, "slow", "x")).await.unwrap().all_succeeded());
+        assert!(
+            rover
+                .send(inform(&rover, "slow", "x"))
+                .await
+                .unwrap()
+                .all_succeeded()
+        );
     }
     let short = Duration::from_millis(300);
     let blocked = rover.send_within(inform(&rover, "slow", "too much"), short);
     let meanwhile = async {
         for _ in 0..20 {
-            assert!(rover.send(inform(&rover, "quick", "x")).await.unwrap().all_succeeded());
+            assert!(
+                rover
+                    .send(inform(&rover, "quick", "x"))
+                    .await
+                    .unwrap()
+                    .all_succeeded()
+            );
             quick.receive().await.unwrap();
         }
     };
@@ -164,7 +215,15 @@ async fn a_full_queue_fails_late_and_harms_nobody_else() {
     let reading = async {
         let mut seen = Vec::new();
         for _ in 0..3 {
-            seen.push(slow.receive().await.unwrap().message.content().unwrap().to_vec());
+            seen.push(
+                slow.receive()
+                    .await
+                    .unwrap()
+                    .message
+                    .content()
+                    .unwrap()
+                    .to_vec(),
+            );
         }
         seen
     };
@@ -176,17 +235,31 @@ async fn a_full_queue_fails_late_and_harms_nobody_else() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_pattern_reaches_all_but_the_sender() {
     let config = config(&[]);
-    let (here, there) = (Domain::open(&config).await.unwrap(), Domain::open(&config).await.unwrap());
+    let (here, there) = (
+        Domain::open(&config).await.unwrap(),
+        Domain::open(&config).await.unwrap(),
+    );
     let sender = here.register("arm_0").unwrap();
-    let others: Vec<Agent> =
-        (1..4).map(|number| there.register(&format!("arm_{number}")).unwrap()).collect();
+    let others: Vec<Agent> = (1..4)
+        .map(|number| there.register(&format!("arm_{number}")).unwrap())
+        .collect();
     let stranger = there.register("camera").unwrap();
-    let deliveries = sender.send(inform(&sender, "arm_.*", "stop")).await.unwrap();
-    let reached: HashSet<&str> = deliveries.0.iter().map(|delivery| &*delivery.receiver).collect();
+    let deliveries = sender
+        .send(inform(&sender, "arm_.*", "stop"))
+        .await
+        .unwrap();
+    let reached: HashSet<&str> = deliveries
+        .0
+        .iter()
+        .map(|delivery| &*delivery.receiver)
+        .collect();
     assert_eq!(reached, HashSet::from(["arm_1", "arm_2", "arm_3"]));
     assert!(deliveries.all_succeeded(), "{deliveries}");
     for arm in &others {
-        assert_eq!(arm.receive().await.unwrap().message.content().unwrap(), "stop");
+        assert_eq!(
+            arm.receive().await.unwrap().message.content().unwrap(),
+            "stop"
+        );
     }
     assert!(stranger.try_receive().unwrap().is_none());
     assert!(sender.try_receive().unwrap().is_none());
@@ -203,14 +276,20 @@ async fn nobody_of_that_name_is_a_failure_told_once() {
         assert_eq!(*told.performative(), Performative::Failure);
         assert_eq!(told.ontology(), Some("fipa-agent-management"));
         let content = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
-        assert!(content.contains("no such agent") && content.contains(to), "{content}");
+        assert!(
+            content.contains("no such agent") && content.contains(to),
+            "{content}"
+        );
         // A failure about a failure is never sent.
         let failure = rover
             .message(Performative::Failure)
             .receiver(AgentId::new(to).unwrap())
             .build()
             .unwrap();
-        assert_eq!(reason(&rover.send(failure).await.unwrap()), FailureReason::NoSuchAgent);
+        assert_eq!(
+            reason(&rover.send(failure).await.unwrap()),
+            FailureReason::NoSuchAgent
+        );
         assert!(rover.try_receive().unwrap().is_none());
     }
 }
@@ -218,8 +297,14 @@ async fn nobody_of_that_name_is_a_failure_told_once() {
 #[tokio::test(flavor = "multi_thread")]
 async fn loaned_content_is_not_copied() {
     let config = config(&[]);
-    let (here, there) = (Domain::open(&config).await.unwrap(), Domain::open(&config).await.unwrap());
-    let (rover, arm) = (here.register("rover").unwrap(), there.register("arm").unwrap());
+    let (here, there) = (
+        Domain::open(&config).await.unwrap(),
+        Domain::open(&config).await.unwrap(),
+    );
+    let (rover, arm) = (
+        here.register("rover").unwrap(),
+        there.register("arm").unwrap(),
+    );
     for len in [100_000, 4 << 20] {
         let mut loan = rover.loan(inform(&rover, "arm", []), len).unwrap();
         for (index, byte) in loan.content_mut().iter_mut().enumerate() {
@@ -229,7 +314,12 @@ async fn loaned_content_is_not_copied() {
         let incoming = arm.receive().await.unwrap();
         let content = incoming.message.content().unwrap();
         assert_eq!(content.len(), len);
-        assert!(content.iter().enumerate().all(|(index, byte)| *byte == index as u8));
+        assert!(
+            content
+                .iter()
+                .enumerate()
+                .all(|(index, byte)| *byte == index as u8)
+        );
         assert!(is_shared_memory(content), "{len} bytes were copied");
     }
     // To several receivers the heap serves, and everything else is the same.
@@ -246,38 +336,73 @@ async fn loaned_content_is_not_copied() {
 fn is_shared_memory(bytes: &[u8]) -> bool {
     let address = bytes.as_ptr() as usize;
     let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
-    maps.lines().filter(|line| line.contains("/dev/shm/fipa_")).any(|line| {
-        let (from, to) = line.split(' ').next().unwrap().split_once('-').unwrap();
-        let number = |text| usize::from_str_radix(text, 16).unwrap();
-        (number(from)..number(to)).contains(&address)
-    })
+    maps.lines()
+        .filter(|line| line.contains("/dev/shm/fipa_"))
+        .any(|line| {
+            let (from, to) = line.split(' ').next().unwrap().split_once('-').unwrap();
+            let number = |text| usize::from_str_radix(text, 16).unwrap();
+            (number(from)..number(to)).contains(&address)
+        })
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn what_is_too_large_says_so() {
     let config = config(&["transport.shm.max_letter=64KiB"]);
     let domain = Domain::open(&config).await.unwrap();
-    let (rover, arm) = (domain.register("rover").unwrap(), domain.register("arm").unwrap());
-    let deliveries = rover.send(inform(&rover, "arm", vec![0; 100_000])).await.unwrap();
+    let (rover, arm) = (
+        domain.register("rover").unwrap(),
+        domain.register("arm").unwrap(),
+    );
+    let deliveries = rover
+        .send(inform(&rover, "arm", vec![0; 100_000]))
+        .await
+        .unwrap();
     assert_eq!(reason(&deliveries), FailureReason::TooLarge);
     assert_eq!(only(&deliveries).attempts().len(), 2, "{deliveries}");
-    assert!(rover.send(inform(&rover, "arm", "small")).await.unwrap().all_succeeded());
-    assert_eq!(arm.receive().await.unwrap().message.content().unwrap(), "small");
+    assert!(
+        rover
+            .send(inform(&rover, "arm", "small"))
+            .await
+            .unwrap()
+            .all_succeeded()
+    );
+    assert_eq!(
+        arm.receive().await.unwrap().message.content().unwrap(),
+        "small"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_agent_that_left_is_gone_and_its_successor_is_reached() {
     let config = config(&[]);
-    let (here, there) = (Domain::open(&config).await.unwrap(), Domain::open(&config).await.unwrap());
+    let (here, there) = (
+        Domain::open(&config).await.unwrap(),
+        Domain::open(&config).await.unwrap(),
+    );
     let rover = here.register("rover").unwrap();
     let arm = there.register("arm").unwrap();
-    assert!(rover.send(inform(&rover, "arm", "first life")).await.unwrap().all_succeeded());
+    assert!(
+        rover
+            .send(inform(&rover, "arm", "first life"))
+            .await
+            .unwrap()
+            .all_succeeded()
+    );
     arm.deregister().unwrap();
     let gone = rover.send(inform(&rover, "arm", "between")).await.unwrap();
     assert_eq!(reason(&gone), FailureReason::NoSuchAgent);
     let arm = there.register("arm").unwrap();
-    assert!(rover.send(inform(&rover, "arm", "second life")).await.unwrap().all_succeeded());
-    assert_eq!(arm.receive().await.unwrap().message.content().unwrap(), "second life");
+    assert!(
+        rover
+            .send(inform(&rover, "arm", "second life"))
+            .await
+            .unwrap()
+            .all_succeeded()
+    );
+    assert_eq!(
+        arm.receive().await.unwrap().message.content().unwrap(),
+        "second life"
+    );
 }
 
 #[test]
@@ -285,12 +410,27 @@ fn processes_without_a_runtime_have_the_same_calls() {
     let config = config(&[]);
     let here = fipa::blocking::Domain::open(&config).unwrap();
     let there = fipa::blocking::Domain::open(&config).unwrap();
-    let (rover, arm) = (here.register("rover").unwrap(), there.register("arm").unwrap());
-    assert!(rover.receive_within(Duration::from_millis(1)).unwrap().is_none());
-    let message =
-        rover.message(Performative::Inform).receiver(arm.id().clone()).content("hello");
+    let (rover, arm) = (
+        here.register("rover").unwrap(),
+        there.register("arm").unwrap(),
+    );
+    assert!(
+        rover
+            .receive_within(Duration::from_millis(1))
+            .unwrap()
+            .is_none()
+    );
+    let message = rover
+        .message(Performative::Inform)
+        .receiver(arm.id().clone())
+        .content("hello");
     // Nobody is receiving yet: the letter is taken in all the same.
-    assert!(rover.send(message.build().unwrap()).unwrap().all_succeeded());
+    assert!(
+        rover
+            .send(message.build().unwrap())
+            .unwrap()
+            .all_succeeded()
+    );
     assert_eq!(arm.receive().unwrap().message.content().unwrap(), "hello");
     drop((rover, arm));
     here.close();
@@ -303,13 +443,24 @@ async fn nothing_is_left_behind() {
     let names = || {
         let shm = std::fs::read_dir("/dev/shm").unwrap();
         let names = shm.map(|file| file.unwrap().file_name().to_string_lossy().into_owned());
-        names.filter(|name| name.contains(&config.domain)).collect::<Vec<_>>()
+        names
+            .filter(|name| name.contains(&config.domain))
+            .collect::<Vec<_>>()
     };
     let user = std::os::unix::fs::MetadataExt::uid(&std::fs::metadata("/proc/self").unwrap());
     let place = format!("/tmp/fipa-{user}/{}", config.domain);
     let domain = Domain::open(&config).await.unwrap();
-    let (rover, arm) = (domain.register("rover").unwrap(), domain.register("arm").unwrap());
-    assert!(rover.send(inform(&rover, "arm", vec![0; 50_000])).await.unwrap().all_succeeded());
+    let (rover, arm) = (
+        domain.register("rover").unwrap(),
+        domain.register("arm").unwrap(),
+    );
+    assert!(
+        rover
+            .send(inform(&rover, "arm", vec![0; 50_000]))
+            .await
+            .unwrap()
+            .all_succeeded()
+    );
     let held = arm.receive().await.unwrap();
     assert!(!names().is_empty());
     drop((held, rover, arm));

@@ -29,7 +29,11 @@ impl Host {
             "discovery.interfaces=lo".to_owned(),
         ];
         all.extend(set.iter().map(|setting| (*setting).to_owned()));
-        let config = Config::load(&Sources { set: all, ..Sources::default() }).unwrap();
+        let config = Config::load(&Sources {
+            set: all,
+            ..Sources::default()
+        })
+        .unwrap();
         Self { config, mark }
     }
 
@@ -41,7 +45,10 @@ impl Host {
 async fn known(domain: &Domain, name: &str) {
     let started = Instant::now();
     while domain.directory().lookup(name).is_none() {
-        assert!(started.elapsed() < Duration::from_secs(60), "{name} was not found");
+        assert!(
+            started.elapsed() < Duration::from_secs(60),
+            "{name} was not found"
+        );
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
 }
@@ -49,7 +56,10 @@ async fn known(domain: &Domain, name: &str) {
 async fn forgotten(domain: &Domain, name: &str) {
     let started = Instant::now();
     while domain.directory().lookup(name).is_some() {
-        assert!(started.elapsed() < Duration::from_secs(60), "{name} was not forgotten");
+        assert!(
+            started.elapsed() < Duration::from_secs(60),
+            "{name} was not forgotten"
+        );
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
 }
@@ -81,45 +91,65 @@ fn reason(deliveries: &Deliveries) -> FailureReason {
 #[tokio::test(flavor = "multi_thread")]
 async fn hosts_find_each_other_and_exchange_letters() {
     let (here, there) = (Host::new(&[]), Host::new(&[]));
-    let (_near, _far) =
-        (Gateway::open(&here.config).await.unwrap(), Gateway::open(&there.config).await.unwrap());
-    let (at_home, abroad) =
-        (Domain::open(&here.config).await.unwrap(), Domain::open(&there.config).await.unwrap());
+    let (_near, _far) = (
+        Gateway::open(&here.config).await.unwrap(),
+        Gateway::open(&there.config).await.unwrap(),
+    );
+    let (at_home, abroad) = (
+        Domain::open(&here.config).await.unwrap(),
+        Domain::open(&there.config).await.unwrap(),
+    );
     let rover = at_home.register(&here.name("rover")).unwrap();
     let arm = abroad.register(&there.name("arm")).unwrap();
     known(&at_home, arm.name()).await;
     known(&abroad, rover.name()).await;
 
     for number in 0..20 {
-        let sent = rover.send(inform(&rover, arm.name(), &number.to_string())).await.unwrap();
+        let sent = rover
+            .send(inform(&rover, arm.name(), &number.to_string()))
+            .await
+            .unwrap();
         assert_eq!(via(&sent), Some(Kind::Tcp));
     }
     for number in 0..20 {
         let incoming = arm.receive().await.unwrap();
         assert_eq!(incoming.message.content().unwrap(), &number.to_string());
-        assert!(incoming.letter.parse_envelope().unwrap().extensions.len() >= 2, "two stamps");
+        assert!(
+            incoming.letter.parse_envelope().unwrap().extensions.len() >= 2,
+            "two stamps"
+        );
     }
     // Through both gateways at once, loaned content included.
     let message = inform(&arm, rover.name(), "");
     let mut loan = arm.loan(message, 1 << 20).unwrap();
     loan.content_mut().fill(3);
     assert_eq!(via(&arm.send_loan(loan).await.unwrap()), Some(Kind::Tcp));
-    assert_eq!(rover.receive().await.unwrap().message.content().unwrap(), &vec![3; 1 << 20]);
+    assert_eq!(
+        rover.receive().await.unwrap().message.content().unwrap(),
+        &vec![3; 1 << 20]
+    );
 
     // What happens to the agent there is known here.
     arm.deregister().unwrap();
     forgotten(&at_home, &there.name("arm")).await;
-    let gone = rover.send(inform(&rover, &there.name("arm"), "?")).await.unwrap();
+    let gone = rover
+        .send(inform(&rover, &there.name("arm"), "?"))
+        .await
+        .unwrap();
     assert_eq!(reason(&gone), FailureReason::NoSuchAgent);
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_slow_agent_abroad_holds_its_sender_back() {
     let (here, there) = (Host::new(&[]), Host::new(&["mts.queue=2"]));
-    let (_near, _far) =
-        (Gateway::open(&here.config).await.unwrap(), Gateway::open(&there.config).await.unwrap());
-    let (at_home, abroad) =
-        (Domain::open(&here.config).await.unwrap(), Domain::open(&there.config).await.unwrap());
+    let (_near, _far) = (
+        Gateway::open(&here.config).await.unwrap(),
+        Gateway::open(&there.config).await.unwrap(),
+    );
+    let (at_home, abroad) = (
+        Domain::open(&here.config).await.unwrap(),
+        Domain::open(&there.config).await.unwrap(),
+    );
     let rover = at_home.register(&here.name("rover")).unwrap();
     let arm = abroad.register(&there.name("arm")).unwrap();
     known(&at_home, arm.name()).await;
@@ -127,7 +157,10 @@ async fn a_slow_agent_abroad_holds_its_sender_back() {
         via(&rover.send(inform(&rover, arm.name(), "x")).await.unwrap());
     }
     let short = Duration::from_secs(1);
-    let late = rover.send_within(inform(&rover, arm.name(), "late"), short).await.unwrap();
+    let late = rover
+        .send_within(inform(&rover, arm.name(), "late"), short)
+        .await
+        .unwrap();
     assert_eq!(reason(&late), FailureReason::QueueFull, "{late}");
     let waiting = rover.send(inform(&rover, arm.name(), "in time"));
     let reading = async {
@@ -153,18 +186,30 @@ async fn without_its_gateway_a_host_still_talks_to_itself() {
     let camera = next_door.register(&here.name("camera")).unwrap();
     let arm = abroad.register(&there.name("arm")).unwrap();
     known(&at_home, arm.name()).await;
-    via(&rover.send(inform(&rover, arm.name(), "before")).await.unwrap());
+    via(&rover
+        .send(inform(&rover, arm.name(), "before"))
+        .await
+        .unwrap());
 
     near.close().await;
     forgotten(&at_home, arm.name()).await;
-    let lost = rover.send(inform(&rover, arm.name(), "while it is gone")).await.unwrap();
+    let lost = rover
+        .send(inform(&rover, arm.name(), "while it is gone"))
+        .await
+        .unwrap();
     assert_eq!(reason(&lost), FailureReason::NoSuchAgent);
-    let sent = rover.send(inform(&rover, camera.name(), "we two")).await.unwrap();
+    let sent = rover
+        .send(inform(&rover, camera.name(), "we two"))
+        .await
+        .unwrap();
     assert_eq!(via(&sent), Some(Kind::Shm));
 
     let _near = Gateway::open(&here.config).await.unwrap();
     known(&at_home, arm.name()).await;
-    via(&rover.send(inform(&rover, arm.name(), "after")).await.unwrap());
+    via(&rover
+        .send(inform(&rover, arm.name(), "after"))
+        .await
+        .unwrap());
 }
 
 #[tokio::test(flavor = "multi_thread")]

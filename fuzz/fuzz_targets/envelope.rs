@@ -10,7 +10,9 @@ use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {
     let view = EnvelopeView::parse(bytes);
-    let Ok((envelope, len)) = Envelope::decode(bytes) else { return };
+    let Ok((envelope, len)) = Envelope::decode(bytes) else {
+        return;
+    };
     let view = view.expect("the view is not stricter");
     assert_eq!(view.len(), len);
     let effective = envelope.effective();

@@ -13,9 +13,13 @@ fuzz_target!(|bytes: &[u8]| {
         assert!(bytes.len() < HEADER_LEN);
         return;
     };
-    let Ok(parcel) = header.parcel(Bytes::copy_from_slice(body)) else { return };
+    let Ok(parcel) = header.parcel(Bytes::copy_from_slice(body)) else {
+        return;
+    };
     let (again, pieces) = ParcelHeader::of(&parcel).expect("what was read can be written");
-    let read = again.parcel(pieces.concat().into()).expect("what was written can be read");
+    let read = again
+        .parcel(pieces.concat().into())
+        .expect("what was written can be read");
     match (&read.body, &parcel.body) {
         (Body::Letter(one), Body::Letter(other)) => assert_eq!(one.to_bytes(), other.to_bytes()),
         (one, other) => assert_eq!(one, other),

@@ -20,7 +20,7 @@ fn seeds() -> Vec<u64> {
     if let Some(seed) = number("FIPA_SIM_SEED") {
         return vec![seed];
     }
-    (0..number("FIPA_SIM_SEEDS").unwrap_or(300)).collect()
+    (0..number("FIPA_SIM_SEEDS").unwrap_or(100)).collect()
 }
 
 fn run(weather: Weather) {

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, SendId, Submission};
 use fipa_mts::letter_for;
-use fipa_sds::{Directory, Role};
+use fipa_sds::Role;
 use fipa_transport::{
     AttemptId, Conclusion, Incarnation, Kind, Outcome, Parcel, Ticket, WayError, WayFault,
 };

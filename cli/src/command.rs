@@ -1,0 +1,39 @@
+//! The commands, one per file: its arguments, with the help that documents it, and `run`.
+
+mod agents;
+mod config;
+mod decode;
+mod demo;
+mod echo;
+mod send;
+mod up;
+
+use clap::Subcommand;
+
+use crate::options::Global;
+use crate::report::Failure;
+
+/// What `fipa` can be told to do.
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    Up(up::Arguments),
+    Agents(agents::Arguments),
+    Send(Box<send::Arguments>),
+    Echo(echo::Arguments),
+    Demo(demo::Arguments),
+    Decode(decode::Arguments),
+    Config(config::Arguments),
+}
+
+/// Does what was asked for.
+pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
+    match command {
+        Command::Up(arguments) => up::run(arguments, global),
+        Command::Agents(arguments) => agents::run(arguments, global),
+        Command::Send(arguments) => send::run(*arguments, global),
+        Command::Echo(arguments) => echo::run(arguments, global),
+        Command::Demo(arguments) => demo::run(arguments, global),
+        Command::Decode(arguments) => decode::run(arguments, global),
+        Command::Config(arguments) => config::run(arguments, global),
+    }
+}

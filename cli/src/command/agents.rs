@@ -1,0 +1,166 @@
+//! `fipa agents`: who is there, and where.
+
+use std::time::Duration;
+
+use clap::Args;
+use comfy_table::{Table, presets};
+use fipa::{Directory, Entry, Matcher, Query, Reach, Role, Time};
+use serde_json::{Value, json};
+
+use crate::membership;
+use crate::options::Global;
+use crate::output;
+use crate::report::Failure;
+
+/// Show who is there, and where
+///
+/// Lists the agents of the domain on this host and, when a gateway is running (`fipa up`), those
+/// that it knows on other hosts; the gateway itself too. Needs no gateway.
+///
+/// A pattern is a regular expression for the whole name, such as `arm_.*`. What has none of
+/// `* + ? [ ( { | ^ $ \` is a name.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  fipa agents
+  fipa agents 'arm_.*'
+  fipa agents --type camera --json | jq -r '.agents[].name'
+
+Columns:
+  REACH      this host, or the gateway that letters go through
+  LOCATIONS  where it takes letters, in order of preference
+  MTS        the message transport service that delivers to it
+  AGE        since it was registered
+
+JSON:
+  { \"domain\": text, \"gateway\": the name of this host's gateway, or null,
+    \"agents\": [ { \"name\", \"type\", \"description\", \"role\": \"agent\" or \"gateway\",
+                  \"reach\": \"local\" or \"remote\", \"gateway\": name, when it is remote,
+                  \"locations\": [ text ], \"mts\": { \"name\", \"incarnation\" },
+                  \"incarnation\", \"registered\": time, \"source\": how it was learnt } ] }")]
+pub(crate) struct Arguments {
+    /// Only those with this name, or whose name matches this pattern
+    #[arg(value_parser = Matcher::parse)]
+    pattern: Option<Matcher>,
+
+    /// Only those of this type, or whose type matches this pattern
+    #[arg(long = "type", value_name = "TYPE", value_parser = Matcher::parse)]
+    agent_type: Option<Matcher>,
+
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
+    let config = global.config()?;
+    let query = Query {
+        name: arguments.pattern,
+        agent_type: arguments.agent_type,
+        ..Query::all()
+    };
+    let listed = membership::run(async {
+        let domain = membership::join(&config).await?;
+        let directory = domain.directory();
+        directory.refresh();
+        let listed = Listed {
+            gateway: gateway(directory).map(|entry| entry.name.to_string()),
+            entries: directory
+                .search(&query)
+                .iter()
+                .map(|entry| Row::of(entry, directory))
+                .collect(),
+        };
+        domain.close().await;
+        Ok(listed)
+    })?;
+    if arguments.json {
+        let agents: Vec<&Value> = listed.entries.iter().map(|row| &row.json).collect();
+        return output::json(
+            &json!({ "domain": config.domain, "gateway": listed.gateway, "agents": agents }),
+        );
+    }
+    if listed.entries.is_empty() {
+        return output::text(&format!(
+            "nobody in the domain {} is known here by that description\n",
+            config.domain
+        ));
+    }
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING).set_header(COLUMNS);
+    for column in table.column_iter_mut() {
+        column.set_padding((0, 2));
+    }
+    table.add_rows(listed.entries.into_iter().map(|row| row.cells));
+    output::text(&format!("{}\n", table.trim_fmt()))
+}
+
+struct Listed {
+    gateway: Option<String>,
+    entries: Vec<Row>,
+}
+
+const COLUMNS: [&str; 6] = ["NAME", "TYPE", "REACH", "LOCATIONS", "MTS", "AGE"];
+
+/// One agent, for people and for programs.
+struct Row {
+    cells: [String; 6],
+    json: Value,
+}
+
+impl Row {
+    fn of(entry: &Entry, directory: &dyn Directory) -> Self {
+        let through = match entry.reach {
+            Reach::Local => None,
+            Reach::Remote { gateway } => Some(match directory.known_incarnation(gateway) {
+                Some(gateway) => gateway.name.to_string(),
+                None => "a gateway".to_owned(),
+            }),
+        };
+        let locations = entry.locations.iter().map(ToString::to_string);
+        let locations: Vec<String> = locations.collect();
+        let registered = Time::from_system_time(entry.registered);
+        let mut json = json!({
+            "name": entry.name,
+            "type": entry.agent_type,
+            "description": entry.description,
+            "role": entry.role,
+            "reach": if through.is_none() { "local" } else { "remote" },
+            "locations": locations,
+            "mts": entry.mts,
+            "incarnation": entry.incarnation,
+            "registered": registered.ok().and_then(Time::to_rfc3339),
+            "source": entry.source,
+        });
+        if let Some(gateway) = &through {
+            json["gateway"] = gateway.as_str().into();
+        }
+        let reach = match through {
+            None => "this host".to_owned(),
+            Some(gateway) => format!("via {gateway}"),
+        };
+        let cells = [
+            entry.name.to_string(),
+            entry.agent_type.clone(),
+            reach,
+            locations.join("\n"),
+            entry.mts.name.to_string(),
+            age(entry),
+        ];
+        Self { cells, json }
+    }
+}
+
+fn gateway(directory: &dyn Directory) -> Option<std::sync::Arc<Entry>> {
+    let entries = directory.entries();
+    let mut gateways = entries
+        .iter()
+        .filter(|entry| entry.role == Role::Gateway && entry.reach == Reach::Local);
+    gateways.next().cloned()
+}
+
+/// In whole seconds, by the clocks of two hosts; nothing when they disagree.
+fn age(entry: &Entry) -> String {
+    let age = entry.registered.elapsed().unwrap_or_default();
+    humantime::format_duration(Duration::from_secs(age.as_secs())).to_string()
+}

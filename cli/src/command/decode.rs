@@ -1,0 +1,185 @@
+//! `fipa decode`: bytes as JSON.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use fipa::{DecodeError, Letter, Message, Payload};
+use fipa_acl::json::{letter_to_json, message_to_json};
+use serde_json::{Value, json};
+
+use crate::options::Global;
+use crate::report::{self, Failure};
+use crate::{input, output};
+
+/// Print a recorded message or letter as JSON
+///
+/// Reads one encoded message (FIPA00069) or one letter, an envelope (FIPA00088) with a message
+/// behind it; the first byte tells which. Bytes that are neither are an error that says where they
+/// break which clause of the standards.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  fipa decode letter.bin
+  fipa decode message.be --compact | jq -r .message.performative
+  echo 'fa 10 13 01' | fipa decode --hex
+
+JSON of a message:
+  { \"message\": { \"performative\", \"sender\": agent, \"receivers\": [agent], \"reply_to\": [agent],
+                 \"content\" (text) or \"content_base64\", \"language\", \"encoding\", \"ontology\",
+                 \"protocol\", \"conversation_id\", \"reply_with\", \"in_reply_to\", \"reply_by\",
+                 \"user_defined\": { name: text } } }
+  agent: { \"name\", \"addresses\": [text], \"resolvers\": [agent], \"user_defined\" }
+
+JSON of a letter:
+  { \"envelope\": { \"base\": parameters, \"extensions\": [parameters], oldest first },
+    \"effective\": parameters, what counts of these,
+    \"message\" as above, or \"payload_base64\" if it is none that can be read }
+  parameters: { \"to\", \"from\", \"comments\", \"acl_representation\", \"payload_length\",
+                \"payload_encoding\", \"date\", \"intended_receivers\", \"received\",
+                \"transport_behaviour\", \"user_defined\" }
+
+Keys appear only when set. Times are in UTC, with milliseconds.")]
+pub(crate) struct Arguments {
+    /// The file to read; - for standard input
+    #[arg(default_value = "-")]
+    file: PathBuf,
+
+    /// The input is text: hexadecimal digits, with or without white space, colons and 0x between
+    #[arg(long)]
+    hex: bool,
+
+    /// Print it on one line
+    #[arg(long)]
+    compact: bool,
+}
+
+/// The largest content, and ample room for what stands around it.
+const MOST: u64 = Message::MAX_CONTENT + (1 << 20);
+
+pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
+    let Arguments { file, hex, compact } = arguments;
+    // Three characters a byte, usually.
+    let mut bytes = input::read(&file, if hex { 3 * MOST } else { MOST })?;
+    if hex {
+        bytes = from_hex(&bytes, &file)?;
+    }
+    let decoded = if is_letter(&bytes) {
+        letter(bytes, &file)
+    } else {
+        message(bytes)
+    };
+    let json = decoded.map_err(|error| malformed(&error, &file))?;
+    if compact {
+        output::json_line(&json)
+    } else {
+        output::json(&json)
+    }
+}
+
+/// An envelope begins with the base (`FE`) or an extension (`FD`): FIPA00088 BaseEnvelopeHeader
+/// and ExtEnvelopeHeader. Everything else is tried as a message, whose error says what is wrong.
+fn is_letter(bytes: &[u8]) -> bool {
+    matches!(bytes.first(), Some(0xfd | 0xfe))
+}
+
+fn message(bytes: Vec<u8>) -> Result<Value, DecodeError> {
+    let payload = Payload {
+        head: bytes.into(),
+        ..Payload::default()
+    };
+    let message = Message::decode(&payload)?;
+    Ok(json!({ "message": message_to_json(&message) }))
+}
+
+fn letter(bytes: Vec<u8>, file: &Path) -> Result<Value, DecodeError> {
+    let (envelope, letter) = Letter::decode(bytes.into())?;
+    let payload = letter.payload();
+    let json = letter_to_json(&envelope, payload);
+    if json.get("message").is_none() && !payload.is_empty() {
+        let why = match Message::decode(payload) {
+            Ok(_) => String::new(),
+            Err(error) => format!(": {error}"),
+        };
+        report::warn(&format!(
+            "{}: the payload behind the envelope of {} bytes is no message that can be read{why}",
+            input::name(file),
+            letter.envelope_len()
+        ));
+    }
+    Ok(json)
+}
+
+fn malformed(error: &DecodeError, file: &Path) -> Failure {
+    Failure::failed(
+        format!("{} ({})", error.problem(), error.clause()),
+        format!("{}, byte {}", input::name(file), error.offset()),
+        "see whether it is one whole message or letter in the bit-efficient encoding, and whether \
+         --hex is missing",
+    )
+}
+
+/// The bytes that the hexadecimal digits stand for.
+fn from_hex(text: &[u8], file: &Path) -> Result<Vec<u8>, Failure> {
+    let wrong = |what: String, at: usize| {
+        Failure::failed(
+            what,
+            format!("{}, character {}", input::name(file), at + 1),
+            "give two hexadecimal digits for each byte, or leave out --hex",
+        )
+    };
+    let mut bytes = Vec::with_capacity(text.len() / 2);
+    let mut high: Option<u8> = None;
+    for (at, &byte) in text.iter().enumerate() {
+        let digit = match byte {
+            b'0'..=b'9' => byte - b'0',
+            b'a'..=b'f' => byte - b'a' + 10,
+            b'A'..=b'F' => byte - b'A' + 10,
+            b':' | b',' if high.is_none() => continue,
+            // The prefix of a byte: the zero before it was no digit.
+            b'x' | b'X' if high == Some(0) => {
+                high = None;
+                continue;
+            }
+            _ if byte.is_ascii_whitespace() && high.is_none() => continue,
+            _ => {
+                let found = char::from(byte);
+                return Err(wrong(format!("{found:?} is no hexadecimal digit here"), at));
+            }
+        };
+        match high.take() {
+            None => high = Some(digit),
+            Some(high) => bytes.push(high << 4 | digit),
+        }
+    }
+    match high {
+        None => Ok(bytes),
+        Some(_) => Err(wrong(
+            "the last byte has one digit only".to_owned(),
+            text.len(),
+        )),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn hexadecimal_text_in_the_usual_forms() {
+        let expected = vec![0xfa, 0x00, 0x0b];
+        for text in [
+            "fa000b",
+            "FA 00 0B\n",
+            "fa:00:0b",
+            "0xfa, 0x00, 0x0b",
+            " fa00 0b ",
+        ] {
+            let bytes = from_hex(text.as_bytes(), Path::new("-"));
+            assert_eq!(bytes.ok(), Some(expected.clone()), "{text:?}");
+        }
+        for text in ["f", "fa 0", "f a", "fg", "1x00", "fa-00"] {
+            let bytes = from_hex(text.as_bytes(), Path::new("-"));
+            assert!(bytes.is_err(), "{text:?}");
+        }
+    }
+}

@@ -1,0 +1,171 @@
+//! `fipa echo`: an agent that answers.
+
+use std::time::Duration;
+
+use clap::Args;
+use fipa::{
+    Agent, AgentId, Config, Incoming, Letter, Message, Performative, ReceiveError, RegisterOptions,
+};
+
+use crate::membership::{self, Stop};
+use crate::options::{self, Global};
+use crate::output;
+use crate::report::{self, Failure};
+
+/// Run an agent that answers every message with an inform of the same content
+///
+/// Prints one line per message it gets, until Ctrl-C. Works with and without a gateway.
+///
+/// It answers what asks for an answer: any message that is no reply itself (has no in-reply-to)
+/// and is no failure or not-understood; an inform only when it has reply-with. Its own answers
+/// have none, so two of them never talk to each other forever.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  fipa echo arm_1
+  fipa echo arm_1 --type arm --description 'left front'
+  fipa echo arm_1 --count 1          end after one message
+
+In another terminal:
+  fipa send --to arm_1 --content hello --wait")]
+pub(crate) struct Arguments {
+    /// The name of the agent
+    name: AgentId,
+
+    /// What kind of agent it is, for `fipa agents --type`
+    #[arg(long = "type", value_name = "TYPE", default_value = "")]
+    agent_type: String,
+
+    /// What it says about itself
+    #[arg(long, value_name = "TEXT", default_value = "")]
+    description: String,
+
+    /// End after so many messages
+    #[arg(long, value_name = "N")]
+    count: Option<u64>,
+}
+
+/// How long news may take from one host to another.
+const NEWS: Duration = Duration::from_secs(3);
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
+    let config = global.config()?;
+    options::runtime()?.block_on(serve(arguments, &config))
+}
+
+async fn serve(arguments: Arguments, config: &Config) -> Result<(), Failure> {
+    let mut stop = Stop::listen()?;
+    let domain = membership::join(config).await?;
+    let options = RegisterOptions {
+        agent_type: arguments.agent_type,
+        description: arguments.description,
+    };
+    let agent = membership::register(&domain, arguments.name.name(), options, config)?;
+    output::text(&format!(
+        "{} of the domain {} answers; Ctrl-C ends it\n",
+        agent.name(),
+        config.domain
+    ))?;
+    let ended = tokio::select! {
+        ended = answer_all(&agent, arguments.count) => ended,
+        () = stop.requested() => Ok(()),
+    };
+    drop(agent);
+    domain.close().await;
+    ended
+}
+
+async fn answer_all(agent: &Agent, count: Option<u64>) -> Result<(), Failure> {
+    let mut received = 0;
+    while count.is_none_or(|count| received < count) {
+        match agent.receive().await {
+            Ok(incoming) => {
+                received += 1;
+                output::text(&line(&incoming))?;
+                if wants_an_answer(&incoming.message) {
+                    answer(agent, &incoming).await;
+                }
+            }
+            Err(error @ ReceiveError::Malformed { .. }) => {
+                received += 1;
+                report::warn(&error.to_string());
+            }
+            Err(error) => {
+                return Err(Failure::failed(
+                    error.to_string(),
+                    format!("agent {:?}", agent.name()),
+                    "start it again",
+                ));
+            }
+        }
+    }
+    Ok(())
+}
+
+fn line(incoming: &Incoming) -> String {
+    match incoming.via {
+        Some(via) => format!("via {via}: {}\n", incoming.message),
+        None => format!("{}\n", incoming.message),
+    }
+}
+
+fn wants_an_answer(message: &Message) -> bool {
+    if message.in_reply_to().is_some() {
+        return false;
+    }
+    match message.performative() {
+        Performative::Failure | Performative::NotUnderstood => false,
+        Performative::Inform => message.reply_with().is_some(),
+        _ => true,
+    }
+}
+
+/// What goes wrong with one answer does not end the agent.
+async fn answer(agent: &Agent, incoming: &Incoming) {
+    let message = &incoming.message;
+    let mut reply = agent.reply(message, Performative::Inform);
+    if let Some(content) = message.content() {
+        reply = reply.content(content.clone());
+    }
+    if let Some(encoding) = message.encoding() {
+        reply = reply.encoding(encoding);
+    }
+    let reply = match reply.build() {
+        Ok(reply) if reply.receivers().is_empty() => {
+            return report::warn("no answer: the message does not say who sent it");
+        }
+        Ok(reply) => reply,
+        Err(error) => return report::warn(&format!("no answer: {error}")),
+    };
+    if came_from_elsewhere(&incoming.letter) {
+        let names = reply.receivers().iter().map(AgentId::name);
+        wait_until_known(agent, names.collect()).await;
+    }
+    match agent.send(reply).await {
+        Ok(deliveries) if deliveries.all_succeeded() => {}
+        Ok(deliveries) => report::warn(&format!("the answer did not arrive: {deliveries}")),
+        Err(error) => report::warn(&format!("no answer: {error}")),
+    }
+}
+
+/// Whether a gateway has stamped the letter.
+fn came_from_elsewhere(letter: &Letter) -> bool {
+    let envelope = letter.parse_envelope();
+    envelope.is_ok_and(|envelope| !envelope.extensions.is_empty())
+}
+
+/// A letter of an agent that has just been started, as `fipa send` is, may come from another host
+/// before the news that there is such an agent.
+async fn wait_until_known(agent: &Agent, names: Vec<&str>) {
+    let directory = agent.domain().directory();
+    let mut changes = directory.watch();
+    let known = async {
+        while names.iter().any(|name| directory.lookup(name).is_none()) {
+            if changes.next().await.is_none() {
+                return;
+            }
+        }
+    };
+    // Whoever is not known by then gets no answer, which sending says.
+    let _ = tokio::time::timeout(NEWS, known).await;
+}

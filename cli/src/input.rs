@@ -1,0 +1,45 @@
+//! Reads what a command is given as a file or on standard input.
+
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::Path;
+
+use crate::report::Failure;
+
+/// All bytes of a file, or of standard input when it is named `-`; at most `limit`.
+pub(crate) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, Failure> {
+    let mut bytes = Vec::new();
+    let read = if path == Path::new("-") {
+        read_all(&mut io::stdin().lock(), limit, &mut bytes)
+    } else {
+        File::open(path).and_then(|mut file| read_all(&mut file, limit, &mut bytes))
+    };
+    match read {
+        Ok(true) => Ok(bytes),
+        Ok(false) => Err(Failure::failed(
+            format!("there are more than {limit} bytes"),
+            name(path),
+            "give it in pieces",
+        )),
+        Err(error) => Err(Failure::failed(
+            format!("cannot read: {error}"),
+            name(path),
+            "name a file that this user can read, or - for standard input",
+        )),
+    }
+}
+
+/// What to call it when something is wrong with it.
+pub(crate) fn name(path: &Path) -> String {
+    if path == Path::new("-") {
+        "standard input".to_owned()
+    } else {
+        path.display().to_string()
+    }
+}
+
+/// Whether that was all.
+fn read_all(source: &mut dyn Read, limit: u64, bytes: &mut Vec<u8>) -> io::Result<bool> {
+    let read = source.take(limit.saturating_add(1)).read_to_end(bytes)?;
+    Ok(read as u64 <= limit)
+}

@@ -1,0 +1,82 @@
+//! Prints to standard output what was asked for.
+
+use std::io::{self, Write};
+
+use fipa::{Deliveries, Outcome};
+use serde::Serialize;
+use serde_json::{Value, json};
+
+use crate::report::Failure;
+
+/// Prints a text that ends its last line itself.
+pub(crate) fn text(text: &str) -> Result<(), Failure> {
+    let mut stdout = io::stdout().lock();
+    let written = stdout
+        .write_all(text.as_bytes())
+        .and_then(|()| stdout.flush());
+    match written {
+        // Whoever reads has seen enough, as `head` does.
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+        Err(error) => Err(Failure::failed(
+            format!("cannot write the output: {error}"),
+            "standard output",
+            "see whether the disk is full, or print to somewhere else",
+        )),
+        Ok(()) => Ok(()),
+    }
+}
+
+/// Prints one JSON document.
+pub(crate) fn json(value: &impl Serialize) -> Result<(), Failure> {
+    document(serde_json::to_string_pretty(value))
+}
+
+/// Prints one JSON document on a line of its own.
+pub(crate) fn json_line(value: &impl Serialize) -> Result<(), Failure> {
+    document(serde_json::to_string(value))
+}
+
+fn document(document: serde_json::Result<String>) -> Result<(), Failure> {
+    let document = document.map_err(|error| {
+        Failure::failed(
+            format!("the output cannot be written as JSON: {error}"),
+            "standard output",
+            "leave out --json",
+        )
+    })?;
+    text(&format!("{document}\n"))
+}
+
+/// What became of a message, one object per receiver: `receiver`, `outcome`, `via` or `reason`,
+/// and the `attempts` that did not work.
+pub(crate) fn deliveries(deliveries: &Deliveries) -> Value {
+    let one = |delivery: &fipa::Delivery| {
+        let attempts = delivery.outcome.attempts().iter().map(|attempt| {
+            json!({
+                "via": attempt.via.name(),
+                "location": attempt.location.to_string(),
+                "error": attempt.error.to_string(),
+            })
+        });
+        let attempts: Vec<Value> = attempts.collect();
+        let receiver = &delivery.receiver;
+        match &delivery.outcome {
+            Outcome::Delivered { via, .. } => json!({
+                "receiver": receiver, "outcome": "delivered", "via": via.name(), "attempts": attempts,
+            }),
+            Outcome::Sent { via, .. } => json!({
+                "receiver": receiver, "outcome": "sent", "via": via.name(), "attempts": attempts,
+            }),
+            other => {
+                let reason = match other {
+                    Outcome::Failed { reason, .. } => reason.to_string(),
+                    unknown => unknown.to_string(),
+                };
+                json!({
+                    "receiver": receiver, "outcome": "failed", "reason": reason, "attempts": attempts,
+                })
+            }
+        }
+    };
+    deliveries.0.iter().map(one).collect()
+}

@@ -1,0 +1,164 @@
+//! `fipa decode`: recorded bytes of real peers as JSON.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+
+mod common;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD as BASE64;
+use common::Host;
+use serde_json::{Value, json};
+
+#[test]
+fn recorded_messages_mean_what_is_written_beside_them() {
+    let host = Host::new();
+    let recorded = vectors('m');
+    assert!(recorded.len() >= 35, "only {} found", recorded.len());
+    for path in recorded {
+        let mut expected = beside(&path);
+        if name(&path) == "m28_resolver_depth2" {
+            // The library that wrote it goes one level deep.
+            let resolver = &mut expected["message"]["sender"]["resolvers"][0];
+            resolver.as_object_mut().unwrap().remove("resolvers");
+        }
+        expected.as_object_mut().unwrap().remove("note");
+        let mut decoded = host.run(&["decode", path.to_str().unwrap()]).done_json();
+        to_base64(&mut decoded["message"]);
+        assert_eq!(decoded, expected, "{}", path.display());
+    }
+}
+
+#[test]
+fn recorded_letters_mean_what_is_written_beside_them() {
+    let host = Host::new();
+    let recorded = vectors('e');
+    assert!(recorded.len() >= 11, "only {} found", recorded.len());
+    let mut messages = 0;
+    for path in recorded {
+        let mut expected = beside(&path);
+        if name(&path) == "e12_extra_override" {
+            // The format has no date in extensions.
+            let extension = &mut expected["envelope"]["extensions"][0];
+            extension.as_object_mut().unwrap().remove("date");
+        }
+        let ran = host.run(&["decode", path.to_str().unwrap()]);
+        assert_eq!(ran.code, Some(0), "{ran:?}");
+        let mut decoded: Value = serde_json::from_slice(&ran.stdout).unwrap();
+        assert_eq!(
+            decoded["envelope"],
+            expected["envelope"],
+            "{}",
+            path.display()
+        );
+        assert!(decoded["effective"]["to"].is_array(), "{decoded}");
+        if let Some(payload) = decoded.get("payload_base64") {
+            assert_eq!(payload, &expected["payload_base64"], "{}", path.display());
+            assert_eq!(ran.stderr.is_empty(), payload == "", "{}", ran.stderr);
+            continue;
+        }
+        // The message is the one that its bytes make on their own.
+        assert_eq!(ran.stderr, "");
+        let payload = BASE64
+            .decode(expected["payload_base64"].as_str().unwrap())
+            .unwrap();
+        let mut alone = host
+            .run_with_input(&["decode", "--compact"], &payload)
+            .done_json();
+        to_base64(&mut alone["message"]);
+        to_base64(&mut decoded["message"]);
+        assert_eq!(decoded["message"], alone["message"], "{}", path.display());
+        messages += 1;
+    }
+    assert!(
+        messages >= 5,
+        "only {messages} letters had a message that was read"
+    );
+}
+
+#[test]
+fn hexadecimal_text() {
+    let host = Host::new();
+    let bytes = fs::read(vector("m19_perf_request.be")).unwrap();
+    let plain = host
+        .run_with_input(&["decode", "-", "--compact"], &bytes)
+        .done();
+    assert_eq!(plain.lines().count(), 1);
+    let hex: String = bytes.iter().map(|byte| format!("{byte:02X} ")).collect();
+    let decoded = host.run_with_input(&["decode", "--hex", "--compact"], hex.as_bytes());
+    assert_eq!(decoded.done(), plain);
+    let told = host
+        .run_with_input(&["decode", "--hex"], b"fa 1g")
+        .failed(1);
+    let expected = "error: 'g' is no hexadecimal digit here\nwhere: standard input, character 5\n";
+    assert!(told.starts_with(expected), "{told}");
+}
+
+#[test]
+fn what_the_help_shows_works() {
+    let decoded = Host::new()
+        .run_with_input(&["decode", "--hex"], b"fa 10 13 01\n")
+        .done_json();
+    assert_eq!(decoded, json!({ "message": { "performative": "request" } }));
+}
+
+#[test]
+fn malformed_bytes_are_told_with_place_and_clause() {
+    let host = Host::new();
+    let message = fs::read(vector("m19_perf_request.be")).unwrap();
+    let cut = message.len() - 1;
+    fs::write(host.path("cut.be"), &message[..cut]).unwrap();
+    let told = host.run(&["decode", "cut.be"]).failed(1);
+    assert!(
+        told.contains(&format!("where: cut.be, byte {cut}\n")),
+        "{told}"
+    );
+    assert!(told.contains("(FIPA00069"), "{told}");
+    let letter = fs::read(vector("e01_simple.be")).unwrap();
+    for (input, clause) in [
+        (&letter[..9], "(FIPA00069"),
+        (b"", "FIPA"),
+        (b"hello", "FIPA"),
+    ] {
+        let told = host.run_with_input(&["decode"], input).failed(1);
+        assert!(
+            told.contains(clause) && told.contains("where: standard input, byte "),
+            "{told}"
+        );
+    }
+    let told = host.run(&["decode", "nothing.be"]).failed(1);
+    assert!(told.contains("where: nothing.be\n"), "{told}");
+}
+
+fn to_base64(message: &mut Value) {
+    let message = message.as_object_mut().unwrap();
+    if let Some(content) = message.remove("content") {
+        let encoded = BASE64.encode(content.as_str().unwrap());
+        message.insert("content_base64".to_owned(), encoded.into());
+    }
+}
+
+fn beside(path: &Path) -> Value {
+    serde_json::from_slice(&fs::read(path.with_extension("json")).unwrap()).unwrap()
+}
+
+fn name(path: &Path) -> &str {
+    path.file_stem().unwrap().to_str().unwrap()
+}
+
+fn vector(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../acl/tests/vectors")
+        .join(name)
+}
+
+fn vectors(initial: char) -> Vec<PathBuf> {
+    let entries = fs::read_dir(vector("")).unwrap();
+    let paths = entries.map(|entry| entry.unwrap().path());
+    paths
+        .filter(|path| path.extension().is_some_and(|ext| ext == "be"))
+        .filter(|path| name(path).starts_with(initial))
+        .collect()
+}

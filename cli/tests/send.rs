@@ -1,0 +1,414 @@
+//! `fipa send` and `fipa echo`, in processes of their own.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+
+mod common;
+
+use std::path::PathBuf;
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD as BASE64;
+use common::Host;
+use serde_json::{Value, json};
+
+#[test]
+fn a_message_and_its_reply_with_and_without_a_gateway() {
+    let host = Host::new();
+    let _echo = host.echo("arm_1");
+    let asked = [
+        "send",
+        "--to",
+        "arm_1",
+        "--content",
+        "hello",
+        "--wait",
+        "--json",
+    ];
+    let converse = || {
+        let json = host.run(&asked).done_json();
+        assert_eq!(
+            json["deliveries"],
+            json!([{ "receiver": "arm_1", "outcome": "delivered", "via": "shm", "attempts": [] }])
+        );
+        let reply = &json["reply"];
+        assert_eq!(reply["performative"], "inform");
+        assert_eq!(reply["sender"]["name"], "arm_1");
+        assert_eq!(reply["content"], "hello");
+        assert!(reply["in_reply_to"].is_string() && reply["conversation_id"].is_string());
+    };
+    converse();
+    let gateway = host.start(&["up"]);
+    assert!(gateway.ready.contains(&host.domain), "{}", gateway.ready);
+    converse();
+    // A gateway that crashes takes nobody else with it.
+    drop(gateway);
+    converse();
+}
+
+#[test]
+fn what_people_read() {
+    let host = Host::new();
+    let mut echo = host.echo("arm_1");
+    let told = host.run(&[
+        "send",
+        "--to",
+        "arm_1",
+        "--from",
+        "me",
+        "--content",
+        "hi",
+        "--wait",
+    ]);
+    let told = told.done();
+    let (outcome, reply) = told.split_once('\n').unwrap();
+    assert_eq!(outcome, "arm_1: delivered via shm");
+    assert!(
+        reply.starts_with("reply: (inform :sender arm_1 :receiver (set me)"),
+        "{reply}"
+    );
+    assert!(reply.ends_with(":content \"hi\")\n"), "{reply}");
+    let seen = echo.line();
+    assert!(
+        seen.starts_with("via shm: (inform :sender me :receiver (set arm_1)"),
+        "{seen}"
+    );
+}
+
+#[test]
+fn all_parameters_arrive() {
+    let host = Host::new();
+    let mut echo = host.echo("arm_1");
+    let sent = [
+        "send",
+        "--to",
+        "arm_1",
+        "--performative",
+        "request-when",
+        "--protocol",
+        "fipa-request",
+        "--conversation-id",
+        "c-1",
+        "--ontology",
+        "crane",
+        "--language",
+        "fipa-sl",
+        "--encoding",
+        "utf-8",
+        "--reply-with",
+        "r-1",
+        "--reply-by",
+        "2030-01-31T12:00:00Z",
+        "--content",
+        "x",
+        "--wait",
+        "--json",
+    ];
+    let json = host.run(&sent).done_json();
+    let seen = echo.line();
+    for part in [
+        "(request-when ",
+        ":protocol fipa-request",
+        ":conversation-id c-1",
+        ":ontology crane",
+        ":language fipa-sl",
+        ":encoding utf-8",
+        ":reply-with r-1",
+        ":reply-by 20300131T120000000Z",
+    ] {
+        assert!(seen.contains(part), "{part} in {seen}");
+    }
+    let reply = &json["reply"];
+    for (key, value) in [
+        ("conversation_id", "c-1"),
+        ("in_reply_to", "r-1"),
+        ("protocol", "fipa-request"),
+        ("encoding", "utf-8"),
+    ] {
+        assert_eq!(reply[key], value, "{reply}");
+    }
+}
+
+#[test]
+fn binary_content_from_a_file_and_from_standard_input() {
+    let host = Host::new();
+    let _echo = host.echo("camera");
+    let every_byte: Vec<u8> = (0..=255).cycle().take(100_000).collect();
+    std::fs::write(host.path("picture.raw"), &every_byte).unwrap();
+    let ask = |file| {
+        [
+            "send",
+            "--to",
+            "camera",
+            "--wait",
+            "--json",
+            "--content-file",
+            file,
+        ]
+    };
+    let came_back = |json: Value| BASE64.decode(json["reply"]["content_base64"].as_str().unwrap());
+    let by_file = host.run(&ask("picture.raw")).done_json();
+    assert_eq!(came_back(by_file).unwrap(), every_byte);
+    let by_input = host.run_with_input(&ask("-"), &every_byte).done_json();
+    assert_eq!(came_back(by_input).unwrap(), every_byte);
+    let missing = host.run(&ask("nothing.raw")).failed(1);
+    assert!(missing.contains("where: nothing.raw\n"), "{missing}");
+}
+
+#[test]
+fn a_receiver_that_nobody_knows() {
+    let host = Host::new();
+    let (json, told) = host
+        .run(&[
+            "send",
+            "--to",
+            "nobody",
+            "--content",
+            "x",
+            "--wait",
+            "--json",
+        ])
+        .failed_json();
+    assert_eq!(
+        json,
+        json!({ "deliveries": [{ "receiver": "nobody", "outcome": "failed",
+                                 "reason": "no such agent", "attempts": [] }] })
+    );
+    assert!(
+        told.contains("error: not delivered: no such agent\nwhere: \"nobody\"\n"),
+        "{told}"
+    );
+    assert!(told.contains("start one with `fipa up`"), "{told}");
+    let _gateway = host.start(&["up"]);
+    let (_, told) = host
+        .run(&["send", "--to", "nobody", "--json"])
+        .failed_json();
+    assert!(told.contains("that the gateway"), "{told}");
+}
+
+#[test]
+fn one_of_two_receivers() {
+    let host = Host::new();
+    let _echo = host.echo("arm_1");
+    let (json, told) = host
+        .run(&["send", "--to", "arm_1", "--to", "arm_2", "--wait", "--json"])
+        .failed_json();
+    let mut outcomes: Vec<_> = json["deliveries"].as_array().unwrap().iter().collect();
+    outcomes.sort_by_key(|one| one["receiver"].to_string());
+    assert_eq!(outcomes[0]["outcome"], "delivered");
+    assert_eq!(outcomes[1]["reason"], "no such agent");
+    // The failure about arm_2 is no reply.
+    assert_eq!(json["reply"]["sender"]["name"], "arm_1");
+    assert!(
+        told.contains("where: \"arm_2\"\n") && !told.contains("no reply"),
+        "{told}"
+    );
+}
+
+#[test]
+fn a_pattern_reaches_all_that_match() {
+    let host = Host::new();
+    let mut echoes = [host.echo("arm_1"), host.echo("arm_2")];
+    let _other = host.echo("camera");
+    let json = host
+        .run(&[
+            "send",
+            "--to",
+            "arm_.*",
+            "--from",
+            "arm_0",
+            "--content",
+            "stop",
+            "--json",
+        ])
+        .done_json();
+    let deliveries = json["deliveries"].as_array().unwrap();
+    let mut reached: Vec<_> = deliveries
+        .iter()
+        .map(|one| one["receiver"].clone())
+        .collect();
+    reached.sort_by_key(Value::to_string);
+    assert_eq!(reached, ["arm_1", "arm_2"]);
+    for echo in &mut echoes {
+        let seen = echo.line();
+        assert!(
+            seen.contains("(inform :sender arm_0") && seen.contains("\"stop\""),
+            "{seen}"
+        );
+    }
+    let (_, told) = host.run(&["send", "--to", "arm_[", "--json"]).failed_json();
+    assert!(told.contains("unclosed character class"), "{told}");
+}
+
+#[test]
+fn no_reply_in_time() {
+    let host = Host::new();
+    let _echo = host.echo("arm_1");
+    let not_answered = [
+        "send",
+        "--to",
+        "arm_1",
+        "--performative",
+        "not-understood",
+        "--wait",
+        "--timeout",
+        "50ms",
+        "--json",
+    ];
+    let (json, told) = host.run(&not_answered).failed_json();
+    assert_eq!(json["deliveries"][0]["outcome"], "delivered");
+    assert_eq!(json.get("reply"), None);
+    assert!(
+        told.starts_with("error: no reply within 50ms\nwhere: \"arm_1\"\n"),
+        "{told}"
+    );
+}
+
+#[test]
+fn echo_agents_do_not_talk_to_each_other_forever() {
+    let host = Host::new();
+    let (mut arm_1, mut arm_2) = (host.echo("arm_1"), host.echo("arm_2"));
+    // The answer goes to the other one, and has no in-reply-to to know it by.
+    let begin = [
+        "--performative",
+        "request",
+        "--reply-to",
+        "arm_2",
+        "--content",
+        "begin",
+    ];
+    host.run(&[&["send", "--to", "arm_1"], &begin[..]].concat())
+        .done();
+    assert!(arm_1.line().contains("\"begin\""));
+    let answer = arm_2.line();
+    assert!(answer.contains("(inform :sender arm_1"), "{answer}");
+    // It takes one message after the other: when it has answered this one, it is done with that.
+    host.run(&["send", "--to", "arm_2", "--content", "between", "--wait"])
+        .done();
+    host.run(&["send", "--to", "arm_1", "--content", "end"])
+        .done();
+    let next = arm_1.line();
+    assert!(next.contains("\"end\""), "{next}");
+}
+
+#[test]
+fn an_echo_that_has_answered_enough_ends() {
+    let host = Host::new();
+    let mut echo = host.start(&["echo", "arm_1", "--count", "2"]);
+    for _ in 0..2 {
+        host.run(&["send", "--to", "arm_1", "--wait"]).done();
+    }
+    assert_eq!(echo.end(), (Some(0), String::new()));
+}
+
+#[test]
+fn a_second_agent_of_the_same_name() {
+    let host = Host::new();
+    let _echo = host.echo("arm_1");
+    for second in [
+        &["echo", "arm_1"][..],
+        &["send", "--to", "x", "--from", "arm_1"],
+    ] {
+        let told = host.run(second).failed(1);
+        assert!(
+            told.starts_with("error: the name \"arm_1\" is taken by an agent at "),
+            "{told}"
+        );
+        assert!(told.contains("\n   do: choose another name"), "{told}");
+    }
+}
+
+#[test]
+fn content_that_is_too_large() {
+    let host = Host::new();
+    let _echo = host.echo("camera");
+    std::fs::write(host.path("large.raw"), vec![0; 2 << 20]).unwrap();
+    let send = [
+        "--set",
+        "transport.shm.max_letter=1MiB",
+        "send",
+        "--to",
+        "camera",
+        "--content-file",
+        "large.raw",
+        "--json",
+    ];
+    let (json, told) = host.run(&send).failed_json();
+    let delivery = &json["deliveries"][0];
+    assert_eq!(
+        (&delivery["outcome"], &delivery["reason"]),
+        (&json!("failed"), &json!("too large"))
+    );
+    let ways: Vec<_> = delivery["attempts"].as_array().unwrap().iter().collect();
+    assert_eq!(ways.len(), 2, "{delivery}");
+    assert!(
+        told.starts_with("error: not delivered: too large\nwhere: \"camera\"\n"),
+        "{told}"
+    );
+    assert!(
+        told.contains("transport.shm.max_letter (here 1048576 bytes)"),
+        "{told}"
+    );
+}
+
+#[test]
+fn wrong_usage() {
+    let host = Host::new();
+    for wrong in [
+        &["send"][..],
+        &["send", "--to", ""],
+        &["send", "--to", "x", "--deadline", "0s"],
+        &["send", "--to", "x", "--deadline", "2h"],
+        &["send", "--to", "x", "--content", "a", "--content-file", "b"],
+        &["send", "--to", "x", "--timeout", "1s"],
+        &["send", "--to", "x", "--performative", "a b"],
+        &["send", "--to", "x", "--reply-by", "tomorrow"],
+        &["send", "--to", "x", "--protocol", "two words"],
+        &["send", "--to", "x", "--set", "mts.queue=0"],
+        &["echo"],
+        &["echo", "arm\n1"],
+        &["echo", "arm_1", "--set", "mts.queue=0"],
+    ] {
+        let told = host.run(wrong).failed(2);
+        assert!(told.starts_with("error: "), "{wrong:?}: {told}");
+    }
+    assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
+}
+
+#[test]
+fn nothing_is_left_behind() {
+    let host = Host::new();
+    let echo = host.echo("arm_1");
+    assert!(!host.left_behind().is_empty());
+    host.run(&["send", "--to", "arm_1", "--content", "x", "--wait"])
+        .done();
+    let gateway = host.start(&["up"]);
+    assert_eq!(gateway.signal("-INT"), (Some(0), String::new()));
+    assert_eq!(echo.signal("-INT"), (Some(0), String::new()));
+    assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
+}
+
+#[test]
+fn a_signal_ends_waiting_in_order() {
+    let host = Host::new();
+    let echo = host.echo("arm_1");
+    // Prints its outcome and waits for a reply that never comes.
+    let waiting = host.start(&[
+        "send",
+        "--to",
+        "arm_1",
+        "--performative",
+        "failure",
+        "--wait",
+        "--timeout",
+        "1h",
+    ]);
+    assert_eq!(waiting.ready, "arm_1: delivered via shm");
+    let (code, told) = waiting.signal("-TERM");
+    assert_eq!(code, Some(1));
+    assert!(
+        told.starts_with("error: told to end before it was done\n"),
+        "{told}"
+    );
+    assert_eq!(echo.signal("-HUP"), (Some(0), String::new()));
+    assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
+}

@@ -1,0 +1,231 @@
+//! `fipa up` and `fipa agents`, in processes of their own.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+
+mod common;
+
+use std::net::TcpListener;
+use std::path::PathBuf;
+
+use common::Host;
+use serde_json::{Value, json};
+
+#[test]
+fn the_gateway_says_what_it_is() {
+    let host = Host::new();
+    let gateway = host.start(&["up", "--json", "--set", "mts.name=sherpa"]);
+    let ready: Value = serde_json::from_str(&gateway.ready).unwrap();
+    assert_eq!(
+        (&ready["name"], &ready["domain"]),
+        (&json!("sherpa"), &json!(host.domain))
+    );
+    assert_eq!(ready["discovery"], json!({ "mdns": false }));
+    let locations = ready["locations"].as_array().unwrap();
+    assert!(
+        locations
+            .iter()
+            .any(|one| one.as_str().unwrap().starts_with("tcp://127.0.0.1:"))
+    );
+    let listed = host.run(&["agents", "--json"]).done_json();
+    assert_eq!(listed["gateway"], "sherpa");
+    let entry = &listed["agents"][0];
+    assert_eq!(
+        (&entry["role"], &entry["name"]),
+        (&json!("gateway"), &json!("sherpa"))
+    );
+    assert_eq!(entry["incarnation"], ready["incarnation"]);
+    assert_eq!(entry["locations"], ready["locations"]);
+    assert_eq!(gateway.signal("-TERM"), (Some(0), String::new()));
+    assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
+}
+
+#[test]
+fn who_joins_and_leaves_is_logged() {
+    let host = Host::new();
+    let _before = host.echo("arm_1");
+    let mut gateway = host.start(&["up", "-v", "--json"]);
+    gateway.tells(&["INFO", "is there", "arm_1"]);
+    let echo = host.echo("arm_2");
+    gateway.tells(&["INFO", "joined", "arm_2"]);
+    assert_eq!(echo.signal("-INT"), (Some(0), String::new()));
+    gateway.tells(&["INFO", "left", "arm_2"]);
+    let (code, log) = gateway.signal("-INT");
+    assert_eq!(code, Some(0), "{log}");
+}
+
+#[test]
+fn a_port_in_use() {
+    let host = Host::new();
+    let holder = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = holder.local_addr().unwrap();
+    let listen = format!("transport.tcp.listen=[\"{address}\"]");
+    let told = host.run(&["up", "--set", &listen]).failed(1);
+    let expected = format!("error: cannot listen on {address}: Address already in use");
+    assert!(told.starts_with(&expected), "{told}");
+    assert!(
+        told.contains("where: transport.tcp.listen of the configuration\n"),
+        "{told}"
+    );
+    assert!(
+        told.contains("end the process that uses the port"),
+        "{told}"
+    );
+    assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
+}
+
+#[test]
+fn a_second_gateway_of_the_domain() {
+    let host = Host::new();
+    let _gateway = host.start(&["up", "--set", "mts.name=first"]);
+    let told = host.run(&["up", "--set", "mts.name=second"]).failed(1);
+    let expected = "error: the domain has a gateway already, \"first\"\n";
+    assert!(told.starts_with(expected), "{told}");
+}
+
+#[test]
+fn a_configuration_with_mistakes() {
+    let host = Host::new();
+    std::fs::write(host.path("robot.toml"), "[mts]\nqueue = 0\n").unwrap();
+    for command in [
+        &["up"][..],
+        &["agents"],
+        &["echo", "x"],
+        &["send", "--to", "x"],
+    ] {
+        let arguments = [command, &["--config", "robot.toml"]].concat();
+        let told = host.run(&arguments).failed(2);
+        assert!(told.contains("where: robot.toml:2\n"), "{told}");
+    }
+    assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
+}
+
+#[test]
+fn who_is_there() {
+    let host = Host::new();
+    let nobody = host.run(&["agents"]).done();
+    assert!(nobody.starts_with("nobody in the domain "), "{nobody}");
+    let _arm = host.start(&[
+        "echo",
+        "arm_1",
+        "--type",
+        "arm",
+        "--description",
+        "left front",
+    ]);
+    let _camera = host.start(&["echo", "camera", "--type", "eye"]);
+
+    let table = host.run(&["agents"]).done();
+    let lines: Vec<&str> = table.lines().collect();
+    assert!(
+        lines[0].starts_with("NAME    TYPE  REACH      LOCATIONS "),
+        "{table}"
+    );
+    assert!(
+        lines[1].starts_with("arm_1   arm   this host  shm://"),
+        "{table}"
+    );
+    assert!(
+        table.contains("\ncamera  eye   this host  shm://"),
+        "{table}"
+    );
+
+    let listed = host.run(&["agents", "--json"]).done_json();
+    assert_eq!(
+        (&listed["domain"], &listed["gateway"]),
+        (&json!(host.domain), &Value::Null)
+    );
+    let arm = &listed["agents"][0];
+    for (key, value) in [
+        ("name", "arm_1"),
+        ("type", "arm"),
+        ("description", "left front"),
+        ("role", "agent"),
+        ("reach", "local"),
+        ("source", "host"),
+    ] {
+        assert_eq!(arm[key], value, "{arm}");
+    }
+    assert!(arm["registered"].as_str().unwrap().ends_with('Z'), "{arm}");
+    assert!(
+        arm["locations"][0].as_str().unwrap().starts_with("shm://"),
+        "{arm}"
+    );
+
+    for (search, found) in [
+        (&["arm_.*"][..], json!(["arm_1"])),
+        (&["arm_1"], json!(["arm_1"])),
+        (&["arm"], json!([])),
+        (&["--type", "eye"], json!(["camera"])),
+        (&[".*", "--type", "arm|eye"], json!(["arm_1", "camera"])),
+    ] {
+        let listed = host
+            .run(&[&["agents", "--json"], search].concat())
+            .done_json();
+        let names = listed["agents"].as_array().unwrap().iter();
+        let names: Vec<&Value> = names.map(|agent| &agent["name"]).collect();
+        assert_eq!(json!(names), found, "{search:?}");
+    }
+    let told = host.run(&["agents", "arm_["]).failed(2);
+    assert!(told.contains("unclosed character class"), "{told}");
+}
+
+#[test]
+fn an_agent_of_another_host() {
+    let (here, there) = (Host::new(), Host::new());
+    let name = format!("arm-{}", there.domain);
+    let mdns = [
+        "--set",
+        "discovery.mdns=true",
+        "--set",
+        "discovery.interfaces=[\"lo\"]",
+    ];
+    let up = |host: &Host| {
+        let named = format!("mts.name=mts-{}", host.domain);
+        host.start(&[&["up", "-v", "--json", "--set", &named], &mdns[..]].concat())
+    };
+    let (mut gateway, _other) = (up(&here), up(&there));
+    let echo = there.echo(&name);
+    gateway.tells(&["INFO", "joined", &name]);
+
+    // The gateway tells the processes of this host a moment later.
+    let mut listed = Value::Null;
+    for _ in 0..600 {
+        listed = here.run(&["agents", &name, "--json"]).done_json()["agents"][0].take();
+        if !listed.is_null() {
+            break;
+        }
+        std::thread::sleep(std::time::Duration::from_millis(50));
+    }
+    assert_eq!(listed["reach"], "remote", "{listed}");
+    assert_eq!(
+        listed["gateway"],
+        format!("mts-{}", here.domain),
+        "{listed}"
+    );
+    assert_eq!(
+        listed["mts"]["name"],
+        format!("mts-{}", there.domain),
+        "{listed}"
+    );
+    let table = here.run(&["agents", &name]).done();
+    assert!(
+        table.contains(&format!("  via mts-{}  ", here.domain)),
+        "{table}"
+    );
+
+    let sent = here.run(&[
+        "send",
+        "--to",
+        &name,
+        "--content",
+        "hello",
+        "--wait",
+        "--json",
+    ]);
+    let json = sent.done_json();
+    assert_eq!(json["deliveries"][0]["via"], "tcp", "{json}");
+    assert_eq!(json["reply"]["content"], "hello", "{json}");
+
+    assert_eq!(echo.signal("-INT"), (Some(0), String::new()));
+    gateway.tells(&["INFO", "left", &name]);
+}
