@@ -4,9 +4,15 @@
 
 use std::collections::HashMap;
 use std::sync::Arc;
+use std::time::Instant;
 
-use fipa_sds::{Directory, Entry, HostDirectory, Reach, Registration, Role as EntryRole};
+use fipa_mts::Contacts;
+use fipa_sds::{
+    ContactDirectory, Directory, Entry, HostDirectory, MergedDirectory, Reach, Registration,
+    Role as EntryRole,
+};
 use fipa_transport::{Incarnation, Kind, Location};
+use parking_lot::Mutex;
 use tokio::task::JoinHandle;
 
 use crate::Config;
@@ -34,22 +40,22 @@ impl Gateway {
                 "discovery.static is not used by this version: gateways are found by mDNS only"
             );
         }
-        let made = parking_lot::Mutex::new(None);
+        let contacts = Arc::new(Acquaintances::default());
+        let made = Mutex::new(None);
         let service = Service::start(
             config,
             Role {
                 name: config.mts.name.as_str().into(),
                 gateway: true,
                 listen: config.transport.tcp.listen.clone(),
+                contacts: Some(Arc::clone(&contacts) as Arc<dyn Contacts>),
                 view: &|host, mts| {
                     let network = network(config, mts)?;
-                    let view: Arc<dyn Directory> = match &network {
-                        Some(network) => {
-                            let there = Arc::clone(network).directory();
-                            Arc::new(fipa_sds::MergedDirectory::new(vec![host, there]))
-                        }
-                        None => host,
-                    };
+                    let there = network.clone().map(Network::directory);
+                    let heard = Arc::clone(&contacts.directory) as Arc<dyn Directory>;
+                    let all = [Some(host as Arc<dyn Directory>), there, Some(heard)];
+                    let all = all.into_iter().flatten().collect();
+                    let view: Arc<dyn Directory> = Arc::new(MergedDirectory::new(all));
                     *made.lock() = Some((network, Arc::clone(&view)));
                     Ok(view)
                 },
@@ -68,15 +74,19 @@ impl Gateway {
             gateway.abort();
             return Err(error);
         }
-        if let Some(network) = gateway.network.clone() {
-            let exchange = Exchange {
-                host: Arc::clone(&gateway.service.host),
-                network,
-                locations: gateway.service.locations.clone(),
-                announced: HashMap::new(),
-            };
-            gateway.task = Some(tokio::spawn(exchange.run()));
-        }
+        let publisher = Arc::new(Publisher {
+            host: Arc::clone(&gateway.service.host),
+            network: gateway.network.clone().map(Network::directory),
+            contacts: Arc::clone(&contacts.directory),
+            locations: gateway.service.locations.clone(),
+        });
+        // From now on, who writes becomes known on this host before its letter arrives there.
+        *contacts.publisher.lock() = Some(Arc::clone(&publisher));
+        let exchange = Exchange {
+            publisher,
+            announced: HashMap::new(),
+        };
+        gateway.task = Some(tokio::spawn(exchange.run()));
         Ok(gateway)
     }
 
@@ -208,25 +218,84 @@ fn network(_: &Config, _: &fipa_sds::Mts) -> Result<Option<Arc<dyn Network>>, Op
     Ok(None)
 }
 
-/// Keeps the two directories in step.
-struct Exchange {
+/// Agents of other hosts that have written before anybody told of them.
+#[derive(Default)]
+struct Acquaintances {
+    directory: Arc<ContactDirectory>,
+    publisher: Mutex<Option<Arc<Publisher>>>,
+}
+
+impl Contacts for Acquaintances {
+    fn heard(&self, name: &str, agent: Incarnation, location: Location) {
+        match self.directory.heard(Instant::now(), name, agent, location) {
+            Ok(true) => {
+                if let Some(publisher) = &*self.publisher.lock() {
+                    publisher.publish();
+                }
+            }
+            Ok(false) => {}
+            Err(error) => tracing::info!(%error, "who has written cannot be answered"),
+        }
+    }
+}
+
+/// Tells the processes of this host who is on others, as reachable through this gateway.
+struct Publisher {
     host: Arc<HostDirectory>,
-    network: Arc<dyn Network>,
+    network: Option<Arc<dyn Directory>>,
+    contacts: Arc<ContactDirectory>,
     /// Where this gateway takes letters: the locations of all that it stands for.
     locations: Vec<Location>,
+}
+
+impl Publisher {
+    fn publish(&self) {
+        let announced = self.network.as_ref().map(|network| network.entries());
+        let heard = self.contacts.entries();
+        let known = announced.iter().flat_map(|entries| entries.iter());
+        // The later of one name counts: what is announced, before what was heard.
+        let all = heard
+            .iter()
+            .chain(known)
+            .filter(|entry| entry.role == EntryRole::Agent);
+        let through_here = all.map(|entry| Entry {
+            locations: self.locations.clone(),
+            ..Entry::clone(entry)
+        });
+        if let Err(error) = self.host.publish_remote(through_here.collect()) {
+            tracing::warn!(%error, "the processes of this host are not told of all other hosts");
+        }
+    }
+}
+
+/// Keeps the two directories in step.
+struct Exchange {
+    publisher: Arc<Publisher>,
     announced: HashMap<Arc<str>, Arc<Entry>>,
 }
 
 impl Exchange {
     async fn run(mut self) {
-        let network = Arc::clone(&self.network).directory();
-        let (mut here, mut there) = (self.host.watch(), network.watch());
+        let publisher = Arc::clone(&self.publisher);
+        let network: Arc<dyn Directory> = match &publisher.network {
+            Some(network) => Arc::clone(network),
+            // Nobody is there, and nobody comes.
+            None => Arc::new(ContactDirectory::new()),
+        };
+        let (mut here, mut there) = (publisher.host.watch(), network.watch());
+        let mut forgetting = tokio::time::interval(ContactDirectory::MEMORY / 4);
         loop {
-            self.announce(&*network);
-            self.publish(&*network);
+            if let Some(network) = &publisher.network {
+                self.announce(&**network);
+            }
+            publisher
+                .contacts
+                .forget(Instant::now(), |entry| network.known(&entry.name).is_some());
+            publisher.publish();
             let goes_on = tokio::select! {
                 change = here.next() => change.is_some(),
                 change = there.next() => change.is_some(),
+                _ = forgetting.tick() => true,
             };
             if !goes_on {
                 return;
@@ -238,7 +307,7 @@ impl Exchange {
 
     /// Announces what has joined on this host, and takes back what has left.
     fn announce(&mut self, network: &dyn Directory) {
-        let entries = self.host.entries();
+        let entries = self.publisher.host.entries();
         let mine: HashMap<Arc<str>, &Arc<Entry>> = entries
             .iter()
             .filter(|entry| entry.reach == Reach::Local && entry.role == EntryRole::Agent)
@@ -251,11 +320,11 @@ impl Exchange {
             }
             stays
         });
-        let locations = self
-            .locations
-            .iter()
-            .filter(|location| location.kind() != Kind::Shm);
-        let locations: Vec<Location> = locations.cloned().collect();
+        let locations = self.publisher.locations.iter();
+        let locations: Vec<Location> = locations
+            .filter(|location| location.kind() != Kind::Shm)
+            .cloned()
+            .collect();
         for (name, entry) in mine {
             if self.announced.contains_key(&name) {
                 continue;
@@ -274,21 +343,6 @@ impl Exchange {
                     tracing::warn!(%name, %error, "an agent is not announced to other hosts");
                 }
             }
-        }
-    }
-
-    /// Tells the processes of this host who is on others, as reachable through this gateway.
-    fn publish(&self, network: &dyn Directory) {
-        let entries = network.entries();
-        let through_here = entries
-            .iter()
-            .filter(|entry| entry.role == EntryRole::Agent);
-        let through_here = through_here.map(|entry| Entry {
-            locations: self.locations.clone(),
-            ..Entry::clone(entry)
-        });
-        if let Err(error) = self.host.publish_remote(through_here.collect()) {
-            tracing::warn!(%error, "the processes of this host are not told of all other hosts");
         }
     }
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_mts::core::CoreConfig;
-use fipa_mts::{Mts, RuntimeConfig, Started};
+use fipa_mts::{Contacts, Mts, RuntimeConfig, Started};
 use fipa_sds::{Directory, HostConfig, HostDirectory, Pattern};
 use fipa_transport::{Incarnation, Kind, Location, Transport};
 use tokio::runtime::Handle;
@@ -40,6 +40,8 @@ pub(crate) struct Role<'a> {
     /// Where TCP listens.
     #[cfg_attr(not(feature = "net"), expect(dead_code, reason = "nothing listens"))]
     pub(crate) listen: Vec<String>,
+    /// Who is told of agents of other hosts that have written.
+    pub(crate) contacts: Option<Arc<dyn Contacts>>,
     /// Makes the view of the directory in which receivers are looked up.
     pub(crate) view: &'a View<'a>,
 }
@@ -72,6 +74,7 @@ impl Service {
             RuntimeConfig {
                 spin: config.transport.shm.spin,
                 unframed_deadline: config.mts.deadline,
+                contacts: role.contacts.clone(),
             },
             view,
             transports,

@@ -234,3 +234,38 @@ async fn a_domain_has_one_gateway_and_a_port_one_owner() {
     }
     gateway.close().await;
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_newcomer_that_writes_can_be_answered_at_once() {
+    let (here, there) = (Host::new(&[]), Host::new(&[]));
+    let (_near, _far) = (
+        Gateway::open(&here.config).await.unwrap(),
+        Gateway::open(&there.config).await.unwrap(),
+    );
+    let (at_home, abroad) = (
+        Domain::open(&here.config).await.unwrap(),
+        Domain::open(&there.config).await.unwrap(),
+    );
+    let arm = abroad.register(&there.name("arm")).unwrap();
+    known(&at_home, arm.name()).await;
+    for round in 0..5 {
+        // Its letter is faster than the news of it.
+        let newcomer = at_home
+            .register(&here.name(&format!("newcomer-{round}")))
+            .unwrap();
+        via(&newcomer
+            .send(inform(&newcomer, arm.name(), "hello"))
+            .await
+            .unwrap());
+        let greeting = arm.receive().await.unwrap().message;
+        let from = greeting.sender().unwrap().name().to_owned();
+        assert_eq!(
+            via(&arm.send(inform(&arm, &from, "welcome")).await.unwrap()),
+            Some(Kind::Tcp)
+        );
+        assert_eq!(
+            newcomer.receive().await.unwrap().message.content().unwrap(),
+            "welcome"
+        );
+    }
+}

@@ -11,4 +11,4 @@ mod runtime;
 mod stamp;
 
 pub use post::{PostError, letter_around, letter_for};
-pub use runtime::{Mts, RuntimeConfig, Sending, Started};
+pub use runtime::{Contacts, Mts, RuntimeConfig, Sending, Started};

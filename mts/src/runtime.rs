@@ -29,13 +29,22 @@ use tokio::task::JoinHandle;
 use crate::core::{Action, Core, CoreConfig, Now, Received, SendId, Submission};
 
 /// What the runtime is told at its start, besides the core's configuration.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct RuntimeConfig {
     /// How long somebody who waits looks for something to do before going to sleep. Zero saves
     /// the battery.
     pub spin: Duration,
     /// The deadline of letters that old peers throw at the gateway: theirs have none.
     pub unframed_deadline: Duration,
+    /// Whom to tell of agents of other hosts that have written and are not in the directory. Must
+    /// not call the service back.
+    pub contacts: Option<Arc<dyn Contacts>>,
+}
+
+/// Who is told of agents of other hosts that nobody has told of before.
+pub trait Contacts: Send + Sync {
+    /// An agent has written from behind this location; see [`Action::Heard`].
+    fn heard(&self, name: &str, agent: Incarnation, location: Location);
 }
 
 /// A running message transport service.
@@ -343,6 +352,15 @@ impl Shared {
                     outcome,
                 } => {
                     state.outcome(send, receiver, outcome);
+                }
+                Action::Heard {
+                    name,
+                    agent,
+                    location,
+                } => {
+                    if let Some(contacts) = &self.config.contacts {
+                        contacts.heard(&name, agent, location);
+                    }
                 }
                 Action::Deliverable { agent } => {
                     if let Some(notify) = state.agents.get(&agent) {

@@ -74,8 +74,16 @@ impl Gateway {
         self.core.handle_timeout(now);
     }
 
-    fn dispatched(&mut self) -> (AttemptId, Location, Parcel) {
+    /// The next thing to do, apart from hearing of the sender.
+    fn next(&mut self) -> Option<Action> {
         match self.core.poll_action() {
+            Some(Action::Heard { .. }) => self.core.poll_action(),
+            other => other,
+        }
+    }
+
+    fn dispatched(&mut self) -> (AttemptId, Location, Parcel) {
+        match self.next() {
             Some(Action::Dispatch {
                 attempt,
                 location,
@@ -404,4 +412,33 @@ fn a_way_that_failed_is_left_alone_for_a_while() {
     core.poll_action();
     let (_, later) = send(&mut core, 1000);
     assert_eq!(later, Kind::Shm, "and it is tried again");
+}
+
+#[test]
+fn a_stranger_that_writes_can_be_answered() {
+    let mut gateway = Gateway::new(true);
+    assert_eq!(
+        gateway.arrive(0, Kind::Tcp, parcel(1, letter())),
+        Verdict::Later
+    );
+    match gateway.core.poll_action() {
+        Some(Action::Heard {
+            name,
+            agent,
+            location,
+        }) => {
+            assert_eq!((&*name, agent, location), ("rover", ROVER, tcp(0x1)));
+        }
+        other => panic!("{other:?}"),
+    }
+    assert!(matches!(
+        gateway.core.poll_action(),
+        Some(Action::Dispatch { .. })
+    ));
+    // Whoever writes from this host is in its directory, or is not to be.
+    gateway.arrive(0, Kind::Shm, parcel(2, letter()));
+    assert!(matches!(
+        gateway.core.poll_action(),
+        Some(Action::Dispatch { .. })
+    ));
 }

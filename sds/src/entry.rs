@@ -121,6 +121,8 @@ pub enum Source {
     Host,
     /// Announced on the network.
     Mdns,
+    /// It has written.
+    Contact,
 }
 
 /// Whether an agent lives on this host.

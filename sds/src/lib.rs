@@ -3,8 +3,8 @@
 //!
 //! * [`Entry`] is what is known about one registration; [`Registration`] is what its owner says.
 //! * [`Directory`] is the one view everybody reads; [`Watch`] tells what changes in it.
-//! * [`MemoryDirectory`], [`StaticDirectory`], [`HostDirectory`] and (feature `mdns`)
-//!   `MdnsDirectory` are its back ends; [`MergedDirectory`] makes one view of several.
+//! * [`MemoryDirectory`], [`StaticDirectory`], [`ContactDirectory`], [`HostDirectory`] and (feature
+//!   `mdns`) `MdnsDirectory` are its back ends; [`MergedDirectory`] makes one view of several.
 //! * [`Query`] and [`Pattern`] search; [`resolve`] turns the name of a receiver into entries.
 //!
 //! The crate depends on `fipa-transport`, sideways, for two words only: an entry lists
@@ -14,6 +14,7 @@
 //! What must not live here: letters, routes, connections. Which of an agent's locations is tried
 //! first is the delivery core's business.
 
+mod contacts;
 mod directory;
 mod entry;
 mod host;
@@ -27,6 +28,7 @@ mod resolve;
 mod table;
 mod watch;
 
+pub use contacts::ContactDirectory;
 pub use directory::{DeregisterError, Directory, RegisterError};
 pub use entry::{Entry, EntryError, Mts, Reach, Registration, Role, Source};
 pub use host::{HostConfig, HostDirectory, HostError};

@@ -298,7 +298,7 @@ prop_compose! {
         domain in "[A-Za-z0-9_-]{1,32}",
         name in "\\PC{1,40}",
         transports in kinds(),
-        deadline in 1..=86_400_000_000_000_u64,
+        deadline in 1..=3_600_000_000_000_u64,
         queue in 1..=65_536_usize,
         routes in prop::collection::btree_map("[a-zé\"'#= .\n-]{1,12}(\\.\\*)?", kinds(), 0..5),
         capacity in 1_u64 << 20..=1 << 40,

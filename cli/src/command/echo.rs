@@ -1,10 +1,8 @@
 //! `fipa echo`: an agent that answers.
 
-use std::time::Duration;
-
 use clap::Args;
 use fipa::{
-    Agent, AgentId, Config, Incoming, Letter, Message, Performative, ReceiveError, RegisterOptions,
+    Agent, AgentId, Config, Incoming, Message, Performative, ReceiveError, RegisterOptions,
 };
 
 use crate::membership::{self, Stop};
@@ -44,9 +42,6 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "N")]
     count: Option<u64>,
 }
-
-/// How long news may take from one host to another.
-const NEWS: Duration = Duration::from_secs(3);
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
@@ -137,35 +132,9 @@ async fn answer(agent: &Agent, incoming: &Incoming) {
         Ok(reply) => reply,
         Err(error) => return report::warn(&format!("no answer: {error}")),
     };
-    if came_from_elsewhere(&incoming.letter) {
-        let names = reply.receivers().iter().map(AgentId::name);
-        wait_until_known(agent, names.collect()).await;
-    }
     match agent.send(reply).await {
         Ok(deliveries) if deliveries.all_succeeded() => {}
         Ok(deliveries) => report::warn(&format!("the answer did not arrive: {deliveries}")),
         Err(error) => report::warn(&format!("no answer: {error}")),
     }
-}
-
-/// Whether a gateway has stamped the letter.
-fn came_from_elsewhere(letter: &Letter) -> bool {
-    let envelope = letter.parse_envelope();
-    envelope.is_ok_and(|envelope| !envelope.extensions.is_empty())
-}
-
-/// A letter of an agent that has just been started, as `fipa send` is, may come from another host
-/// before the news that there is such an agent.
-async fn wait_until_known(agent: &Agent, names: Vec<&str>) {
-    let directory = agent.domain().directory();
-    let mut changes = directory.watch();
-    let known = async {
-        while names.iter().any(|name| directory.lookup(name).is_none()) {
-            if changes.next().await.is_none() {
-                return;
-            }
-        }
-    };
-    // Whoever is not known by then gets no answer, which sending says.
-    let _ = tokio::time::timeout(NEWS, known).await;
 }

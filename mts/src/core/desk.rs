@@ -16,10 +16,6 @@ use super::{CoreConfig, SendId};
 
 /// Something the runtime has to do for the delivery core.
 #[derive(Debug)]
-#[expect(
-    clippy::large_enum_variant,
-    reason = "most are dispatches, and none is kept"
-)]
 pub enum Action {
     /// Give this parcel to the transport of the location's kind. When the transport refuses at
     /// once, the core is told as of any other conclusion.
@@ -55,6 +51,16 @@ pub enum Action {
         receiver: Arc<str>,
         /// What became of it.
         outcome: Outcome,
+    },
+    /// An agent of another host that the directory does not know has written; letters for it can
+    /// be sent to where this one came from. Comes before the letter is passed on.
+    Heard {
+        /// The name it writes under.
+        name: String,
+        /// This life of it.
+        agent: Incarnation,
+        /// Where its message transport service can be reached.
+        location: Location,
     },
     /// Something was put into this agent's queue.
     Deliverable {

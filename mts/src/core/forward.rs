@@ -36,6 +36,9 @@ impl Core {
             Ok(admitted) => admitted,
             Err(refusal) => return Verdict::Now(refusal),
         };
+        if from.remote {
+            self.hear(parcel.stream.sender, &stamped, &from);
+        }
         let (bound, stream) = (self.desk.config.lane, parcel.stream);
         let bytes = self.desk.held.saturating_add(stamped.len());
         let too_many_bytes = self.desk.held > 0 && bytes > self.desk.config.custody_bytes;
@@ -95,6 +98,24 @@ impl Core {
         let stamped = stamp::put(letter, &config.name, config.incarnation, now.utc)
             .map_err(|error| refused(error.to_string()))?;
         Ok((entry, stamped))
+    }
+
+    /// Makes known who has written, if nobody has told of that agent yet: it can be answered.
+    fn hear(&mut self, agent: Incarnation, letter: &Letter, from: &Hop) {
+        let directory = &self.desk.directory;
+        if !agent.is_known() || directory.known_incarnation(agent).is_some() {
+            return;
+        }
+        if let Some(name) = stamp::sender(letter)
+            && directory.known(&name).is_none()
+        {
+            let location = from.location.clone();
+            self.desk.actions.push_back(Action::Heard {
+                name,
+                agent,
+                location,
+            });
+        }
     }
 
     /// Whether a letter that has nobody who could be held back finds room.

@@ -5,10 +5,10 @@
 //! [`Action`]s. The same core serves a robot process and, with leave to forward, the gateway; and
 //! the same core runs in simulations on virtual time.
 //!
-//! * [`lane`]: letters of one stream on their way, in order, one way at a time.
-//! * [`inbox`]: the receiving end, where letters are taken once and in order.
-//! * [`forward`]: letters for somebody else.
-//! * [`desk`]: what lanes share: attempts, health of ways, things to be done.
+//! * `lane`: letters of one stream on their way, in order, one way at a time.
+//! * `inbox`: the receiving end, where letters are taken once and in order.
+//! * `forward`: letters for somebody else.
+//! * `desk`: what lanes share: attempts, health of ways, things to be done.
 //!
 //! A letter's order and identity are its *stream* (one life of the sender, one life of the
 //! receiver) and its sequence. Every letter names the one that must be taken before it, so that

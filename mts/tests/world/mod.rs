@@ -453,6 +453,8 @@ impl World {
                         return Err(format!("letter {number}: {first}, then {outcome}"));
                     }
                 }
+                // Everybody knows everybody here.
+                Action::Heard { .. } => {}
                 Action::Deliverable { agent } => {
                     if self.reading.insert(agent) {
                         self.after_ms(1 + self.weather.reading_pause_ms, Event::Read { at, agent });
