@@ -166,6 +166,7 @@ fn browse() -> String {
         .stderr(Stdio::inherit())
         .output()
         .unwrap();
+    assert!(output.status.success(), "avahi-browse failed");
     String::from_utf8(output.stdout).unwrap()
 }
 

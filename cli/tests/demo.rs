@@ -1,0 +1,92 @@
+//! The demo, as a stranger runs it, and interrupted.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::io::{BufRead, BufReader, Read};
+use std::process::{Child, Command, Stdio};
+
+use serde_json::Value;
+
+fn demo(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_fipa"));
+    command.arg("demo").args(arguments).stdin(Stdio::null());
+    command
+}
+
+/// What a demo has in the file system, by the number of its process.
+fn traces(pid: u32) -> Vec<String> {
+    let names = |directory| {
+        let files = std::fs::read_dir(directory).unwrap();
+        files.map(|file| file.unwrap().file_name().to_string_lossy().into_owned())
+    };
+    let all = names("/dev/shm").chain(names("/tmp"));
+    all.filter(|name| name.contains(&format!("demo-{pid}")))
+        .collect()
+}
+
+/// The processes that a demo has started.
+fn parts(pid: u32) -> usize {
+    let mark = format!("domain=demo-{pid}-");
+    let processes = std::fs::read_dir("/proc").unwrap().flatten();
+    let lines = processes.map(|process| std::fs::read(process.path().join("cmdline")));
+    let lines = lines
+        .flatten()
+        .map(|line| String::from_utf8_lossy(&line).into_owned());
+    lines.filter(|line| line.contains(&mark)).count()
+}
+
+#[test]
+fn every_step_does_what_it_says() {
+    let child = demo(&["--json"]).stdout(Stdio::piped()).spawn().unwrap();
+    let pid = child.id();
+    let output = child.wait_with_output().unwrap();
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let steps = report["steps"].as_array().unwrap();
+    for step in steps {
+        assert_eq!(step["ok"], true, "{step:#}");
+    }
+    assert!(output.status.success());
+    assert_eq!(steps.len(), 10);
+    let via: Vec<&Value> = steps.iter().map(|step| &step["via"]).collect();
+    assert_eq!((via[1], via[2]), (&"shm".into(), &"tcp".into()));
+    assert_eq!(steps[6]["attempts"][0]["via"], "shm");
+    assert_eq!(traces(pid), Vec::<String>::new());
+    assert_eq!(parts(pid), 0);
+}
+
+#[test]
+fn an_interrupted_demo_leaves_nothing_behind() {
+    let mut child: Child = demo(&[])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let pid = child.id();
+    let mut story = BufReader::new(child.stdout.take().unwrap());
+    let mut line = String::new();
+    while !line.contains("arm_2") {
+        line.clear();
+        assert!(
+            story.read_line(&mut line).unwrap() > 0,
+            "the story ended early"
+        );
+    }
+    assert!(parts(pid) > 2);
+    let interrupted = Command::new("kill")
+        .args(["-INT", &pid.to_string()])
+        .status()
+        .unwrap();
+    assert!(interrupted.success());
+    let status = child.wait().unwrap();
+    assert_eq!(status.code(), Some(1));
+    let mut told = String::new();
+    child
+        .stderr
+        .take()
+        .unwrap()
+        .read_to_string(&mut told)
+        .unwrap();
+    assert!(told.contains("interrupted"), "{told}");
+    assert_eq!(traces(pid), Vec::<String>::new());
+    assert_eq!(parts(pid), 0);
+}
