@@ -29,6 +29,12 @@ fn config(set: &[&str]) -> Config {
     .unwrap()
 }
 
+/// Two members of one domain, which stand for two processes.
+async fn two(config: &Config) -> (Domain, Domain) {
+    let member = || async { Domain::open(config).await.unwrap() };
+    (member().await, member().await)
+}
+
 fn inform(from: &Agent, to: &str, content: impl Into<Vec<u8>>) -> Message {
     from.message(Performative::Inform)
         .receiver(AgentId::new(to).unwrap())
@@ -57,10 +63,7 @@ async fn letters_go_both_ways_and_say_by_which_way() {
         ("tcp,shm", Kind::Tcp),
     ] {
         let config = config(&[&format!("mts.transports={transports}")]);
-        let (here, there) = (
-            Domain::open(&config).await.unwrap(),
-            Domain::open(&config).await.unwrap(),
-        );
+        let (here, there) = two(&config).await;
         let (rover, arm) = (
             here.register("rover").unwrap(),
             there.register("arm").unwrap(),
@@ -101,10 +104,7 @@ async fn letters_go_both_ways_and_say_by_which_way() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_name_belongs_to_one_at_a_time() {
     let config = config(&[]);
-    let (here, there) = (
-        Domain::open(&config).await.unwrap(),
-        Domain::open(&config).await.unwrap(),
-    );
+    let (here, there) = two(&config).await;
     let first = here.register("arm").unwrap();
     for domain in [&here, &there] {
         match domain.register("arm") {
@@ -122,10 +122,7 @@ async fn a_name_belongs_to_one_at_a_time() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_thousand_letters_arrive_in_order_and_once() {
     let config = config(&["mts.queue=16"]);
-    let (here, there) = (
-        Domain::open(&config).await.unwrap(),
-        Domain::open(&config).await.unwrap(),
-    );
+    let (here, there) = two(&config).await;
     let (rover, arm) = (
         here.register("rover").unwrap(),
         there.register("arm").unwrap(),
@@ -174,10 +171,7 @@ async fn futures_poll_once<T>(
 #[tokio::test(flavor = "multi_thread")]
 async fn a_full_queue_fails_late_and_harms_nobody_else() {
     let config = config(&["mts.queue=2"]);
-    let (here, there) = (
-        Domain::open(&config).await.unwrap(),
-        Domain::open(&config).await.unwrap(),
-    );
+    let (here, there) = two(&config).await;
     let rover = here.register("rover").unwrap();
     let (slow, quick) = (
         there.register("slow").unwrap(),
@@ -235,10 +229,7 @@ async fn a_full_queue_fails_late_and_harms_nobody_else() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_pattern_reaches_all_but_the_sender() {
     let config = config(&[]);
-    let (here, there) = (
-        Domain::open(&config).await.unwrap(),
-        Domain::open(&config).await.unwrap(),
-    );
+    let (here, there) = two(&config).await;
     let sender = here.register("arm_0").unwrap();
     let others: Vec<Agent> = (1..4)
         .map(|number| there.register(&format!("arm_{number}")).unwrap())
@@ -297,10 +288,7 @@ async fn nobody_of_that_name_is_a_failure_told_once() {
 #[tokio::test(flavor = "multi_thread")]
 async fn loaned_content_is_not_copied() {
     let config = config(&[]);
-    let (here, there) = (
-        Domain::open(&config).await.unwrap(),
-        Domain::open(&config).await.unwrap(),
-    );
+    let (here, there) = two(&config).await;
     let (rover, arm) = (
         here.register("rover").unwrap(),
         there.register("arm").unwrap(),
@@ -375,10 +363,7 @@ async fn what_is_too_large_says_so() {
 #[tokio::test(flavor = "multi_thread")]
 async fn an_agent_that_left_is_gone_and_its_successor_is_reached() {
     let config = config(&[]);
-    let (here, there) = (
-        Domain::open(&config).await.unwrap(),
-        Domain::open(&config).await.unwrap(),
-    );
+    let (here, there) = two(&config).await;
     let rover = here.register("rover").unwrap();
     let arm = there.register("arm").unwrap();
     assert!(

@@ -37,6 +37,12 @@ impl Host {
         Self { config, mark }
     }
 
+    /// The host's gateway, and a process on it.
+    async fn occupied(&self) -> (Gateway, Domain) {
+        let gateway = Gateway::open(&self.config).await.unwrap();
+        (gateway, Domain::open(&self.config).await.unwrap())
+    }
+
     fn name(&self, agent: &str) -> String {
         format!("{agent}-{}", self.mark)
     }
@@ -91,14 +97,8 @@ fn reason(deliveries: &Deliveries) -> FailureReason {
 #[tokio::test(flavor = "multi_thread")]
 async fn hosts_find_each_other_and_exchange_letters() {
     let (here, there) = (Host::new(&[]), Host::new(&[]));
-    let (_near, _far) = (
-        Gateway::open(&here.config).await.unwrap(),
-        Gateway::open(&there.config).await.unwrap(),
-    );
-    let (at_home, abroad) = (
-        Domain::open(&here.config).await.unwrap(),
-        Domain::open(&there.config).await.unwrap(),
-    );
+    let (_near, at_home) = here.occupied().await;
+    let (_far, abroad) = there.occupied().await;
     let rover = at_home.register(&here.name("rover")).unwrap();
     let arm = abroad.register(&there.name("arm")).unwrap();
     known(&at_home, arm.name()).await;
@@ -142,14 +142,8 @@ async fn hosts_find_each_other_and_exchange_letters() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_slow_agent_abroad_holds_its_sender_back() {
     let (here, there) = (Host::new(&[]), Host::new(&["mts.queue=2"]));
-    let (_near, _far) = (
-        Gateway::open(&here.config).await.unwrap(),
-        Gateway::open(&there.config).await.unwrap(),
-    );
-    let (at_home, abroad) = (
-        Domain::open(&here.config).await.unwrap(),
-        Domain::open(&there.config).await.unwrap(),
-    );
+    let (_near, at_home) = here.occupied().await;
+    let (_far, abroad) = there.occupied().await;
     let rover = at_home.register(&here.name("rover")).unwrap();
     let arm = abroad.register(&there.name("arm")).unwrap();
     known(&at_home, arm.name()).await;
@@ -238,14 +232,8 @@ async fn a_domain_has_one_gateway_and_a_port_one_owner() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_newcomer_that_writes_can_be_answered_at_once() {
     let (here, there) = (Host::new(&[]), Host::new(&[]));
-    let (_near, _far) = (
-        Gateway::open(&here.config).await.unwrap(),
-        Gateway::open(&there.config).await.unwrap(),
-    );
-    let (at_home, abroad) = (
-        Domain::open(&here.config).await.unwrap(),
-        Domain::open(&there.config).await.unwrap(),
-    );
+    let (_near, at_home) = here.occupied().await;
+    let (_far, abroad) = there.occupied().await;
     let arm = abroad.register(&there.name("arm")).unwrap();
     known(&at_home, arm.name()).await;
     for round in 0..5 {
