@@ -453,3 +453,24 @@ async fn nothing_is_left_behind() {
     assert_eq!(names(), Vec::<String>::new());
     assert!(!std::path::Path::new(&place).exists());
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn after_the_end_nothing_hangs() {
+    let (here, there) = two(&config(&[])).await;
+    let (rover, arm) = (
+        here.register("rover").unwrap(),
+        there.register("arm").unwrap(),
+    );
+    let message = inform(&rover, arm.name(), "too late");
+    here.close().await;
+    let deliveries = rover.send(message).await.unwrap();
+    assert!(!deliveries.all_succeeded(), "{deliveries}");
+    let ended = loop {
+        match rover.receive().await {
+            // What was told before the end may still be read.
+            Ok(incoming) => assert_eq!(*incoming.message.performative(), Performative::Failure),
+            Err(error) => break error,
+        }
+    };
+    assert!(matches!(ended, fipa::ReceiveError::Closed), "{ended}");
+}

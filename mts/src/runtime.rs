@@ -179,7 +179,13 @@ impl Mts {
         let mut state = self.shared.state.lock();
         let (id, expected) = state.core.send(Now::read(), submission);
         slot.outcomes.lock().expected = expected;
-        state.sends.insert(id, Arc::clone(&slot));
+        if expected > 0 {
+            state.sends.insert(id, Arc::clone(&slot));
+        }
+        if self.shared.closed.load(Ordering::Acquire) {
+            // Nobody keeps time any more.
+            state.core.give_up();
+        }
         self.shared.carry_out(state);
         Sending {
             shared: Arc::clone(&self.shared),
