@@ -12,6 +12,9 @@ use std::path::{Path, PathBuf};
 /// The environment variable that says where domains meet, instead of `/tmp/fipa-<uid>`.
 pub(crate) const VARIABLE: &str = "FIPA_RUNTIME_DIR";
 
+/// How often a place that somebody else is just leaving is made again.
+pub(crate) const RETRIES: u32 = 20;
+
 /// The directory of a domain, made private.
 #[derive(Debug, Clone)]
 pub(crate) struct Place {
@@ -57,9 +60,18 @@ impl Place {
             base,
             domain: domain.to_owned(),
         };
-        make_private(&place.base)?;
-        make_private(&place.path())?;
-        Ok(place)
+        let made = || make_private(&place.base).and_then(|()| make_private(&place.path()));
+        let mut result = made();
+        for _ in 0..RETRIES {
+            match &result {
+                // Whoever left last has removed the one between the two.
+                Err(PlaceError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
+                    result = made();
+                }
+                _ => break,
+            }
+        }
+        result.map(|()| place)
     }
 
     /// The domain's directory.

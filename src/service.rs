@@ -6,13 +6,13 @@ use std::time::Duration;
 
 use fipa_mts::core::CoreConfig;
 use fipa_mts::{Contacts, Mts, RuntimeConfig, Started};
-use fipa_sds::{Directory, HostConfig, HostDirectory, Pattern};
+use fipa_sds::{Directory, HostConfig, HostDirectory, HostError, Pattern};
 use fipa_transport::{Incarnation, Kind, Location, Transport};
 use tokio::runtime::Handle;
 
 use crate::Config;
 use crate::domain::OpenError;
-use crate::place::Place;
+use crate::place::{Place, RETRIES};
 
 /// How long a service that ends waits for what is under way.
 pub(crate) const CLOSING_PATIENCE: Duration = Duration::from_secs(1);
@@ -54,15 +54,10 @@ impl Service {
     pub(crate) fn start(config: &Config, role: Role<'_>) -> Result<Self, OpenError> {
         config.check()?;
         let handle = Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
-        let place = Place::prepare(&config.domain)?;
         let incarnation = Incarnation::random();
         let own = fipa_sds::Mts::new(Arc::clone(&role.name), incarnation);
-        let host = Arc::new(HostDirectory::open(HostConfig {
-            dir: place.part("directory"),
-            mts: own.clone(),
-            gateway: role.gateway,
-        })?);
-        let view = (role.view)(Arc::clone(&host), &own)?;
+        let (place, host) = enter(&config.domain, &own, role.gateway)?;
+        let view = (role.view)(Arc::clone(&host), &own).inspect_err(|_| place.leave())?;
         let mut refused = Vec::new();
         let transports = transports(config, &role, &place, incarnation, &handle, &mut refused);
         let Started {
@@ -120,6 +115,41 @@ impl Service {
             tracing::warn!(%error, "could not leave the directory of this host in order");
         }
         self.place.leave();
+    }
+}
+
+/// Makes the domain's place and joins the directory there.
+fn enter(
+    domain: &str,
+    own: &fipa_sds::Mts,
+    gateway: bool,
+) -> Result<(Place, Arc<HostDirectory>), OpenError> {
+    let mut tries = 0;
+    loop {
+        tries += 1;
+        let place = Place::prepare(domain)?;
+        let joined = HostDirectory::open(HostConfig {
+            dir: place.part("directory"),
+            mts: own.clone(),
+            gateway,
+        });
+        match joined {
+            Ok(host) => return Ok((place, Arc::new(host))),
+            Err(error) if was_removed(&error) && tries < RETRIES => {}
+            Err(error) => {
+                place.leave();
+                return Err(error.into());
+            }
+        }
+    }
+}
+
+/// Whoever left last has removed the place, between its being made and being joined.
+fn was_removed(error: &HostError) -> bool {
+    match error {
+        HostError::Io { source, .. } => source.kind() == std::io::ErrorKind::NotFound,
+        HostError::Removed { .. } => true,
+        _ => false,
     }
 }
 

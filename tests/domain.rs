@@ -474,3 +474,22 @@ async fn after_the_end_nothing_hangs() {
     };
     assert!(matches!(ended, fipa::ReceiveError::Closed), "{ended}");
 }
+
+#[test]
+fn members_may_come_and_go_all_at_once() {
+    let config = config(&["mts.transports=tcp"]);
+    std::thread::scope(|scope| {
+        for member in 0..6 {
+            let config = &config;
+            scope.spawn(move || {
+                for round in 0..20 {
+                    let domain = fipa::blocking::Domain::open(config).unwrap();
+                    let agent = domain.register(&format!("agent-{member}-{round}")).unwrap();
+                    assert!(domain.directory().lookup(agent.name()).is_some());
+                    drop(agent);
+                    domain.close();
+                }
+            });
+        }
+    });
+}

@@ -301,12 +301,12 @@ impl Core {
             lane.scheduled = Some(due);
             self.timers.push(Reverse((due, stream)));
         }
-        for Moved::To(entry, delivery) in moved {
+        for Moved { to, delivery } in moved {
             let stream = Stream {
                 sender: stream.sender,
-                receiver: entry.incarnation,
+                receiver: to.incarnation,
             };
-            self.put(now, stream, Arc::clone(&entry.name), delivery);
+            self.put(now, stream, Arc::clone(&to.name), delivery);
         }
     }
 

@@ -69,10 +69,11 @@ pub(crate) struct Lane {
     waiting: Option<Location>,
 }
 
-/// What a lane cannot decide alone.
-pub(crate) enum Moved {
-    /// The receiver was registered anew, and this letter was certainly not delivered before.
-    To(Arc<Entry>, Delivery),
+/// A letter for another lane: its receiver was registered anew, and it was certainly not delivered
+/// before.
+pub(crate) struct Moved {
+    pub(crate) to: Arc<Entry>,
+    pub(crate) delivery: Delivery,
 }
 
 impl Lane {
@@ -305,7 +306,10 @@ impl Lane {
                 if let Some(mut delivery) = self.letters.pop_front() {
                     desk.held -= delivery.letter.len();
                     delivery.progress.tried.clear();
-                    moved.push(Moved::To(entry, delivery));
+                    moved.push(Moved {
+                        to: entry,
+                        delivery,
+                    });
                 }
                 true
             }
