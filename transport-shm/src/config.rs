@@ -189,3 +189,10 @@ pub enum ShmError {
         prefix: String,
     },
 }
+
+impl ShmError {
+    /// Whether a file or directory was not there.
+    pub(crate) fn is_missing_file(&self) -> bool {
+        matches!(self, Self::File { source, .. } if source.kind() == std::io::ErrorKind::NotFound)
+    }
+}

@@ -15,7 +15,7 @@ use fipa_transport::Incarnation;
 use iceoryx2::node::{Node, NodeState, NodeView};
 use iceoryx2::prelude::{CallbackProgression, Config};
 use parking_lot::Mutex;
-use rustix::fs::{FlockOperation, Mode, OFlags, flock, open};
+use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, open, stat};
 
 use crate::layout::Svc;
 use crate::memory::SHM;
@@ -102,12 +102,38 @@ impl Domain {
         &self.names
     }
 
-    /// Makes the directories, and checks that they are nobody else's.
-    pub(crate) fn prepare(&self) -> Result<(), ShmError> {
-        for directory in [self.config.root.as_path(), self.names.directory()] {
-            make_private(directory)?;
+    /// Makes the directories, checks that they are nobody else's, and excludes others as
+    /// [`lock`](Self::lock) does. Whoever leaves last may be removing them at the same time.
+    pub(crate) fn enter(&self) -> Result<OwnedFd, ShmError> {
+        let mut tries = 0;
+        loop {
+            tries += 1;
+            match self.try_enter() {
+                Ok(Some(lock)) => return Ok(lock),
+                Err(error) if tries >= ENTERING || !error.is_missing_file() => return Err(error),
+                Ok(None) if tries >= ENTERING => {
+                    let gone = std::io::ErrorKind::NotFound;
+                    let root = &self.config.root;
+                    return Err(file_error("others keep removing", root, gone));
+                }
+                _ => {}
+            }
         }
-        Ok(())
+    }
+
+    /// None when the root was removed before it was locked.
+    fn try_enter(&self) -> Result<Option<OwnedFd>, ShmError> {
+        let root = self.config.root.as_path();
+        make_private(root)?;
+        let lock = self.lock()?;
+        let cannot = |e| file_error("cannot look at the directory", root, e);
+        let locked = fstat(&lock).map_err(cannot)?;
+        let there = stat(root).map_err(cannot)?;
+        if (locked.st_dev, locked.st_ino) != (there.st_dev, there.st_ino) {
+            return Ok(None);
+        }
+        make_private(self.names.directory())?;
+        Ok(Some(lock))
     }
 
     /// Excludes others from starting and cleaning until the result is dropped. The lock is on the
@@ -287,6 +313,9 @@ impl Domain {
         self.ice.global.prefix.to_string()
     }
 }
+
+/// How often an endpoint tries to enter a domain whose directory others are removing.
+const ENTERING: u32 = 20;
 
 /// How long to wait for somebody else who is removing the traces of the same process.
 const PATIENCE: Duration = Duration::from_secs(1);

@@ -54,10 +54,8 @@ impl Endpoint {
         let domain = Domain::new(&config)?;
         let budget = Arc::new(Budget::new(&config.prefix, config.capacity));
         budget.check_start()?;
-        domain.prepare()?;
         // Under the lock, so that nobody takes what is half made for the traces of the dead.
-        let lock = domain.lock()?;
-        domain.prepare()?;
+        let lock = domain.enter()?;
         let domain = Arc::new(domain.joined());
         let opened = Self::open_locked(config, runtime, budget, domain);
         drop(lock);
