@@ -125,6 +125,23 @@ fn transport(criterion: &mut Criterion) {
     });
 }
 
+/// Removes what a bare iceoryx2 leaves in shared memory.
+struct Leftovers(String);
+
+impl Drop for Leftovers {
+    fn drop(&mut self) {
+        for file in std::fs::read_dir("/dev/shm")
+            .into_iter()
+            .flatten()
+            .flatten()
+        {
+            if file.file_name().to_string_lossy().starts_with(&self.0) {
+                let _ = std::fs::remove_file(file.path());
+            }
+        }
+    }
+}
+
 fn raw(criterion: &mut Criterion) {
     let directory = tempfile::tempdir().expect("a directory");
     let mut config = Config::default();
@@ -133,6 +150,7 @@ fn raw(criterion: &mut Criterion) {
         .global
         .set_root_path(&Path::new(root.as_bytes()).expect("a path"));
     let prefix = format!("fipabench-{}_", Incarnation::random());
+    let _leftovers = Leftovers(prefix.clone());
     config.global.prefix = FileName::new(prefix.as_bytes()).expect("a prefix");
     let node = NodeBuilder::new()
         .config(&config)
