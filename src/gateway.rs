@@ -8,8 +8,8 @@ use std::time::Instant;
 
 use fipa_mts::Contacts;
 use fipa_sds::{
-    ContactDirectory, Directory, Entry, HostDirectory, MergedDirectory, Reach, Registration,
-    Role as EntryRole,
+    ContactDirectory, Directory, Entry, HostDirectory, MergedDirectory, Reach, RegisterError,
+    Registration, Role as EntryRole,
 };
 use fipa_transport::{Incarnation, Kind, Location};
 use parking_lot::Mutex;
@@ -93,14 +93,7 @@ impl Gateway {
     /// Registers the gateway itself, so that the processes of this host find it.
     fn enter(&self) -> Result<(), OpenError> {
         let service = &self.service;
-        let entries = service.host.entries();
-        if let Some(other) = entries
-            .iter()
-            .find(|entry| entry.role == EntryRole::Gateway)
-        {
-            return Err(OpenError::GatewayRunning(other.name.to_string()));
-        }
-        service.host.register(Registration {
+        let own = service.host.register(Registration {
             role: EntryRole::Gateway,
             agent_type: "fipa-mts".to_owned(),
             description: "message transport service".to_owned(),
@@ -109,8 +102,23 @@ impl Gateway {
                 service.own.incarnation,
                 service.locations.clone(),
             )
+        });
+        let own = own.map_err(|error| match error {
+            RegisterError::AlreadyRegistered { holder } if holder.role == EntryRole::Gateway => {
+                OpenError::GatewayRunning(holder.name.to_string())
+            }
+            other => other.into(),
         })?;
-        Ok(())
+        // Looked for only now: of two that start at the same moment, at most one finds nobody.
+        service.host.refresh();
+        let entries = service.host.entries();
+        let mut gateways = entries
+            .iter()
+            .filter(|entry| entry.role == EntryRole::Gateway);
+        match gateways.find(|entry| entry.incarnation != own.incarnation) {
+            Some(other) => Err(OpenError::GatewayRunning(other.name.to_string())),
+            None => Ok(()),
+        }
     }
 
     /// The name of the gateway.

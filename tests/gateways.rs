@@ -215,6 +215,13 @@ async fn a_domain_has_one_gateway_and_a_port_one_owner() {
         Err(other) => panic!("{other}"),
         Ok(_) => panic!("two gateways"),
     }
+    // Whatever it would be called.
+    let mut another = host.config.clone();
+    another.mts.name = "another-gateway".to_owned();
+    assert!(matches!(
+        Gateway::open(&another).await,
+        Err(OpenError::GatewayRunning(name)) if name == gateway.name()
+    ));
     let mut ways = gateway.locations().iter();
     let address = ways.find(|way| way.kind() == Kind::Tcp).unwrap().address();
     let taken = format!("transport.tcp.listen={address}");
