@@ -154,21 +154,26 @@ impl Gateway {
     /// Ends the gateway: says goodbye to the network and gives letters under way a moment to
     /// arrive.
     pub async fn close(mut self) {
-        self.leave_network();
+        if let Some(task) = self.task.take() {
+            task.abort();
+        }
+        if let Some(network) = self.network.take() {
+            // Blocks for as long as it takes to say goodbye.
+            let goodbye = tokio::task::spawn_blocking(move || network.close()).await;
+            if let Err(error) = goodbye {
+                tracing::warn!(%error, "did not say goodbye to the network");
+            }
+        }
         self.service.close().await;
     }
 
-    fn leave_network(&mut self) {
+    fn abort(&mut self) {
         if let Some(task) = self.task.take() {
             task.abort();
         }
         if let Some(network) = self.network.take() {
             network.close();
         }
-    }
-
-    fn abort(&mut self) {
-        self.leave_network();
         self.service.abort();
     }
 }
