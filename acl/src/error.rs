@@ -93,6 +93,12 @@ pub enum Problem {
     /// A mandatory parameter is missing.
     #[error("the {0} is missing")]
     Missing(&'static str),
+    /// Content that was announced as Base64 and is not.
+    #[error("the content is not Base64")]
+    Base64,
+    /// XML that is not well-formed, or uses what is not accepted from strangers.
+    #[error("unacceptable XML: {0}")]
+    Xml(&'static str),
     /// Another encoding than the one that is understood.
     #[error("the {0} representation is not supported here")]
     UnsupportedRepresentation(Representation),
@@ -139,4 +145,15 @@ pub enum EncodeError {
          control characters, and without X-)"
     )]
     UserDefinedName(String),
+    /// A value that the encoding or the reader it is for has no way to say.
+    #[error("the {what} cannot be written: {why}")]
+    Unrepresentable {
+        /// The parameter.
+        what: &'static str,
+        /// What stands in the way.
+        why: &'static str,
+    },
+    /// There is no such encoding of this kind of thing.
+    #[error("there is no {0} representation to write this in")]
+    UnsupportedRepresentation(Representation),
 }

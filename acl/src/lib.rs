@@ -4,10 +4,12 @@
 //! and back. What must not: input and output, clocks, threads, `unsafe`.
 //!
 //! * [`Message`] is what agents say to each other (FIPA00061), made with [`Message::builder`] and
-//!   encoded with [`Message::to_payload`]. [`MessageView`] reads one without allocating.
+//!   encoded with [`Message::to_payload`], or [`Message::encode`] where the reader needs another
+//!   encoding than the bit-efficient one. [`MessageView`] reads one without allocating.
 //! * [`Envelope`] is what message transport services read (FIPA00067): a base and the extensions
 //!   that services put in front on the way. [`EnvelopeView`] is its borrowed counterpart.
 //! * [`Letter`] is both, encoded, and what everything else in this project passes around.
+//! * [`explain()`] tells people what every byte of a bit-efficient message or letter means.
 //!
 //! ```
 //! use fipa_acl::{AgentId, Message, Performative};
@@ -35,24 +37,31 @@ pub mod bitefficient;
 
 mod agent_id;
 mod builder;
+mod codec;
+mod dialect;
 mod envelope;
 mod error;
+mod explain;
 #[cfg(feature = "json")]
 pub mod json;
 mod letter;
 mod message;
 mod performative;
 mod representation;
+mod string;
 mod time;
 mod word;
+mod xml;
 
 pub use agent_id::{AgentId, AgentIdError};
 pub use bitefficient::{AgentIdView, AgentIds, MessageView, Text};
 pub use builder::{BuildError, MessageBuilder};
+pub use dialect::Dialect;
 pub use envelope::{
     Envelope, EnvelopeParams, EnvelopeView, Received, ReceiverNames, StampView, Stamps,
 };
 pub use error::{DecodeError, EncodeError, Problem};
+pub use explain::{Explanation, Span, explain};
 pub use letter::{Letter, Payload};
 pub use message::Message;
 pub use performative::{Performative, PerformativeError, UserPerformative};

@@ -33,14 +33,19 @@ pub(crate) enum Piece<'a> {
 /// where a reader of the former could go wrong (a quotation mark after a backslash, a backslash
 /// at the end).
 pub(crate) fn string_literal<'a>(text: &'a str, mut put: impl FnMut(Piece<'a>)) {
-    let bytes = text.as_bytes();
-    let ambiguous = bytes.last() == Some(&b'\\') || memchr::memmem::find(bytes, b"\\\"").is_some();
-    if ambiguous {
+    if !is_quotable(text) {
         put(Piece::LengthPrefix(text.len()));
         put(Piece::Text(text));
         return;
     }
     quoted(text, |piece| put(Piece::Text(piece)));
+}
+
+/// Whether every reader finds the end of the text in quotation marks: no quotation mark behind a
+/// backslash and no backslash at the end.
+pub(crate) fn is_quotable(text: &str) -> bool {
+    let bytes = text.as_bytes();
+    bytes.last() != Some(&b'\\') && memchr::memmem::find(bytes, b"\\\"").is_none()
 }
 
 /// The pieces of a text in quotation marks, `"` written as `\"`.

@@ -2,131 +2,18 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
-use std::time::{Duration, SystemTime};
+mod arbitrary;
 
 use bytes::{Bytes, BytesMut};
 use fipa_acl::{
-    AclRepresentation, AgentId, Envelope, EnvelopeParams, EnvelopeView, Letter, Message,
-    MessageView, Payload, Performative, Received, Time, bitefficient,
+    AclRepresentation, AgentId, DecodeError, Envelope, EnvelopeParams, EnvelopeView, Explanation,
+    Letter, Message, MessageView, Payload, Performative, Received, bitefficient, explain,
 };
 use proptest::collection::vec;
 use proptest::option;
 use proptest::prelude::*;
 
-/// Text that an encoding has to be careful with.
-fn text() -> BoxedStrategy<String> {
-    prop_oneof![
-        "[a-z@#0-9-]{0,8}",
-        "[a-z\"\\\\#0-9 ():]{0,12}",
-        "[^\\x00]{0,20}",
-        Just("\"quoted\"".to_owned()),
-        Just("#3\"abc".to_owned()),
-        Just("ends with \\".to_owned()),
-    ]
-    .boxed()
-}
-
-fn some_text() -> BoxedStrategy<String> {
-    text()
-        .prop_filter("not empty", |text| !text.is_empty())
-        .boxed()
-}
-
-fn token() -> BoxedStrategy<String> {
-    prop_oneof![
-        "[a-z0-9.#@\"-]{1,10}",
-        Just("X-".to_owned()),
-        Just("x-X-a".to_owned())
-    ]
-    .boxed()
-}
-
-fn pairs() -> impl Strategy<Value = Vec<(String, String)>> {
-    vec((token(), text()), 0..3)
-}
-
-fn agent() -> BoxedStrategy<AgentId> {
-    let plain = (some_text(), vec(some_text(), 0..3), pairs()).prop_map(|(name, urls, pairs)| {
-        let mut agent = AgentId::new(name).unwrap();
-        for url in urls {
-            agent = agent.with_address(url).unwrap();
-        }
-        for (name, value) in pairs {
-            agent = agent.with_user_defined(name, value).unwrap();
-        }
-        agent
-    });
-    plain
-        .prop_recursive(3, 8, 2, |inner| {
-            (inner.clone(), vec(inner, 0..2)).prop_map(|(agent, resolvers)| {
-                resolvers.into_iter().fold(agent, |agent, resolver| {
-                    agent.with_resolver(resolver).unwrap()
-                })
-            })
-        })
-        .boxed()
-}
-
-fn time() -> BoxedStrategy<Time> {
-    let ms = 0_u64..253_402_300_800_000;
-    prop_oneof![
-        ms.prop_map(|ms| {
-            let time = SystemTime::UNIX_EPOCH + Duration::from_millis(ms);
-            Time::from_system_time(time).unwrap()
-        }),
-        (0_u64..1_000_000_000_000).prop_map(|ms| Time::after(Duration::from_millis(ms)).unwrap()),
-        (0_u64..1_000_000_000_000).prop_map(|ms| Time::before(Duration::from_millis(ms)).unwrap()),
-        Just("20101223T120037980".parse().unwrap()),
-        Just("20101223T120037980K".parse().unwrap()),
-    ]
-    .boxed()
-}
-
-fn performative() -> impl Strategy<Value = Performative> {
-    prop_oneof![
-        prop::sample::select(&Performative::STANDARD[..]),
-        "[a-z][a-z0-9-]{0,9}".prop_map(|name| name.parse().unwrap()),
-    ]
-}
-
-fn content() -> impl Strategy<Value = Option<Vec<u8>>> {
-    let sizes = prop_oneof![
-        4 => 0..20_usize,
-        1 => 250..260_usize,
-        1 => Just(65_535_usize),
-        1 => Just(65_536_usize),
-    ];
-    option::of((sizes, any::<u8>()).prop_map(|(size, byte)| vec![byte; size]))
-}
-
-prop_compose! {
-    fn message()(
-        performative in performative(),
-        sender in option::of(agent()),
-        receivers in vec(agent(), 0..3),
-        reply_to in vec(agent(), 0..2),
-        content in content(),
-        texts in vec(option::of(text()), 6),
-        protocol in option::of(token()),
-        reply_by in option::of(time()),
-        user_defined in pairs(),
-    ) -> Message {
-        let mut builder = Message::builder(performative).receivers(receivers);
-        if let Some(sender) = sender { builder = builder.sender(sender); }
-        for agent in reply_to { builder = builder.reply_to(agent); }
-        if let Some(content) = content { builder = builder.content(content); }
-        if let Some(text) = &texts[0] { builder = builder.language(text); }
-        if let Some(text) = &texts[1] { builder = builder.encoding(text); }
-        if let Some(text) = &texts[2] { builder = builder.ontology(text); }
-        if let Some(text) = &texts[3] { builder = builder.conversation_id(text); }
-        if let Some(text) = &texts[4] { builder = builder.reply_with(text); }
-        if let Some(text) = &texts[5] { builder = builder.in_reply_to(text); }
-        if let Some(protocol) = protocol { builder = builder.protocol(protocol); }
-        if let Some(time) = reply_by { builder = builder.reply_by(time); }
-        for (name, value) in user_defined { builder = builder.user_defined(name, value); }
-        builder.build().unwrap()
-    }
-}
+use arbitrary::{agent, message, pairs, some_text, time};
 
 prop_compose! {
     fn received()(
@@ -191,7 +78,46 @@ fn nearly_encoded() -> impl Strategy<Value = Vec<u8>> {
     })
 }
 
+/// Explains the bytes and checks that every byte is told once, up to the error that decoding
+/// gives, if any.
+fn explained(bytes: &[u8]) -> Explanation {
+    let explanation = explain(bytes);
+    let mut end = 0;
+    for span in &explanation.spans {
+        assert_eq!(span.offset, end);
+        assert!(span.len > 0);
+        assert!(!span.meaning.chars().any(char::is_control), "{span:?}");
+        end += span.len;
+    }
+    let error = explanation.error.as_ref();
+    assert_eq!(end, error.map_or(bytes.len(), DecodeError::offset));
+    let is_letter = matches!(bytes.first(), Some(0xfd | 0xfe));
+    let decoded = if is_letter {
+        EnvelopeView::parse(bytes).err()
+    } else {
+        MessageView::parse(bytes).err()
+    };
+    if !is_letter || decoded.is_some() {
+        assert_eq!(error, decoded.as_ref());
+    }
+    explanation
+}
+
+/// How many spans mean just this.
+fn count(explanation: &Explanation, meaning: &str) -> usize {
+    let spans = explanation.spans.iter();
+    spans.filter(|span| span.meaning == meaning).count()
+}
+
+fn all_agents<'a>(agents: impl IntoIterator<Item = &'a AgentId>) -> usize {
+    agents
+        .into_iter()
+        .map(|agent| 1 + all_agents(agent.resolvers()))
+        .sum()
+}
+
 fn never_panics(bytes: &[u8]) {
+    explained(bytes);
     if let Ok(view) = MessageView::parse(bytes) {
         assert_eq!(view.user_defined().count(), view.user_defined().count());
         view.receivers()
@@ -272,6 +198,55 @@ proptest! {
         let wanted: Vec<_> = wanted.iter().map(|agent| agent.name().to_owned()).collect();
         prop_assert_eq!(names, wanted);
         prop_assert_eq!(view.stamps().count(), envelope.extensions.len() + 1);
+    }
+
+    #[test]
+    fn a_letter_is_explained_to_the_last_byte(
+        envelope in envelope().boxed(),
+        message in message().boxed(),
+    ) {
+        let payload = message.to_payload().to_bytes();
+        let of_message = explained(&payload);
+        prop_assert_eq!(&of_message.error, &None);
+        let standard = Performative::STANDARD.contains(message.performative());
+        let user_defined = if standard { "" } else { ", user-defined" };
+        let act = format!("performative: {}{user_defined}", message.performative());
+        prop_assert_eq!(count(&of_message, &act), 1);
+        let agents = message.sender().into_iter().chain(message.receivers()).chain(message.reply_to());
+        let agents = all_agents(agents);
+        prop_assert_eq!(count(&of_message, "end of agent identifier"), agents);
+        prop_assert_eq!(count(&of_message, "end of message"), 1);
+        for (what, text) in [
+            ("language", message.language()),
+            ("conversation-id", message.conversation_id()),
+            ("protocol", message.protocol()),
+        ] {
+            let start = format!("{what}: '{}", text.unwrap_or_default());
+            let found = of_message.spans.iter().find(|span| span.meaning.starts_with(&start));
+            let plain = text.is_some_and(|text| text.len() < 60 && !text.contains(char::is_control));
+            prop_assert!(found.is_some() || !plain, "{start}");
+            prop_assert!(found.is_none() || text.is_some(), "{start}");
+        }
+
+        let encoded = envelope.encode_standard().unwrap();
+        let letter = explained(&[&encoded[..], &payload].concat());
+        prop_assert_eq!(&letter.error, &None);
+        prop_assert_eq!(count(&letter, "end of base envelope"), 1);
+        let parts = || envelope.extensions.iter().chain([&envelope.base]);
+        prop_assert_eq!(count(&letter, "end of extension envelope"), envelope.extensions.len());
+        prop_assert_eq!(count(&letter, "end of received"), parts().count());
+        let in_envelope = parts().flat_map(|part| {
+            part.to.iter().chain(&part.from).chain(&part.intended_receivers)
+        });
+        let agents = agents + all_agents(in_envelope);
+        prop_assert_eq!(count(&letter, "end of agent identifier"), agents);
+        // All lengths are right.
+        prop_assert!(!letter.spans.iter().any(|span| span.meaning.contains("(ignored)")));
+        // The message is explained as on its own, only further behind.
+        let own = letter.spans.iter().skip_while(|span| span.offset < encoded.len());
+        let own: Vec<_> = own.map(|span| (span.offset - encoded.len(), span.len, &span.meaning)).collect();
+        let alone: Vec<_> = of_message.spans.iter().map(|span| (span.offset, span.len, &span.meaning)).collect();
+        prop_assert_eq!(own, alone);
     }
 
     #[test]

@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
 use bytes::Bytes;
-use fipa_acl::{Message, Payload, Performative, Problem};
+use fipa_acl::{Message, MessageView, Payload, Performative, Problem};
 
 fn message() -> Message {
     Message::builder(Performative::Inform)
@@ -109,14 +109,14 @@ fn other_encodings_and_code_tables_are_named() {
     let of = |bytes: &'static [u8]| problem(&Payload::from(Bytes::from_static(bytes)));
     assert_eq!(of(b"\xfb\x10\x08\x01"), Problem::CodeTable);
     assert_eq!(of(b"\xfa\x10\x08\x05\x11\x00\x01"), Problem::CodeTable);
-    assert!(matches!(
-        of(b"(inform)"),
-        Problem::UnsupportedRepresentation(_)
-    ));
-    assert!(matches!(
-        of(b"<fipa-message/>"),
-        Problem::UnsupportedRepresentation(_)
-    ));
+    for text in [&b"(inform)"[..], b"<fipa-message/>"] {
+        let error = MessageView::parse(text).unwrap_err();
+        let unsupported = matches!(error.problem(), Problem::UnsupportedRepresentation(_));
+        assert!(
+            unsupported,
+            "{error}: a view is of the bit-efficient encoding"
+        );
+    }
     assert_eq!(of(b"hello"), Problem::UnknownRepresentation);
     assert_eq!(of(b"\xfa\x10\x08\x01\n"), Problem::Trailing(1));
 }

@@ -1,14 +1,17 @@
-//! Any bytes are a message or an error; a message that was read survives being written, whole and
-//! split around its content, and as JSON.
+//! Any bytes are a bit-efficient message or an error; a message that was read survives being
+//! written, whole and split around its content, and as JSON.
 
 #![no_main]
 
 use bytes::Bytes;
 use fipa_acl::json::{message_from_json, message_to_json};
-use fipa_acl::{Message, MessageView, Payload};
+use fipa_acl::{Message, MessageView, Payload, Representation};
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {
+    if Representation::detect(bytes) != Some(Representation::BitEfficient) {
+        return;
+    }
     let decoded = Message::decode(&Payload::from(Bytes::copy_from_slice(bytes)));
     assert_eq!(decoded.is_ok(), MessageView::parse(bytes).is_ok());
     let Ok(message) = decoded else { return };

@@ -1,6 +1,7 @@
 //! Agent identifiers in a bit-efficient message, borrowed.
 
 use crate::AgentId;
+use crate::bitefficient::notes::{self, Notes};
 use crate::bitefficient::reader::Reader;
 use crate::bitefficient::text::{Text, expression};
 use crate::error::{DecodeError, Problem};
@@ -98,8 +99,8 @@ impl<'a> Iterator for AgentIds<'a> {
 }
 
 /// Reads an agent identifier, whose resolvers may be nested `depth` deep.
-pub(crate) fn agent_id<'a>(
-    reader: &mut Reader<'a>,
+pub(crate) fn agent_id<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
     depth: usize,
 ) -> Result<AgentIdView<'a>, DecodeError> {
     let code = reader.byte(CLAUSE, "an agent identifier")?;
@@ -121,6 +122,8 @@ pub(crate) fn agent_id<'a>(
         resolvers: &[],
         parameters: &[],
     };
+    reader.note(|| format!("agent identifier: name {}", notes::quoted(name)));
+    reader.notes().deeper();
     let start = reader.position();
     loop {
         let before = reader.position();
@@ -129,6 +132,8 @@ pub(crate) fn agent_id<'a>(
             Some(Parameter::Resolvers(resolvers)) => view.resolvers = resolvers,
             Some(Parameter::UserDefined(..)) => {}
             None => {
+                reader.notes().shallower();
+                reader.note(|| "end of agent identifier".to_owned());
                 let with_end = reader.since(start);
                 view.parameters = with_end.get(..before - start).unwrap_or_default();
                 return Ok(view);
@@ -137,15 +142,20 @@ pub(crate) fn agent_id<'a>(
     }
 }
 
-/// Reads agent identifiers up to the end of their set, and gives the bytes in front of that.
-pub(crate) fn agent_ids<'a>(
-    reader: &mut Reader<'a>,
+/// Reads the agent identifiers of a set up to its end, and gives the bytes in front of that.
+pub(crate) fn agent_ids<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
     depth: usize,
+    set: &'static str,
 ) -> Result<&'a [u8], DecodeError> {
+    reader.note(|| set.to_owned());
+    reader.notes().deeper();
     let start = reader.position();
     loop {
         let ids = reader.since(start);
         if reader.take_if(0x01) {
+            reader.notes().shallower();
+            reader.note(|| format!("end of {set}"));
             return Ok(ids);
         }
         agent_id(reader, depth)?;
@@ -160,8 +170,8 @@ enum Parameter<'a> {
 
 /// The next parameter of an identifier, or `None` at its end (or, in bytes cut out before, at
 /// theirs).
-fn parameter<'a>(
-    reader: &mut Reader<'a>,
+fn parameter<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
     depth: usize,
 ) -> Result<Option<Parameter<'a>>, DecodeError> {
     let code = reader.byte(CLAUSE, "an agent identifier")?;
@@ -172,7 +182,7 @@ fn parameter<'a>(
             let Some(depth) = depth.checked_sub(1) else {
                 return Err(reader.error(CLAUSE, Problem::TooDeep("resolvers")));
             };
-            Parameter::Resolvers(agent_ids(reader, depth)?)
+            Parameter::Resolvers(agent_ids(reader, depth, "resolvers")?)
         }
         0x04 => {
             let (name, value) = user_defined(reader)?;
@@ -182,23 +192,29 @@ fn parameter<'a>(
     }))
 }
 
-fn addresses<'a>(reader: &mut Reader<'a>) -> Result<&'a [u8], DecodeError> {
+fn addresses<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<&'a [u8], DecodeError> {
+    reader.note(|| "addresses".to_owned());
+    reader.notes().deeper();
     let start = reader.position();
     loop {
         let addresses = reader.since(start);
         if reader.take_if(0x01) {
+            reader.notes().shallower();
+            reader.note(|| "end of addresses".to_owned());
             return Ok(addresses);
         }
-        if word(reader, "address")?.is_empty() {
+        let address = word(reader, "address")?;
+        if address.is_empty() {
             return Err(reader.error(CLAUSE, Problem::Empty("address")));
         }
+        reader.note(|| format!("address {}", notes::quoted(address)));
     }
 }
 
 /// Reads a `BinWord`.
 #[inline]
-pub(crate) fn word<'a>(
-    reader: &mut Reader<'a>,
+pub(crate) fn word<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
     what: &'static str,
 ) -> Result<&'a str, DecodeError> {
     const CLAUSE: &str = "FIPA00069 2.1 BinWord";
@@ -210,8 +226,8 @@ pub(crate) fn word<'a>(
 }
 
 /// Reads name and value of a user-defined parameter; the name comes without `X-`.
-pub(crate) fn user_defined<'a>(
-    reader: &mut Reader<'a>,
+pub(crate) fn user_defined<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
 ) -> Result<(&'a str, Text<'a>), DecodeError> {
     let offset = reader.offset();
     let name = without_x(word(reader, "user-defined name")?);
@@ -219,11 +235,15 @@ pub(crate) fn user_defined<'a>(
         let problem = Problem::NotAWord("name of a user-defined parameter");
         return Err(DecodeError::new(offset, "FIPA00061 user-defined", problem));
     }
+    reader.note(|| format!("user-defined parameter {}", notes::quoted(name)));
     // JADE writes an empty value as a lone 00, which is no expression.
     if reader.take_if(0x00) {
+        reader.note(|| "user-defined value: none, as JADE writes it".to_owned());
         return Ok((name, Text::plain("")));
     }
-    Ok((name, expression(reader, "user-defined value")?))
+    let value = expression(reader, "user-defined value")?;
+    reader.note(|| notes::named("user-defined value", &value));
+    Ok((name, value))
 }
 
 /// The name of a user-defined parameter without its `X-`, which not every peer writes.

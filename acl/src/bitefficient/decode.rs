@@ -10,36 +10,34 @@ use crate::bitefficient::view::{ContentView, MessageView};
 use crate::error::{DecodeError, Problem};
 use crate::{AgentId, Message, Payload};
 
-impl Message {
-    /// Reads an encoded message. The content of the result shares the memory it was given in and
-    /// is not looked at, unless it was written with escapes.
-    ///
-    /// # Errors
-    /// When the payload is not one whole message in the bit-efficient encoding (see
-    /// [`MessageView::parse_payload`]).
-    pub fn decode(payload: &Payload) -> Result<Self, DecodeError> {
-        let view = MessageView::parse_payload(payload)?;
-        let text = |text: Option<Text<'_>>| text.map(|text| text.as_str().into_owned());
-        Ok(Self {
-            performative: view.performative(),
-            sender: view.sender().map(owned).transpose()?,
-            receivers: view.receivers().map(owned).collect::<Result<_, _>>()?,
-            reply_to: view.reply_to().map(owned).collect::<Result<_, _>>()?,
-            content: view.content_view().map(|content| shared(payload, content)),
-            language: text(view.language()),
-            encoding: text(view.encoding()),
-            ontology: text(view.ontology()),
-            protocol: view.protocol().map(str::to_owned),
-            conversation_id: text(view.conversation_id()),
-            reply_with: text(view.reply_with()),
-            in_reply_to: text(view.in_reply_to()),
-            reply_by: view.reply_by(),
-            user_defined: view
-                .user_defined()
-                .map(|(name, value)| (name.to_owned(), value.as_str().into_owned()))
-                .collect(),
-        })
-    }
+/// Reads a bit-efficient message. The content of the result shares the memory it was given in and
+/// is not looked at, unless it was written with escapes.
+///
+/// # Errors
+/// When the payload is not one whole message in the bit-efficient encoding (see
+/// [`MessageView::parse_payload`]).
+pub(crate) fn decode(payload: &Payload) -> Result<Message, DecodeError> {
+    let view = MessageView::parse_payload(payload)?;
+    let text = |text: Option<Text<'_>>| text.map(|text| text.as_str().into_owned());
+    Ok(Message {
+        performative: view.performative(),
+        sender: view.sender().map(owned).transpose()?,
+        receivers: view.receivers().map(owned).collect::<Result<_, _>>()?,
+        reply_to: view.reply_to().map(owned).collect::<Result<_, _>>()?,
+        content: view.content_view().map(|content| shared(payload, content)),
+        language: text(view.language()),
+        encoding: text(view.encoding()),
+        ontology: text(view.ontology()),
+        protocol: view.protocol().map(str::to_owned),
+        conversation_id: text(view.conversation_id()),
+        reply_with: text(view.reply_with()),
+        in_reply_to: text(view.in_reply_to()),
+        reply_by: view.reply_by(),
+        user_defined: view
+            .user_defined()
+            .map(|(name, value)| (name.to_owned(), value.as_str().into_owned()))
+            .collect(),
+    })
 }
 
 /// The view has checked all that an identifier can be refused for; the error is passed on rather

@@ -7,6 +7,7 @@
 
 mod agent_id;
 mod decode;
+pub(crate) mod notes;
 pub(crate) mod reader;
 pub(crate) mod text;
 mod view;
@@ -14,6 +15,7 @@ pub(crate) mod write;
 
 pub(crate) use agent_id::without_x;
 pub use agent_id::{AgentIdView, AgentIds};
+pub(crate) use decode::decode;
 pub use text::Text;
 pub use view::MessageView;
 pub use write::{encode, encoded_len};

@@ -1,31 +1,75 @@
 //! Reading what both bit-efficient formats consist of, with every bound checked.
 
+use crate::bitefficient::notes::{Notes, Silent};
 use crate::bitefficient::text::Text;
 use crate::error::{DecodeError, Problem};
 use crate::time::{Base, Fields, Time, Zone};
 
 /// A place in bytes that came from outside.
 #[derive(Debug, Clone)]
-pub(crate) struct Reader<'a> {
+pub(crate) struct Reader<'a, N = Silent> {
     bytes: &'a [u8],
     position: usize,
     /// Where `bytes` begin in what is decoded, for errors.
     base: usize,
+    /// Who is told what the bytes mean.
+    notes: N,
 }
 
 type Result<T> = std::result::Result<T, DecodeError>;
 
 impl<'a> Reader<'a> {
     pub(crate) fn new(bytes: &'a [u8]) -> Self {
-        Self::at(bytes, 0)
+        Self::noting(bytes, 0, Silent)
     }
+}
 
-    pub(crate) fn at(bytes: &'a [u8], base: usize) -> Self {
+impl<'a, N: Notes> Reader<'a, N> {
+    /// A reader of bytes that begin at the offset `base` of what is decoded.
+    pub(crate) fn noting(bytes: &'a [u8], base: usize, notes: N) -> Self {
         Self {
             bytes,
             position: 0,
             base,
+            notes,
         }
+    }
+
+    /// What was read since the last note means this.
+    #[inline(always)]
+    pub(crate) fn note(&mut self, meaning: impl FnOnce() -> String) {
+        let end = self.offset();
+        self.notes.note(end, meaning);
+    }
+
+    /// Who is told what the bytes mean, to be told more.
+    #[inline(always)]
+    pub(crate) fn notes(&mut self) -> &mut N {
+        &mut self.notes
+    }
+
+    /// A second reader at the same place, to look ahead; nobody is told what it reads.
+    #[inline]
+    pub(crate) fn ahead(&self) -> Reader<'a> {
+        Reader {
+            bytes: self.bytes,
+            position: self.position,
+            base: self.base,
+            notes: Silent,
+        }
+    }
+
+    /// Goes on where the one that looked ahead is.
+    #[inline]
+    pub(crate) fn follow(&mut self, ahead: &Reader<'a>) {
+        self.position = ahead.position;
+    }
+
+    /// Goes on with other bytes, which begin at the offset `base`.
+    pub(crate) fn go_on(&mut self, bytes: &'a [u8], base: usize) {
+        self.bytes = bytes;
+        self.position = 0;
+        self.base = base;
     }
 
     /// How many bytes were read.
@@ -43,6 +87,11 @@ impl<'a> Reader<'a> {
     #[inline]
     pub(crate) fn remaining(&self) -> usize {
         self.bytes.len() - self.position
+    }
+
+    /// What was not read yet.
+    pub(crate) fn rest(&self) -> &'a [u8] {
+        self.bytes.get(self.position..).unwrap_or_default()
     }
 
     /// What was read since `start`, a former [`position`](Self::position).

@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 use std::fmt;
 
+use crate::bitefficient::notes::{self, Notes};
 use crate::bitefficient::reader::{Form, Reader, digit_chars, string_form, utf8};
 use crate::error::{DecodeError, Problem};
 use crate::word::push_string_literal;
@@ -66,6 +67,11 @@ impl<'a> Text<'a> {
         Self(Repr::Counted(text))
     }
 
+    /// Whether the text was written in quotation marks.
+    pub(crate) fn is_quoted(&self) -> bool {
+        matches!(self.0, Repr::Quoted(_))
+    }
+
     /// Whether the text was written with a byte count, as only fipa_services does in envelopes.
     pub(crate) fn is_counted(&self) -> bool {
         matches!(self.0, Repr::Counted(_))
@@ -112,8 +118,8 @@ const CLAUSE: &str = "FIPA00069 2.1 BinExpression";
 
 /// Reads a `BinExpression`: checked in one pass, nothing kept but where it is.
 #[inline]
-pub(crate) fn expression<'a>(
-    reader: &mut Reader<'a>,
+pub(crate) fn expression<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
     what: &'static str,
 ) -> Result<Text<'a>, DecodeError> {
     match reader.peek() {
@@ -130,11 +136,14 @@ pub(crate) fn expression<'a>(
     }
 }
 
-fn other_expression<'a>(
-    reader: &mut Reader<'a>,
+fn other_expression<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
     what: &'static str,
 ) -> Result<Text<'a>, DecodeError> {
     let start = reader.position();
+    if let Some(0x60 | 0x70..=0x79) = reader.peek() {
+        reader.note(|| format!("{what}: an expression"));
+    }
     let code = reader.byte(CLAUSE, what)?;
     match code {
         // An opaque expression, a leftover of former editions: the string that follows is it.
@@ -148,7 +157,9 @@ fn other_expression<'a>(
             Ok(Text(Repr::Encoded(reader.since(start))))
         }
         0x60 | 0x70..=0x79 => {
+            reader.notes().deeper();
             check_levels(reader, code, what)?;
+            reader.notes().shallower();
             Ok(Text(Repr::Encoded(reader.since(start))))
         }
         0x11 | 0x15 | 0x18 => Err(reader.error(CLAUSE, Problem::CodeTable)),
@@ -157,8 +168,8 @@ fn other_expression<'a>(
 }
 
 /// The text of a `BinString` whose code was read.
-fn string_after<'a>(
-    reader: &mut Reader<'a>,
+fn string_after<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
     code: u8,
     what: &'static str,
 ) -> Result<Text<'a>, DecodeError> {
@@ -184,7 +195,11 @@ fn string_after<'a>(
 
 /// Walks over a parenthesised expression whose first byte was read, up to the parenthesis that
 /// closes it.
-fn check_levels(reader: &mut Reader<'_>, first: u8, what: &'static str) -> Result<(), DecodeError> {
+fn check_levels<N: Notes>(
+    reader: &mut Reader<'_, N>,
+    first: u8,
+    what: &'static str,
+) -> Result<(), DecodeError> {
     let mut depth = 0_usize;
     let mut code = first;
     loop {
@@ -199,12 +214,16 @@ fn check_levels(reader: &mut Reader<'_>, first: u8, what: &'static str) -> Resul
         if depth == 0 {
             // A token fused with the last parenthesis would stand outside of everything.
             return if code == 0x40 {
+                let end = reader.position();
+                note_token(reader, code, end);
                 Ok(())
             } else {
                 Err(reader.error(CLAUSE, Problem::Unbalanced))
             };
         }
+        let start = reader.position();
         check_token(reader, code, what)?;
+        note_token(reader, code, start);
         code = reader.byte(CLAUSE, what)?;
     }
 }
@@ -235,7 +254,11 @@ fn token_of(code: u8) -> Option<Token> {
     })
 }
 
-fn check_token(reader: &mut Reader<'_>, code: u8, what: &'static str) -> Result<(), DecodeError> {
+fn check_token<N: Notes>(
+    reader: &mut Reader<'_, N>,
+    code: u8,
+    what: &'static str,
+) -> Result<(), DecodeError> {
     let Some(token) = token_of(code) else {
         return Err(match code {
             0x11 | 0x15 | 0x18 | 0x51 | 0x55 | 0x59 | 0x71 | 0x75 | 0x79 => {
@@ -266,6 +289,32 @@ fn check_token(reader: &mut Reader<'_>, code: u8, what: &'static str) -> Result<
         }
     }
     Ok(())
+}
+
+/// Notes a token of an expression that was read from `start` on, behind its code, as FIPA00070
+/// writes it.
+fn note_token<N: Notes>(reader: &mut Reader<'_, N>, code: u8, start: usize) {
+    let bytes = reader.since(start);
+    let closes = matches!(code, 0x40 | 0x50..=0x59);
+    let opens = matches!(code, 0x60 | 0x70..=0x79);
+    if closes {
+        reader.notes().shallower();
+    }
+    reader.note(|| {
+        let mut token = String::new();
+        // The bytes were checked just now: this cannot fail.
+        let _ = render_token(&mut Reader::new(bytes), code, &mut token);
+        let parenthesis = match (opens, closes) {
+            (true, _) => "(",
+            (_, true) if token.is_empty() => ")",
+            (_, true) => ") ",
+            _ => "",
+        };
+        notes::plain(&format!("{parenthesis}{token}"))
+    });
+    if opens {
+        reader.notes().deeper();
+    }
 }
 
 /// Writes a checked number or expression as FIPA00070 does.

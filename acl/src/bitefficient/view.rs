@@ -5,7 +5,8 @@ use std::borrow::Cow;
 use crate::bitefficient::agent_id::{
     AgentIdView, AgentIds, agent_id, agent_ids, user_defined, word,
 };
-use crate::bitefficient::reader::Reader;
+use crate::bitefficient::notes::{self, Notes, Silent};
+use crate::bitefficient::reader::{Form, Reader, string_form};
 use crate::bitefficient::text::{Text, expression, string_content};
 use crate::error::{DecodeError, Problem};
 use crate::word::{is_token, is_word};
@@ -63,7 +64,7 @@ impl<'a> MessageView<'a> {
     /// # Errors
     /// When the bytes are not one whole message in the bit-efficient encoding.
     pub fn parse(bytes: &'a [u8]) -> Result<Self, DecodeError> {
-        Parser::new(bytes, None)?.message()
+        Parser::new(Reader::new(bytes), None)?.message()
     }
 
     /// Reads a message that may be split around its content, which is not touched then.
@@ -76,7 +77,16 @@ impl<'a> MessageView<'a> {
             content: &payload.content,
             tail: &payload.tail,
         });
-        Parser::new(&payload.head, split)?.message()
+        Parser::new(Reader::new(&payload.head), split)?.message()
+    }
+
+    /// Reads what lies in one piece, and tells `notes` what every byte of it means.
+    pub(crate) fn parse_noting(
+        bytes: &'a [u8],
+        base: usize,
+        notes: impl Notes,
+    ) -> Result<Self, DecodeError> {
+        Parser::new(Reader::noting(bytes, base, notes), None)?.message()
     }
 
     /// What the message does; allocates for a user-defined act.
@@ -224,41 +234,67 @@ enum Parameter<'a> {
 }
 
 #[inline]
-fn parameter<'a>(reader: &mut Reader<'a>) -> Result<Parameter<'a>, DecodeError> {
+fn parameter<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<Parameter<'a>, DecodeError> {
     let code = reader.byte(CLAUSE, "a message")?;
     Ok(match code {
         0x00 => {
             let (name, value) = user_defined(reader)?;
             Parameter::UserDefined(name, value)
         }
-        0x01 => Parameter::End,
-        0x02 => Parameter::Sender(agent_id(reader, AgentId::MAX_DEPTH)?),
-        0x03 => Parameter::Receivers(agent_ids(reader, AgentId::MAX_DEPTH)?),
+        0x01 => {
+            reader.note(|| "end of message".to_owned());
+            Parameter::End
+        }
+        0x02 => Parameter::Sender(sender(reader)?),
+        0x03 => Parameter::Receivers(agent_ids(reader, AgentId::MAX_DEPTH, "receivers")?),
         0x04 => Parameter::Content(content(reader)?),
-        0x05 => Parameter::ReplyWith(expression(reader, "reply-with")?),
-        0x06 => Parameter::ReplyBy(reader.date_time("FIPA00069 2.3 BinDateTime")?),
-        0x07 => Parameter::InReplyTo(expression(reader, "in-reply-to")?),
-        0x08 => Parameter::ReplyTo(agent_ids(reader, AgentId::MAX_DEPTH)?),
-        0x09 => Parameter::Language(expression(reader, "language")?),
-        0x0a => Parameter::Encoding(expression(reader, "encoding")?),
-        0x0b => Parameter::Ontology(expression(reader, "ontology")?),
+        0x05 => Parameter::ReplyWith(text(reader, "reply-with")?),
+        0x06 => {
+            let time = reader.date_time("FIPA00069 2.3 BinDateTime")?;
+            reader.note(|| notes::date("reply-by:", time));
+            Parameter::ReplyBy(time)
+        }
+        0x07 => Parameter::InReplyTo(text(reader, "in-reply-to")?),
+        0x08 => Parameter::ReplyTo(agent_ids(reader, AgentId::MAX_DEPTH, "reply-to")?),
+        0x09 => Parameter::Language(text(reader, "language")?),
+        0x0a => Parameter::Encoding(text(reader, "encoding")?),
+        0x0b => Parameter::Ontology(text(reader, "ontology")?),
         0x0c => Parameter::Protocol(protocol(reader)?),
-        0x0d => Parameter::ConversationId(expression(reader, "conversation-id")?),
+        0x0d => Parameter::ConversationId(text(reader, "conversation-id")?),
         other => return Err(reader.unexpected(CLAUSE, other, "a parameter of a message")),
     })
 }
 
-fn protocol<'a>(reader: &mut Reader<'a>) -> Result<&'a str, DecodeError> {
+fn sender<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<AgentIdView<'a>, DecodeError> {
+    reader.note(|| "sender".to_owned());
+    reader.notes().deeper();
+    let sender = agent_id(reader, AgentId::MAX_DEPTH)?;
+    reader.notes().shallower();
+    Ok(sender)
+}
+
+#[inline]
+fn text<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
+    what: &'static str,
+) -> Result<Text<'a>, DecodeError> {
+    let text = expression(reader, what)?;
+    reader.note(|| notes::named(what, &text));
+    Ok(text)
+}
+
+fn protocol<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<&'a str, DecodeError> {
     let offset = reader.offset();
     let name = word(reader, "protocol")?;
     if is_token(name) {
+        reader.note(|| format!("protocol: {}", notes::quoted(name)));
         return Ok(name);
     }
     let problem = Problem::NotAWord("protocol");
     Err(DecodeError::new(offset, "FIPA00070 Word", problem))
 }
 
-fn content<'a>(reader: &mut Reader<'a>) -> Result<ContentView<'a>, DecodeError> {
+fn content<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<ContentView<'a>, DecodeError> {
     const CLAUSE: &str = "FIPA00069 2.1 BinString";
     let len = match reader.peek() {
         Some(0x14) => {
@@ -267,24 +303,43 @@ fn content<'a>(reader: &mut Reader<'a>) -> Result<ContentView<'a>, DecodeError> 
             if bytes.len() as u64 > Message::MAX_CONTENT {
                 return Err(reader.error(CLAUSE, Problem::TooLong("content")));
             }
+            reader.note(|| string_noted(bytes));
             return Ok(ContentView::String(bytes));
         }
         Some(0x16..=0x19) => content_len(reader)?,
-        _ => return Ok(ContentView::Expression(expression(reader, "content")?)),
+        _ => return Ok(ContentView::Expression(text(reader, "content")?)),
     };
-    Ok(ContentView::Bytes(reader.bytes(len, CLAUSE, "content")?))
+    let bytes = reader.bytes(len, CLAUSE, "content")?;
+    reader.notes().deeper();
+    reader.note(|| notes::content(bytes));
+    reader.notes().shallower();
+    Ok(ContentView::Bytes(bytes))
 }
 
 /// Reads code and length of content that is given with its length.
-fn content_len(reader: &mut Reader<'_>) -> Result<usize, DecodeError> {
+fn content_len<N: Notes>(reader: &mut Reader<'_, N>) -> Result<usize, DecodeError> {
     const CLAUSE: &str = "FIPA00069 2.1 BinString";
-    match reader.byte(CLAUSE, "content")? {
-        0x16 => reader.u8_len(CLAUSE),
-        0x17 => reader.u16_len(CLAUSE),
-        0x19 => reader.u32_len(CLAUSE),
-        0x18 => Err(reader.error(CLAUSE, Problem::CodeTable)),
-        other => Err(reader.unexpected(CLAUSE, other, "content with its length")),
-    }
+    let (len, code) = match reader.byte(CLAUSE, "content")? {
+        0x16 => (reader.u8_len(CLAUSE)?, "Len8"),
+        0x17 => (reader.u16_len(CLAUSE)?, "Len16"),
+        0x19 => (reader.u32_len(CLAUSE)?, "Len32"),
+        0x18 => return Err(reader.error(CLAUSE, Problem::CodeTable)),
+        other => return Err(reader.unexpected(CLAUSE, other, "content with its length")),
+    };
+    reader.note(|| format!("content, {len} bytes ({code})"));
+    Ok(len)
+}
+
+/// Describes content that was read up to a NUL.
+fn string_noted(bytes: &[u8]) -> String {
+    let (form, inner) = string_form(bytes);
+    let written = match form {
+        Form::Quoted => ", a string in quotation marks",
+        Form::Counted => ", a string with its length in front",
+        Form::Bare => ", a string",
+    };
+    let (len, content) = (inner.len(), notes::content(inner));
+    format!("content, {len} bytes{written}: {content}")
 }
 
 /// What comes behind the head of a split message.
@@ -294,25 +349,29 @@ struct Pieces<'a> {
     tail: &'a [u8],
 }
 
-struct Parser<'a> {
-    reader: Reader<'a>,
+struct Parser<'a, N = Silent> {
+    reader: Reader<'a, N>,
     /// The rest of a split message, until its content was met.
     split: Option<Pieces<'a>>,
     performative: PerformativeView<'a>,
 }
 
-impl<'a> Parser<'a> {
+impl<'a, N: Notes> Parser<'a, N> {
     /// Reads what comes before the parameters.
-    fn new(bytes: &'a [u8], split: Option<Pieces<'a>>) -> Result<Self, DecodeError> {
-        let mut reader = Reader::new(bytes);
-        let id = reader.byte(CLAUSE, "a message")?;
-        match id {
+    fn new(mut reader: Reader<'a, N>, split: Option<Pieces<'a>>) -> Result<Self, DecodeError> {
+        let start = reader.ahead();
+        match reader.byte(CLAUSE, "a message")? {
             0xfa => {}
-            0xfb | 0xfc => return Err(DecodeError::new(0, CLAUSE, Problem::CodeTable)),
-            _ => return Err(not_bit_efficient(bytes)),
+            0xfb | 0xfc => return Err(start.error(CLAUSE, Problem::CodeTable)),
+            _ => return Err(not_bit_efficient(&start)),
         }
+        reader.note(|| "message, bit-efficient, without code tables".to_owned());
         // Peers write other versions than 1.0 and mean the same.
-        reader.byte(CLAUSE, "the version")?;
+        let version = reader.byte(CLAUSE, "the version")?;
+        reader.note(|| match version {
+            0x10 => "version 1.0".to_owned(),
+            other => format!("version {}.{}, taken for 1.0", other >> 4, other & 0x0f),
+        });
         let offset = reader.offset();
         let wrong = |clause, problem| DecodeError::new(offset, clause, problem);
         let code = reader.byte(CLAUSE, "the performative")?;
@@ -336,6 +395,12 @@ impl<'a> Parser<'a> {
                 )
             })?)
         };
+        reader.note(|| match &performative {
+            PerformativeView::Standard(act) => format!("performative: {act}"),
+            PerformativeView::Other(name) => {
+                format!("performative: {}, user-defined", notes::plain(name))
+            }
+        });
         Ok(Self {
             reader,
             split,
@@ -413,7 +478,7 @@ impl<'a> Parser<'a> {
         if self.reader.peek() != Some(0x04) || self.reader.remaining() > 6 {
             return Ok(None);
         }
-        let mut ahead = self.reader.clone();
+        let mut ahead = self.reader.ahead();
         ahead.skip_peeked();
         let len = content_len(&mut ahead)?;
         if ahead.remaining() > 0 {
@@ -423,7 +488,7 @@ impl<'a> Parser<'a> {
             let problem = Problem::Split("the length of the content differs");
             return Err(self.reader.error(CLAUSE, problem));
         }
-        self.reader = Reader::at(tail, ahead.offset().saturating_add(len));
+        self.reader.go_on(tail, ahead.offset().saturating_add(len));
         self.split = None;
         Ok(Some(content))
     }
@@ -442,12 +507,12 @@ impl<'a> Parser<'a> {
 }
 
 #[cold]
-fn not_bit_efficient(bytes: &[u8]) -> DecodeError {
-    let problem = match Representation::detect(bytes) {
+fn not_bit_efficient(start: &Reader<'_>) -> DecodeError {
+    let problem = match Representation::detect(start.rest()) {
         Some(other @ (Representation::String | Representation::Xml)) => {
             Problem::UnsupportedRepresentation(other)
         }
         _ => Problem::UnknownRepresentation,
     };
-    DecodeError::new(0, CLAUSE, problem)
+    start.error(CLAUSE, problem)
 }

@@ -1,6 +1,7 @@
 //! Agent identifiers in a bit-efficient envelope. They differ from those in messages: plain
 //! strings instead of words, and another code for user-defined parameters.
 
+use crate::bitefficient::notes::{self, Notes};
 use crate::bitefficient::reader::Reader;
 use crate::bitefficient::{Text, without_x};
 use crate::envelope::read::any;
@@ -19,8 +20,8 @@ pub(super) struct AgentIdView<'a> {
 }
 
 /// Reads an agent identifier, whose resolvers may be nested `depth` deep.
-pub(super) fn agent_id<'a>(
-    reader: &mut Reader<'a>,
+pub(super) fn agent_id<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
     depth: usize,
 ) -> Result<AgentIdView<'a>, DecodeError> {
     let code = reader.byte(CLAUSE, "an agent identifier")?;
@@ -37,21 +38,30 @@ pub(super) fn agent_id<'a>(
     if name.raw().len() > 2 * AgentId::MAX_NAME {
         return wrong(Problem::TooLong("agent name"));
     }
+    reader.note(|| format!("agent identifier: name {}", notes::text(&name)));
+    reader.notes().deeper();
     let start = reader.position();
     while parameter(reader, depth)?.is_some() {}
+    reader.notes().shallower();
+    reader.note(|| "end of agent identifier".to_owned());
     let parameters = reader.since(start);
     Ok(AgentIdView { name, parameters })
 }
 
-/// Reads agent identifiers up to the end of their set, and gives the bytes in front of that.
-pub(super) fn agent_ids<'a>(
-    reader: &mut Reader<'a>,
+/// Reads the agent identifiers of a set up to its end, and gives the bytes in front of that.
+pub(super) fn agent_ids<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
     depth: usize,
+    set: &'static str,
 ) -> Result<&'a [u8], DecodeError> {
+    reader.note(|| set.to_owned());
+    reader.notes().deeper();
     let start = reader.position();
     loop {
         let ids = reader.since(start);
         if reader.take_if(0x01) {
+            reader.notes().shallower();
+            reader.note(|| format!("end of {set}"));
             return Ok(ids);
         }
         agent_id(reader, depth)?;
@@ -118,8 +128,8 @@ enum Parameter<'a> {
 }
 
 /// The next parameter of an identifier, or `None` at its end.
-fn parameter<'a>(
-    reader: &mut Reader<'a>,
+fn parameter<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
     depth: usize,
 ) -> Result<Option<Parameter<'a>>, DecodeError> {
     let code = reader.byte(CLAUSE, "an agent identifier")?;
@@ -130,7 +140,7 @@ fn parameter<'a>(
             let Some(depth) = depth.checked_sub(1) else {
                 return Err(reader.error(CLAUSE, Problem::TooDeep("resolvers")));
             };
-            Parameter::Resolvers(agent_ids(reader, depth)?)
+            Parameter::Resolvers(agent_ids(reader, depth, "resolvers")?)
         }
         // 05 since edition C; JADE writes 04 with a string behind it.
         0x04 | 0x05 => {
@@ -140,28 +150,35 @@ fn parameter<'a>(
             } else {
                 any(reader, "user-defined value")?
             };
+            reader.note(|| notes::user_defined(&name, &value));
             Parameter::UserDefined(name, value)
         }
         other => return Err(reader.unexpected(CLAUSE, other, "a part of an agent identifier")),
     }))
 }
 
-fn addresses<'a>(reader: &mut Reader<'a>) -> Result<&'a [u8], DecodeError> {
+fn addresses<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<&'a [u8], DecodeError> {
+    reader.note(|| "addresses".to_owned());
+    reader.notes().deeper();
     let start = reader.position();
     loop {
         let addresses = reader.since(start);
         if reader.take_if(0x01) {
+            reader.notes().shallower();
+            reader.note(|| "end of addresses".to_owned());
             return Ok(addresses);
         }
-        if reader.string(CLAUSE, "address")?.is_empty() {
+        let address = reader.string(CLAUSE, "address")?;
+        if address.is_empty() {
             return Err(reader.error(CLAUSE, Problem::Empty("address")));
         }
+        reader.note(|| format!("address {}", notes::text(&address)));
     }
 }
 
 /// Reads the name of a user-defined parameter; an `X-` is still there.
-pub(super) fn user_defined_name<'a>(
-    reader: &mut Reader<'a>,
+pub(super) fn user_defined_name<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
     clause: &'static str,
 ) -> Result<Text<'a>, DecodeError> {
     let offset = reader.offset();

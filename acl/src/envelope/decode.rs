@@ -6,8 +6,10 @@ use crate::bitefficient::{Text, without_x};
 use crate::envelope::agent_id::AgentIdViews;
 use crate::envelope::read::{Event, Parameter, Part, ReceivedView, UserDefined, Walk};
 use crate::envelope::view::Age;
-use crate::error::DecodeError;
-use crate::{AgentId, Envelope, EnvelopeParams, EnvelopeView, Letter, Received};
+use crate::error::{DecodeError, Problem};
+use crate::{
+    AgentId, Envelope, EnvelopeParams, EnvelopeView, Letter, Received, Representation, xml,
+};
 
 impl Envelope {
     /// Reads an encoded envelope with its extensions, behind which the payload may follow, and
@@ -15,11 +17,14 @@ impl Envelope {
     ///
     /// The reader is lenient: it takes what the standard says and what fipa_services and JADE
     /// write. Texts that are empty and stamps without a name, which is how fipa_services says that
-    /// there is none, become absent.
+    /// there is none, become absent. XML envelopes (FIPA00085) are told by their `<`.
     ///
     /// # Errors
-    /// When the bytes do not begin with a whole envelope in the bit-efficient encoding.
+    /// When the bytes do not begin with a whole envelope.
     pub fn decode(bytes: &[u8]) -> Result<(Self, usize), DecodeError> {
+        if is_xml(bytes) {
+            return xml::decode_envelope(bytes);
+        }
         let mut newest_first = Vec::new();
         let mut oldest_first = Vec::new();
         let mut age = Age::Base;
@@ -57,10 +62,13 @@ impl Letter {
     /// Takes a letter that lies in one piece apart. Nothing is copied.
     ///
     /// # Errors
-    /// When the bytes do not begin with a whole envelope in the bit-efficient encoding. The
-    /// message behind it is not looked at.
+    /// When the bytes do not begin with a whole envelope. The message behind it is not looked at.
     pub fn split(mut bytes: Bytes) -> Result<Self, DecodeError> {
-        let envelope_len = EnvelopeView::parse(&bytes)?.len();
+        let envelope_len = if is_xml(&bytes) {
+            xml::decode_envelope(&bytes)?.1
+        } else {
+            EnvelopeView::parse(&bytes)?.len()
+        };
         let envelope = bytes.split_to(envelope_len);
         Ok(Self::new(envelope, bytes))
     }
@@ -78,19 +86,25 @@ impl Letter {
     /// Reads the envelope, stamps included.
     ///
     /// # Errors
-    /// When the envelope is not in the bit-efficient encoding, or is not one whole envelope.
+    /// When the bytes of the envelope are not one whole envelope.
     pub fn parse_envelope(&self) -> Result<Envelope, DecodeError> {
         let bytes = self.envelope();
         let (envelope, used) = Envelope::decode(&bytes)?;
-        match bytes.len() - used {
+        let rest = bytes.get(used..).unwrap_or_default();
+        let (rest, clause) = if is_xml(&bytes) {
+            (rest.trim_ascii(), "FIPA00085")
+        } else {
+            (rest, "FIPA00088 MessageEnvelope")
+        };
+        match rest.len() {
             0 => Ok(envelope),
-            rest => Err(DecodeError::new(
-                used,
-                "FIPA00088 MessageEnvelope",
-                crate::Problem::Trailing(rest),
-            )),
+            rest => Err(DecodeError::new(used, clause, Problem::Trailing(rest))),
         }
     }
+}
+
+fn is_xml(bytes: &[u8]) -> bool {
+    Representation::detect(bytes) == Some(Representation::Xml)
 }
 
 fn begin(params: &mut EnvelopeParams, part: Part<'_>) {

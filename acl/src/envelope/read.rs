@@ -5,8 +5,9 @@
 //! fipa_services writes in front of numbers; strings in every form.
 
 use crate::AgentId;
-use crate::bitefficient::Text;
+use crate::bitefficient::notes::{self, Notes, Silent};
 use crate::bitefficient::reader::{Reader, digit_chars, utf8};
+use crate::bitefficient::{Text, without_x};
 use crate::envelope::agent_id::{AgentIdView, agent_id, agent_ids, user_defined_name};
 use crate::error::{DecodeError, Problem};
 use crate::word::is_token;
@@ -76,8 +77,8 @@ pub(super) enum UserDefined<'a> {
 
 /// A walk through an envelope, part by part.
 #[derive(Debug, Clone)]
-pub(super) struct Walk<'a> {
-    reader: Reader<'a>,
+pub(super) struct Walk<'a, N = Silent> {
+    reader: Reader<'a, N>,
     place: Place,
     extensions: usize,
 }
@@ -101,8 +102,15 @@ pub(super) enum Event<'a> {
 
 impl<'a> Walk<'a> {
     pub(super) fn new(bytes: &'a [u8]) -> Self {
+        Self::noting(bytes, Silent)
+    }
+}
+
+impl<'a, N: Notes> Walk<'a, N> {
+    /// A walk that tells `notes` what every byte means.
+    pub(super) fn noting(bytes: &'a [u8], notes: N) -> Self {
         Self {
-            reader: Reader::new(bytes),
+            reader: Reader::noting(bytes, 0, notes),
             place: Place::BetweenParts,
             extensions: 0,
         }
@@ -123,10 +131,14 @@ impl<'a> Walk<'a> {
                     if let Some(parameter) = parameter(&mut self.reader)? {
                         return Ok(Some(Event::Parameter(parameter)));
                     }
-                    self.place = match self.place {
-                        Place::InExtension => Place::BetweenParts,
-                        _ => Place::Behind,
+                    let (next, end) = match self.place {
+                        Place::InExtension => (Place::BetweenParts, "end of extension envelope"),
+                        _ => (Place::Behind, "end of base envelope"),
                     };
+                    self.place = next;
+                    let offset = self.reader.offset();
+                    self.reader.notes().shallower();
+                    self.reader.notes().note_envelope_end(offset, end);
                 }
                 Place::Behind => return Ok(None),
             }
@@ -149,46 +161,86 @@ impl<'a> Walk<'a> {
 }
 
 /// Reads what every part begins with.
-fn part<'a>(reader: &mut Reader<'a>) -> Result<Part<'a>, DecodeError> {
+fn part<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<Part<'a>, DecodeError> {
     let id = reader.byte(CLAUSE, "an envelope")?;
     if !matches!(id, 0xfd | 0xfe) {
         return Err(not_bit_efficient(reader, id));
     }
+    reader.note(|| {
+        let part = if id == 0xfd { "extension" } else { "base" };
+        format!("{part} envelope")
+    });
     // The length. Two bytes of zero announce one of four.
-    if reader.u16_len("FIPA00088 EnvLen")? == 0 {
-        reader.u32_len("FIPA00088 EnvLen")?;
+    let mut len = reader.u16_len("FIPA00088 EnvLen")?;
+    if len == 0 {
+        len = reader.u32_len("FIPA00088 EnvLen")?;
     }
+    let offset = reader.offset();
+    reader.notes().note_envelope_len(offset, len);
+    reader.notes().deeper();
     if id == 0xfd {
         // JADE writes the tag of a stamp here.
-        reader.take_if(0x0a);
+        if reader.take_if(0x0a) {
+            reader.note(|| "the code of a stamp, as JADE writes it".to_owned());
+        }
         return Ok(Part::Extension(received(reader)?));
     }
     let representation = acl_representation(reader)?;
-    Ok(Part::Base(representation, reader.date_time(DATE)?))
+    let date = reader.date_time(DATE)?;
+    reader.note(|| notes::date("date", date));
+    Ok(Part::Base(representation, date))
 }
 
 /// The next parameter, or `None` at the end of the part.
-fn parameter<'a>(reader: &mut Reader<'a>) -> Result<Option<Parameter<'a>>, DecodeError> {
+fn parameter<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
+) -> Result<Option<Parameter<'a>>, DecodeError> {
     const CLAUSE: &str = "FIPA00088 Parameter";
     let code = reader.byte(CLAUSE, "an envelope")?;
     Ok(Some(match code {
         0x00 => Parameter::UserDefined(user_defined(reader)?),
         0x01 => return Ok(None),
-        0x02 => Parameter::To(agent_ids(reader, AgentId::MAX_DEPTH)?),
-        0x03 => Parameter::From(agent_id(reader, AgentId::MAX_DEPTH)?),
+        0x02 => Parameter::To(agent_ids(reader, AgentId::MAX_DEPTH, "to")?),
+        0x03 => Parameter::From(from(reader)?),
         0x04 => Parameter::AclRepresentation(acl_representation(reader)?),
-        0x05 => Parameter::Comments(reader.string(CLAUSE, "comments")?),
+        0x05 => Parameter::Comments(text(reader, CLAUSE, "comments")?),
         0x06 => Parameter::PayloadLength(payload_length(reader)?),
-        0x07 => Parameter::PayloadEncoding(reader.string(CLAUSE, "payload-encoding")?),
-        0x09 => Parameter::IntendedReceivers(agent_ids(reader, AgentId::MAX_DEPTH)?),
+        0x07 => Parameter::PayloadEncoding(text(reader, CLAUSE, "payload-encoding")?),
+        0x09 => {
+            let set = "intended-receiver";
+            Parameter::IntendedReceivers(agent_ids(reader, AgentId::MAX_DEPTH, set)?)
+        }
         0x0a => Parameter::Received(received(reader)?),
-        0x0b => Parameter::TransportBehaviour(any(reader, "transport-behaviour")?),
+        0x0b => {
+            let text = any(reader, "transport-behaviour")?;
+            reader.note(|| notes::named("transport-behaviour", &text));
+            Parameter::TransportBehaviour(text)
+        }
         other => return Err(reader.unexpected(CLAUSE, other, "a parameter of an envelope")),
     }))
 }
 
-fn acl_representation<'a>(
-    reader: &mut Reader<'a>,
+fn from<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<AgentIdView<'a>, DecodeError> {
+    reader.note(|| "from".to_owned());
+    reader.notes().deeper();
+    let from = agent_id(reader, AgentId::MAX_DEPTH)?;
+    reader.notes().shallower();
+    Ok(from)
+}
+
+#[inline]
+fn text<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
+    clause: &'static str,
+    what: &'static str,
+) -> Result<Text<'a>, DecodeError> {
+    let text = reader.string(clause, what)?;
+    reader.note(|| notes::named(what, &text));
+    Ok(text)
+}
+
+fn acl_representation<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
 ) -> Result<AclRepresentationView<'a>, DecodeError> {
     const CLAUSE: &str = "FIPA00088 ACLRepresentation";
     let standard = match reader.peek() {
@@ -198,37 +250,53 @@ fn acl_representation<'a>(
         // JADE writes and reads a name without the code.
         _ => {
             reader.take_if(0x00);
-            let name = reader.string(CLAUSE, "acl-representation")?;
+            let name = text(reader, CLAUSE, "acl-representation")?;
             return Ok(AclRepresentationView::Named(name));
         }
     };
     reader.skip_peeked();
+    reader.note(|| {
+        let name = AclRepresentation::from(standard);
+        format!("acl-representation: {name}")
+    });
     Ok(AclRepresentationView::Standard(standard))
 }
 
-fn payload_length(reader: &mut Reader<'_>) -> Result<u64, DecodeError> {
+fn payload_length<N: Notes>(reader: &mut Reader<'_, N>) -> Result<u64, DecodeError> {
     const CLAUSE: &str = "FIPA00088 payload-length";
     // As digits these would be a zero in front, which nobody writes: they are the tags that
     // fipa_services puts there.
-    if !reader.take_if(0x12) {
-        reader.take_if(0x13);
-    }
+    let tagged = reader.take_if(0x12) || reader.take_if(0x13);
     let offset = reader.offset();
     let number = digit_chars(reader.digits(CLAUSE)?).try_fold(None, |number: Option<u64>, char| {
         let digit = char.and_then(|char| char.to_digit(10))?;
         let number = number.unwrap_or(0).checked_mul(10)?;
         Some(Some(number.checked_add(u64::from(digit))?))
     });
-    number
+    let len = number
         .flatten()
-        .ok_or_else(|| DecodeError::new(offset, CLAUSE, Problem::Number))
+        .ok_or_else(|| DecodeError::new(offset, CLAUSE, Problem::Number))?;
+    reader.note(|| {
+        let written = if tagged {
+            ", with the code of a number in front (fipa_services)"
+        } else {
+            ""
+        };
+        format!("payload-length: {len}{written}")
+    });
+    Ok(len)
 }
 
-fn received<'a>(reader: &mut Reader<'a>) -> Result<ReceivedView<'a>, DecodeError> {
+fn received<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<ReceivedView<'a>, DecodeError> {
     const CLAUSE: &str = "FIPA00088 ReceivedObject";
+    let by = reader.string(CLAUSE, "received-by")?;
+    reader.note(|| format!("received: by {}", notes::text(&by)));
+    reader.notes().deeper();
+    let date = reader.date_time(DATE)?;
+    reader.note(|| notes::date("date", date));
     let mut view = ReceivedView {
-        by: reader.string(CLAUSE, "received-by")?,
-        date: reader.date_time(DATE)?,
+        by,
+        date,
         from: None,
         id: None,
         via: None,
@@ -243,6 +311,8 @@ fn received<'a>(reader: &mut Reader<'a>) -> Result<ReceivedView<'a>, DecodeError
             Some(ReceivedPart::Via(text)) => view.via = Some(text),
             Some(ReceivedPart::UserDefined(_)) => {}
             None => {
+                reader.notes().shallower();
+                reader.note(|| "end of received".to_owned());
                 view.rest = rest;
                 return Ok(view);
             }
@@ -257,15 +327,17 @@ enum ReceivedPart<'a> {
     UserDefined(UserDefined<'a>),
 }
 
-fn received_part<'a>(reader: &mut Reader<'a>) -> Result<Option<ReceivedPart<'a>>, DecodeError> {
+fn received_part<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
+) -> Result<Option<ReceivedPart<'a>>, DecodeError> {
     const CLAUSE: &str = "FIPA00088 ReceivedObject";
     let code = reader.byte(CLAUSE, "a stamp")?;
     Ok(Some(match code {
         0x00 => ReceivedPart::UserDefined(user_defined(reader)?),
         0x01 => return Ok(None),
-        0x02 => ReceivedPart::From(reader.string(CLAUSE, "received-from")?),
-        0x03 => ReceivedPart::Id(reader.string(CLAUSE, "received-id")?),
-        0x04 => ReceivedPart::Via(reader.string(CLAUSE, "received-via")?),
+        0x02 => ReceivedPart::From(text(reader, CLAUSE, "received-from")?),
+        0x03 => ReceivedPart::Id(text(reader, CLAUSE, "received-id")?),
+        0x04 => ReceivedPart::Via(text(reader, CLAUSE, "received-via")?),
         other => return Err(reader.unexpected(CLAUSE, other, "a part of a stamp")),
     }))
 }
@@ -286,27 +358,30 @@ impl<'a> ReceivedView<'a> {
     }
 }
 
-fn user_defined<'a>(reader: &mut Reader<'a>) -> Result<UserDefined<'a>, DecodeError> {
+fn user_defined<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<UserDefined<'a>, DecodeError> {
     const CLAUSE: &str = "FIPA00088 user-defined";
-    let mut ahead = reader.clone();
+    let mut ahead = reader.ahead();
     let first = ahead.string(CLAUSE, "user-defined name")?;
     // A name has no blank: with one, it is name and value in one string, as JADE writes it.
-    if let Some((name, _)) = first.raw().split_once(' ')
+    if let Some((name, value)) = first.raw().split_once(' ')
         && is_token(name)
     {
-        *reader = ahead;
+        reader.follow(&ahead);
+        reader.note(|| {
+            let (name, value) = (notes::quoted(without_x(name)), notes::quoted(value));
+            format!("user-defined parameter {name}: {value}, in one string as JADE writes it")
+        });
         return Ok(UserDefined::Joined(first));
     }
     let name = user_defined_name(reader, CLAUSE)?;
-    Ok(UserDefined::Pair(
-        name,
-        reader.string(CLAUSE, "user-defined value")?,
-    ))
+    let value = reader.string(CLAUSE, "user-defined value")?;
+    reader.note(|| notes::user_defined(&name, &value));
+    Ok(UserDefined::Pair(name, value))
 }
 
 /// Reads an `Any`, which has to be text.
-pub(super) fn any<'a>(
-    reader: &mut Reader<'a>,
+pub(super) fn any<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
     what: &'static str,
 ) -> Result<Text<'a>, DecodeError> {
     const CLAUSE: &str = "FIPA00088 Any";
@@ -326,7 +401,7 @@ pub(super) fn any<'a>(
 }
 
 #[cold]
-fn not_bit_efficient(reader: &Reader<'_>, found: u8) -> DecodeError {
+fn not_bit_efficient<N: Notes>(reader: &Reader<'_, N>, found: u8) -> DecodeError {
     if reader.offset() > 1 {
         return reader.unexpected(CLAUSE, found, "the base envelope or another extension");
     }

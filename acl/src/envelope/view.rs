@@ -2,6 +2,7 @@
 
 use crate::AclRepresentation;
 use crate::bitefficient::Text;
+use crate::bitefficient::notes::Notes;
 use crate::envelope::agent_id::{AgentIdView, AgentIdViews};
 use crate::envelope::read::{AclRepresentationView, Event, Parameter, Part, Walk};
 use crate::error::DecodeError;
@@ -26,6 +27,15 @@ impl<'a> EnvelopeView<'a> {
     /// # Errors
     /// When the bytes do not begin with a whole envelope in the bit-efficient encoding.
     pub fn parse(bytes: &'a [u8]) -> Result<Self, DecodeError> {
+        Self::walk(bytes, Walk::new(bytes))
+    }
+
+    /// Reads an envelope, and tells `notes` what every byte of it means.
+    pub(crate) fn parse_noting(bytes: &'a [u8], notes: impl Notes) -> Result<Self, DecodeError> {
+        Self::walk(bytes, Walk::noting(bytes, notes))
+    }
+
+    fn walk<N: Notes>(bytes: &'a [u8], mut walk: Walk<'a, N>) -> Result<Self, DecodeError> {
         let mut view = Self {
             bytes: &[],
             from: Newest::default(),
@@ -37,7 +47,6 @@ impl<'a> EnvelopeView<'a> {
             part: 0,
             age: Age::Base,
         };
-        let mut walk = Walk::new(bytes);
         while let Some(event) = walk.next()? {
             match event {
                 Event::Part(part) => {

@@ -124,20 +124,14 @@ async fn receive(endpoint: Arc<Endpoint>, place: Stranger, stream: TcpStream, fr
                     .await;
                 return;
             }
-            Some(0xfe | 0xfd) => match unframed::read(&endpoint, &mut read, begun).await {
+            // A bit-efficient or an XML envelope.
+            Some(0xfe | 0xfd | b'<') => match unframed::read(&endpoint, &mut read, begun).await {
                 Ok(letter) => {
                     unframed::hand_on(&endpoint, letter);
                     return;
                 }
                 Err(refused) => refused.to_string(),
             },
-            Some(b'<') => {
-                let before = endpoint.tally().refused_xml.fetch_add(1, Ordering::Relaxed);
-                let what = "a letter with an XML envelope was refused: only bit-efficient ones \
-                            are understood";
-                warn_seldom(before, format_args!("{from}: {what}"));
-                return;
-            }
             first => format!("nothing begins with {first:02x?}"),
         },
         // Somebody only looked whether the port is open.

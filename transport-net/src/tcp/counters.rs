@@ -44,8 +44,6 @@ counters! {
     unframed_in,
     /// Connections closed because of what the peer sent, or because it was too slow.
     refused_nonsense,
-    /// XML envelopes refused.
-    refused_xml,
     /// Connections refused or pushed out because there were too many.
     refused_crowd,
     /// Failures of the operating system to hand out a new connection.

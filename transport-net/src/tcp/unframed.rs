@@ -1,5 +1,5 @@
-//! Letters of old peers (fipa_services): one per connection, without a header, until end of
-//! stream.
+//! Letters of old peers (fipa_services, and JADE over its raw TCP extension): one per connection,
+//! without a header, until end of stream. Their envelopes are bit-efficient or XML.
 
 use bytes::{Bytes, BytesMut};
 use fipa_acl::{DecodeError, EncodeError, Envelope, EnvelopeParams, Letter};

@@ -1,0 +1,169 @@
+//! Writing envelopes (FIPA00085).
+
+use bytes::Bytes;
+
+use crate::error::EncodeError;
+use crate::xml::agent_id::{self, Form};
+use crate::xml::message_write::without_zone;
+use crate::xml::out::Out;
+use crate::{AgentId, Dialect, Envelope, EnvelopeParams, Received, Time};
+
+/// The encoded envelope, all extensions included.
+///
+/// JADE reads one part only and gets the parameters that count; older stamps are not among them.
+/// fipa_services reads times without a zone only; it gets them without.
+///
+/// # Errors
+/// When XML cannot carry it, or the reader that the dialect is for cannot read what it says.
+pub(crate) fn encode(envelope: &Envelope, dialect: Dialect) -> Result<Bytes, EncodeError> {
+    let mut out = Out::new(dialect);
+    out.raw(match dialect {
+        Dialect::Standard => "<?xml version=\"1.0\"?>",
+        Dialect::FipaServices => "<?xml version=\"1.0\" ?>",
+        // The line break is JADE's own.
+        Dialect::Jade => "<?xml version=\"1.0\"?>\n",
+    });
+    out.open("envelope");
+    if dialect == Dialect::Jade {
+        write_part(&mut out, 1, &envelope.effective(), dialect)?;
+    } else {
+        for (index, part) in (1..).zip([&envelope.base].into_iter().chain(&envelope.extensions)) {
+            write_part(&mut out, index, part, dialect)?;
+        }
+    }
+    out.close("envelope");
+    Ok(out.into_bytes())
+}
+
+fn write_part(
+    out: &mut Out,
+    index: usize,
+    params: &EnvelopeParams,
+    dialect: Dialect,
+) -> Result<(), EncodeError> {
+    out.raw(&format!("<params index=\"{index}\">"));
+    write_agents(out, "to", &params.to, dialect)?;
+    let from = params.from.as_ref().map(std::slice::from_ref);
+    write_agents(out, "from", from.unwrap_or_default(), dialect)?;
+    write_text(out, "comments", params.comments.as_deref())?;
+    if let Some(representation) = &params.acl_representation {
+        let (element, name) = ("acl-representation", representation.as_str());
+        out.open(element);
+        out.text_trimmed(element, present(element, name)?)?;
+        out.close(element);
+    }
+    if let Some(len) = params.payload_length {
+        out.element("payload-length", "payload-length", &len.to_string())?;
+    }
+    write_text(out, "payload-encoding", params.payload_encoding.as_deref())?;
+    if let Some(date) = params.date {
+        out.element("date", "date", &time_text("date", date, dialect)?)?;
+    }
+    let intended = &params.intended_receivers;
+    write_agents(out, "intended-receiver", intended, dialect)?;
+    if let Some(behaviour) = params.transport_behaviour.as_deref() {
+        if dialect != Dialect::Standard {
+            return Err(EncodeError::Unrepresentable {
+                what: "transport-behaviour",
+                why: "neither fipa_services nor JADE reads it in an XML envelope",
+            });
+        }
+        write_text(out, "transport-behaviour", Some(behaviour))?;
+    }
+    let user_defined = &params.user_defined;
+    // JADE writes them before, fipa_services behind the stamp.
+    if dialect == Dialect::Jade {
+        write_user_defined(out, user_defined, dialect)?;
+    }
+    if let Some(received) = &params.received {
+        write_received(out, received, dialect)?;
+    }
+    if dialect != Dialect::Jade {
+        write_user_defined(out, user_defined, dialect)?;
+    }
+    out.close("params");
+    Ok(())
+}
+
+fn write_agents(
+    out: &mut Out,
+    element: &str,
+    agents: &[AgentId],
+    dialect: Dialect,
+) -> Result<(), EncodeError> {
+    // JADE writes one agent in each element; fipa_services reads only the last element.
+    let at_once = if dialect == Dialect::Jade {
+        1
+    } else {
+        agents.len().max(1)
+    };
+    for group in agents.chunks(at_once) {
+        out.open(element);
+        for agent in group {
+            agent_id::write(out, agent, Form::Envelope, dialect)?;
+        }
+        out.close(element);
+    }
+    Ok(())
+}
+
+fn write_received(out: &mut Out, received: &Received, dialect: Dialect) -> Result<(), EncodeError> {
+    let date = time_text("received-date", received.date, dialect)?;
+    let by = ("received-by", Some(received.by.as_str()));
+    let from = ("received-from", received.from.as_deref());
+    let date = ("received-date", Some(date.as_str()));
+    let id = ("received-id", received.id.as_deref());
+    let via = ("received-via", received.via.as_deref());
+    out.open("received");
+    let order = if dialect == Dialect::Jade {
+        [date, by, from, id, via]
+    } else {
+        [by, from, date, id, via]
+    };
+    for (element, value) in order {
+        if let Some(value) = value {
+            out.empty(element, "value", element, present(element, value)?)?;
+        }
+    }
+    write_user_defined(out, &received.user_defined, dialect)?;
+    out.close("received");
+    Ok(())
+}
+
+fn write_text(out: &mut Out, element: &'static str, text: Option<&str>) -> Result<(), EncodeError> {
+    match text {
+        None => Ok(()),
+        Some(text) => out.element(element, element, present(element, text)?),
+    }
+}
+
+fn write_user_defined(
+    out: &mut Out,
+    pairs: &[(String, String)],
+    dialect: Dialect,
+) -> Result<(), EncodeError> {
+    for (name, value) in pairs {
+        out.user_defined(name, value, dialect != Dialect::Standard)?;
+    }
+    Ok(())
+}
+
+/// An empty text is how peers say that there is none.
+fn present<'a>(what: &'static str, text: &'a str) -> Result<&'a str, EncodeError> {
+    (!text.is_empty())
+        .then_some(text)
+        .ok_or(EncodeError::Empty(what))
+}
+
+fn time_text(what: &'static str, time: Time, dialect: Dialect) -> Result<String, EncodeError> {
+    if time.is_relative() {
+        let why = "FIPA00085 has no relative times";
+        return Err(EncodeError::Unrepresentable { what, why });
+    }
+    Ok(match dialect {
+        Dialect::Standard => time.to_string(),
+        Dialect::FipaServices => without_zone(time).to_string(),
+        // JADE puts a Z where the standard has the T, and ignores a letter in the end.
+        Dialect::Jade => time.to_string().replacen('T', "Z", 1),
+    })
+}

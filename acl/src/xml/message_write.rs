@@ -1,0 +1,187 @@
+//! Writing messages (FIPA00071).
+
+use bytes::Bytes;
+
+use crate::error::EncodeError;
+use crate::xml::agent_id::{self, Form};
+use crate::xml::message_read::JADE_ENCODING;
+use crate::xml::out::Out;
+use crate::{AgentId, Dialect, Message, Performative, Time, Zone};
+
+/// The encoded message.
+///
+/// # Errors
+/// When XML cannot carry it (bytes that are no text, control characters), or the reader that the
+/// dialect is for cannot read what it says. fipa_services reads times without a zone only; it
+/// gets them without, and takes them as its local time.
+pub(crate) fn encode(message: &Message, dialect: Dialect) -> Result<Bytes, EncodeError> {
+    let mut out = Out::new(dialect);
+    let jade = dialect == Dialect::Jade;
+    match dialect {
+        Dialect::Standard => out.raw("<?xml version=\"1.0\"?>"),
+        Dialect::FipaServices => out.raw("<?xml version=\"1.0\" ?>"),
+        Dialect::Jade => {}
+    }
+    out.raw("<fipa-message");
+    out.attribute("act", "performative", &act(message, jade)?)?;
+    if dialect == Dialect::FipaServices {
+        let conversation = message.conversation_id().unwrap_or_default();
+        out.attribute("conversation-id", "conversation-id", conversation)?;
+    }
+    out.raw(">");
+    let sender = message.sender().map(std::slice::from_ref);
+    let sender = ("sender", sender.unwrap_or_default());
+    let receivers = ("receiver", message.receivers());
+    let first = if jade {
+        [sender, receivers]
+    } else {
+        [receivers, sender]
+    };
+    for (element, agents) in first {
+        write_agents(&mut out, element, agents, dialect)?;
+    }
+    write_content(&mut out, message, dialect)?;
+    for (element, text) in [
+        ("language", message.language()),
+        ("encoding", message.encoding()),
+        ("ontology", message.ontology()),
+    ] {
+        write_text(&mut out, element, text, dialect)?;
+    }
+    if let Some(protocol) = message.protocol() {
+        write_text(&mut out, "protocol", Some(protocol), dialect)?;
+    }
+    if jade {
+        let conversation = message.conversation_id();
+        write_text(&mut out, "conversation-id", conversation, dialect)?;
+    }
+    write_text(&mut out, "reply-with", message.reply_with(), dialect)?;
+    write_text(&mut out, "in-reply-to", message.in_reply_to(), dialect)?;
+    if let Some(time) = message.reply_by() {
+        let text = time_text(time, dialect)?;
+        out.empty("reply-by", "time", "reply-by", &text)?;
+    }
+    write_agents(&mut out, "reply-to", message.reply_to(), dialect)?;
+    if !jade {
+        let conversation = message.conversation_id();
+        write_text(&mut out, "conversation-id", conversation, dialect)?;
+    }
+    for (name, value) in message.user_defined() {
+        if name.eq_ignore_ascii_case(JADE_ENCODING) {
+            return Err(EncodeError::Unrepresentable {
+                what: "user-defined parameter JADE-Encoding",
+                why: "it would be taken for the encoding of the content",
+            });
+        }
+        match dialect {
+            Dialect::Standard => out.user_defined(name, value, false)?,
+            Dialect::FipaServices => out.user_defined(name, value, true)?,
+            Dialect::Jade => {
+                readable_by_jade("user-defined parameter", value)?;
+                out.user_element(name, value)?;
+            }
+        }
+    }
+    out.close("fipa-message");
+    Ok(out.into_bytes())
+}
+
+fn act(message: &Message, jade: bool) -> Result<String, EncodeError> {
+    match message.performative() {
+        Performative::Other(_) if jade => Err(EncodeError::Unrepresentable {
+            what: "performative",
+            why: "JADE drops messages with others than those of the standard",
+        }),
+        act if jade => Ok(act.as_str().to_ascii_uppercase()),
+        act => Ok(act.as_str().to_owned()),
+    }
+}
+
+fn write_agents(
+    out: &mut Out,
+    element: &str,
+    agents: &[AgentId],
+    dialect: Dialect,
+) -> Result<(), EncodeError> {
+    // JADE reads one agent in each element.
+    let at_once = if dialect == Dialect::Jade {
+        1
+    } else {
+        agents.len().max(1)
+    };
+    for group in agents.chunks(at_once) {
+        out.open(element);
+        for agent in group {
+            agent_id::write(out, agent, Form::Message, dialect)?;
+        }
+        out.close(element);
+    }
+    Ok(())
+}
+
+fn write_content(out: &mut Out, message: &Message, dialect: Dialect) -> Result<(), EncodeError> {
+    let Some(content) = message.content() else {
+        return Ok(());
+    };
+    // Copied before it is looked at: nobody vouches that shared memory stays as it is.
+    let content = content.to_vec();
+    let text = std::str::from_utf8(&content).map_err(|_| EncodeError::Unrepresentable {
+        what: "content",
+        why: "it is not UTF-8 text",
+    })?;
+    if dialect == Dialect::Jade {
+        readable_by_jade("content", text)?;
+    }
+    out.open("content");
+    out.content(text)?;
+    out.close("content");
+    Ok(())
+}
+
+fn write_text(
+    out: &mut Out,
+    element: &'static str,
+    text: Option<&str>,
+    dialect: Dialect,
+) -> Result<(), EncodeError> {
+    let Some(text) = text else { return Ok(()) };
+    if dialect == Dialect::Jade {
+        readable_by_jade(element, text)?;
+    }
+    out.element(element, element, text)
+}
+
+/// JADE takes white space around a text away, and puts a blank wherever its parser hands a text
+/// over in pieces, which it does at escaped characters.
+fn readable_by_jade(what: &'static str, text: &str) -> Result<(), EncodeError> {
+    if text.trim() != text {
+        let why = "JADE would cut off the white space around it";
+        return Err(EncodeError::Unrepresentable { what, why });
+    }
+    if text.contains(['<', '>', '&', '\r']) {
+        let why = "JADE would put blanks around its escaped characters";
+        return Err(EncodeError::Unrepresentable { what, why });
+    }
+    Ok(())
+}
+
+fn time_text(time: Time, dialect: Dialect) -> Result<String, EncodeError> {
+    if dialect != Dialect::FipaServices {
+        return Ok(time.to_string());
+    }
+    if time.is_relative() {
+        return Err(EncodeError::Unrepresentable {
+            what: "reply-by",
+            why: "fipa_services does not read relative times",
+        });
+    }
+    Ok(without_zone(time).to_string())
+}
+
+/// fipa_services does not read a zone, and takes every time for its local one.
+pub(super) fn without_zone(time: Time) -> Time {
+    Time {
+        zone: Zone::Unspecified,
+        ..time
+    }
+}

@@ -1,0 +1,23 @@
+//! The XML encodings: messages (FIPA00071) and envelopes (FIPA00085).
+//!
+//! [`reader`] walks over elements and knows nothing of FIPA; the other modules know what the
+//! elements mean. Nothing of a document type definition is ever processed, and no entities but the
+//! five of XML itself exist.
+//!
+//! Reading takes what the standard, fipa_services and JADE write: tags in any case, values as
+//! attribute or text, one element per agent or one for all, unknown elements passed over, and
+//! content in CDATA sections byte for byte, even where that is no XML. What is written is XML 1.0
+//! to the letter.
+
+mod agent_id;
+mod envelope_read;
+mod envelope_write;
+mod message_read;
+mod message_write;
+mod out;
+mod reader;
+
+pub(crate) use envelope_read::decode as decode_envelope;
+pub(crate) use envelope_write::encode as encode_envelope;
+pub(crate) use message_read::decode;
+pub(crate) use message_write::encode;

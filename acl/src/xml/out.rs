@@ -1,0 +1,181 @@
+//! Writing XML 1.0: escaped text, nothing that a reader would change.
+
+use bytes::Bytes;
+
+use crate::Dialect;
+use crate::error::EncodeError;
+use crate::word::is_token;
+
+/// A document in the making.
+pub(super) struct Out {
+    text: String,
+    /// White space is escaped wherever a reader that condenses it would change it. fipa_services
+    /// itself writes content in CDATA sections only, so outside of them nothing is promised.
+    guards_space: bool,
+}
+
+impl Out {
+    pub(super) fn new(dialect: Dialect) -> Self {
+        Self {
+            text: String::new(),
+            guards_space: dialect == Dialect::FipaServices,
+        }
+    }
+
+    pub(super) fn into_bytes(self) -> Bytes {
+        self.text.into_bytes().into()
+    }
+
+    /// Something that needs no escaping.
+    pub(super) fn raw(&mut self, text: &str) {
+        self.text.push_str(text);
+    }
+
+    pub(super) fn open(&mut self, element: &str) {
+        self.text.push('<');
+        self.text.push_str(element);
+        self.text.push('>');
+    }
+
+    pub(super) fn close(&mut self, element: &str) {
+        self.text.push_str("</");
+        self.text.push_str(element);
+        self.text.push('>');
+    }
+
+    /// A value in an attribute of an element that is otherwise empty.
+    pub(super) fn empty(
+        &mut self,
+        element: &str,
+        attribute: &str,
+        what: &'static str,
+        value: &str,
+    ) -> Result<(), EncodeError> {
+        self.text.push('<');
+        self.text.push_str(element);
+        self.attribute(attribute, what, value)?;
+        self.text.push_str(" />");
+        Ok(())
+    }
+
+    pub(super) fn attribute(
+        &mut self,
+        attribute: &str,
+        what: &'static str,
+        value: &str,
+    ) -> Result<(), EncodeError> {
+        self.text.push(' ');
+        self.text.push_str(attribute);
+        self.text.push_str("=\"");
+        self.text_trimmed(what, value)?;
+        self.text.push('"');
+        Ok(())
+    }
+
+    pub(super) fn element(
+        &mut self,
+        element: &str,
+        what: &'static str,
+        text: &str,
+    ) -> Result<(), EncodeError> {
+        self.open(element);
+        self.text(what, text)?;
+        self.close(element);
+        Ok(())
+    }
+
+    /// Text that keeps its line breaks and tabulators as they are where the reader lets it.
+    pub(super) fn content(&mut self, text: &str) -> Result<(), EncodeError> {
+        self.escaped("content", text, self.guards_space)
+    }
+
+    pub(super) fn text(&mut self, what: &'static str, text: &str) -> Result<(), EncodeError> {
+        self.escaped(what, text, true)
+    }
+
+    /// Text whose reader takes white space around it away: there it is escaped.
+    pub(super) fn text_trimmed(
+        &mut self,
+        what: &'static str,
+        text: &str,
+    ) -> Result<(), EncodeError> {
+        let inner = text.trim_start_matches(' ');
+        let before = text.len() - inner.len();
+        let core = inner.trim_end_matches(' ');
+        self.spaces(before);
+        self.escaped(what, core, true)?;
+        self.spaces(inner.len() - core.len());
+        Ok(())
+    }
+
+    fn spaces(&mut self, count: usize) {
+        for _ in 0..count {
+            self.text.push_str("&#x20;");
+        }
+    }
+
+    /// A user-defined parameter as the standards have it. Peers write a type too.
+    pub(super) fn user_defined(
+        &mut self,
+        name: &str,
+        value: &str,
+        typed: bool,
+    ) -> Result<(), EncodeError> {
+        if !is_token(name) {
+            let shown = name.chars().take(60).collect();
+            return Err(EncodeError::UserDefinedName(shown));
+        }
+        self.raw("<user-defined");
+        let what = "user-defined parameter";
+        self.attribute("href", what, &format!("X-{name}"))?;
+        self.raw(if typed { " type=\"string\">" } else { ">" });
+        self.text(what, value)?;
+        self.close("user-defined");
+        Ok(())
+    }
+
+    /// A user-defined parameter as an element of its own name.
+    pub(super) fn user_element(&mut self, name: &str, value: &str) -> Result<(), EncodeError> {
+        let allowed = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
+        if name.is_empty() || !name.bytes().all(allowed) {
+            return Err(EncodeError::Unrepresentable {
+                what: "user-defined parameter",
+                why: "its reader needs a name of letters, digits, '-', '_' and '.'",
+            });
+        }
+        self.element(&format!("X-{name}"), "user-defined parameter", value)
+    }
+
+    fn escaped(&mut self, what: &'static str, text: &str, layout: bool) -> Result<(), EncodeError> {
+        let mut plain = 0;
+        // In front of the text there might as well be a space.
+        let mut after_space = true;
+        for (at, character) in text.char_indices() {
+            let condensed = self.guards_space && (after_space || at + 1 == text.len());
+            after_space = character == ' ';
+            let escape = match character {
+                ' ' if condensed => "&#x20;",
+                '<' => "&lt;",
+                '>' => "&gt;",
+                '&' => "&amp;",
+                '"' if layout => "&quot;",
+                '\r' => "&#x0D;",
+                '\n' if layout => "&#x0A;",
+                '\t' if layout => "&#x09;",
+                '\n' | '\t' => continue,
+                '\0'..='\x1f' | '\u{fffe}' | '\u{ffff}' => {
+                    return Err(EncodeError::Unrepresentable {
+                        what,
+                        why: "XML has no way to write its control characters",
+                    });
+                }
+                _ => continue,
+            };
+            self.text.push_str(text.get(plain..at).unwrap_or_default());
+            self.text.push_str(escape);
+            plain = at + character.len_utf8();
+        }
+        self.text.push_str(text.get(plain..).unwrap_or_default());
+        Ok(())
+    }
+}

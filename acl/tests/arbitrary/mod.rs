@@ -1,0 +1,132 @@
+//! Messages of all kinds, for property tests.
+
+use std::time::{Duration, SystemTime};
+
+use fipa_acl::{AgentId, Message, Performative, Time};
+use proptest::collection::vec;
+use proptest::option;
+use proptest::prelude::*;
+
+/// Text that an encoding has to be careful with.
+pub(crate) fn text() -> BoxedStrategy<String> {
+    prop_oneof![
+        "[a-z@#0-9-]{0,8}",
+        "[a-z\"\\\\#0-9 ():]{0,12}",
+        "[^\\x00]{0,20}",
+        Just("\"quoted\"".to_owned()),
+        Just("#3\"abc".to_owned()),
+        Just("ends with \\".to_owned()),
+    ]
+    .boxed()
+}
+
+pub(crate) fn some_text() -> BoxedStrategy<String> {
+    text()
+        .prop_filter("not empty", |text| !text.is_empty())
+        .boxed()
+}
+
+pub(crate) fn token() -> BoxedStrategy<String> {
+    prop_oneof![
+        "[a-z0-9.#@\"-]{1,10}",
+        Just("X-".to_owned()),
+        Just("x-X-a".to_owned())
+    ]
+    .boxed()
+}
+
+pub(crate) fn pairs() -> impl Strategy<Value = Vec<(String, String)>> {
+    vec((token(), text()), 0..3)
+}
+
+pub(crate) fn agent() -> BoxedStrategy<AgentId> {
+    let plain = (some_text(), vec(some_text(), 0..3), pairs()).prop_map(|(name, urls, pairs)| {
+        let mut agent = AgentId::new(name).unwrap();
+        for url in urls {
+            agent = agent.with_address(url).unwrap();
+        }
+        for (name, value) in pairs {
+            agent = agent.with_user_defined(name, value).unwrap();
+        }
+        agent
+    });
+    plain
+        .prop_recursive(3, 8, 2, |inner| {
+            (inner.clone(), vec(inner, 0..2)).prop_map(|(agent, resolvers)| {
+                resolvers.into_iter().fold(agent, |agent, resolver| {
+                    agent.with_resolver(resolver).unwrap()
+                })
+            })
+        })
+        .boxed()
+}
+
+pub(crate) fn time() -> BoxedStrategy<Time> {
+    let ms = 0_u64..253_402_300_800_000;
+    prop_oneof![
+        ms.prop_map(|ms| {
+            let time = SystemTime::UNIX_EPOCH + Duration::from_millis(ms);
+            Time::from_system_time(time).unwrap()
+        }),
+        (0_u64..1_000_000_000_000).prop_map(|ms| Time::after(Duration::from_millis(ms)).unwrap()),
+        (0_u64..1_000_000_000_000).prop_map(|ms| Time::before(Duration::from_millis(ms)).unwrap()),
+        Just("20101223T120037980".parse().unwrap()),
+        Just("20101223T120037980K".parse().unwrap()),
+    ]
+    .boxed()
+}
+
+fn performative() -> impl Strategy<Value = Performative> {
+    prop_oneof![
+        prop::sample::select(&Performative::STANDARD[..]),
+        "[a-z][a-z0-9-]{0,9}".prop_map(|name| name.parse().unwrap()),
+    ]
+}
+
+fn content() -> impl Strategy<Value = Option<Vec<u8>>> {
+    let sizes = prop_oneof![
+        4 => 0..20_usize,
+        1 => 250..260_usize,
+        1 => Just(65_535_usize),
+        1 => Just(65_536_usize),
+    ];
+    option::of(prop_oneof![
+        (sizes, any::<u8>()).prop_map(|(size, byte)| vec![byte; size]),
+        vec(any::<u8>(), 0..30),
+        text().prop_map(String::into_bytes),
+    ])
+}
+
+pub(crate) fn message() -> impl Strategy<Value = Message> {
+    message_of(agent(), token())
+}
+
+prop_compose! {
+    /// A message with these agents and protocols.
+    pub(crate) fn message_of(agent: BoxedStrategy<AgentId>, word: BoxedStrategy<String>)(
+        performative in performative(),
+        sender in option::of(agent.clone()),
+        receivers in vec(agent.clone(), 0..3),
+        reply_to in vec(agent, 0..2),
+        content in content(),
+        texts in vec(option::of(text()), 6),
+        protocol in option::of(word),
+        reply_by in option::of(time()),
+        user_defined in pairs(),
+    ) -> Message {
+        let mut builder = Message::builder(performative).receivers(receivers);
+        if let Some(sender) = sender { builder = builder.sender(sender); }
+        for agent in reply_to { builder = builder.reply_to(agent); }
+        if let Some(content) = content { builder = builder.content(content); }
+        if let Some(text) = &texts[0] { builder = builder.language(text); }
+        if let Some(text) = &texts[1] { builder = builder.encoding(text); }
+        if let Some(text) = &texts[2] { builder = builder.ontology(text); }
+        if let Some(text) = &texts[3] { builder = builder.conversation_id(text); }
+        if let Some(text) = &texts[4] { builder = builder.reply_with(text); }
+        if let Some(text) = &texts[5] { builder = builder.in_reply_to(text); }
+        if let Some(protocol) = protocol { builder = builder.protocol(protocol); }
+        if let Some(time) = reply_by { builder = builder.reply_by(time); }
+        for (name, value) in user_defined { builder = builder.user_defined(name, value); }
+        builder.build().unwrap()
+    }
+}
