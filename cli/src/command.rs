@@ -5,6 +5,7 @@ mod config;
 mod decode;
 mod demo;
 mod echo;
+mod encode;
 mod send;
 mod up;
 
@@ -22,6 +23,7 @@ pub(crate) enum Command {
     Echo(echo::Arguments),
     Demo(demo::Arguments),
     Decode(decode::Arguments),
+    Encode(encode::Arguments),
     Config(config::Arguments),
 }
 
@@ -34,6 +36,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Echo(arguments) => echo::run(arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),
         Command::Decode(arguments) => decode::run(arguments, global),
+        Command::Encode(arguments) => encode::run(arguments, global),
         Command::Config(arguments) => config::run(arguments, global),
     }
 }

@@ -1,9 +1,12 @@
-//! `fipa decode`: bytes as JSON.
+//! `fipa decode`: bytes as JSON, or explained byte by byte.
+
+mod explained;
 
 use std::path::{Path, PathBuf};
 
 use clap::Args;
 use fipa::{DecodeError, Letter, Message, Payload};
+use fipa_acl::Representation;
 use fipa_acl::json::{letter_to_json, message_to_json};
 use serde_json::{Value, json};
 
@@ -13,15 +16,20 @@ use crate::{input, output};
 
 /// Print a recorded message or letter as JSON
 ///
-/// Reads one encoded message (FIPA00069) or one letter, an envelope (FIPA00088) with a message
-/// behind it; the first byte tells which. Bytes that are neither are an error that says where they
-/// break which clause of the standards.
+/// Reads one encoded message (bit-efficient, FIPA00069; string, FIPA00070; XML, FIPA00071) or one
+/// letter, an envelope (bit-efficient, FIPA00088; XML, FIPA00085) with a message behind it; the
+/// first bytes tell which. Bytes that are neither are an error that says where they break which
+/// clause of the standards.
+///
+/// With --explain it prints every byte of what is bit-efficient and what it means, up to the error
+/// if there is one.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   fipa decode letter.bin
   fipa decode message.be --compact | jq -r .message.performative
   echo 'fa 10 13 01' | fipa decode --hex
+  fipa decode --explain letter.bin
 
 JSON of a message:
   { \"message\": { \"performative\", \"sender\": agent, \"receivers\": [agent], \"reply_to\": [agent],
@@ -38,7 +46,12 @@ JSON of a letter:
                 \"payload_encoding\", \"date\", \"intended_receivers\", \"received\",
                 \"transport_behaviour\", \"user_defined\" }
 
-Keys appear only when set. Times are in UTC, with milliseconds.")]
+Keys appear only when set. Times are in UTC, with milliseconds.
+
+JSON with --explain:
+  { \"length\": how many bytes there are,
+    \"spans\": [ { \"offset\", \"length\", \"depth\", \"meaning\" } ], one behind the other,
+    \"error\": { \"offset\", \"problem\", \"clause\" }, if there is one }")]
 pub(crate) struct Arguments {
     /// The file to read; - for standard input
     #[arg(default_value = "-")]
@@ -51,17 +64,34 @@ pub(crate) struct Arguments {
     /// Print it on one line
     #[arg(long)]
     compact: bool,
+
+    /// Print the bytes and what they mean
+    #[arg(long, conflicts_with = "compact")]
+    explain: bool,
+
+    /// Print JSON also with --explain
+    #[arg(long)]
+    json: bool,
 }
 
 /// The largest content, and ample room for what stands around it.
 const MOST: u64 = Message::MAX_CONTENT + (1 << 20);
 
 pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
-    let Arguments { file, hex, compact } = arguments;
+    let Arguments {
+        file,
+        hex,
+        compact,
+        explain,
+        json,
+    } = arguments;
     // Three characters a byte, usually.
     let mut bytes = input::read(&file, if hex { 3 * MOST } else { MOST })?;
     if hex {
         bytes = from_hex(&bytes, &file)?;
+    }
+    if explain {
+        return explained::print(&bytes, json, &file);
     }
     let decoded = if is_letter(&bytes) {
         letter(bytes, &file)
@@ -77,9 +107,21 @@ pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
 }
 
 /// An envelope begins with the base (`FE`) or an extension (`FD`): FIPA00088 BaseEnvelopeHeader
-/// and ExtEnvelopeHeader. Everything else is tried as a message, whose error says what is wrong.
+/// and ExtEnvelopeHeader; or it is the first element of XML. Everything else is tried as a
+/// message, whose error says what is wrong.
 fn is_letter(bytes: &[u8]) -> bool {
-    matches!(bytes.first(), Some(0xfd | 0xfe))
+    matches!(bytes.first(), Some(0xfd | 0xfe)) || is_xml_envelope(bytes)
+}
+
+fn is_xml_envelope(bytes: &[u8]) -> bool {
+    if Representation::detect(bytes) != Some(Representation::Xml) {
+        return false;
+    }
+    // What stands in front of the first element begins with <? or <!.
+    let mut tags = bytes.split(|&byte| byte == b'<').skip(1);
+    let element = tags.find(|tag| !matches!(tag.first(), Some(b'?' | b'!')));
+    let name = element.and_then(|element| element.get(..b"envelope".len()));
+    name.is_some_and(|name| name.eq_ignore_ascii_case(b"envelope"))
 }
 
 fn message(bytes: Vec<u8>) -> Result<Value, DecodeError> {
@@ -113,8 +155,8 @@ fn malformed(error: &DecodeError, file: &Path) -> Failure {
     Failure::failed(
         format!("{} ({})", error.problem(), error.clause()),
         format!("{}, byte {}", input::name(file), error.offset()),
-        "see whether it is one whole message or letter in the bit-efficient encoding, and whether \
-         --hex is missing",
+        "see whether it is one whole message or letter, and whether --hex is missing; --explain \
+         shows what stands in front of it",
     )
 }
 
