@@ -2,6 +2,11 @@
 
 use std::fmt;
 
+/// The user-defined parameter by which JADE says that content is Base64, without `X-`.
+pub(crate) const JADE_ENCODING: &str = "JADE-Encoding";
+/// The value that says so, whatever its case.
+pub(crate) const BASE64: &str = "Base64";
+
 /// Which reader an encoding is written for.
 ///
 /// Reading needs none of this: every reader takes the standard and what both peers write.

@@ -2,8 +2,10 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
+mod recorded;
+
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
@@ -13,11 +15,13 @@ use fipa_acl::{
     AclRepresentation, AgentId, Dialect, EnvelopeView, Letter, Message, MessageView, Payload,
     Performative, Representation, Zone,
 };
-use serde_json::{Value, json};
+use serde_json::json;
+
+use self::recorded::{expected, name, vector, vectors, with_base64};
 
 #[test]
 fn every_message_of_the_cpp_library() {
-    let files = vectors('m');
+    let files = vectors('m', "be");
     assert!(files.len() >= 35, "only {} found", files.len());
     for path in files {
         let mut expected = expected(&path)["message"].take();
@@ -42,7 +46,7 @@ fn every_message_of_the_cpp_library() {
 
 #[test]
 fn every_letter_of_the_cpp_library() {
-    let files = vectors('e');
+    let files = vectors('e', "be");
     assert!(files.len() >= 11, "only {} found", files.len());
     for path in files {
         let mut expected = expected(&path);
@@ -170,7 +174,7 @@ fn messages_of_jade() {
 
 #[test]
 fn every_string_message_of_the_cpp_library() {
-    let files = vectors_with('m', "str");
+    let files = vectors('m', "str");
     assert!(files.len() >= 35, "only {} found", files.len());
     for path in files {
         let expected = expected(&path)["message"].take();
@@ -302,43 +306,4 @@ fn string_decoded(bytes: &Bytes, path: &Path) -> Message {
         assert!(shared, "{}", path.display());
     }
     message
-}
-
-fn with_base64(message: &Message) -> Value {
-    let mut json = message_to_json(message);
-    let object = json.as_object_mut().unwrap();
-    if let Some(text) = object.remove("content") {
-        let encoded = BASE64.encode(text.as_str().unwrap());
-        object.insert("content_base64".into(), Value::String(encoded));
-    }
-    json
-}
-
-fn expected(path: &Path) -> Value {
-    serde_json::from_slice(&fs::read(path.with_extension("json")).unwrap()).unwrap()
-}
-
-fn name(path: &Path) -> &str {
-    path.file_stem().unwrap().to_str().unwrap()
-}
-
-fn vector(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("tests/vectors")
-        .join(name)
-}
-
-fn vectors(initial: char) -> Vec<PathBuf> {
-    vectors_with(initial, "be")
-}
-
-fn vectors_with(initial: char, extension: &str) -> Vec<PathBuf> {
-    let mut found: Vec<_> = fs::read_dir(vector(""))
-        .unwrap()
-        .map(|entry| entry.unwrap().path())
-        .filter(|path| path.extension().is_some_and(|ext| ext == extension))
-        .filter(|path| name(path).starts_with(initial))
-        .collect();
-    found.sort();
-    found
 }

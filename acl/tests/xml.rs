@@ -3,8 +3,9 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
+mod recorded;
+
 use std::fs;
-use std::path::{Path, PathBuf};
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
@@ -14,7 +15,9 @@ use fipa_acl::{
     AclRepresentation, AgentId, DecodeError, Dialect, EncodeError, Envelope, EnvelopeParams,
     Letter, Message, Payload, Performative, Problem, Received, Representation, Time, Zone,
 };
-use serde_json::{Value, json};
+use serde_json::json;
+
+use self::recorded::{expected, name, vector, vectors, with_base64};
 
 #[test]
 fn every_message_of_the_cpp_library() {
@@ -547,40 +550,4 @@ fn read(xml: &str) -> Result<Message, DecodeError> {
 
 fn problem(xml: &str) -> Problem {
     read(xml).unwrap_err().problem().clone()
-}
-
-/// The recorded JSON has all content as Base64.
-fn with_base64(message: &Message) -> Value {
-    let mut json = message_to_json(message);
-    let object = json.as_object_mut().unwrap();
-    if let Some(text) = object.remove("content") {
-        let encoded = BASE64.encode(text.as_str().unwrap());
-        object.insert("content_base64".into(), Value::String(encoded));
-    }
-    json
-}
-
-fn expected(path: &Path) -> Value {
-    serde_json::from_slice(&fs::read(path.with_extension("json")).unwrap()).unwrap()
-}
-
-fn name(path: &Path) -> &str {
-    path.file_stem().unwrap().to_str().unwrap()
-}
-
-fn vector(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("tests/vectors")
-        .join(name)
-}
-
-fn vectors(initial: char, extension: &str) -> Vec<PathBuf> {
-    let mut found: Vec<_> = fs::read_dir(vector(""))
-        .unwrap()
-        .map(|entry| entry.unwrap().path())
-        .filter(|path| path.extension().is_some_and(|ext| ext == extension))
-        .filter(|path| name(path).starts_with(initial))
-        .collect();
-    found.sort();
-    found
 }

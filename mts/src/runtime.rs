@@ -235,12 +235,7 @@ impl Mts {
         len: usize,
         tail_room: usize,
     ) -> Box<dyn LoanedContent> {
-        let way = self
-            .shared
-            .state
-            .lock()
-            .core
-            .first_way(Now::read(), receiver);
+        let way = self.first_way(receiver);
         let loaned = way.and_then(|way| {
             let transport = self.shared.transport(way.kind())?;
             match transport.loan(&way, head_room, len, tail_room) {
@@ -255,8 +250,7 @@ impl Mts {
     }
 
     /// The way a letter to this receiver would take first, now.
-    #[must_use]
-    pub fn first_way(&self, receiver: &str) -> Option<Location> {
+    fn first_way(&self, receiver: &str) -> Option<Location> {
         self.shared
             .state
             .lock()

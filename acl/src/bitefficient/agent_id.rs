@@ -148,18 +148,7 @@ pub(crate) fn agent_ids<'a, N: Notes>(
     depth: usize,
     set: &'static str,
 ) -> Result<&'a [u8], DecodeError> {
-    reader.note(|| set.to_owned());
-    reader.notes().deeper();
-    let start = reader.position();
-    loop {
-        let ids = reader.since(start);
-        if reader.take_if(0x01) {
-            reader.notes().shallower();
-            reader.note(|| format!("end of {set}"));
-            return Ok(ids);
-        }
-        agent_id(reader, depth)?;
-    }
+    reader.set(set, |reader| agent_id(reader, depth))
 }
 
 enum Parameter<'a> {

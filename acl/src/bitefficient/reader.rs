@@ -48,6 +48,27 @@ impl<'a, N: Notes> Reader<'a, N> {
         &mut self.notes
     }
 
+    /// Reads a set or sequence member by member up to its end, and gives the bytes in front of that.
+    #[inline]
+    pub(crate) fn set<T>(
+        &mut self,
+        name: &'static str,
+        mut member: impl FnMut(&mut Self) -> Result<T>,
+    ) -> Result<&'a [u8]> {
+        self.note(|| name.to_owned());
+        self.notes().deeper();
+        let start = self.position();
+        loop {
+            let members = self.since(start);
+            if self.take_if(0x01) {
+                self.notes().shallower();
+                self.note(|| format!("end of {name}"));
+                return Ok(members);
+            }
+            member(self)?;
+        }
+    }
+
     /// A second reader at the same place, to look ahead; nobody is told what it reads.
     #[inline]
     pub(crate) fn ahead(&self) -> Reader<'a> {

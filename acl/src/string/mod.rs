@@ -9,12 +9,10 @@ mod lex;
 mod read;
 mod write;
 
+use crate::dialect::{BASE64, JADE_ENCODING};
+
 pub(crate) use read::decode;
 pub(crate) use write::encode;
-
-/// The user-defined parameter by which JADE says that the content is Base64, without `X-`.
-const JADE_ENCODING: &str = "JADE-Encoding";
-const BASE64: &str = "Base64";
 
 /// Whether the user-defined parameter makes readers take the content for Base64.
 fn announces_base64((name, value): &(String, String)) -> bool {

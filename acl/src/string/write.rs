@@ -4,9 +4,10 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64_ENGINE;
 use bytes::Bytes;
 
+use super::announces_base64;
 use super::lex::{Keywords, holds_keyword};
 use super::read::{PARAMETERS, SLOTS};
-use super::{BASE64, JADE_ENCODING, announces_base64};
+use crate::dialect::{BASE64, JADE_ENCODING};
 use crate::error::EncodeError;
 use crate::time::{Time, Zone};
 use crate::word::{Piece, is_quotable, is_token, is_word, quoted, string_literal};

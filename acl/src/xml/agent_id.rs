@@ -117,6 +117,31 @@ pub(super) enum Form {
     Envelope,
 }
 
+/// Writes elements with agent identifiers in them, all in one where the dialect's reader takes it.
+pub(super) fn write_all(
+    out: &mut Out,
+    element: &str,
+    agents: &[AgentId],
+    form: Form,
+    dialect: Dialect,
+) -> Result<(), EncodeError> {
+    // JADE writes one agent in each element and reads no more from one of a message;
+    // fipa_services reads only the last element of an envelope.
+    let at_once = if dialect == Dialect::Jade {
+        1
+    } else {
+        agents.len().max(1)
+    };
+    for group in agents.chunks(at_once) {
+        out.open(element);
+        for agent in group {
+            write(out, agent, form, dialect)?;
+        }
+        out.close(element);
+    }
+    Ok(())
+}
+
 pub(super) fn write(
     out: &mut Out,
     agent: &AgentId,

@@ -6,7 +6,7 @@ use crate::error::EncodeError;
 use crate::xml::agent_id::{self, Form};
 use crate::xml::message_write::without_zone;
 use crate::xml::out::Out;
-use crate::{AgentId, Dialect, Envelope, EnvelopeParams, Received, Time};
+use crate::{Dialect, Envelope, EnvelopeParams, Received, Time};
 
 /// The encoded envelope, all extensions included.
 ///
@@ -42,9 +42,15 @@ fn write_part(
     dialect: Dialect,
 ) -> Result<(), EncodeError> {
     out.raw(&format!("<params index=\"{index}\">"));
-    write_agents(out, "to", &params.to, dialect)?;
+    agent_id::write_all(out, "to", &params.to, Form::Envelope, dialect)?;
     let from = params.from.as_ref().map(std::slice::from_ref);
-    write_agents(out, "from", from.unwrap_or_default(), dialect)?;
+    agent_id::write_all(
+        out,
+        "from",
+        from.unwrap_or_default(),
+        Form::Envelope,
+        dialect,
+    )?;
     write_text(out, "comments", params.comments.as_deref())?;
     if let Some(representation) = &params.acl_representation {
         let (element, name) = ("acl-representation", representation.as_str());
@@ -60,7 +66,7 @@ fn write_part(
         out.element("date", "date", &time_text("date", date, dialect)?)?;
     }
     let intended = &params.intended_receivers;
-    write_agents(out, "intended-receiver", intended, dialect)?;
+    agent_id::write_all(out, "intended-receiver", intended, Form::Envelope, dialect)?;
     if let Some(behaviour) = params.transport_behaviour.as_deref() {
         if dialect != Dialect::Standard {
             return Err(EncodeError::Unrepresentable {
@@ -82,28 +88,6 @@ fn write_part(
         write_user_defined(out, user_defined, dialect)?;
     }
     out.close("params");
-    Ok(())
-}
-
-fn write_agents(
-    out: &mut Out,
-    element: &str,
-    agents: &[AgentId],
-    dialect: Dialect,
-) -> Result<(), EncodeError> {
-    // JADE writes one agent in each element; fipa_services reads only the last element.
-    let at_once = if dialect == Dialect::Jade {
-        1
-    } else {
-        agents.len().max(1)
-    };
-    for group in agents.chunks(at_once) {
-        out.open(element);
-        for agent in group {
-            agent_id::write(out, agent, Form::Envelope, dialect)?;
-        }
-        out.close(element);
-    }
     Ok(())
 }
 

@@ -3,9 +3,10 @@
 use std::borrow::Cow;
 
 use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD as BASE64;
+use base64::engine::general_purpose::STANDARD;
 use bytes::Bytes;
 
+use crate::dialect::{BASE64, JADE_ENCODING};
 use crate::error::{DecodeError, Problem};
 use crate::word::is_token;
 use crate::xml::agent_id;
@@ -13,9 +14,6 @@ use crate::xml::reader::{Element, Elements, Value};
 use crate::{AgentId, Message, Payload};
 
 const CLAUSE: &str = "FIPA00071";
-
-/// The user-defined parameter by which JADE says that content is binary (its only value: Base64).
-pub(super) const JADE_ENCODING: &str = "JADE-Encoding";
 
 /// Reads a message. The content of the result shares the memory it was given in, unless it is
 /// escaped.
@@ -123,7 +121,7 @@ fn content_value<'a>(
 /// Whether JADE says that the content is Base64; this is part of the encoding, not of the message.
 fn take_jade_encoding(message: &mut Message) -> bool {
     let said = |(name, value): &(String, String)| {
-        name.eq_ignore_ascii_case(JADE_ENCODING) && value.trim().eq_ignore_ascii_case("base64")
+        name.eq_ignore_ascii_case(JADE_ENCODING) && value.trim().eq_ignore_ascii_case(BASE64)
     };
     let before = message.user_defined.len();
     message.user_defined.retain(|pair| !said(pair));
@@ -139,7 +137,7 @@ fn content_bytes(content: &Value<'_>, base64: bool, whole: &Bytes) -> Result<Byt
             .filter(|byte| !byte.is_ascii_whitespace())
             .collect();
         let wrong = |_| DecodeError::new(content.offset, CLAUSE, Problem::Base64);
-        return Ok(BASE64.decode(dense).map_err(wrong)?.into());
+        return Ok(STANDARD.decode(dense).map_err(wrong)?.into());
     }
     Ok(match bytes {
         Cow::Borrowed([]) => Bytes::new(),

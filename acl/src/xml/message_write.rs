@@ -2,11 +2,11 @@
 
 use bytes::Bytes;
 
+use crate::dialect::JADE_ENCODING;
 use crate::error::EncodeError;
 use crate::xml::agent_id::{self, Form};
-use crate::xml::message_read::JADE_ENCODING;
 use crate::xml::out::Out;
-use crate::{AgentId, Dialect, Message, Performative, Time, Zone};
+use crate::{Dialect, Message, Performative, Time, Zone};
 
 /// The encoded message.
 ///
@@ -38,7 +38,7 @@ pub(crate) fn encode(message: &Message, dialect: Dialect) -> Result<Bytes, Encod
         [receivers, sender]
     };
     for (element, agents) in first {
-        write_agents(&mut out, element, agents, dialect)?;
+        agent_id::write_all(&mut out, element, agents, Form::Message, dialect)?;
     }
     write_content(&mut out, message, dialect)?;
     for (element, text) in [
@@ -61,7 +61,13 @@ pub(crate) fn encode(message: &Message, dialect: Dialect) -> Result<Bytes, Encod
         let text = time_text(time, dialect)?;
         out.empty("reply-by", "time", "reply-by", &text)?;
     }
-    write_agents(&mut out, "reply-to", message.reply_to(), dialect)?;
+    agent_id::write_all(
+        &mut out,
+        "reply-to",
+        message.reply_to(),
+        Form::Message,
+        dialect,
+    )?;
     if !jade {
         let conversation = message.conversation_id();
         write_text(&mut out, "conversation-id", conversation, dialect)?;
@@ -95,28 +101,6 @@ fn act(message: &Message, jade: bool) -> Result<String, EncodeError> {
         act if jade => Ok(act.as_str().to_ascii_uppercase()),
         act => Ok(act.as_str().to_owned()),
     }
-}
-
-fn write_agents(
-    out: &mut Out,
-    element: &str,
-    agents: &[AgentId],
-    dialect: Dialect,
-) -> Result<(), EncodeError> {
-    // JADE reads one agent in each element.
-    let at_once = if dialect == Dialect::Jade {
-        1
-    } else {
-        agents.len().max(1)
-    };
-    for group in agents.chunks(at_once) {
-        out.open(element);
-        for agent in group {
-            agent_id::write(out, agent, Form::Message, dialect)?;
-        }
-        out.close(element);
-    }
-    Ok(())
 }
 
 fn write_content(out: &mut Out, message: &Message, dialect: Dialect) -> Result<(), EncodeError> {
