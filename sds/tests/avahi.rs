@@ -225,7 +225,9 @@ async fn peers_are_read(directory: &MdnsDirectory) {
     assert_eq!(found.source, Source::Mdns);
     assert_eq!(
         found.locations,
-        ["tcp://192.0.2.2:7788".parse::<Location>().unwrap()]
+        ["tcp://192.0.2.2:7788;fipa-services"
+            .parse::<Location>()
+            .unwrap()]
     );
     drop(peer);
     eventually("the peer has left", || {

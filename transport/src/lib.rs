@@ -22,7 +22,7 @@ pub mod wire;
 
 pub use faulty::{Fault, Faulty};
 pub use incarnation::Incarnation;
-pub use location::{Kind, Location, LocationError};
+pub use location::{Kind, Location, LocationError, Signature};
 pub use outcome::{Attempt, FailureReason, Outcome};
 pub use parcel::{Body, Parcel, Report, Stream};
 pub use transport::{

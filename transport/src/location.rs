@@ -56,19 +56,87 @@ impl FromStr for Kind {
     }
 }
 
-/// An address at which a message transport service can be reached, with the incarnation of the
-/// service that listened there.
+/// What is understood at a location: the signature type of a service locator (FIPA00001), which
+/// the peers call the signature of a location.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[non_exhaustive]
+pub enum Signature {
+    /// This project's own frames, acknowledged.
+    #[default]
+    Frames,
+    /// One letter per connection, bit-efficient in the dialect of fipa_services, not acknowledged.
+    FipaServices,
+    /// One letter per connection, an XML envelope and a string message, not acknowledged: JADE's
+    /// proxy agent.
+    JadeProxy,
+}
+
+impl Signature {
+    /// Every signature.
+    pub const ALL: [Self; 3] = [Self::Frames, Self::FipaServices, Self::JadeProxy];
+
+    /// How it is written behind the address of a [`Location`]; our own is not written.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Frames => "fipa",
+            Self::FipaServices => "fipa-services",
+            Self::JadeProxy => "jade",
+        }
+    }
+
+    /// How the peers write it in the directory. What speaks frames takes the letters of
+    /// fipa_services on the same port, so it bears their signature, too.
+    #[must_use]
+    pub const fn signature_type(self) -> &'static str {
+        match self {
+            Self::Frames | Self::FipaServices => "fipa::services::transports::MessageTransport",
+            Self::JadeProxy => "JadeProxyAgent",
+        }
+    }
+
+    /// What an old peer means by a signature type, if it is one that is known here. Never
+    /// [`Signature::Frames`], which the peers cannot tell from their own.
+    #[must_use]
+    pub fn of_signature_type(text: &str) -> Option<Self> {
+        [Self::FipaServices, Self::JadeProxy]
+            .into_iter()
+            .find(|signature| signature.signature_type() == text)
+    }
+}
+
+impl fmt::Display for Signature {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+impl FromStr for Signature {
+    type Err = LocationError;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        Self::ALL
+            .into_iter()
+            .find(|signature| signature.name() == text)
+            .ok_or_else(|| LocationError::UnknownSignature(text.chars().take(40).collect()))
+    }
+}
+
+/// An address at which a message transport service can be reached, what is understood there, and
+/// the incarnation of the service that listened there.
 ///
-/// Written `kind://address` or `kind://address#incarnation`, for example
-/// `tcp://10.0.0.2:7788#00abcdef01234567`. What `address` means is up to the transport. A
-/// transport that connects to a location with a known incarnation and finds another one there
-/// reports that nobody was reached: ports are reused.
+/// Written `kind://address`, then `;signature` unless our own frames are understood there, then
+/// `#incarnation` when it is known: `tcp://10.0.0.2:7788#00abcdef01234567`,
+/// `tcp://10.0.0.3:6789;fipa-services`, `tcp://10.0.0.4:6789;jade`. What `address` means is up to
+/// the transport. A transport that connects to a location with a known incarnation and finds
+/// another one there reports that nobody was reached: ports are reused.
 ///
 /// Cheap to clone.
 #[derive(Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Location {
     kind: Kind,
     address: Arc<str>,
+    signature: Signature,
     incarnation: Incarnation,
 }
 
@@ -76,7 +144,7 @@ impl Location {
     /// Longest address accepted, in bytes.
     pub const MAX_ADDRESS: usize = 512;
 
-    /// A location of a service whose incarnation is not known.
+    /// A location of a service that understands our frames and whose incarnation is not known.
     ///
     /// # Errors
     /// When the address is empty, too long, or has characters that an address cannot have
@@ -96,6 +164,7 @@ impl Location {
         Ok(Self {
             kind,
             address: address.into(),
+            signature: Signature::Frames,
             incarnation: Incarnation::UNKNOWN,
         })
     }
@@ -105,6 +174,19 @@ impl Location {
     pub fn with_incarnation(mut self, incarnation: Incarnation) -> Self {
         self.incarnation = incarnation;
         self
+    }
+
+    /// The same location, where this is understood.
+    ///
+    /// # Errors
+    /// When the kind of transport is not TCP, over which alone the old peers are reached, and
+    /// something else than frames is to be spoken.
+    pub fn with_signature(mut self, signature: Signature) -> Result<Self, LocationError> {
+        if signature != Signature::Frames && self.kind != Kind::Tcp {
+            return Err(LocationError::NotOverKind(signature, self.kind));
+        }
+        self.signature = signature;
+        Ok(self)
     }
 
     /// The transport that can reach it.
@@ -119,6 +201,12 @@ impl Location {
         &self.address
     }
 
+    /// What is understood there.
+    #[must_use]
+    pub fn signature(&self) -> Signature {
+        self.signature
+    }
+
     /// The incarnation of the message transport service at this location, which may be unknown.
     #[must_use]
     pub fn incarnation(&self) -> Incarnation {
@@ -129,6 +217,9 @@ impl Location {
 impl fmt::Display for Location {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}://{}", self.kind, self.address)?;
+        if self.signature != Signature::Frames {
+            write!(f, ";{}", self.signature)?;
+        }
         if self.incarnation.is_known() {
             write!(f, "#{}", self.incarnation)?;
         }
@@ -158,6 +249,12 @@ pub enum LocationError {
     /// The address has characters that no address has.
     #[error("address with white space, control characters, '#' or ';': {0:?}")]
     AddressCharacters(String),
+    /// What stands behind `;` is no signature.
+    #[error("unknown signature behind ';' (known: fipa-services, jade, fipa): {0:?}")]
+    UnknownSignature(String),
+    /// The transport does not reach those who speak so.
+    #[error("{0} is spoken over tcp only, not over {1}")]
+    NotOverKind(Signature, Kind),
     /// What stands behind `#` is not an incarnation.
     #[error("not an incarnation behind '#' (16 hexadecimal digits expected): {0:?}")]
     Incarnation(String),
@@ -172,17 +269,23 @@ impl FromStr for Location {
             .split_once("://")
             .ok_or_else(|| LocationError::NoScheme(short()))?;
         let kind = kind.parse()?;
-        let (address, incarnation) = match rest.split_once('#') {
-            Some((address, digits)) => {
+        let (rest, incarnation) = match rest.split_once('#') {
+            Some((rest, digits)) => {
                 let parsed = digits.parse();
                 (
-                    address,
+                    rest,
                     parsed.map_err(|_| LocationError::Incarnation(short()))?,
                 )
             }
             None => (rest, Incarnation::UNKNOWN),
         };
-        Ok(Self::new(kind, address)?.with_incarnation(incarnation))
+        let (address, signature) = match rest.split_once(';') {
+            Some((address, signature)) => (address, signature.parse()?),
+            None => (rest, Signature::Frames),
+        };
+        Self::new(kind, address)?
+            .with_incarnation(incarnation)
+            .with_signature(signature)
     }
 }
 
@@ -210,9 +313,35 @@ mod tests {
             "tcp://10.0.0.2:7788",
             "tcp://[fe80::1%eth0]:7788#00abcdef01234567",
             "shm://0000000000000001#0000000000000001",
+            "tcp://10.0.0.3:6789;fipa-services",
+            "tcp://[fe80::1%eth0]:6789;jade#00abcdef01234567",
         ] {
             assert_eq!(text.parse::<Location>().unwrap().to_string(), text);
         }
+    }
+
+    #[test]
+    fn our_own_signature_need_not_be_written() {
+        let plain: Location = "tcp://10.0.0.2:7788".parse().unwrap();
+        assert_eq!(plain.signature(), Signature::Frames);
+        assert_eq!("tcp://10.0.0.2:7788;fipa".parse(), Ok(plain.clone()));
+        let old = plain.clone().with_signature(Signature::FipaServices);
+        assert_ne!(old, Ok(plain));
+    }
+
+    #[test]
+    fn signature_types_of_the_peers_are_known() {
+        for (text, signature) in [
+            (
+                "fipa::services::transports::MessageTransport",
+                Signature::FipaServices,
+            ),
+            ("JadeProxyAgent", Signature::JadeProxy),
+        ] {
+            assert_eq!(Signature::of_signature_type(text), Some(signature));
+            assert_eq!(signature.signature_type(), text);
+        }
+        assert_eq!(Signature::of_signature_type("fipa"), None);
     }
 
     #[test]
@@ -225,6 +354,12 @@ mod tests {
             "tcp://a b",
             "tcp://a#1",
             "tcp://a;b",
+            "tcp://a;",
+            "tcp://;jade",
+            "tcp://a;jade;jade",
+            "tcp://a#0000000000000001;jade",
+            "udp://a;jade",
+            "shm://a;fipa-services",
         ] {
             assert!(text.parse::<Location>().is_err(), "{text:?}");
         }

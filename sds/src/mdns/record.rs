@@ -30,13 +30,10 @@
 
 use std::time::SystemTime;
 
-use fipa_transport::{Incarnation, Kind, Location};
+use fipa_transport::{Incarnation, Kind, Location, LocationError, Signature};
 
 use crate::entry::{millis_of_time, time_of_millis};
 use crate::{Entry, EntryError, Mts, Reach, Role, Source};
-
-/// The signature of the peers' locations that speak what we speak.
-const SIGNATURE: &str = "fipa::services::transports::MessageTransport";
 
 /// Longest value that the peers write, and that we write into one string.
 const MAX_VALUE: usize = 200;
@@ -194,8 +191,8 @@ fn ours(record: &Record<'_>) -> Result<Entry, RecordError> {
     for location in locations.split(' ').filter(|location| !location.is_empty()) {
         match location.parse() {
             Ok(location) => known.push(location),
-            // A transport that a later version has is no reason not to use the others.
-            Err(fipa_transport::LocationError::UnknownKind(_)) => {}
+            // What a later version has is no reason not to use the others.
+            Err(LocationError::UnknownKind(_) | LocationError::UnknownSignature(_)) => {}
             Err(_) => return Err(RecordError::Value(key)),
         }
     }
@@ -259,7 +256,8 @@ fn locator(locations: &[Location]) -> String {
         if location.kind() != Kind::Tcp || numeric.is_err() {
             continue;
         }
-        let one = format!("tcp://{} {SIGNATURE};", location.address());
+        let signature = location.signature().signature_type();
+        let one = format!("tcp://{} {signature};", location.address());
         if locator.len() + one.len() <= MAX_VALUE {
             locator += &one;
         }
@@ -268,15 +266,17 @@ fn locator(locations: &[Location]) -> String {
 }
 
 /// `address signature[ service-signature];`, repeated. Schemes that we do not have are left out,
-/// and so are signatures of what we cannot speak (JADE's proxy agent), rather than sending there
-/// what nobody understands.
+/// and so are signatures of what we cannot speak, rather than sending there what nobody
+/// understands.
 fn locations_of_locator(locator: &str) -> Vec<Location> {
     let location = |one: &str| {
         let mut words = one.split_ascii_whitespace();
-        let address = words.next()?;
-        let understood = words.next().is_none_or(|signature| signature == SIGNATURE);
-        let location: Location = address.parse().ok()?;
-        (understood && location.kind() == Kind::Tcp).then_some(location)
+        let address: Location = words.next()?.parse().ok()?;
+        let signature = match words.next() {
+            Some(text) => Signature::of_signature_type(text)?,
+            None => Signature::FipaServices,
+        };
+        address.with_signature(signature).ok()
     };
     let locations = locator.split(';').filter_map(location);
     locations.take(Entry::MAX_LOCATIONS).collect()
@@ -395,7 +395,10 @@ mod tests {
         assert_eq!(entry.agent_type, "\u{fffd}sensor");
         assert_eq!(
             entry.locations,
-            ["tcp://10.0.0.2:7788".parse::<Location>().unwrap()]
+            [
+                "tcp://10.0.0.2:7788;fipa-services".parse().unwrap(),
+                "tcp://10.0.0.3:6789;jade".parse::<Location>().unwrap(),
+            ]
         );
         assert_eq!(entry.description, "");
         assert_eq!(entry.registered, example().registered);
@@ -484,10 +487,13 @@ mod tests {
     fn any_location() -> impl Strategy<Value = Location> {
         let kind = prop::sample::select(Kind::ALL.to_vec());
         let address = "[!-\"$-:<-~é]{1,200}";
-        (kind, address, any::<u64>()).prop_map(|(kind, address, incarnation)| {
-            Location::new(kind, &address)
+        let signature = prop::sample::select(Signature::ALL.to_vec());
+        let parts = (kind, address, signature, any::<u64>());
+        parts.prop_map(|(kind, address, signature, incarnation)| {
+            let plain = Location::new(kind, &address)
                 .unwrap()
-                .with_incarnation(Incarnation::from_u64(incarnation))
+                .with_incarnation(Incarnation::from_u64(incarnation));
+            plain.clone().with_signature(signature).unwrap_or(plain)
         })
     }
 

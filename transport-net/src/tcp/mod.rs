@@ -25,8 +25,8 @@ mod unframed;
 use std::sync::Arc;
 
 use fipa_transport::{
-    Answer, AttemptId, Kind, ListenError, Location, Parcel, Sink, Ticket, Transport, WayError,
-    WayFault,
+    Answer, AttemptId, Kind, ListenError, Location, Parcel, Signature, Sink, Ticket, Transport,
+    WayError, WayFault,
 };
 use tokio::net::TcpListener;
 use tokio::runtime::Handle;
@@ -85,6 +85,10 @@ impl TcpTransport {
         if to.kind() != Kind::Tcp {
             let detail = format!("{to} is no TCP location");
             return Err(WayError::new(WayFault::Unreachable, detail));
+        }
+        if to.signature() != Signature::Frames {
+            let detail = format!("{to} does not understand frames");
+            return Err(WayError::new(WayFault::Incompatible, detail));
         }
         if parcel.receiver.is_empty() || parcel.receiver.len() > Parcel::MAX_NAME {
             let detail = "the receiver's name is empty or too long";
