@@ -1,144 +1,55 @@
-//! With the real Avahi, in a network namespace of its own: what we announce, `avahi-browse` shows
-//! to the peers' taste, and what `avahi-publish` announces, we find.
+//! With the real Avahi on another host: what we announce, `avahi-browse` shows to the peers'
+//! taste, and what `avahi-publish` announces, we find.
 //!
-//! Needs root, and of Debian the packages avahi-daemon, avahi-utils, dbus, iproute2 and
-//! util-linux. Where they are missing the test says so and is skipped; in CI it fails.
+//! Needs root, and of Debian the packages avahi-daemon, avahi-utils, dbus and iproute2. Where they
+//! are missing the test says so and is skipped; in CI it fails.
 
 // The exception that clippy.toml makes for tests does not reach what they call.
 #![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)]
 
 mod common;
 
-use std::path::Path;
-use std::process::{Child, Command, Stdio};
-
 use common::{eventually, registration};
-use fipa_sds::{Directory, MdnsConfig, MdnsDirectory, Mts, Source};
+use fipa_sds::{Change, Directory, MdnsConfig, MdnsDirectory, Mts, RegisterError, Role, Source};
+use fipa_testbed::{Avahi, Network};
 use fipa_transport::{Incarnation, Location};
 
-const TOOLS: [&str; 6] = [
-    "avahi-daemon",
-    "avahi-browse",
-    "avahi-publish",
-    "dbus-daemon",
-    "ip",
-    "unshare",
-];
+const SERVICE_TYPE: &str = "_fipa_service_directory._udp";
+const SIGNATURE: &str = "fipa::services::transports::MessageTransport";
 
 #[test]
 fn avahi_and_we_read_each_other() {
-    let mut missing: Vec<&str> = TOOLS.into_iter().filter(|tool| !is_there(tool)).collect();
-    if !rustix::process::geteuid().is_root() {
-        missing.push("root");
-    }
-    if !missing.is_empty() {
-        let missing = missing.join(", ");
-        assert!(
-            std::env::var("CI").as_deref() != Ok("true"),
-            "missing: {missing}"
-        );
-        eprintln!("SKIPPED, not a success: the test with Avahi needs {missing}");
-        return;
-    }
-    // What is started in there ends with it: the namespace of processes, too, is its own.
-    let status = Command::new("unshare")
-        .args(["--net", "--mount", "--pid", "--fork", "--kill-child"])
-        .args(["--mount-proc", "--"])
-        .arg(std::env::current_exe().unwrap())
-        .args(["--exact", "in_the_namespace", "--ignored", "--nocapture"])
-        .env(INSIDE, "1")
-        .status()
-        .unwrap();
-    assert!(status.success(), "see above");
+    fipa_testbed::isolated("inside_avahi_and_we_read_each_other", &Avahi::TOOLS);
 }
 
-const INSIDE: &str = "FIPA_SDS_TEST_IN_NAMESPACE";
-
-fn is_there(tool: &str) -> bool {
-    let path = std::env::var_os("PATH").unwrap_or_default();
-    let mut dirs = std::env::split_paths(&path).chain(["/usr/sbin".into(), "/sbin".into()]);
-    dirs.any(|dir| dir.join(tool).is_file())
+#[test]
+#[ignore = "is run by the other test in namespaces of its own"]
+fn inside_avahi_and_we_read_each_other() {
+    fipa_testbed::enter();
+    let network = Network::new(2);
+    let avahi = Avahi::start(network.host(1));
+    network.host(0).enter(|| {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        runtime.block_on(async {
+            let directory = open("sherpa-mts");
+            we_are_read(&directory, &avahi).await;
+            peers_are_read(&directory, &avahi).await;
+            split_values_are_read(&directory, &avahi).await;
+            records_with_little_in_them_are_read(&directory, &avahi).await;
+            names_conflict(&directory, &avahi).await;
+            assert_eq!(directory.status().last_error, None);
+            assert_eq!(directory.status().refused, 0);
+            all_interfaces_include_loopback().await;
+        });
+    });
 }
 
-const BUS_CONFIG: &str = r#"<!DOCTYPE busconfig PUBLIC
- "-//freedesktop//DTD D-Bus Bus Configuration 1.0//EN"
- "http://www.freedesktop.org/standards/dbus/1.0/busconfig.dtd">
-<busconfig><type>system</type><listen>unix:path=/run/fipa-test-bus</listen>
-<auth>EXTERNAL</auth><policy context="default"><allow user="*"/><allow own="*"/>
-<allow send_destination="*"/><allow receive_sender="*"/></policy></busconfig>"#;
-
-const AVAHI_CONFIG: &str = "[server]\nhost-name=peer\nallow-interfaces=fipa0\nuse-ipv6=no\n\
-[publish]\npublish-workstation=no\n";
-
-const BUS_VARIABLE: &str = "DBUS_SYSTEM_BUS_ADDRESS";
-const BUS: &str = "unix:path=/run/fipa-test-bus";
-
-/// A process that ends with the test.
-struct Running(Child);
-
-impl Running {
-    fn start(command: &mut Command) -> Self {
-        Self(command.env(BUS_VARIABLE, BUS).spawn().unwrap())
-    }
-}
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-fn run(command: &str) {
-    let mut words = command.split(' ');
-    let status = Command::new(words.next().unwrap()).args(words).status();
-    assert!(status.unwrap().success(), "{command}");
-}
-
-#[tokio::test]
-#[ignore = "is run by the other test in a network namespace"]
-async fn in_the_namespace() {
-    assert!(
-        std::env::var_os(INSIDE).is_some(),
-        "started by the other test"
-    );
-    // Avahi keeps its process number and socket in /run, and takes no loopback interface.
-    run("mount -t tmpfs tmpfs /run");
-    run("ip link set lo up");
-    run("ip link add fipa0 type veth peer name fipa1");
-    run("ip addr add 10.99.0.1/24 dev fipa0");
-    run("ip link set fipa0 up");
-    run("ip link set fipa1 up");
-    std::fs::write("/run/bus.conf", BUS_CONFIG).unwrap();
-    std::fs::write("/run/avahi.conf", AVAHI_CONFIG).unwrap();
-    let _bus = Running::start(
-        Command::new("dbus-daemon").args(["--config-file=/run/bus.conf", "--nofork"]),
-    );
-    eventually("the bus", || {
-        Path::new("/run/fipa-test-bus").exists().then_some(())
-    })
-    .await;
-    let _avahi = Running::start(Command::new("avahi-daemon").args([
-        "--no-drop-root",
-        "--no-chroot",
-        "--no-rlimits",
-        "--file=/run/avahi.conf",
-    ]));
-    eventually("Avahi", || {
-        let check = Command::new("avahi-daemon").arg("--check").status();
-        check.unwrap().success().then_some(())
-    })
-    .await;
-
-    let directory = MdnsDirectory::open(MdnsConfig {
-        interfaces: vec!["fipa0".to_owned()],
-        ..MdnsConfig::new(Mts::new("sherpa-mts", Incarnation::random()))
-    })
-    .unwrap();
-    we_are_read(&directory).await;
-    peers_are_read(&directory).await;
-    assert_eq!(directory.status().last_error, None);
-    all_interfaces_include_loopback().await;
+fn open(name: &str) -> MdnsDirectory {
+    let config = MdnsConfig {
+        interfaces: vec!["eth0".to_owned()],
+        ..MdnsConfig::new(Mts::new(name, Incarnation::random()))
+    };
+    MdnsDirectory::open(config).unwrap()
 }
 
 /// In the namespace, too, because outside it would be heard beyond this machine.
@@ -158,19 +69,15 @@ async fn all_interfaces_include_loopback() {
     eventually("said on loopback", || loopback.lookup("foot")).await;
 }
 
-/// The lines of `avahi-browse` about our agent.
-fn browse() -> String {
-    let output = Command::new("avahi-browse")
-        .args(["-rpt", "_fipa_service_directory._udp"])
-        .env(BUS_VARIABLE, BUS)
-        .stderr(Stdio::inherit())
-        .output()
-        .unwrap();
-    assert!(output.status.success(), "avahi-browse failed");
-    String::from_utf8(output.stdout).unwrap()
+/// The line of `avahi-browse` about a record that was resolved, with all of this in it.
+fn browsed(avahi: &Avahi<'_>, parts: &[&str]) -> Option<String> {
+    let lines = avahi.browse(SERVICE_TYPE);
+    let wanted =
+        |line: &String| line.starts_with('=') && parts.iter().all(|part| line.contains(part));
+    lines.into_iter().find(wanted)
 }
 
-async fn we_are_read(directory: &MdnsDirectory) {
+async fn we_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
     let mut agent = registration("arm.left");
     agent.description = "left".to_owned();
     agent.locations = vec![
@@ -179,17 +86,12 @@ async fn we_are_read(directory: &MdnsDirectory) {
     ];
     directory.register(agent.clone()).unwrap();
     let line = eventually("avahi-browse shows the agent", || {
-        let lines = browse();
-        // `=` is a record resolved; the label comes in decimal escapes.
-        let found = lines
-            .lines()
-            .find(|line| line.starts_with('=') && line.contains(r"arm\063left"));
-        found.map(str::to_owned)
+        browsed(avahi, &[r"arm\063left"])
     })
     .await;
     for expected in [
         "\"TYPE=gripper\"",
-        "\"LOCATOR=tcp://10.99.0.1:7788 fipa::services::transports::MessageTransport;\"",
+        &format!("\"LOCATOR=tcp://10.99.0.1:7788 {SIGNATURE};\""),
         "\"DESCRIPTION=left\"",
         "\"TIMESTAMP=2",
         "\"fipa-name=arm.left\"",
@@ -198,31 +100,43 @@ async fn we_are_read(directory: &MdnsDirectory) {
         assert!(line.contains(expected), "{expected} is not in: {line}");
     }
 
+    agent.description = "turned".to_owned();
+    directory.register(agent.clone()).unwrap();
+    eventually("avahi-browse shows the change", || {
+        browsed(avahi, &[r"arm\063left", "\"DESCRIPTION=turned\""])
+    })
+    .await;
+
     // A goodbye is understood, too.
     directory.deregister("arm.left", agent.incarnation).unwrap();
     eventually("avahi-browse no longer shows it", || {
-        (!browse().contains("arm")).then_some(())
+        let lines = avahi.browse(SERVICE_TYPE);
+        let gone = !lines.iter().any(|line| line.contains("arm"));
+        gone.then_some(())
     })
     .await;
 }
 
-async fn peers_are_read(directory: &MdnsDirectory) {
-    let peer = Running::start(Command::new("avahi-publish").args([
-        "-s",
+async fn peers_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
+    let locator =
+        format!("LOCATOR=udt://192.0.2.2:1 {SIGNATURE};tcp://192.0.2.2:7788 {SIGNATURE};");
+    let peer = avahi.publish(
         "echo@192?0?2?2:1099/JADE",
-        "_fipa_service_directory._udp",
-        "0",
-        "TYPE=echo agent",
-        "LOCATOR=udt://192.0.2.2:1 fipa::services::transports::MessageTransport;\
-         tcp://192.0.2.2:7788 fipa::services::transports::MessageTransport;",
-        "DESCRIPTION=answers",
-        "TIMESTAMP=20261120-11:00:00:123456",
-    ]));
+        SERVICE_TYPE,
+        0,
+        &[
+            "TYPE=echo agent",
+            &locator,
+            "DESCRIPTION=answers",
+            "TIMESTAMP=20261120-11:00:00:123456",
+        ],
+    );
     let name = "echo@192.0.2.2:1099/JADE";
     let found = eventually("the peer", || directory.lookup(name)).await;
     assert_eq!(found.agent_type, "echo agent");
     assert_eq!(found.description, "answers");
     assert_eq!(found.source, Source::Mdns);
+    assert_eq!(found.role, Role::Agent);
     assert_eq!(
         found.locations,
         ["tcp://192.0.2.2:7788;fipa-services"
@@ -230,7 +144,139 @@ async fn peers_are_read(directory: &MdnsDirectory) {
             .unwrap()]
     );
     drop(peer);
-    eventually("the peer has left", || {
+    gone(directory, name).await;
+}
+
+/// As fipa_services announces an agent with many transports: 1,300 bytes, with values split into
+/// strings of 200 bytes that repeat the key.
+async fn split_values_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
+    let mut watch = directory.watch();
+    let location =
+        |number: u16, scheme: &str| format!("{scheme}://10.99.0.2:{number} {SIGNATURE};");
+    let locator: String = (7000..7006)
+        .map(|number| location(number, "tcp") + &location(number, "udt"))
+        .collect();
+    let description = "d".repeat(250);
+    let mut strings = vec!["TYPE=crane".to_owned()];
+    for (key, value) in [("LOCATOR", &locator), ("DESCRIPTION", &description)] {
+        for part in value.as_bytes().chunks(200 - key.len() - 1) {
+            strings.push(format!("{key}={}", String::from_utf8_lossy(part)));
+        }
+    }
+    strings.push("TIMESTAMP=20261120-11:00:00:123456".to_owned());
+    let total: usize = strings.iter().map(|string| string.len() + 1).sum();
+    assert!((1100..=1300).contains(&total), "{total}");
+    let strings: Vec<&str> = strings.iter().map(String::as_str).collect();
+    let peer = avahi.publish("crane", SERVICE_TYPE, 0, &strings);
+
+    let found = eventually("all of the peer's locations", || {
+        let found = directory.lookup("crane")?;
+        assert!(
+            found
+                .locations
+                .iter()
+                .all(|location| location.kind().name() == "tcp")
+        );
+        (found.locations.len() == 6).then_some(found)
+    })
+    .await;
+    let addresses: Vec<_> = found.locations.iter().map(ToString::to_string).collect();
+    let expected: Vec<_> = (7000..7006)
+        .map(|port| format!("tcp://10.99.0.2:{port};fipa-services"))
+        .collect();
+    assert_eq!(addresses, expected);
+    assert_eq!(found.description, description);
+    assert_eq!(found.agent_type, "crane");
+    drop(peer);
+    gone(directory, "crane").await;
+    // It joined once and left once, whatever was learnt of it in between.
+    let mut told = Vec::new();
+    while let Some(change) = watch.try_next() {
+        told.push(change);
+    }
+    assert!(matches!(told.first(), Some(Change::Joined(_))), "{told:?}");
+    assert!(matches!(told.last(), Some(Change::Left(_))), "{told:?}");
+    let between = &told[1..told.len() - 1];
+    assert!(
+        between
+            .iter()
+            .all(|change| matches!(change, Change::Changed { .. }))
+    );
+}
+
+/// Keys in another order, twice, and none at all; binary values.
+async fn records_with_little_in_them_are_read(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
+    let one = format!("locator=tcp://10.99.0.2:7001 {SIGNATURE};");
+    let two = format!("LOCATOR=tcp://10.99.0.2:7002 {SIGNATURE};");
+    let peers = [
+        avahi.publish(
+            "twice",
+            SERVICE_TYPE,
+            7,
+            &["TIMESTAMP=x", &one, "TYPE=t", &two],
+        ),
+        avahi.publish("bare", SERVICE_TYPE, 0, &[]),
+    ];
+    let twice = eventually("both locations", || {
+        directory
+            .lookup("twice")
+            .filter(|found| found.locations.len() == 2)
+    })
+    .await;
+    assert_eq!(twice.agent_type, "t");
+    assert_eq!(twice.locations[0].address(), "10.99.0.2:7001");
+    let bare = eventually("a record without keys", || directory.lookup("bare")).await;
+    assert_eq!((bare.locations.len(), &*bare.agent_type), (0, ""));
+    drop(peers);
+    gone(directory, "twice").await;
+    gone(directory, "bare").await;
+}
+
+/// Who was there first keeps the name, whoever that is.
+async fn names_conflict(directory: &MdnsDirectory, avahi: &Avahi<'_>) {
+    // Ours first: Avahi gives the peer another name.
+    let ours = registration("lift");
+    directory.register(ours.clone()).unwrap();
+    eventually("avahi-browse shows ours", || {
+        browsed(avahi, &["lift", "fipa-name"])
+    })
+    .await;
+    let peer = avahi.publish("lift", SERVICE_TYPE, 0, &["TYPE=theirs"]);
+    let found = eventually("the peer by its new name", || directory.lookup("lift #2")).await;
+    assert_eq!(found.agent_type, "theirs");
+    assert!(browsed(avahi, &["lift;", "fipa-name=lift"]).is_some());
+    assert_eq!(directory.status().announced, 1);
+    drop(peer);
+    gone(directory, "lift #2").await;
+    directory.deregister("lift", ours.incarnation).unwrap();
+
+    // The peer first: who has heard of it does not get the name, and who has not, loses it.
+    let strings = ["TYPE=theirs", "TIMESTAMP=20200101-00:00:00:000000"];
+    let _peer = avahi.publish("winch", SERVICE_TYPE, 0, &strings);
+    let holder = eventually("the peer", || directory.lookup("winch")).await;
+    match directory.register(registration("winch")) {
+        Err(RegisterError::AlreadyRegistered { holder: told }) => assert_eq!(told, holder),
+        other => panic!("{other:?}"),
+    }
+    let newcomer = open("newcomer");
+    let mut withdrawals = newcomer.withdrawals();
+    newcomer.register(registration("winch")).unwrap();
+    let told = tokio::time::timeout(common::WATCHDOG, withdrawals.recv()).await;
+    let told = told.expect("the later is told").unwrap();
+    assert_eq!(told.holder.agent_type, "theirs");
+    eventually("the peer's is the only record", || {
+        let lines = avahi.browse(SERVICE_TYPE);
+        let resolved = lines.iter().filter(|line| line.starts_with('='));
+        let winches: Vec<_> = resolved.filter(|line| line.contains("winch")).collect();
+        (winches.len() == 1 && winches[0].contains("theirs")).then_some(())
+    })
+    .await;
+    let seen = eventually("the newcomer sees the peer", || newcomer.lookup("winch")).await;
+    assert_eq!(seen.agent_type, "theirs");
+}
+
+async fn gone(directory: &MdnsDirectory, name: &str) {
+    eventually(&format!("{name:?} has left"), || {
         directory.lookup(name).is_none().then_some(())
     })
     .await;

@@ -12,6 +12,7 @@
 
 mod record;
 mod task;
+mod whole;
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;

@@ -20,7 +20,8 @@
 //!
 //! What the peers read keeps to what they can take: at most 200 bytes in a value, no scheme but
 //! `tcp`, and numeric IPv4 addresses; the rest is left out for them. A value of ours that is
-//! longer goes on in `key.1`, `key.2` and so on. No key ever occurs twice.
+//! longer goes on in `key.1`, `key.2` and so on. No key ever occurs twice in a record of ours; the
+//! peers split a long value over several strings with one key, which are joined again.
 //!
 //! `TIMESTAMP` has no zone. The peers write local time; we write UTC, and take theirs for UTC,
 //! too: among ourselves `fipa-time` counts, which knows no zones.
@@ -95,19 +96,29 @@ pub(super) fn encode(entry: &Entry) -> Properties {
 ///
 /// With `fipa-version` the record is one of ours, and has to be right. Without, it is a peer's,
 /// of which is taken what there is; `now` stands in for a time that it does not tell.
+///
+/// The peers spread a long value over several strings with one key. Without `whole`, only the
+/// first string of each key is there, and what may be cut is not used.
 pub(super) fn decode(
     label: &str,
     properties: &[(&str, &[u8])],
+    whole: bool,
     now: SystemTime,
 ) -> Result<Entry, RecordError> {
     let record = Record(properties);
     let entry = match record.text("fipa-version")? {
         Some(version) if version == "1" => ours(&record)?,
         Some(version) => return Err(RecordError::Version(version.chars().take(40).collect())),
-        None => theirs(label, &record, now),
+        None => theirs(label, &record, whole, now),
     };
     entry.check()?;
     Ok(entry)
+}
+
+/// Whether the record is one of ours.
+pub(super) fn is_ours(properties: &Properties) -> bool {
+    let mut keys = properties.iter().map(|(key, _)| key);
+    keys.any(|key| key.eq_ignore_ascii_case("fipa-version"))
 }
 
 /// The instance label of a name: at most 63 bytes, neither dots nor backslashes.
@@ -175,9 +186,16 @@ impl Record<'_> {
         text.parse().map_err(|_| RecordError::Value(key))
     }
 
+    /// All values of one of the peers' keys, in order: they are parts of one.
+    fn joined(&self, key: &str) -> Vec<u8> {
+        let parts = self.0.iter().filter(|(k, _)| k.eq_ignore_ascii_case(key));
+        parts.flat_map(|(_, value)| value.iter().copied()).collect()
+    }
+
     /// A text of the peers: what of it is legal.
     fn their_text(&self, key: &str, max: usize) -> String {
-        let text = String::from_utf8_lossy(self.value(key).unwrap_or_default());
+        let value = self.joined(key);
+        let text = String::from_utf8_lossy(&value);
         let mut text: String = text.chars().filter(|c| !c.is_control()).collect();
         text.truncate(text.floor_char_boundary(max));
         text
@@ -223,18 +241,23 @@ fn ours(record: &Record<'_>) -> Result<Entry, RecordError> {
     })
 }
 
-fn theirs(label: &str, record: &Record<'_>, now: SystemTime) -> Entry {
+fn theirs(label: &str, record: &Record<'_>, whole: bool, now: SystemTime) -> Entry {
     let name = label.replace('?', ".");
     let registered = record
         .value("TIMESTAMP")
         .and_then(|value| std::str::from_utf8(value).ok())
         .and_then(millis_of_timestamp)
         .unwrap_or_else(|| millis_of_time(now));
-    let locator = record.value("LOCATOR").unwrap_or_default();
+    let locator = record.joined("LOCATOR");
+    let mut locator = &*String::from_utf8_lossy(&locator);
+    if !whole {
+        // Half an address is a wrong one.
+        locator = &locator[..locator.rfind(';').map_or(0, |end| end + 1)];
+    }
     Entry {
         agent_type: record.their_text("TYPE", Entry::MAX_TYPE),
         incarnation: Incarnation::UNKNOWN,
-        locations: locations_of_locator(&String::from_utf8_lossy(locator)),
+        locations: locations_of_locator(locator),
         // Peers do not say which service it is; each agent might have its own.
         mts: Mts::new(name.as_str(), Incarnation::UNKNOWN),
         name: name.into(),
@@ -331,12 +354,14 @@ mod tests {
     use super::*;
     use crate::MAX_NAME;
 
+    const SIGNATURE: &str = Signature::FipaServices.signature_type();
+
     fn read(label: &str, properties: &Properties) -> Result<Entry, RecordError> {
         let borrowed: Vec<(&str, &[u8])> = properties
             .iter()
             .map(|(key, value)| (key.as_str(), value.as_slice()))
             .collect();
-        decode(label, &borrowed, UNIX_EPOCH)
+        decode(label, &borrowed, true, UNIX_EPOCH)
     }
 
     fn example() -> Entry {
@@ -390,7 +415,7 @@ mod tests {
             ),
             ("TYPE", b"\xff\x00sensor"),
         ];
-        let entry = decode("echo@192?0?2?2:1099/JADE", &properties, UNIX_EPOCH).unwrap();
+        let entry = decode("echo@192?0?2?2:1099/JADE", &properties, true, UNIX_EPOCH).unwrap();
         assert_eq!(&*entry.name, "echo@192.0.2.2:1099/JADE");
         assert_eq!(entry.agent_type, "\u{fffd}sensor");
         assert_eq!(
@@ -405,9 +430,39 @@ mod tests {
         assert!(!entry.incarnation.is_known());
 
         let now = UNIX_EPOCH + Duration::from_secs(5);
-        let bare = decode("bare", &[], now).unwrap();
+        let bare = decode("bare", &[], true, now).unwrap();
         assert_eq!(bare.registered, now);
-        assert!(decode("", &[], now).is_err());
+        assert!(decode("", &[], true, now).is_err());
+    }
+
+    /// As fipa_services splits it: at 200 bytes, wherever that is.
+    #[test]
+    fn values_that_peers_have_split_are_joined() {
+        let location = |number: u16| {
+            format!("udt://10.0.0.{number}:1 {SIGNATURE};tcp://10.0.0.{number}:7788 {SIGNATURE};")
+        };
+        let locator: String = (1..=4).map(location).collect();
+        assert!(locator.len() > 400);
+        let parts = locator.as_bytes().chunks(200 - "LOCATOR=".len());
+        let mut properties: Vec<(&str, &[u8])> = parts.map(|part| ("LOCATOR", part)).collect();
+        properties.insert(1, ("TYPE", b"arm"));
+        let addresses = |properties: &[(&str, &[u8])], whole| {
+            let entry = decode("arm", properties, whole, UNIX_EPOCH).unwrap();
+            assert_eq!(entry.agent_type, "arm");
+            let addresses = entry.locations.iter();
+            addresses
+                .map(|one| one.address().to_owned())
+                .collect::<Vec<_>>()
+                .join(" ")
+        };
+        assert_eq!(
+            addresses(&properties, true),
+            "10.0.0.1:7788 10.0.0.2:7788 10.0.0.3:7788 10.0.0.4:7788"
+        );
+        // Of the first string alone, what is cut is not used.
+        assert_eq!(addresses(&properties[..2], false), "10.0.0.1:7788");
+        let cut: [(&str, &[u8]); 2] = [("LOCATOR", b"tcp://10.0.0.1:77"), ("TYPE", b"arm")];
+        assert_eq!(addresses(&cut, false), "");
     }
 
     #[test]

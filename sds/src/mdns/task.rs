@@ -1,12 +1,14 @@
 //! The task that listens to the network.
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use mdns_sd::{DaemonEvent, Receiver, ResolvedService, ServiceDaemon, ServiceEvent};
 use tokio::time::Instant;
 
+use super::record::Properties;
+use super::whole::{Reader, Sockets};
 use super::{MAX_SPOILT, MdnsDirectory, SERVICE_TYPE, Shared, Withdrawal, record};
 use crate::Entry;
 
@@ -16,9 +18,10 @@ pub(super) async fn run(shared: Arc<Shared>) {
         return;
     };
     let mut unconfirmed = HashSet::new();
+    let mut peers = Peers::default();
     // The daemon drops a listener who has fallen behind; then all is asked for again.
     while let Some(found) = subscribe(&shared, |daemon| daemon.browse(SERVICE_TYPE)) {
-        listen(&shared, &found, &monitor, &mut unconfirmed).await;
+        listen(&shared, &found, &monitor, &mut unconfirmed, &mut peers).await;
         shared.failed("events were lost; asking the network again".to_owned());
         unconfirmed = shared.table.origins();
         tokio::time::sleep(Duration::from_secs(1)).await;
@@ -45,19 +48,29 @@ async fn listen(
     found: &Receiver<ServiceEvent>,
     monitor: &Receiver<DaemonEvent>,
     unconfirmed: &mut HashSet<Arc<str>>,
+    peers: &mut Peers,
 ) {
     let give_up = Instant::now() + Duration::from_secs(5);
     loop {
-        let due = shared.announce_due();
+        let due = [shared.announce_due(), peers.ask(shared)];
+        let due = due.into_iter().flatten().min();
         tokio::select! {
             () = shared.postponed.notified() => {}
             () = until(due), if due.is_some() => {}
+            whole = peers.answered() => {
+                for (fullname, properties) in whole {
+                    peer_read(shared, peers, &fullname, properties);
+                }
+            }
             event = found.recv_async() => match event {
                 Ok(ServiceEvent::ServiceResolved(service)) => {
                     unconfirmed.remove(service.get_fullname());
-                    resolved(shared, &service);
+                    resolved(shared, peers, &service);
                 }
-                Ok(ServiceEvent::ServiceRemoved(_, fullname)) => removed(shared, &fullname),
+                Ok(ServiceEvent::ServiceRemoved(_, fullname)) => {
+                    peers.forget(&fullname);
+                    removed(shared, &fullname);
+                }
                 Ok(ServiceEvent::SearchStopped(_)) | Err(_) => return,
                 Ok(_) => {}
             },
@@ -82,34 +95,131 @@ async fn until(due: Option<std::time::Instant>) {
     }
 }
 
-fn resolved(shared: &Shared, service: &ResolvedService) {
+/// Old peers' records, which the daemon tells only a part of; see [`super::whole`].
+#[derive(Default)]
+struct Peers {
+    reader: Reader,
+    sockets: Option<Sockets>,
+    /// What the daemon has told of a record, and what the whole of it was then.
+    known: HashMap<Arc<str>, (Properties, Option<Properties>)>,
+}
+
+impl Peers {
+    /// What is known of the whole record of which the daemon tells this. It is asked for again
+    /// in any case: that part of it is the same says nothing about the rest.
+    fn whole(&mut self, fullname: &Arc<str>, told: &Properties) -> Option<Properties> {
+        let now = std::time::Instant::now();
+        let label = label_of(fullname);
+        self.reader.want(now, fullname, &label, fastrand::f64());
+        let (before, whole) = self.known.get(fullname)?;
+        whole.clone().filter(|_| before == told)
+    }
+
+    fn forget(&mut self, fullname: &str) {
+        self.reader.forget(&label_of(fullname));
+        self.known.remove(fullname);
+    }
+
+    /// Asks what is due, and says when there is more to be asked.
+    fn ask(&mut self, shared: &Shared) -> Option<std::time::Instant> {
+        if self.reader.is_idle() {
+            self.sockets = None;
+            return None;
+        }
+        let questions = self.reader.handle_timeout(std::time::Instant::now());
+        if !questions.is_empty() {
+            // Opened anew each time: interfaces come and go.
+            match Sockets::open(&shared.config) {
+                Ok(sockets) => self.sockets = Some(sockets),
+                Err(error) => shared.failed(format!("cannot ask for whole records: {error}")),
+            }
+        }
+        for question in questions {
+            if let Some(sockets) = &self.sockets {
+                sockets.send(&question);
+            }
+        }
+        self.reader.poll_timeout()
+    }
+
+    /// The next whole records that were asked for.
+    async fn answered(&mut self) -> Vec<(Arc<str>, Properties)> {
+        match &mut self.sockets {
+            Some(sockets) => self.reader.handle_packet(sockets.receive().await),
+            None => std::future::pending().await,
+        }
+    }
+}
+
+fn resolved(shared: &Shared, peers: &mut Peers, service: &ResolvedService) {
     let fullname: Arc<str> = service.get_fullname().into();
-    let properties: Vec<(&str, &[u8])> = service
-        .get_properties()
-        .iter()
-        .map(|property| (property.key(), property.val().unwrap_or_default()))
+    let properties = service.get_properties().iter();
+    let told: Properties = properties
+        .map(|property| {
+            let value = property.val().unwrap_or_default();
+            (property.key().to_owned(), value.to_vec())
+        })
         .collect();
-    let label = label_of(service.get_fullname());
-    let entry = match record::decode(&label, &properties, SystemTime::now()) {
+    if record::is_ours(&told) {
+        return found(shared, &fullname, &told, true);
+    }
+    if !shared.has_room(&fullname) {
+        return;
+    }
+    match peers.whole(&fullname, &told) {
+        Some(whole) => found(shared, &fullname, &whole, true),
+        None => {
+            found(shared, &fullname, &told, false);
+            // Until the answer comes, that is all.
+            peers.known.insert(fullname, (told, None));
+        }
+    }
+}
+
+/// The whole of a peer's record has been read.
+fn peer_read(shared: &Shared, peers: &mut Peers, fullname: &Arc<str>, whole: Properties) {
+    if let Some((_, known)) = peers.known.get_mut(fullname) {
+        found(shared, fullname, &whole, true);
+        *known = Some(whole);
+    }
+}
+
+/// What is known of a record now.
+fn found(shared: &Shared, fullname: &Arc<str>, properties: &Properties, whole: bool) {
+    let borrowed: Vec<(&str, &[u8])> = properties
+        .iter()
+        .map(|(key, value)| (key.as_str(), value.as_slice()))
+        .collect();
+    let label = label_of(fullname);
+    let entry = match record::decode(&label, &borrowed, whole, SystemTime::now()) {
         Ok(entry) => Arc::new(entry),
         Err(error) => {
             shared.status.lock().refused += 1;
             tracing::debug!(record = label, %error, "record not used");
             // It may have been right before.
-            return removed(shared, &fullname);
+            return removed(shared, fullname);
         }
     };
     if entry.mts.incarnation == shared.config.mts.incarnation {
-        return own_found(shared, &fullname, &entry);
+        return own_found(shared, fullname, &entry);
     }
-    if shared.table.len() >= MdnsDirectory::MAX_RECORDS && !shared.table.has_origin(&fullname) {
-        let mut status = shared.status.lock();
-        status.refused += 1;
-        status.last_error = Some("too many records on the network".to_owned());
-        return;
+    if shared.has_room(fullname) {
+        shared.table.replace(fullname, Some(Arc::clone(&entry)));
+        contested(shared, &entry);
     }
-    shared.table.replace(&fullname, Some(Arc::clone(&entry)));
-    contested(shared, &entry);
+}
+
+impl Shared {
+    /// Whether one more record can be kept, or it is known already.
+    fn has_room(&self, fullname: &Arc<str>) -> bool {
+        let has = self.table.len() < MdnsDirectory::MAX_RECORDS || self.table.has_origin(fullname);
+        if !has {
+            let mut status = self.status.lock();
+            status.refused += 1;
+            status.last_error = Some("too many records on the network".to_owned());
+        }
+        has
+    }
 }
 
 fn removed(shared: &Shared, fullname: &str) {
