@@ -2,6 +2,8 @@
 
 use bytes::Bytes;
 
+use crate::bitefficient::dialects::{self, Peer};
+use crate::envelope::encode as encode_envelope;
 use crate::error::{DecodeError, EncodeError};
 use crate::{Dialect, Envelope, Message, Payload, Representation, bitefficient, string, xml};
 
@@ -34,8 +36,11 @@ impl Message {
         dialect: Dialect,
     ) -> Result<Bytes, EncodeError> {
         match representation {
-            // Both peers read what the standard says.
-            Representation::BitEfficient => Ok(self.to_payload().to_bytes()),
+            Representation::BitEfficient => match dialect {
+                Dialect::Standard => Ok(self.to_payload().to_bytes()),
+                Dialect::FipaServices => dialects::encode(self, Peer::FipaServices),
+                Dialect::Jade => dialects::encode(self, Peer::Jade),
+            },
             Representation::String => string::encode(self, dialect),
             Representation::Xml => xml::encode(self, dialect),
         }
@@ -47,7 +52,8 @@ impl Envelope {
     ///
     /// In XML, JADE reads no extensions: it gets the parameters that count
     /// ([`effective`](Self::effective)), with the newest stamp only. fipa_services reads no zones:
-    /// it gets times without, and takes them as its local ones.
+    /// it gets times without, and takes them as its local ones. Its bit-efficient envelopes may
+    /// have extensions without a stamp.
     ///
     /// # Errors
     /// When a mandatory parameter is missing, or one has a value that the encoding or the reader
@@ -57,20 +63,10 @@ impl Envelope {
         representation: Representation,
         dialect: Dialect,
     ) -> Result<Bytes, EncodeError> {
-        match (representation, dialect) {
-            (Representation::BitEfficient, Dialect::FipaServices) => {
-                Err(EncodeError::Unrepresentable {
-                    what: "bit-efficient envelope",
-                    why: "fipa_services does not read those of the standard; XML it does",
-                })
-            }
-            (Representation::BitEfficient, Dialect::Standard | Dialect::Jade) => {
-                self.encode_standard()
-            }
-            (Representation::Xml, dialect) => xml::encode_envelope(self, dialect),
-            (other @ Representation::String, _) => {
-                Err(EncodeError::UnsupportedRepresentation(other))
-            }
+        match representation {
+            Representation::BitEfficient => encode_envelope(self, dialect),
+            Representation::Xml => xml::encode_envelope(self, dialect),
+            other @ Representation::String => Err(EncodeError::UnsupportedRepresentation(other)),
         }
     }
 }

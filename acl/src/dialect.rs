@@ -2,6 +2,10 @@
 
 use std::fmt;
 
+use crate::error::EncodeError;
+use crate::time::{Time, Zone};
+use crate::word::is_word;
+
 /// The user-defined parameter by which JADE says that content is Base64, without `X-`.
 pub(crate) const JADE_ENCODING: &str = "JADE-Encoding";
 /// The value that says so, whatever its case.
@@ -29,5 +33,39 @@ impl fmt::Display for Dialect {
             Self::FipaServices => "fipa_services",
             Self::Jade => "JADE",
         })
+    }
+}
+
+/// A time for fipa_services, which reads no zones and takes every time for its local one: both
+/// ends are to live in the same zone, so a time in UTC is written without saying so.
+pub(crate) fn local_time(what: &'static str, time: Time) -> Result<Time, EncodeError> {
+    let why = match time.zone() {
+        _ if time.is_relative() => "fipa_services knows no relative times",
+        Zone::Letter(_) => "fipa_services knows no zones",
+        Zone::Utc | Zone::Unspecified => {
+            let zone = Zone::Unspecified;
+            return Ok(Time { zone, ..time });
+        }
+    };
+    Err(EncodeError::Unrepresentable { what, why })
+}
+
+/// Checks that fipa_services reads this as a word, in messages of either of its encodings.
+pub(crate) fn check_word(what: &'static str, text: &str) -> Result<(), EncodeError> {
+    if !is_word(text) {
+        return Err(not_a_word(what));
+    }
+    if !text.is_ascii() {
+        let why = "fipa_services reads words of ASCII characters only";
+        return Err(EncodeError::Unrepresentable { what, why });
+    }
+    Ok(())
+}
+
+pub(crate) fn not_a_word(what: &'static str) -> EncodeError {
+    EncodeError::Unrepresentable {
+        what,
+        why: "it is not a FIPA00070 word (no blanks or parentheses, and not beginning with a \
+              digit, '#', '-', '@' or '\"')",
     }
 }

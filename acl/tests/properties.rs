@@ -6,64 +6,13 @@ mod arbitrary;
 
 use bytes::{Bytes, BytesMut};
 use fipa_acl::{
-    AclRepresentation, AgentId, DecodeError, Envelope, EnvelopeParams, EnvelopeView, Explanation,
-    Letter, Message, MessageView, Payload, Performative, Received, bitefficient, explain,
+    AgentId, DecodeError, Envelope, EnvelopeView, Explanation, Letter, Message, MessageView,
+    Payload, Performative, bitefficient, explain,
 };
 use proptest::collection::vec;
-use proptest::option;
 use proptest::prelude::*;
 
-use arbitrary::{agent, message, pairs, some_text, time};
-
-prop_compose! {
-    fn received()(
-        by in some_text(),
-        from in option::of(some_text()),
-        date in time(),
-        id in option::of(some_text()),
-        via in option::of(some_text()),
-        user_defined in pairs(),
-    ) -> Received {
-        Received { by, from, date, id, via, user_defined }
-    }
-}
-
-prop_compose! {
-    fn params()(
-        to in vec(agent(), 0..3),
-        from in option::of(agent()),
-        comments in option::of(some_text()),
-        acl_representation in some_text(),
-        standard in option::of(0..3_usize),
-        payload_length in option::of(any::<u64>()),
-        payload_encoding in option::of(some_text()),
-        date in time(),
-        intended_receivers in vec(agent(), 0..3),
-        received in received(),
-        transport_behaviour in option::of(some_text()),
-        user_defined in pairs(),
-    ) -> EnvelopeParams {
-        let known = [AclRepresentation::BitEfficient, AclRepresentation::String, AclRepresentation::Xml];
-        let acl_representation = match standard {
-            Some(which) => known[which].clone(),
-            None => AclRepresentation::from(&*acl_representation),
-        };
-        EnvelopeParams {
-            to, from, comments, payload_length, payload_encoding, intended_receivers,
-            transport_behaviour, user_defined,
-            acl_representation: Some(acl_representation),
-            date: Some(date),
-            received: Some(received),
-        }
-    }
-}
-
-prop_compose! {
-    fn envelope()(base in params().boxed(), extensions in vec(params().boxed(), 0..3)) -> Envelope {
-        let extensions = extensions.into_iter().map(|e| EnvelopeParams { date: None, ..e });
-        Envelope { base, extensions: extensions.collect() }
-    }
-}
+use arbitrary::{envelope, message};
 
 /// Bytes with a chance to be taken for something.
 fn nearly_encoded() -> impl Strategy<Value = Vec<u8>> {

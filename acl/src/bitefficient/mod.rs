@@ -7,6 +7,7 @@
 
 mod agent_id;
 mod decode;
+pub(crate) mod dialects;
 pub(crate) mod notes;
 pub(crate) mod reader;
 pub(crate) mod text;

@@ -13,7 +13,7 @@ use crate::word::{is_token, is_word};
 use crate::{AgentId, Message, Payload, Performative, Representation, Time};
 
 /// The name that fipa_services writes for a sender that is not set.
-const UNDEFINED_AGENT: &str = "agent_id:undefined";
+pub(super) const UNDEFINED_AGENT: &str = "agent_id:undefined";
 
 /// An encoded message (FIPA00069), read without allocating.
 ///

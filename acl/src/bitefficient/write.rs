@@ -295,6 +295,27 @@ pub(crate) fn write_date_time(time: Time, out: &mut impl Out) {
         Zone::Letter(letter) => u8::try_from(letter).ok(),
     };
     out.byte(base + if letter.is_some() { 4 } else { 0 });
+    write_seconds(time, out);
+    let millisecond = time.fields.millisecond;
+    out.slice(&[
+        two_digits(millisecond / 10),
+        ((millisecond % 10 + 1) << 4) as u8,
+    ]);
+    if let Some(letter) = letter {
+        out.byte(letter);
+    }
+}
+
+/// The same as fipa_services writes it, whatever the zone: four digits of milliseconds.
+pub(crate) fn write_local_date_time(time: Time, out: &mut impl Out) {
+    out.byte(0x20);
+    write_seconds(time, out);
+    let millisecond = time.fields.millisecond;
+    out.slice(&[two_digits(millisecond / 100), two_digits(millisecond)]);
+}
+
+/// Year to seconds.
+fn write_seconds(time: Time, out: &mut impl Out) {
     let Fields {
         year,
         month,
@@ -302,19 +323,16 @@ pub(crate) fn write_date_time(time: Time, out: &mut impl Out) {
         hour,
         minute,
         second,
-        millisecond,
+        millisecond: _,
     } = time.fields;
-    // Every field is below 100 (years and milliseconds are cut up), so nothing is lost.
-    let two = |value: u16| ((value / 10 % 10 + 1) << 4 | (value % 10 + 1)) as u8;
-    out.slice(&[two(year / 100), two(year % 100)]);
-    for field in [month, day, hour, minute, second] {
-        out.byte(two(u16::from(field)));
-    }
-    out.byte(two(millisecond / 10));
-    out.byte(((millisecond % 10 + 1) << 4) as u8);
-    if let Some(letter) = letter {
-        out.byte(letter);
-    }
+    let [month, day, hour, minute, second] = [month, day, hour, minute, second].map(u16::from);
+    let fields = [year / 100, year, month, day, hour, minute, second];
+    out.slice(&fields.map(two_digits));
+}
+
+/// The last two digits of a number.
+fn two_digits(number: u16) -> u8 {
+    ((number / 10 % 10 + 1) << 4 | (number % 10 + 1)) as u8
 }
 
 /// Digits (FIPA00069 2.2) of a number.

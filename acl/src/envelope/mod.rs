@@ -9,6 +9,7 @@ mod write;
 use std::collections::HashSet;
 
 pub use view::{EnvelopeView, ReceiverNames, StampView, Stamps};
+pub(crate) use write::encode;
 
 use crate::{AclRepresentation, AgentId, Time};
 

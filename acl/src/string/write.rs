@@ -7,9 +7,9 @@ use bytes::Bytes;
 use super::announces_base64;
 use super::lex::{Keywords, holds_keyword};
 use super::read::{PARAMETERS, SLOTS};
-use crate::dialect::{BASE64, JADE_ENCODING};
+use crate::dialect::{BASE64, JADE_ENCODING, check_word, local_time, not_a_word};
 use crate::error::EncodeError;
-use crate::time::{Time, Zone};
+use crate::time::Time;
 use crate::word::{Piece, is_quotable, is_token, is_word, quoted, string_literal};
 use crate::{AgentId, Dialect, Message, Performative};
 
@@ -144,11 +144,13 @@ impl Writer {
     }
 
     fn address(&mut self, address: &str) -> Result<(), EncodeError> {
+        let what = "address of an agent";
         if !is_token(address) || address.starts_with(['"', '#']) {
-            return Err(EncodeError::Unrepresentable {
-                what: "address of an agent",
-                why: "it is not one word",
-            });
+            let why = "it is not one word";
+            return Err(EncodeError::Unrepresentable { what, why });
+        }
+        if self.dialect == Dialect::FipaServices {
+            check_word(what, address)?;
         }
         self.push(address);
         if self.dialect == Dialect::FipaServices {
@@ -206,15 +208,11 @@ impl Writer {
         what: &'static str,
         keywords: &Keywords<T>,
     ) -> Result<(), EncodeError> {
-        if !is_word(word) {
-            return Err(EncodeError::Unrepresentable {
-                what,
-                why: "it is not a FIPA00070 word (no blanks or parentheses, and not beginning with \
-                      a digit, '#', '-', '@' or '\"')",
-            });
-        }
         if self.dialect == Dialect::FipaServices {
+            check_word(what, word)?;
             refuse_keyword(word, what, keywords)?;
+        } else if !is_word(word) {
+            return Err(not_a_word(what));
         }
         self.push(word);
         Ok(())
@@ -287,20 +285,11 @@ impl Writer {
         self.push("\"");
     }
 
-    fn time(&mut self, mut time: Time) -> Result<(), EncodeError> {
-        if self.dialect == Dialect::FipaServices {
-            let why = match time.zone() {
-                _ if time.is_relative() => Some("fipa_services knows no relative times"),
-                Zone::Letter(_) => Some("fipa_services knows no zones"),
-                // It takes times as local, and wants both ends to live in the same zone.
-                Zone::Utc | Zone::Unspecified => None,
-            };
-            if let Some(why) = why {
-                let what = "reply-by";
-                return Err(EncodeError::Unrepresentable { what, why });
-            }
-            time.zone = Zone::Unspecified;
-        }
+    fn time(&mut self, time: Time) -> Result<(), EncodeError> {
+        let time = match self.dialect {
+            Dialect::FipaServices => local_time("reply-by", time)?,
+            _ => time,
+        };
         self.push(&time.to_string());
         Ok(())
     }

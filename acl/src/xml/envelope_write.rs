@@ -2,9 +2,9 @@
 
 use bytes::Bytes;
 
+use crate::dialect::local_time;
 use crate::error::EncodeError;
 use crate::xml::agent_id::{self, Form};
-use crate::xml::message_write::without_zone;
 use crate::xml::out::Out;
 use crate::{Dialect, Envelope, EnvelopeParams, Received, Time};
 
@@ -146,7 +146,7 @@ fn time_text(what: &'static str, time: Time, dialect: Dialect) -> Result<String,
     }
     Ok(match dialect {
         Dialect::Standard => time.to_string(),
-        Dialect::FipaServices => without_zone(time).to_string(),
+        Dialect::FipaServices => local_time(what, time)?.to_string(),
         // JADE puts a Z where the standard has the T, and ignores a letter in the end.
         Dialect::Jade => time.to_string().replacen('T', "Z", 1),
     })

@@ -2,11 +2,11 @@
 
 use bytes::Bytes;
 
-use crate::dialect::JADE_ENCODING;
+use crate::dialect::{JADE_ENCODING, local_time};
 use crate::error::EncodeError;
 use crate::xml::agent_id::{self, Form};
 use crate::xml::out::Out;
-use crate::{Dialect, Message, Performative, Time, Zone};
+use crate::{Dialect, Message, Performative, Time};
 
 /// The encoded message.
 ///
@@ -150,22 +150,9 @@ fn readable_by_jade(what: &'static str, text: &str) -> Result<(), EncodeError> {
 }
 
 fn time_text(time: Time, dialect: Dialect) -> Result<String, EncodeError> {
-    if dialect != Dialect::FipaServices {
-        return Ok(time.to_string());
-    }
-    if time.is_relative() {
-        return Err(EncodeError::Unrepresentable {
-            what: "reply-by",
-            why: "fipa_services does not read relative times",
-        });
-    }
-    Ok(without_zone(time).to_string())
-}
-
-/// fipa_services does not read a zone, and takes every time for its local one.
-pub(super) fn without_zone(time: Time) -> Time {
-    Time {
-        zone: Zone::Unspecified,
-        ..time
-    }
+    let time = match dialect {
+        Dialect::FipaServices => local_time("reply-by", time)?,
+        _ => time,
+    };
+    Ok(time.to_string())
 }

@@ -1,8 +1,12 @@
-//! Messages of all kinds, for property tests.
+//! Messages and envelopes of all kinds, for property tests.
+
+#![allow(dead_code, reason = "every test uses its part")]
 
 use std::time::{Duration, SystemTime};
 
-use fipa_acl::{AgentId, Message, Performative, Time};
+use fipa_acl::{
+    AclRepresentation, AgentId, Envelope, EnvelopeParams, Message, Performative, Received, Time,
+};
 use proptest::collection::vec;
 use proptest::option;
 use proptest::prelude::*;
@@ -128,5 +132,55 @@ prop_compose! {
         if let Some(time) = reply_by { builder = builder.reply_by(time); }
         for (name, value) in user_defined { builder = builder.user_defined(name, value); }
         builder.build().unwrap()
+    }
+}
+
+prop_compose! {
+    fn received()(
+        by in some_text(),
+        from in option::of(some_text()),
+        date in time(),
+        id in option::of(some_text()),
+        via in option::of(some_text()),
+        user_defined in pairs(),
+    ) -> Received {
+        Received { by, from, date, id, via, user_defined }
+    }
+}
+
+prop_compose! {
+    fn params()(
+        to in vec(agent(), 0..3),
+        from in option::of(agent()),
+        comments in option::of(some_text()),
+        acl_representation in some_text(),
+        standard in option::of(0..3_usize),
+        payload_length in option::of(any::<u64>()),
+        payload_encoding in option::of(some_text()),
+        date in time(),
+        intended_receivers in vec(agent(), 0..3),
+        received in received(),
+        transport_behaviour in option::of(some_text()),
+        user_defined in pairs(),
+    ) -> EnvelopeParams {
+        let known = [AclRepresentation::BitEfficient, AclRepresentation::String, AclRepresentation::Xml];
+        let acl_representation = match standard {
+            Some(which) => known[which].clone(),
+            None => AclRepresentation::from(&*acl_representation),
+        };
+        EnvelopeParams {
+            to, from, comments, payload_length, payload_encoding, intended_receivers,
+            transport_behaviour, user_defined,
+            acl_representation: Some(acl_representation),
+            date: Some(date),
+            received: Some(received),
+        }
+    }
+}
+
+prop_compose! {
+    pub(crate) fn envelope()(base in params().boxed(), extensions in vec(params().boxed(), 0..3)) -> Envelope {
+        let extensions = extensions.into_iter().map(|e| EnvelopeParams { date: None, ..e });
+        Envelope { base, extensions: extensions.collect() }
     }
 }

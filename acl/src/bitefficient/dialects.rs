@@ -1,0 +1,240 @@
+//! Writing bit-efficient messages in the hand of a peer, content last as both have it.
+
+use bytes::Bytes;
+
+use crate::bitefficient::reader::{Form, string_form};
+use crate::bitefficient::view::UNDEFINED_AGENT;
+use crate::bitefficient::without_x;
+use crate::bitefficient::write::{Out, write_date_time, write_len, write_local_date_time};
+use crate::dialect::{check_word, local_time};
+use crate::error::EncodeError;
+use crate::word::is_token;
+use crate::{AgentId, Message, Performative, Time};
+
+/// Whose hand to write in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Peer {
+    FipaServices,
+    Jade,
+}
+
+/// The encoded message.
+///
+/// # Errors
+/// When the peer could not read what the message says.
+pub(crate) fn encode(message: &Message, peer: Peer) -> Result<Bytes, EncodeError> {
+    let content_len = message.content.as_ref().map_or(0, Bytes::len);
+    let mut writer = Writer {
+        out: Vec::with_capacity(content_len.saturating_add(512)),
+        peer,
+    };
+    writer.message(message)?;
+    Ok(writer.out.into())
+}
+
+struct Writer {
+    out: Vec<u8>,
+    peer: Peer,
+}
+
+impl Writer {
+    fn message(&mut self, message: &Message) -> Result<(), EncodeError> {
+        self.out.slice(&[0xfa, 0x10]);
+        self.performative(&message.performative)?;
+        match &message.sender {
+            Some(sender) => {
+                self.out.byte(0x02);
+                self.agent(sender)?;
+            }
+            // What fipa_services writes itself.
+            None if self.peer == Peer::FipaServices => {
+                self.out.slice(b"\x02\x02\x10");
+                self.out.slice(UNDEFINED_AGENT.as_bytes());
+                self.out.slice(b"\0\x01");
+            }
+            None => {}
+        }
+        self.agent_set(0x03, &message.receivers)?;
+        self.text(0x05, "reply-with", message.reply_with())?;
+        if let Some(time) = message.reply_by {
+            self.out.byte(0x06);
+            self.time(time)?;
+        }
+        self.text(0x07, "in-reply-to", message.in_reply_to())?;
+        self.agent_set(0x08, &message.reply_to)?;
+        self.text(0x09, "language", message.language())?;
+        self.text(0x0a, "encoding", message.encoding())?;
+        self.text(0x0b, "ontology", message.ontology())?;
+        if let Some(protocol) = &message.protocol {
+            self.out.byte(0x0c);
+            self.word("protocol", protocol)?;
+        }
+        self.text(0x0d, "conversation-id", message.conversation_id())?;
+        self.user_defined(0x00, &message.user_defined)?;
+        if let Some(content) = &message.content {
+            self.out.byte(0x04);
+            self.content(content);
+        }
+        self.out.byte(0x01);
+        Ok(())
+    }
+
+    fn performative(&mut self, performative: &Performative) -> Result<(), EncodeError> {
+        let what = "user-defined performative";
+        match performative.code() {
+            Some(code) => self.out.byte(code),
+            None if self.peer == Peer::Jade => {
+                let why = "JADE reads none in a bit-efficient message";
+                return Err(EncodeError::Unrepresentable { what, why });
+            }
+            None => {
+                self.out.byte(0x00);
+                self.word(what, performative.as_str())?;
+            }
+        }
+        Ok(())
+    }
+
+    fn agent_set(&mut self, code: u8, agents: &[AgentId]) -> Result<(), EncodeError> {
+        if agents.is_empty() {
+            return Ok(());
+        }
+        self.out.byte(code);
+        for agent in agents {
+            self.agent(agent)?;
+        }
+        self.out.byte(0x01);
+        Ok(())
+    }
+
+    /// The parts in the only order that fipa_services reads.
+    fn agent(&mut self, agent: &AgentId) -> Result<(), EncodeError> {
+        self.out.byte(0x02);
+        self.word("name of an agent", agent.name())?;
+        if !agent.addresses().is_empty() {
+            self.out.byte(0x02);
+            for address in agent.addresses() {
+                self.word("address of an agent", address)?;
+            }
+            self.out.byte(0x01);
+        }
+        self.agent_set(0x03, agent.resolvers())?;
+        self.user_defined(0x04, agent.user_defined())?;
+        self.out.byte(0x01);
+        Ok(())
+    }
+
+    fn user_defined(&mut self, code: u8, pairs: &[(String, String)]) -> Result<(), EncodeError> {
+        for (name, value) in pairs {
+            self.out.byte(code);
+            let what = "name of a user-defined parameter";
+            // fipa_services keeps names without X- in its memory, and does not add it here.
+            if self.peer == Peer::FipaServices && without_x(name) == name {
+                self.word(what, name)?;
+            } else {
+                self.word(what, &format!("X-{name}"))?;
+            }
+            self.expression("user-defined parameter", value)?;
+        }
+        Ok(())
+    }
+
+    fn text(
+        &mut self,
+        code: u8,
+        what: &'static str,
+        text: Option<&str>,
+    ) -> Result<(), EncodeError> {
+        let Some(text) = text else { return Ok(()) };
+        self.out.byte(code);
+        self.expression(what, text)
+    }
+
+    /// JADE takes for a word whatever stands up to the NUL.
+    fn word(&mut self, what: &'static str, word: &str) -> Result<(), EncodeError> {
+        if self.peer == Peer::FipaServices {
+            check_word(what, word)?;
+        }
+        self.out.byte(0x10);
+        self.out.slice(word.as_bytes());
+        self.out.byte(0x00);
+        Ok(())
+    }
+
+    fn expression(&mut self, what: &'static str, text: &str) -> Result<(), EncodeError> {
+        if self.peer == Peer::FipaServices {
+            self.out.byte(0x14);
+            // Its own writer escapes nothing, and cannot read then what it wrote.
+            if text.contains('"') || text.ends_with('\\') {
+                self.counted(text.as_bytes());
+            } else {
+                self.out.byte(b'"');
+                self.out.slice(text.as_bytes());
+                self.out.byte(b'"');
+            }
+            self.out.byte(0x00);
+            return Ok(());
+        }
+        // JADE keeps quotation marks and byte counts as part of the text.
+        if is_token(text) {
+            return self.word(what, text);
+        }
+        if string_form(text.as_bytes()).0 == Form::Bare {
+            self.out.byte(0x14);
+            self.out.slice(text.as_bytes());
+            self.out.byte(0x00);
+            return Ok(());
+        }
+        // Longer ones it takes for negative ones.
+        if text.len() >= 128 {
+            let why = "JADE would misread a text in quotation marks of this length";
+            return Err(EncodeError::Unrepresentable { what, why });
+        }
+        write_len(text.len(), &mut self.out);
+        self.out.slice(text.as_bytes());
+        Ok(())
+    }
+
+    /// As a string where it can stand there as one, else with its length in front.
+    fn content(&mut self, content: &Bytes) {
+        let before = self.out.len();
+        self.out.byte(0x14);
+        if self.peer == Peer::FipaServices {
+            self.out.slice(format!("#{}\"", content.len()).as_bytes());
+        }
+        let start = self.out.len();
+        self.out.slice(content);
+        // The copy is looked at, because nobody vouches that shared memory stays as it is.
+        let copy = self.out.get(start..).unwrap_or_default();
+        let is_string = memchr::memchr(0, copy).is_none()
+            && match self.peer {
+                Peer::FipaServices => true,
+                Peer::Jade => {
+                    string_form(copy).0 == Form::Bare && std::str::from_utf8(copy).is_ok()
+                }
+            };
+        if is_string {
+            self.out.byte(0x00);
+            return;
+        }
+        let copy = self.out.split_off(start);
+        self.out.truncate(before);
+        write_len(copy.len(), &mut self.out);
+        self.out.slice(&copy);
+    }
+
+    fn counted(&mut self, bytes: &[u8]) {
+        self.out.slice(format!("#{}\"", bytes.len()).as_bytes());
+        self.out.slice(bytes);
+    }
+
+    fn time(&mut self, time: Time) -> Result<(), EncodeError> {
+        match self.peer {
+            Peer::Jade => write_date_time(time, &mut self.out),
+            Peer::FipaServices => {
+                write_local_date_time(local_time("reply-by", time)?, &mut self.out);
+            }
+        }
+        Ok(())
+    }
+}
