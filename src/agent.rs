@@ -290,7 +290,7 @@ pub struct Incoming {
 
 impl Incoming {
     fn decode(received: fipa_mts::core::Received) -> Result<Self, ReceiveError> {
-        let fipa_mts::core::Received { letter, via } = received;
+        let fipa_mts::core::Received { letter, via, .. } = received;
         match Message::decode(letter.payload()) {
             Ok(message) => Ok(Self {
                 message,

@@ -2,29 +2,37 @@
 //! forward, listening on the network, and the go-between of two directories: what lives on this
 //! host is announced to the network, what is announced there is told to the processes here.
 
+mod clerk;
+mod neighbours;
+
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
 
 use fipa_mts::Contacts;
+use fipa_mts::core::Peer;
 use fipa_sds::{
     ContactDirectory, Directory, Entry, HostDirectory, MergedDirectory, Reach, RegisterError,
     Registration, Role as EntryRole,
 };
-use fipa_transport::{Incarnation, Kind, Location};
+use fipa_transport::{Incarnation, Introduction, Kind, Location};
 use parking_lot::Mutex;
 use tokio::task::JoinHandle;
 
-use crate::Config;
+use self::clerk::Clerk;
+pub use self::neighbours::Neighbour;
+use self::neighbours::{Neighbours, View};
 use crate::domain::OpenError;
 use crate::service::{Role, Service};
+use crate::{AgentId, Config};
 
 /// A running gateway. Ends when [`close`](Self::close) is called or it is dropped.
 pub struct Gateway {
     service: Service,
     network: Option<Arc<dyn Network>>,
     view: Arc<dyn Directory>,
-    task: Option<JoinHandle<()>>,
+    neighbours: Arc<Neighbours>,
+    tasks: Vec<JoinHandle<()>>,
 }
 
 impl Gateway {
@@ -35,11 +43,6 @@ impl Gateway {
     /// When the configuration, the domain's directory or a configured address cannot be used, or
     /// the domain has a gateway already.
     pub async fn open(config: &Config) -> Result<Self, OpenError> {
-        if !config.discovery.peers.is_empty() {
-            tracing::warn!(
-                "discovery.static is not used by this version: gateways are found by mDNS only"
-            );
-        }
         let contacts = Arc::new(Acquaintances::default());
         let made = Mutex::new(None);
         let service = Service::start(
@@ -55,7 +58,10 @@ impl Gateway {
                     let heard = Arc::clone(&contacts.directory) as Arc<dyn Directory>;
                     let all = [Some(host as Arc<dyn Directory>), there, Some(heard)];
                     let all = all.into_iter().flatten().collect();
-                    let view: Arc<dyn Directory> = Arc::new(MergedDirectory::new(all));
+                    let view: Arc<dyn Directory> = Arc::new(View {
+                        all: MergedDirectory::new(all),
+                        neighbours: Arc::clone(&contacts.neighbours),
+                    });
                     *made.lock() = Some((network, Arc::clone(&view)));
                     Ok(view)
                 },
@@ -68,8 +74,13 @@ impl Gateway {
             service,
             network,
             view,
-            task: None,
+            neighbours: Arc::clone(&contacts.neighbours),
+            tasks: Vec::new(),
         };
+        // The queue first: once the name is known, letters come.
+        let own = &gateway.service.own;
+        let mts = &gateway.service.mts;
+        mts.register(Arc::clone(&own.name), own.incarnation);
         if let Err(error) = gateway.enter() {
             gateway.abort();
             return Err(error);
@@ -86,8 +97,27 @@ impl Gateway {
             publisher,
             announced: HashMap::new(),
         };
-        gateway.task = Some(tokio::spawn(exchange.run()));
+        gateway.tasks.push(tokio::spawn(exchange.run()));
+        gateway.open_for_letters(config)?;
         Ok(gateway)
+    }
+
+    /// From now on the gateway answers letters, and keeps in touch with its static peers.
+    fn open_for_letters(&mut self, config: &Config) -> Result<(), OpenError> {
+        let own = &self.service.own;
+        let id = AgentId::new(&*own.name)
+            .map_err(|error| OpenError::Name(RegisterError::Failed(Arc::new(error))))?;
+        let clerk = Clerk {
+            mts: self.service.mts.clone(),
+            id,
+            incarnation: own.incarnation,
+            view: Arc::clone(&self.view),
+        };
+        self.tasks.push(tokio::spawn(clerk.run()));
+        let peers = peers(config);
+        self.neighbours.name_peers(peers.clone());
+        self.service.mts.keep_in_touch(peers);
+        Ok(())
     }
 
     /// Registers the gateway itself, so that the processes of this host find it.
@@ -145,6 +175,13 @@ impl Gateway {
         &*self.view
     }
 
+    /// The gateways of other hosts that a connection is open with at the moment, whoever opened
+    /// it.
+    #[must_use]
+    pub fn neighbours(&self) -> Vec<Neighbour> {
+        self.neighbours.all()
+    }
+
     /// What goes wrong with finding other hosts, if anything does.
     #[must_use]
     pub fn discovery_problem(&self) -> Option<String> {
@@ -154,7 +191,7 @@ impl Gateway {
     /// Ends the gateway: says goodbye to the network and gives letters under way a moment to
     /// arrive.
     pub async fn close(mut self) {
-        if let Some(task) = self.task.take() {
+        for task in self.tasks.drain(..) {
             task.abort();
         }
         if let Some(network) = self.network.take() {
@@ -168,7 +205,7 @@ impl Gateway {
     }
 
     fn abort(&mut self) {
-        if let Some(task) = self.task.take() {
+        for task in self.tasks.drain(..) {
             task.abort();
         }
         if let Some(network) = self.network.take() {
@@ -182,6 +219,17 @@ impl Drop for Gateway {
     fn drop(&mut self) {
         self.abort();
     }
+}
+
+/// The static peers of the configuration.
+fn peers(config: &Config) -> Vec<Peer> {
+    let peers = config.discovery.peers.iter();
+    peers
+        .map(|peer| Peer {
+            name: peer.name.as_str().into(),
+            locations: peer.locations.clone(),
+        })
+        .collect()
 }
 
 /// A directory of other hosts, in which this one's agents are announced.
@@ -231,9 +279,11 @@ fn network(_: &Config, _: &fipa_sds::Mts) -> Result<Option<Arc<dyn Network>>, Op
     Ok(None)
 }
 
-/// Agents of other hosts that have written before anybody told of them.
+/// Gateways of other hosts that are connected, and agents there that have written before anybody
+/// told of them.
 #[derive(Default)]
 struct Acquaintances {
+    neighbours: Arc<Neighbours>,
     directory: Arc<ContactDirectory>,
     publisher: Mutex<Option<Arc<Publisher>>>,
 }
@@ -249,6 +299,14 @@ impl Contacts for Acquaintances {
             Ok(false) => {}
             Err(error) => tracing::info!(%error, "who has written cannot be answered"),
         }
+    }
+
+    fn introduced(&self, peer: &Introduction) {
+        self.neighbours.introduced(peer);
+    }
+
+    fn parted(&self, peer: &Introduction) {
+        self.neighbours.parted(peer);
     }
 }
 

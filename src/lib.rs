@@ -57,5 +57,5 @@ pub use fipa_transport::{
     Attempt, FailureReason, Incarnation, Kind, ListenError, Location, Outcome,
 };
 #[cfg(feature = "net")]
-pub use gateway::Gateway;
+pub use gateway::{Gateway, Neighbour};
 pub use place::PlaceError;

@@ -16,17 +16,17 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use fipa_acl::Letter;
-use fipa_sds::Directory;
+use fipa_sds::{Directory, Entry};
 use fipa_transport::{
-    Arrival, AttemptId, Conclusion, Incarnation, Kind, ListenError, LoanedContent, Location,
-    Outcome, Sink, Transport, Verdict,
+    Arrival, AttemptId, Conclusion, Incarnation, Introduction, Kind, ListenError, LoanedContent,
+    Location, Outcome, Sink, Transport, Verdict,
 };
 use parking_lot::{Mutex, MutexGuard};
 use tokio::runtime::Handle;
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 
-use crate::core::{Action, Core, CoreConfig, Now, Received, SendId, Submission};
+use crate::core::{Action, Core, CoreConfig, Now, Peer, PeerState, Received, SendId, Submission};
 
 /// What the runtime is told at its start, besides the core's configuration.
 #[derive(Clone)]
@@ -36,15 +36,21 @@ pub struct RuntimeConfig {
     pub spin: Duration,
     /// The deadline of letters that old peers throw at the gateway: theirs have none.
     pub unframed_deadline: Duration,
-    /// Whom to tell of agents of other hosts that have written and are not in the directory. Must
-    /// not call the service back.
+    /// Whom to tell of other hosts. Must not call the service back.
     pub contacts: Option<Arc<dyn Contacts>>,
 }
 
-/// Who is told of agents of other hosts that nobody has told of before.
+/// Who is told of other hosts: of services that connections are open with, and of agents that
+/// nobody has told of before.
 pub trait Contacts: Send + Sync {
     /// An agent has written from behind this location; see [`Action::Heard`].
     fn heard(&self, name: &str, agent: Incarnation, location: Location);
+
+    /// A service has introduced itself on a connection; see [`Sink::introduced`].
+    fn introduced(&self, peer: &Introduction);
+
+    /// A connection has ended; see [`Sink::parted`].
+    fn parted(&self, peer: &Introduction);
 }
 
 /// A running message transport service.
@@ -175,9 +181,13 @@ impl Mts {
     /// Sends a letter. The outcomes, one per receiver, come with the future; the letter is on its
     /// way when this returns, whether the future is awaited or not.
     pub fn send(&self, submission: Submission) -> Sending {
+        self.begin(|core| core.send(Now::read(), submission))
+    }
+
+    fn begin(&self, send: impl FnOnce(&mut Core) -> (SendId, usize)) -> Sending {
         let slot = Arc::new(Slot::default());
         let mut state = self.shared.state.lock();
-        let (id, expected) = state.core.send(Now::read(), submission);
+        let (id, expected) = send(&mut state.core);
         slot.outcomes.lock().expected = expected;
         if expected > 0 {
             state.sends.insert(id, Arc::clone(&slot));
@@ -191,6 +201,25 @@ impl Mts {
             shared: Arc::clone(&self.shared),
             slot,
         }
+    }
+
+    /// Sends a letter to this one life of an agent; see [`Core::send_to`].
+    pub fn send_to(&self, submission: Submission, entry: &Entry) -> Sending {
+        self.begin(|core| (core.send_to(Now::read(), submission, entry), 1))
+    }
+
+    /// Keeps in touch with these services, and no others, from now on; see
+    /// [`Core::keep_in_touch`].
+    pub fn keep_in_touch(&self, peers: Vec<Peer>) {
+        let mut state = self.shared.state.lock();
+        state.core.keep_in_touch(Now::read(), peers);
+        self.shared.carry_out(state);
+    }
+
+    /// How it stands with the services to keep in touch with.
+    #[must_use]
+    pub fn peers(&self) -> Vec<PeerState> {
+        self.shared.state.lock().core.peers(Now::read())
     }
 
     /// The next letter for this agent, or none when the agent was deregistered or the service
@@ -499,6 +528,28 @@ impl Sink for Receiving {
             .core
             .handle_conclusion(Now::read(), attempt, conclusion);
         shared.carry_out(state);
+    }
+
+    fn introduced(&self, peer: &Introduction) {
+        if let Some(shared) = self.shared.upgrade()
+            && let Some(contacts) = &shared.config.contacts
+        {
+            contacts.introduced(peer);
+        }
+    }
+
+    fn parted(&self, peer: &Introduction) {
+        let Some(shared) = self.shared.upgrade() else {
+            return;
+        };
+        if let Some(contacts) = &shared.config.contacts {
+            contacts.parted(peer);
+        }
+        if let Some(dialled) = &peer.dialled {
+            let mut state = shared.state.lock();
+            state.core.handle_parted(Now::read(), dialled);
+            shared.carry_out(state);
+        }
     }
 }
 

@@ -9,8 +9,8 @@ use parking_lot::Mutex;
 
 use crate::transport::LoanedContent;
 use crate::{
-    Answer, Arrival, AttemptId, Conclusion, Kind, ListenError, Location, Parcel, Sink, Ticket,
-    Transport, Verdict, WayError, WayFault,
+    Answer, Arrival, AttemptId, Conclusion, Introduction, Kind, ListenError, Location, Parcel,
+    Sink, Ticket, Transport, Verdict, WayError, WayFault,
 };
 
 /// A way of failing.
@@ -214,5 +214,13 @@ impl Sink for Filter {
         let fault = self.shared.pending.lock().remove(&attempt);
         let conclusion = if fault.is_some() { lost() } else { conclusion };
         self.sink.concluded(attempt, conclusion);
+    }
+
+    fn introduced(&self, peer: &Introduction) {
+        self.sink.introduced(peer);
+    }
+
+    fn parted(&self, peer: &Introduction) {
+        self.sink.parted(peer);
     }
 }

@@ -113,6 +113,29 @@ pub trait Sink: Send + Sync {
 
     /// An attempt came to its end.
     fn concluded(&self, attempt: AttemptId, conclusion: Conclusion);
+
+    /// A service has introduced itself on a connection that was opened: parcels can go both ways
+    /// from now on. Transports without connections say nothing; nor need a sink listen.
+    fn introduced(&self, peer: &Introduction) {
+        let _ = peer;
+    }
+
+    /// The connection on which this service had [introduced](Self::introduced) itself is at its
+    /// end. There may be another one with it: there were as many introductions as connections.
+    fn parted(&self, peer: &Introduction) {
+        let _ = peer;
+    }
+}
+
+/// What a service says of itself when a connection with it has been opened.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Introduction {
+    /// Its name; several may have the same one.
+    pub name: Arc<str>,
+    /// Where it is, with its incarnation.
+    pub hop: Hop,
+    /// The location for which this side opened the connection, if this side did.
+    pub dialled: Option<Location>,
 }
 
 /// A parcel that arrived.

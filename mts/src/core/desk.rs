@@ -87,7 +87,8 @@ pub(crate) enum Origin {
 /// A delivery that did not succeed, for the failure message.
 #[derive(Debug)]
 pub(crate) struct Undelivered {
-    pub(crate) stream: Stream,
+    /// The agent of this process that sent it, if one did.
+    pub(crate) sender: Option<Incarnation>,
     pub(crate) receiver: Arc<str>,
     pub(crate) letter: Letter,
     pub(crate) reason: FailureReason,
@@ -101,6 +102,8 @@ pub(crate) enum Purpose {
     Letter { stream: Stream, sequence: u64 },
     /// A report or a credit.
     Note(Box<Note>),
+    /// Whether a static peer is there.
+    Touch { peer: u64 },
 }
 
 /// A report or a credit on its way.
@@ -327,7 +330,7 @@ impl Desk {
     }
 }
 
-fn note_parcel(stream: Stream, receiver: Arc<str>, sequence: u64, body: Body) -> Parcel {
+pub(super) fn note_parcel(stream: Stream, receiver: Arc<str>, sequence: u64, body: Body) -> Parcel {
     Parcel {
         receiver,
         stream,

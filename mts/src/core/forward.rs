@@ -84,7 +84,9 @@ impl Core {
         let entry = self.desk.directory.by_incarnation(parcel.stream.receiver);
         let entry = entry.ok_or_else(|| unknown("the agent is not known to the gateway"))?;
         if entry.role == Role::Gateway {
-            return Err(refused("a gateway takes no letters for itself".to_owned()));
+            return Err(refused(
+                "letters for another gateway are not passed on".to_owned(),
+            ));
         }
         // Never between strangers: what comes from the network is for this host.
         if from.remote && (entry.reach != Reach::Local || parcel.hops > MAX_HOPS) {
@@ -162,7 +164,7 @@ impl Core {
                 };
                 if !self.has_room(stream, letter.len()) {
                     self.desk.undelivered.push_back(Undelivered {
-                        stream,
+                        sender: None,
                         receiver: Arc::clone(&entry.name),
                         letter: letter.clone(),
                         reason: FailureReason::QueueFull,
@@ -179,10 +181,7 @@ impl Core {
             if !found {
                 tracing::info!(%receiver, %sender, "an unframed letter names nobody of this host");
                 self.desk.undelivered.push_back(Undelivered {
-                    stream: Stream {
-                        sender: stream_sender,
-                        receiver: Incarnation::UNKNOWN,
-                    },
+                    sender: None,
                     receiver: receiver.as_str().into(),
                     letter: letter.clone(),
                     reason: FailureReason::NoSuchAgent,
@@ -197,7 +196,7 @@ impl Core {
     pub(super) fn tell_failures(&mut self, now: Now) {
         while let Some(undelivered) = self.desk.undelivered.pop_front() {
             let Undelivered {
-                stream,
+                sender,
                 receiver,
                 letter,
                 reason,
@@ -208,9 +207,10 @@ impl Core {
             else {
                 continue;
             };
-            if let Some(inbox) = self.agents.get_mut(&stream.sender) {
+            if let Some((agent, inbox)) =
+                sender.and_then(|agent| Some((agent, self.agents.get_mut(&agent)?)))
+            {
                 if inbox.push_failure(report.letter) {
-                    let agent = stream.sender;
                     self.desk.actions.push_back(Action::Deliverable { agent });
                 }
                 continue;
@@ -223,8 +223,7 @@ impl Core {
             if entry.role == Role::Gateway {
                 continue;
             }
-            let sequence = self.next_sequence;
-            self.next_sequence += 1;
+            let sequence = self.sequence_of(self.desk.config.incarnation);
             let deadline = now.instant + FAILURE_DEADLINE;
             let mut delivery = Delivery::new(Origin::Nobody, report.letter, sequence, deadline);
             delivery.hops = u8::from(entry.reach != Reach::Local);

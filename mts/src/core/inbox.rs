@@ -15,6 +15,9 @@ use super::MAX_DEADLINE;
 pub struct Received {
     /// The letter.
     pub letter: Letter,
+    /// The life of the agent that sent it; unknown for an old peer's, and for what this process
+    /// told the agent itself.
+    pub sender: Incarnation,
     /// How it came, on its last stretch; none for what this process told the agent itself.
     pub via: Option<Kind>,
 }
@@ -100,6 +103,7 @@ impl Inbox {
         }
         self.queue.push_back(Received {
             letter,
+            sender: stream.sender,
             via: Some(via),
         });
         Answer::Accepted
@@ -112,6 +116,7 @@ impl Inbox {
         }
         self.queue.push_back(Received {
             letter,
+            sender: Incarnation::UNKNOWN,
             via: Some(via),
         });
         true
@@ -124,7 +129,11 @@ impl Inbox {
             return false;
         }
         self.failures += 1;
-        self.queue.push_back(Received { letter, via: None });
+        self.queue.push_back(Received {
+            letter,
+            sender: Incarnation::UNKNOWN,
+            via: None,
+        });
         true
     }
 

@@ -8,6 +8,7 @@
 //! * `lane`: letters of one stream on their way, in order, one way at a time.
 //! * `inbox`: the receiving end, where letters are taken once and in order.
 //! * `forward`: letters for somebody else.
+//! * `peers`: services that the configuration names, and how it stands with them.
 //! * `desk`: what lanes share: attempts, health of ways, things to be done.
 //!
 //! A letter's order and identity are its *stream* (one life of the sender, one life of the
@@ -19,6 +20,7 @@ mod desk;
 mod forward;
 mod inbox;
 mod lane;
+mod peers;
 
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, HashMap};
@@ -26,7 +28,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::Letter;
-use fipa_sds::{Directory, Resolution};
+use fipa_sds::{Directory, Entry, Resolution};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind, Location,
     Outcome, Parcel, Report, Stream, Verdict,
@@ -38,6 +40,8 @@ use desk::{Desk, NOTE_TRIES, Note, Origin, Purpose, Undelivered};
 use inbox::Inbox;
 pub use inbox::Received;
 use lane::{Delivery, Lane, Moved};
+use peers::Peers;
+pub use peers::{Peer, PeerState};
 
 /// What time it is, by both clocks.
 #[derive(Debug, Clone, Copy)]
@@ -88,8 +92,9 @@ pub struct Core {
     agents: HashMap<Incarnation, Inbox>,
     timers: BinaryHeap<Reverse<(Instant, Stream)>>,
     notes: BinaryHeap<Reverse<LateNote>>,
+    peers: Peers,
     next_send: u64,
-    /// Sequence of the letters that this service sends in its own name.
+    /// Sequence of the letters that this service sends in its own name, where it is no agent.
     next_sequence: u64,
     next_forget: Option<Instant>,
 }
@@ -127,6 +132,7 @@ impl Core {
             agents: HashMap::new(),
             timers: BinaryHeap::new(),
             notes: BinaryHeap::new(),
+            peers: Peers::default(),
             next_send: 1,
             next_sequence: 1,
             next_forget: None,
@@ -192,23 +198,15 @@ impl Core {
             };
             if entries.is_empty() {
                 count += 1;
-                let stream = Stream {
-                    sender,
-                    receiver: Incarnation::UNKNOWN,
-                };
                 let reason = FailureReason::NoSuchAgent;
-                self.undeliverable(send, stream, receiver, letter.clone(), reason);
+                self.undeliverable(send, sender, receiver, letter.clone(), reason);
             }
             for entry in entries {
                 if !entry.incarnation.is_known() {
                     // An old peer's agent: there is no way to it that this version can write.
                     count += 1;
-                    let stream = Stream {
-                        sender,
-                        receiver: Incarnation::UNKNOWN,
-                    };
                     let (name, reason) = (Arc::clone(&entry.name), FailureReason::Unreachable);
-                    self.undeliverable(send, stream, name, letter.clone(), reason);
+                    self.undeliverable(send, sender, name, letter.clone(), reason);
                     continue;
                 }
                 if reached.contains(&entry.incarnation) {
@@ -216,24 +214,46 @@ impl Core {
                 }
                 reached.push(entry.incarnation);
                 count += 1;
-                let stream = Stream {
-                    sender,
-                    receiver: entry.incarnation,
-                };
-                let waiting = self.lanes.get(&stream).map_or(0, Lane::len);
-                if waiting >= self.desk.config.lane {
-                    let (name, reason) = (Arc::clone(&entry.name), FailureReason::QueueFull);
-                    self.undeliverable(send, stream, name, letter.clone(), reason);
-                    continue;
-                }
-                let sequence = self.sequence_of(sender);
-                let origin = Origin::Local { send };
-                let delivery = Delivery::new(origin, letter.clone(), sequence, deadline);
-                self.put(now, stream, Arc::clone(&entry.name), delivery);
+                self.send_one(now, (send, sender), &entry, letter.clone(), deadline);
             }
         }
         self.tell_failures(now);
         (send, count)
+    }
+
+    /// Sends a letter to this one life of an agent, whatever others are called; the receivers of
+    /// the submission are not looked at. One outcome will follow under this number.
+    pub fn send_to(&mut self, now: Now, submission: Submission, entry: &Entry) -> SendId {
+        let send = SendId(self.next_send);
+        self.next_send += 1;
+        let deadline = now.instant + submission.deadline.min(MAX_DEADLINE);
+        let sending = (send, submission.sender);
+        self.send_one(now, sending, entry, submission.letter, deadline);
+        self.tell_failures(now);
+        send
+    }
+
+    fn send_one(
+        &mut self,
+        now: Now,
+        (send, sender): (SendId, Incarnation),
+        entry: &Entry,
+        letter: Letter,
+        deadline: Instant,
+    ) {
+        let stream = Stream {
+            sender,
+            receiver: entry.incarnation,
+        };
+        let name = Arc::clone(&entry.name);
+        let waiting = self.lanes.get(&stream).map_or(0, Lane::len);
+        if waiting >= self.desk.config.lane {
+            return self.undeliverable(send, sender, name, letter, FailureReason::QueueFull);
+        }
+        let sequence = self.sequence_of(sender);
+        let origin = Origin::Local { send };
+        let delivery = Delivery::new(origin, letter, sequence, deadline);
+        self.put(now, stream, name, delivery);
     }
 
     fn sequence_of(&mut self, sender: Incarnation) -> u64 {
@@ -248,7 +268,7 @@ impl Core {
     fn undeliverable(
         &mut self,
         send: SendId,
-        stream: Stream,
+        sender: Incarnation,
         receiver: Arc<str>,
         letter: Letter,
         reason: FailureReason,
@@ -258,7 +278,7 @@ impl Core {
             attempts: Vec::new(),
         };
         self.desk.undelivered.push_back(Undelivered {
-            stream,
+            sender: Some(sender),
             receiver: Arc::clone(&receiver),
             letter,
             reason,
@@ -404,6 +424,11 @@ impl Core {
                 }
             }
             Some(Purpose::Note(note)) => self.note_concluded(now, *note, conclusion),
+            Some(Purpose::Touch { peer }) => {
+                let asked = (peer, attempt);
+                self.peers
+                    .concluded(now.instant, asked, conclusion, &mut self.desk);
+            }
             None => {}
         }
         self.tell_failures(now);
@@ -458,8 +483,25 @@ impl Core {
                 self.desk.note(note);
             }
         }
+        self.peers.handle_timeout(now.instant, &mut self.desk);
         self.tell_failures(now);
         self.forget_idle_lanes(now);
+    }
+
+    /// Keeps in touch with these services, and no others, from now on.
+    pub fn keep_in_touch(&mut self, now: Now, peers: Vec<Peer>) {
+        self.peers.set(now.instant, peers, &mut self.desk);
+    }
+
+    /// How it stands with the services to keep in touch with.
+    #[must_use]
+    pub fn peers(&self, now: Now) -> Vec<PeerState> {
+        self.peers.states(now.instant)
+    }
+
+    /// A connection that was opened for this location has ended.
+    pub fn handle_parted(&mut self, now: Now, location: &Location) {
+        self.peers.parted(now.instant, location);
     }
 
     fn forget_idle_lanes(&mut self, now: Now) {
@@ -478,7 +520,7 @@ impl Core {
     pub fn poll_timeout(&self) -> Option<Instant> {
         let lanes = self.timers.peek().map(|Reverse((due, _))| *due);
         let notes = self.notes.peek().map(|Reverse(late)| late.0);
-        [lanes, notes].into_iter().flatten().min()
+        [lanes, notes, self.peers.due()].into_iter().flatten().min()
     }
 
     /// The next thing to be done.

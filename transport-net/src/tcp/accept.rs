@@ -119,7 +119,7 @@ async fn receive(endpoint: Arc<Endpoint>, place: Stranger, stream: TcpStream, fr
                     return;
                 };
                 let reader = FrameReader::new(endpoint.limits().max_letter, begun);
-                Running::new(endpoint, link, sink)
+                Running::new(endpoint, link, sink, None)
                     .serve((read, write), reader, from, || drop(place))
                     .await;
                 return;

@@ -25,7 +25,7 @@ pub(crate) async fn dial(
     to: Location,
 ) {
     let limits = endpoint.limits().clone();
-    let running = Running::new(endpoint, link.clone(), sink);
+    let running = Running::new(endpoint, link.clone(), sink, Some(to.clone()));
     let unreachable = |what: &dyn std::fmt::Display| {
         let detail = format!("{}: {what}", to.address());
         End::NotOpened(WayError::new(WayFault::Unreachable, detail))

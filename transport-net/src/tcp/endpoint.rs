@@ -245,7 +245,7 @@ impl Endpoint {
         link: &Arc<Link>,
         peer: &Hello,
         from: SocketAddr,
-    ) -> Result<Option<Hop>, End> {
+    ) -> Result<Hop, End> {
         let incarnation = peer.identity.incarnation;
         let inbound = Inbound {
             incarnation,
@@ -292,7 +292,7 @@ impl Endpoint {
         let location = Location::new(Kind::Tcp, &back)
             .map_err(|error| End::Nonsense(error.to_string()))?
             .with_incarnation(incarnation);
-        Ok(Some(Hop { location, remote }))
+        Ok(Hop { location, remote })
     }
 
     /// A connection has ended: nothing leads there any more.

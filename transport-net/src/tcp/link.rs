@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use fipa_transport::{Answer, AttemptId, Hop, Parcel, Sink, Ticket};
+use fipa_transport::{Answer, AttemptId, Introduction, Location, Parcel, Sink, Ticket};
 use parking_lot::Mutex;
 use tokio::io::AsyncReadExt;
 use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
@@ -182,21 +182,29 @@ pub(crate) struct Running {
     endpoint: Arc<Endpoint>,
     link: Arc<Link>,
     sink: Arc<dyn Sink>,
-    /// Where parcels on this link come from, once the peer has said hello.
-    hop: Option<Hop>,
+    /// What this side opened the connection for, if it did.
+    dialled: Option<Location>,
+    /// Who is there, once the peer has said hello.
+    peer: Option<Introduction>,
     end: End,
 }
 
 impl Running {
     /// To be made by the task itself: from now on the link gets its end, whatever happens to the
     /// task.
-    pub(crate) fn new(endpoint: Arc<Endpoint>, link: Arc<Link>, sink: Arc<dyn Sink>) -> Self {
+    pub(crate) fn new(
+        endpoint: Arc<Endpoint>,
+        link: Arc<Link>,
+        sink: Arc<dyn Sink>,
+        dialled: Option<Location>,
+    ) -> Self {
         link.begun.store(true, Ordering::Release);
         Self {
             endpoint,
             link,
             sink,
-            hop: None,
+            dialled,
+            peer: None,
             // What is said when the runtime drops the task.
             end: End::Closed,
         }
@@ -342,18 +350,27 @@ impl Running {
             Event::Greeted => {
                 let peer = self.link.state.lock().connection.peer().cloned();
                 if let Some(peer) = peer {
-                    self.hop = self.endpoint.enter(&self.link, &peer, from).await?;
+                    let hop = self.endpoint.enter(&self.link, &peer, from).await?;
+                    self.peer = Some(Introduction {
+                        name: peer.identity.name.into(),
+                        hop,
+                        dialled: self.dialled.clone(),
+                    });
                 }
                 self.link.state.lock().connection.welcome();
+                if let Some(peer) = &self.peer {
+                    self.sink.introduced(peer);
+                }
                 if let Some(greeted) = greeted.take() {
                     greeted();
                 }
             }
             Event::Arrived { id, parcel } => {
                 count(&self.endpoint.tally().parcels_in);
-                let Some(from) = self.hop.clone() else {
+                let Some(peer) = &self.peer else {
                     return Err(End::Nonsense("a parcel from nobody".into()));
                 };
+                let from = peer.hop.clone();
                 let ticket = self.link.ticket(id);
                 let verdict = self.sink.arrived(fipa_transport::Arrival {
                     parcel: *parcel,
@@ -388,6 +405,9 @@ impl Drop for Running {
         self.endpoint.left(&self.link, &self.end);
         for (attempt, conclusion) in concluded {
             self.sink.concluded(attempt, conclusion);
+        }
+        if let Some(peer) = &self.peer {
+            self.sink.parted(peer);
         }
         self.link.over.send_replace(true);
     }

@@ -353,11 +353,15 @@ impl Lane {
     fn fail(&mut self, index: usize, reason: FailureReason, desk: &mut Desk) {
         let delivery = &mut self.letters[index];
         let attempts = std::mem::take(&mut delivery.progress.attempts);
-        let local = matches!(delivery.origin, Origin::Local { .. } | Origin::Nobody);
-        if local {
+        let sender = match delivery.origin {
+            Origin::Local { .. } => Some(Some(self.stream.sender)),
+            Origin::Nobody => Some(None),
+            Origin::Forwarded { .. } => None,
+        };
+        if let Some(sender) = sender {
             let detail = attempts.last().map(ToString::to_string).unwrap_or_default();
             desk.undelivered.push_back(Undelivered {
-                stream: self.stream,
+                sender,
                 receiver: Arc::clone(&self.receiver),
                 letter: delivery.letter.clone(),
                 reason,

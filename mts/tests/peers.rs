@@ -1,0 +1,158 @@
+//! Static peers: when they are asked whether they are there.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Peer};
+use fipa_sds::{MemoryDirectory, Mts};
+use fipa_transport::{
+    Answer, AttemptId, Body, Conclusion, Incarnation, Kind, Location, WayError, WayFault,
+};
+
+struct Bench {
+    core: Core,
+    now: Now,
+}
+
+impl Bench {
+    fn new() -> Self {
+        let incarnation = Incarnation::from_u64(1);
+        let directory = MemoryDirectory::new(Mts::new("mts", incarnation));
+        let config = CoreConfig::new("mts", incarnation, vec![Kind::Udp, Kind::Tcp]);
+        Self {
+            core: Core::new(config, Arc::new(directory)),
+            now: Now {
+                instant: Instant::now(),
+                utc: SystemTime::UNIX_EPOCH,
+            },
+        }
+    }
+
+    /// The one thing asked since the last time, if anything was.
+    fn asked(&mut self) -> Option<(AttemptId, String)> {
+        match self.core.poll_action()? {
+            Action::Dispatch {
+                attempt,
+                location,
+                parcel,
+            } => {
+                assert_eq!(parcel.body, Body::Credit);
+                Some((attempt, location.to_string()))
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+
+    fn fails(&mut self, attempt: AttemptId) {
+        let error = WayError::new(WayFault::Unreachable, "nobody");
+        let conclusion = Conclusion::NotSent(error);
+        self.core.handle_conclusion(self.now, attempt, conclusion);
+    }
+
+    fn answers(&mut self, attempt: AttemptId) {
+        let conclusion = Conclusion::Answered(Answer::Accepted);
+        self.core.handle_conclusion(self.now, attempt, conclusion);
+    }
+
+    /// Lets time pass until something is due; says how long that was.
+    fn wait(&mut self) -> Duration {
+        let due = self.core.poll_timeout().unwrap();
+        let waited = due - self.now.instant;
+        self.now.instant = due;
+        self.core.handle_timeout(self.now);
+        waited
+    }
+}
+
+fn peer(locations: &[&str]) -> Peer {
+    let locations = locations.iter().map(|text| text.parse().unwrap()).collect();
+    Peer {
+        name: "crex".into(),
+        locations,
+    }
+}
+
+#[test]
+fn every_location_is_asked_and_then_again_after_growing_pauses() {
+    let mut bench = Bench::new();
+    // In the order of the configuration's transports; what it does not use is left out.
+    let listed = peer(&["quic://a:1", "tcp://a:2", "udp://a:3", "tcp://b:4"]);
+    bench.core.keep_in_touch(bench.now, vec![listed]);
+    let mut pauses = Vec::new();
+    for _ in 0..9 {
+        for expected in ["udp://a:3", "tcp://a:2", "tcp://b:4"] {
+            let (attempt, asked) = bench.asked().unwrap();
+            assert_eq!(asked, expected);
+            bench.fails(attempt);
+        }
+        assert!(bench.asked().is_none());
+        pauses.push(bench.wait());
+    }
+    assert!(pauses.is_sorted(), "{pauses:?}");
+    assert_eq!(pauses.first(), Some(&Duration::from_millis(100)));
+    assert_eq!(pauses.last(), Some(&Duration::from_secs(5)));
+    let state = &bench.core.peers(bench.now)[0];
+    assert_eq!((state.failures.len(), state.rounds), (3, 9));
+    assert_eq!(state.answers, None);
+}
+
+#[test]
+fn who_answers_is_asked_seldom_and_at_once_when_the_connection_ends() {
+    let mut bench = Bench::new();
+    let listed = peer(&["tcp://a:2"]);
+    bench.core.keep_in_touch(bench.now, vec![listed.clone()]);
+    let (attempt, _) = bench.asked().unwrap();
+    bench.answers(attempt);
+    let state = &bench.core.peers(bench.now)[0];
+    assert_eq!(state.answers, Some(listed.locations[0].clone()));
+    assert_eq!(bench.wait(), Duration::from_secs(5));
+    let (attempt, _) = bench.asked().unwrap();
+    bench.answers(attempt);
+    bench.now.instant += Duration::from_secs(1);
+    let location: Location = "tcp://a:2".parse().unwrap();
+    bench.core.handle_parted(bench.now, &location);
+    assert_eq!(bench.wait(), Duration::ZERO);
+    let (attempt, _) = bench.asked().unwrap();
+    bench.answers(attempt);
+    // One that comes and goes all the time is not asked all the time.
+    bench.core.handle_parted(bench.now, &location);
+    assert_eq!(bench.wait(), Duration::from_millis(200));
+}
+
+#[test]
+fn silence_counts_as_nobody() {
+    let mut bench = Bench::new();
+    bench
+        .core
+        .keep_in_touch(bench.now, vec![peer(&["tcp://a:2", "tcp://b:2"])]);
+    bench.asked().unwrap();
+    bench.wait();
+    assert!(matches!(
+        bench.core.poll_action(),
+        Some(Action::Abandon { .. })
+    ));
+    assert_eq!(bench.asked().unwrap().1, "tcp://b:2");
+    let state = &bench.core.peers(bench.now)[0];
+    assert_eq!(state.failures[0].1.fault, WayFault::TimedOut);
+}
+
+#[test]
+fn other_peers_replace_those_before_and_the_same_stay() {
+    let mut bench = Bench::new();
+    let (first, second) = (peer(&["tcp://a:1"]), peer(&["tcp://b:1"]));
+    bench.core.keep_in_touch(bench.now, vec![first.clone()]);
+    let (attempt, _) = bench.asked().unwrap();
+    bench.answers(attempt);
+    let both = vec![second, first];
+    bench.core.keep_in_touch(bench.now, both);
+    assert_eq!(bench.asked().unwrap().1, "tcp://b:1");
+    assert!(bench.asked().is_none(), "the first was asked a moment ago");
+    bench.core.keep_in_touch(bench.now, Vec::new());
+    assert!(matches!(
+        bench.core.poll_action(),
+        Some(Action::Abandon { .. })
+    ));
+    assert_eq!(bench.core.poll_timeout(), None);
+}

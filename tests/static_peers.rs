@@ -1,0 +1,104 @@
+//! Gateways that know each other from their configuration, where nobody can be discovered.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use fipa::config::Sources;
+use fipa::{AgentId, Config, Domain, Gateway, Kind, Neighbour, Performative};
+
+fn config(set: &[String]) -> Config {
+    static NEXT: AtomicU32 = AtomicU32::new(0);
+    let number = NEXT.fetch_add(1, Ordering::Relaxed);
+    let mark = format!("{}-{number}", std::process::id());
+    let own = [
+        format!("domain=static-{mark}"),
+        format!("mts.name=gateway-{mark}"),
+        "discovery.mdns=false".to_owned(),
+    ];
+    Config::load(&Sources {
+        set: own.iter().chain(set).cloned().collect(),
+        ..Sources::default()
+    })
+    .unwrap()
+}
+
+fn address(gateway: &Gateway) -> String {
+    let mut ways = gateway.locations().iter();
+    let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
+    way.address().to_owned()
+}
+
+fn knowing(name: &str, addresses: &[&str]) -> String {
+    let addresses: Vec<String> = addresses.iter().map(|a| format!("\"tcp://{a}\"")).collect();
+    format!(
+        "discovery.static={{ \"{name}\" = [{}] }}",
+        addresses.join(", ")
+    )
+}
+
+async fn until(what: &str, condition: impl Fn() -> bool) {
+    let started = Instant::now();
+    while !condition() {
+        assert!(started.elapsed() < Duration::from_secs(60), "never: {what}");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_static_peer_is_connected_before_any_letter_and_again_when_it_comes_back() {
+    let far_config = config(&[]);
+    let far = Gateway::open(&far_config).await.unwrap();
+    let at = address(&far);
+    // Nobody is at the first address.
+    let near = config(&[knowing("far", &["127.0.0.1:9", &at])]);
+    let near = Gateway::open(&near).await.unwrap();
+    let far_is = |neighbours: Vec<Neighbour>, life| {
+        let mut all = neighbours.into_iter();
+        all.any(|it| it.entry.incarnation == life && it.peer.as_deref() == Some("far"))
+    };
+    let first_life = far.incarnation();
+    until("the far gateway is a neighbour", || {
+        far_is(near.neighbours(), first_life)
+    })
+    .await;
+    // It need not have been told of those who call.
+    until("the near gateway is a neighbour", || {
+        let mut all = far.neighbours().into_iter();
+        all.any(|it| it.entry.incarnation == near.incarnation())
+    })
+    .await;
+    far.close().await;
+    until("nobody is there", || near.neighbours().is_empty()).await;
+    let mut again = far_config.clone();
+    again.transport.tcp.listen = vec![at];
+    let far = Gateway::open(&again).await.unwrap();
+    let second_life = far.incarnation();
+    assert_ne!(first_life, second_life);
+    until("its next life is a neighbour", || {
+        far_is(near.neighbours(), second_life)
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_gateway_says_what_it_does_not_understand() {
+    let config = config(&[]);
+    let gateway = Gateway::open(&config).await.unwrap();
+    let domain = Domain::open(&config).await.unwrap();
+    let rover = domain.register("rover").unwrap();
+    let request = rover
+        .message(Performative::Request)
+        .receiver(AgentId::new(gateway.name()).unwrap())
+        .ontology("tea")
+        .reply_with("1")
+        .content("make some")
+        .build()
+        .unwrap();
+    assert!(rover.send(request).await.unwrap().all_succeeded());
+    let answer = rover.receive().await.unwrap().message;
+    assert_eq!(*answer.performative(), Performative::NotUnderstood);
+    assert_eq!(answer.in_reply_to(), Some("1"));
+    assert_eq!(answer.sender().unwrap().name(), gateway.name());
+}
