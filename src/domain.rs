@@ -2,12 +2,13 @@
 
 use std::sync::Arc;
 
-use fipa_sds::{Directory, HostError, RegisterError, Registration};
+use fipa_sds::{Directory, HostError, Query, RegisterError, Registration};
 use fipa_transport::{Incarnation, Kind, ListenError};
 
 use crate::agent::Agent;
 use crate::config::ConfigError;
 use crate::place::PlaceError;
+use crate::routes::{self, Report};
 use crate::service::{Role, Service};
 use crate::{AgentId, AgentIdError, Config};
 
@@ -148,6 +149,15 @@ impl Domain {
     #[must_use]
     pub fn directory(&self) -> &dyn Directory {
         &*self.inner.service.host
+    }
+
+    /// Which way letters from this process to the agents that match would go now, and what has
+    /// happened on each of its ways. For agents of other hosts that is the way to the gateway; see
+    /// [`routes::of_gateway`](crate::routes::of_gateway) for how it goes on from there.
+    #[must_use]
+    pub fn routes(&self, to: &Query) -> Report {
+        let entries = routes::agents(self.directory(), to);
+        self.inner.service.report(&entries)
     }
 
     /// Leaves the domain: gives letters under way a moment to arrive, then ends. All agents of

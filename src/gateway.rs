@@ -28,7 +28,7 @@ use crate::{AgentId, Config};
 
 /// A running gateway. Ends when [`close`](Self::close) is called or it is dropped.
 pub struct Gateway {
-    service: Service,
+    service: Arc<Service>,
     network: Option<Arc<dyn Network>>,
     view: Arc<dyn Directory>,
     neighbours: Arc<Neighbours>,
@@ -71,7 +71,7 @@ impl Gateway {
             return Err(OpenError::NoRuntime);
         };
         let mut gateway = Self {
-            service,
+            service: Arc::new(service),
             network,
             view,
             neighbours: Arc::clone(&contacts.neighbours),
@@ -108,9 +108,9 @@ impl Gateway {
         let id = AgentId::new(&*own.name)
             .map_err(|error| OpenError::Name(RegisterError::Failed(Arc::new(error))))?;
         let clerk = Clerk {
-            mts: self.service.mts.clone(),
+            service: Arc::clone(&self.service),
             id,
-            incarnation: own.incarnation,
+            neighbours: Arc::clone(&self.neighbours),
             view: Arc::clone(&self.view),
         };
         self.tasks.push(tokio::spawn(clerk.run()));

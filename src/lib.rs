@@ -26,6 +26,7 @@
 //! * [`Domain`] is this process's membership, [`Agent`] one name in it.
 //! * [`config`] is what the owner of a robot chooses, in one TOML file.
 //! * [`blocking`] is for processes without an async runtime.
+//! * [`routes`] tells which way letters would go now, and why.
 //! * [`Gateway`] (feature `net`) is what `fipa up` runs; robot processes do not need it.
 //!
 //! What must not live here: delivery (that is `fipa-mts`), transports, terminals.
@@ -40,6 +41,7 @@ mod domain;
 #[cfg(feature = "net")]
 mod gateway;
 mod place;
+pub mod routes;
 mod service;
 
 pub use agent::{Agent, Deliveries, Delivery, Incoming, Loan, ReceiveError, SendError};

@@ -6,13 +6,14 @@ use std::time::Duration;
 
 use fipa_mts::core::CoreConfig;
 use fipa_mts::{Contacts, Mts, RuntimeConfig, Started};
-use fipa_sds::{Directory, HostConfig, HostDirectory, HostError, Pattern};
+use fipa_sds::{Directory, Entry, HostConfig, HostDirectory, HostError, Pattern};
 use fipa_transport::{Incarnation, Kind, Location, Transport};
 use tokio::runtime::Handle;
 
 use crate::Config;
 use crate::domain::OpenError;
 use crate::place::{Place, RETRIES};
+use crate::routes::Report;
 
 /// How long a service that ends waits for what is under way.
 pub(crate) const CLOSING_PATIENCE: Duration = Duration::from_secs(1);
@@ -23,10 +24,6 @@ pub(crate) struct Service {
     pub(crate) host: Arc<HostDirectory>,
     pub(crate) locations: Vec<Location>,
     /// The service as the directory names it.
-    #[cfg_attr(
-        not(feature = "net"),
-        expect(dead_code, reason = "only a gateway says it")
-    )]
     pub(crate) own: fipa_sds::Mts,
     place: Place,
 }
@@ -100,6 +97,19 @@ impl Service {
             tracing::warn!(%kind, error, "a transport cannot be used; going on without it");
         }
         Ok(service)
+    }
+
+    /// What this service does with letters to these agents now.
+    pub(crate) fn report(&self, to: &[Arc<Entry>]) -> Report {
+        Report {
+            mts: self.own.name.to_string(),
+            incarnation: self.own.incarnation,
+            locations: self.locations.clone(),
+            routes: self.mts.routes(to),
+            ways: self.mts.ways(),
+            peers: self.mts.peers().into_iter().map(Into::into).collect(),
+            neighbours: Vec::new(),
+        }
     }
 
     /// Gives what is under way a moment to end, then ends.

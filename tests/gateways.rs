@@ -7,9 +7,10 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use fipa::config::Sources;
+use fipa::routes::{self, Standing};
 use fipa::{
     Agent, AgentId, Config, Deliveries, Domain, FailureReason, Gateway, Kind, Message, OpenError,
-    Outcome, Performative,
+    Outcome, Performative, Query,
 };
 
 /// A host that no other test has, and names that nobody else announces.
@@ -263,4 +264,65 @@ async fn a_newcomer_that_writes_can_be_answered_at_once() {
             "welcome"
         );
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_gateway_tells_which_way_letters_go_and_what_became_of_them() {
+    let here = Host::new(&[
+        "mts.deadline=1s",
+        "routes={ \"arm.*\" = [\"tcp\", \"shm\"] }",
+    ]);
+    let there = Host::new(&[]);
+    let (near, at_home) = here.occupied().await;
+    let (far, abroad) = there.occupied().await;
+    let rover = at_home.register(&here.name("rover")).unwrap();
+    let arm = abroad.register(&there.name("arm")).unwrap();
+    known(&at_home, arm.name()).await;
+    for _ in 0..5 {
+        via(&rover.send(inform(&rover, arm.name(), "x")).await.unwrap());
+    }
+    let asker = at_home.register(&here.name("asker")).unwrap();
+    let gateway = at_home.directory().lookup(near.name()).unwrap();
+    let patience = Duration::from_secs(30);
+    let ask = || routes::of_gateway(&asker, &gateway, Some(arm.name()), patience);
+
+    let report = ask().await.unwrap();
+    assert_eq!(report.incarnation, near.incarnation());
+    let [route] = report.routes.as_slice() else {
+        panic!("{report:?}");
+    };
+    assert_eq!(route.receiver, arm.name());
+    assert_eq!(route.gateway, Some(far.incarnation()));
+    assert_eq!(route.exception.as_deref(), Some("arm.*"));
+    assert_eq!(route.ways[0].location.incarnation(), far.incarnation());
+    assert_eq!(route.ways[0].standing, Standing::Ready);
+    let way = &route.ways[0].location;
+    let counted = report.ways.iter().find(|it| it.location == *way).unwrap();
+    assert_eq!(
+        (counted.tried, counted.taken, counted.failed),
+        (5, 5, 0),
+        "{counted:?}"
+    );
+    assert_eq!(counted.in_flight, 0);
+    let mut connected = report.neighbours.iter();
+    assert!(connected.any(|it| it.incarnation == far.incarnation()));
+
+    // What this process does itself: its letters go to the gateway, by the same exception.
+    let own = at_home.routes(&Query::all());
+    let mut routes = own.routes.iter();
+    let to_arm = routes.find(|it| it.receiver == arm.name()).unwrap();
+    assert_eq!(to_arm.gateway, Some(near.incarnation()));
+    assert_eq!(to_arm.ways[0].location.kind(), Kind::Tcp);
+
+    // A gateway that is killed says no goodbye: what is tried fails, and that is told.
+    let mut killed = Some(far);
+    drop(killed.take());
+    let lost = rover.send(inform(&rover, arm.name(), "?")).await.unwrap();
+    assert!(!lost.all_succeeded(), "{lost}");
+    let report = ask().await.unwrap();
+    let counted = report.ways.iter().find(|it| it.location == *way);
+    let counted = counted.unwrap();
+    assert!(counted.failed > 0, "{counted:?}");
+    assert!(counted.last_error.is_some(), "{counted:?}");
+    assert_eq!(counted.tried, counted.taken + counted.failed, "{counted:?}");
 }

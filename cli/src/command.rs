@@ -6,6 +6,7 @@ mod decode;
 mod demo;
 mod echo;
 mod encode;
+mod routes;
 mod send;
 mod up;
 
@@ -21,6 +22,7 @@ pub(crate) enum Command {
     Agents(agents::Arguments),
     Send(Box<send::Arguments>),
     Echo(echo::Arguments),
+    Routes(routes::Arguments),
     Demo(demo::Arguments),
     Decode(decode::Arguments),
     Encode(encode::Arguments),
@@ -34,6 +36,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Agents(arguments) => agents::run(arguments, global),
         Command::Send(arguments) => send::run(*arguments, global),
         Command::Echo(arguments) => echo::run(arguments, global),
+        Command::Routes(arguments) => routes::run(arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),
         Command::Decode(arguments) => decode::run(arguments, global),
         Command::Encode(arguments) => encode::run(arguments, global),

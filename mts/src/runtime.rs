@@ -26,7 +26,9 @@ use tokio::runtime::Handle;
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 
-use crate::core::{Action, Core, CoreConfig, Now, Peer, PeerState, Received, SendId, Submission};
+use crate::core::{
+    Action, Core, CoreConfig, Now, Peer, PeerState, Received, Route, SendId, Submission, WayState,
+};
 
 /// What the runtime is told at its start, besides the core's configuration.
 #[derive(Clone)]
@@ -52,6 +54,9 @@ pub trait Contacts: Send + Sync {
     /// A connection has ended; see [`Sink::parted`].
     fn parted(&self, peer: &Introduction);
 }
+
+/// Routes that are looked up under one lock.
+const ROUTES_AT_ONCE: usize = 64;
 
 /// A running message transport service.
 ///
@@ -220,6 +225,25 @@ impl Mts {
     #[must_use]
     pub fn peers(&self) -> Vec<PeerState> {
         self.shared.state.lock().core.peers(Now::read())
+    }
+
+    /// How letters from here to these agents would go now.
+    #[must_use]
+    pub fn routes(&self, to: &[Arc<Entry>]) -> Vec<Route> {
+        // Not all under one lock: letters go on meanwhile.
+        let parts = to.chunks(ROUTES_AT_ONCE).flat_map(|part| {
+            let state = self.shared.state.lock();
+            let now = Now::read();
+            let routes = part.iter().map(|entry| state.core.route(now, entry));
+            routes.collect::<Vec<_>>()
+        });
+        parts.collect()
+    }
+
+    /// What has happened on each way so far; see [`Core::ways`].
+    #[must_use]
+    pub fn ways(&self) -> Vec<WayState> {
+        self.shared.state.lock().core.ways(Now::read())
     }
 
     /// The next letter for this agent, or none when the agent was deregistered or the service

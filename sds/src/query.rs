@@ -1,5 +1,7 @@
 //! Searching the directory, and the patterns in which receivers may be named.
 
+use std::fmt;
+
 use regex::{Regex, RegexBuilder};
 
 use crate::{Entry, MAX_NAME};
@@ -49,6 +51,16 @@ impl Pattern {
     #[must_use]
     pub fn matches(&self, text: &str) -> bool {
         self.0.is_match(text)
+    }
+}
+
+/// The pattern as it was written.
+impl fmt::Display for Pattern {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let whole = self.0.as_str();
+        let inner = whole.strip_prefix(r"\A(?:").unwrap_or(whole);
+        let inner = inner.strip_suffix(r")\z").unwrap_or(inner);
+        f.write_str(inner.trim_end_matches('\n'))
     }
 }
 

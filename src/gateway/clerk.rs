@@ -4,30 +4,36 @@
 //! Letters are told apart by their ontology. What nobody here understands is answered so, when an
 //! answer was asked for.
 
+use std::error::Error;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_mts::core::{Received, Submission};
-use fipa_mts::{Mts, letter_for};
-use fipa_sds::{Directory, Entry};
+use fipa_mts::letter_for;
+use fipa_sds::{Directory, Entry, Matcher, Query};
 use fipa_transport::Incarnation;
+
+use super::neighbours::Neighbours;
+use crate::routes;
+use crate::service::Service;
 
 /// How long an answer may be under way.
 const ANSWER_DEADLINE: Duration = Duration::from_secs(5);
 
 /// The agent that the gateway itself is.
 pub(crate) struct Clerk {
-    pub(crate) mts: Mts,
+    pub(crate) service: Arc<Service>,
     pub(crate) id: AgentId,
-    pub(crate) incarnation: Incarnation,
+    pub(crate) neighbours: Arc<Neighbours>,
     pub(crate) view: Arc<dyn Directory>,
 }
 
 impl Clerk {
     /// Reads and answers until the service ends.
     pub(crate) async fn run(self) {
-        while let Some(received) = self.mts.receive(self.incarnation).await {
+        let (mts, own) = (&self.service.mts, self.service.own.incarnation);
+        while let Some(received) = mts.receive(own).await {
             let Received { letter, sender, .. } = received;
             match Message::decode(letter.payload()) {
                 Ok(message) => self.handle(&message, sender),
@@ -48,9 +54,39 @@ impl Clerk {
             tracing::debug!(performative = %message.performative(), "nothing to be done about it");
             return;
         }
-        self.answer(message, sender, Performative::NotUnderstood, |answer| {
-            answer.content("the gateway does not know this ontology")
-        });
+        match message.ontology() {
+            Some(routes::ONTOLOGY) => self.tell_routes(message, sender),
+            _ => self.answer(message, sender, Performative::NotUnderstood, |answer| {
+                answer.content("the gateway does not know this ontology")
+            }),
+        }
+    }
+
+    fn tell_routes(&self, message: &Message, sender: Incarnation) {
+        match self.report_for(message) {
+            Ok(content) => self.answer(message, sender, Performative::Inform, |answer| {
+                answer.language("json").content(content)
+            }),
+            Err(error) => self.answer(message, sender, Performative::NotUnderstood, |answer| {
+                answer.content(error.to_string())
+            }),
+        }
+    }
+
+    fn report_for(&self, message: &Message) -> Result<Vec<u8>, Box<dyn Error>> {
+        let query = match message.content() {
+            Some(receivers) if !receivers.is_empty() => {
+                Query::by_name(Matcher::parse(std::str::from_utf8(receivers)?)?)
+            }
+            _ => Query::all(),
+        };
+        let entries = routes::agents(&*self.view, &query);
+        let neighbours = self.neighbours.all().into_iter();
+        let report = routes::Report {
+            neighbours: neighbours.map(Into::into).collect(),
+            ..self.service.report(&entries)
+        };
+        Ok(serde_json::to_vec(&report)?)
     }
 
     /// Answers to the very life of an agent that asked.
@@ -77,13 +113,13 @@ impl Clerk {
         match letter_for(message, SystemTime::now()) {
             Ok(letter) => {
                 let submission = Submission {
-                    sender: self.incarnation,
+                    sender: self.service.own.incarnation,
                     letter,
                     receivers: Vec::new(),
                     deadline: ANSWER_DEADLINE,
                 };
                 // It is on its way; when it fails, whoever waits for it asks again.
-                drop(self.mts.send_to(submission, to));
+                drop(self.service.mts.send_to(submission, to));
             }
             Err(error) => tracing::warn!(%error, "the gateway could not write"),
         }

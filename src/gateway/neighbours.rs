@@ -17,6 +17,8 @@ use fipa_sds::{
 use fipa_transport::{Incarnation, Introduction, Location};
 use parking_lot::Mutex;
 
+use crate::routes::Connected;
+
 /// Those that a connection is open with. Their number is bounded by that of connections.
 #[derive(Debug, Default)]
 pub(crate) struct Neighbours {
@@ -40,6 +42,20 @@ pub struct Neighbour {
     pub connections: usize,
     /// What `discovery.static` calls it, if it stands there.
     pub peer: Option<Arc<str>>,
+}
+
+impl From<Neighbour> for Connected {
+    fn from(neighbour: Neighbour) -> Self {
+        let entry = neighbour.entry;
+        let since = SystemTime::now().duration_since(entry.registered);
+        Self {
+            name: entry.name.to_string(),
+            incarnation: entry.incarnation,
+            locations: entry.locations.clone(),
+            connections: neighbour.connections,
+            seconds: since.unwrap_or_default().as_secs(),
+        }
+    }
 }
 
 impl Neighbours {

@@ -57,10 +57,16 @@ impl CoreConfig {
 
     /// The order of transports for letters to this receiver.
     pub(crate) fn order_for(&self, receiver: &str) -> &[Kind] {
-        let exception = self
-            .routes
-            .iter()
-            .find(|(pattern, _)| pattern.matches(receiver));
-        exception.map_or(&self.order, |(_, order)| order)
+        self.route_for(receiver).1
+    }
+
+    /// The order of transports for letters to this receiver, and the pattern that says so when it
+    /// is an exception.
+    pub(crate) fn route_for(&self, receiver: &str) -> (Option<&Pattern>, &[Kind]) {
+        let mut routes = self.routes.iter();
+        match routes.find(|(pattern, _)| pattern.matches(receiver)) {
+            Some((pattern, order)) => (Some(pattern), order),
+            None => (None, &self.order),
+        }
     }
 }

@@ -12,6 +12,7 @@ use fipa_transport::{
     Stream, Ticket,
 };
 
+use super::routes::Tallies;
 use super::{CoreConfig, SendId};
 
 /// Something the runtime has to do for the delivery core.
@@ -126,6 +127,7 @@ pub(crate) struct Desk {
     pub(crate) undelivered: VecDeque<Undelivered>,
     /// Bytes of all letters in lanes.
     pub(crate) held: usize,
+    pub(super) tallies: Tallies,
     health: HashMap<Location, Health>,
     /// Lanes that found no room on the way to a location, in order.
     waiting_for_room: HashMap<Location, VecDeque<Stream>>,
@@ -153,6 +155,7 @@ impl Desk {
             attempts: HashMap::new(),
             undelivered: VecDeque::new(),
             held: 0,
+            tallies: Tallies::default(),
             health: HashMap::new(),
             waiting_for_room: HashMap::new(),
             next_attempt: 1,
@@ -305,6 +308,12 @@ impl Desk {
             self.waiting_for_room.remove(location);
         }
         stream
+    }
+
+    /// How often in a row this way has failed and until when it is put back, if it is.
+    pub(super) fn failing(&self, now: Instant, location: &Location) -> Option<(u32, Instant)> {
+        let health = self.health.get(location)?;
+        (health.retry_at > now).then_some((health.failures, health.retry_at))
     }
 
     pub(crate) fn way_worked(&mut self, location: &Location) {

@@ -9,6 +9,7 @@
 //! * `inbox`: the receiving end, where letters are taken once and in order.
 //! * `forward`: letters for somebody else.
 //! * `peers`: services that the configuration names, and how it stands with them.
+//! * `routes`: which way letters would go and what happened on each way, for people.
 //! * `desk`: what lanes share: attempts, health of ways, things to be done.
 //!
 //! A letter's order and identity are its *stream* (one life of the sender, one life of the
@@ -21,6 +22,7 @@ mod forward;
 mod inbox;
 mod lane;
 mod peers;
+mod routes;
 
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, HashMap};
@@ -42,6 +44,7 @@ pub use inbox::Received;
 use lane::{Delivery, Lane, Moved};
 use peers::Peers;
 pub use peers::{Peer, PeerState};
+pub use routes::{Route, Standing, Way, WayState};
 
 /// What time it is, by both clocks.
 #[derive(Debug, Clone, Copy)]
@@ -328,6 +331,18 @@ impl Core {
             };
             self.put(now, stream, Arc::clone(&to.name), delivery);
         }
+    }
+
+    /// How letters from here to the agent of this entry would go now.
+    #[must_use]
+    pub fn route(&self, now: Now, entry: &Entry) -> Route {
+        self.desk.route(now.instant, entry)
+    }
+
+    /// What has happened on each way so far, in the order of their locations.
+    #[must_use]
+    pub fn ways(&self, now: Now) -> Vec<WayState> {
+        self.desk.way_states(now.instant)
     }
 
     /// The first way that a letter from here to this receiver would take now.

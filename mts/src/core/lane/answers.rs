@@ -9,6 +9,7 @@ use fipa_transport::{
 };
 
 use super::super::desk::Desk;
+use super::super::routes::Tally;
 use super::delivery::State;
 use super::{BUSY_PAUSE, CONGESTED_PAUSE, CONGESTED_TRIES, Lane, Moved};
 
@@ -34,14 +35,23 @@ impl Lane {
             } if *current == attempt => location.clone(),
             _ => return,
         };
-        self.under_way -= 1;
+        self.back();
         self.letters[index].progress.state = State::Waiting;
         match conclusion {
             Conclusion::Answered(answer) => {
+                if let Some(tally) = self.tally() {
+                    Tally::add(match answer {
+                        Answer::Accepted | Answer::Custody => &tally.taken,
+                        _ => &tally.turned_back,
+                    });
+                }
                 desk.way_worked(&location);
                 self.answered(now, index, location, answer, desk, moved);
             }
             Conclusion::Handed => {
+                if let Some(tally) = self.tally() {
+                    Tally::add(&tally.taken);
+                }
                 desk.way_worked(&location);
                 let attempts = std::mem::take(&mut self.letters[index].progress.attempts);
                 self.settle(
@@ -175,6 +185,9 @@ impl Lane {
         desk: &mut Desk,
     ) {
         self.recovering = true;
+        if let Some(tally) = self.tally() {
+            tally.fail(now, &error);
+        }
         if error.fault == WayFault::Congested && self.congested < CONGESTED_TRIES {
             // What is under way, in this lane or in another, makes room.
             self.congested += 1;
@@ -204,9 +217,8 @@ impl Lane {
         let Some(index) = self.index(sequence) else {
             return;
         };
-        let delivery = &mut self.letters[index];
         let delivered = !matches!(report.outcome, Outcome::Failed { .. });
-        let taken_by = match &delivery.progress.state {
+        let taken_by = match &self.letters[index].progress.state {
             // It is being tried again; that somebody failed with it before changes nothing.
             State::Waiting if !delivered => return,
             State::Waiting => None,
@@ -217,10 +229,11 @@ impl Lane {
             } => {
                 let kind = location.kind();
                 desk.abandon(kind, *attempt);
-                self.under_way -= 1;
+                self.back();
                 Some(kind)
             }
         };
+        let delivery = &mut self.letters[index];
         delivery.progress.state = State::Waiting;
         // The sender is told the way between the hosts, which only this side may have seen.
         let way = |theirs| match taken_by {

@@ -25,10 +25,14 @@ impl Lane {
                 {
                     let (attempt, location) = (*attempt, location.clone());
                     desk.abandon(location.kind(), attempt);
-                    self.under_way -= 1;
+                    delivery.progress.state = State::Waiting;
+                    self.back();
                     self.recovering = true;
-                    let text = "the letter's deadline passed";
-                    delivery.failed_at(&location, WayError::new(WayFault::TimedOut, text));
+                    let error = WayError::new(WayFault::TimedOut, "the letter's deadline passed");
+                    if let Some(tally) = self.tally() {
+                        tally.fail(now, &error);
+                    }
+                    self.letters[index].failed_at(&location, error);
                 }
                 self.fail(index, reason, desk);
                 continue;
@@ -45,9 +49,9 @@ impl Lane {
             {
                 let (attempt, location) = (*attempt, location.clone());
                 desk.abandon(location.kind(), attempt);
-                self.under_way -= 1;
                 delivery.progress.state = State::Waiting;
                 delivery.progress.unconfirmed = true;
+                self.back();
                 let error = WayError::new(WayFault::TimedOut, "");
                 self.came_back(now, index, &location, error, desk);
             }

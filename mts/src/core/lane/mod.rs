@@ -25,6 +25,7 @@ use fipa_transport::{
 pub(crate) use self::delivery::Delivery;
 use self::delivery::State;
 use super::desk::{Desk, Origin, Purpose, Undelivered};
+use super::routes::Tally;
 
 /// How many failed letters of a stream are remembered to mend the order of later ones.
 const MAX_SKIPPED: usize = 64;
@@ -51,6 +52,8 @@ pub(crate) struct Lane {
     under_way: usize,
     /// The way that letters under way go.
     way: Option<Location>,
+    /// Where it is counted what happens on that way, also when it was the last one.
+    tally: Option<(Location, Arc<Tally>)>,
     /// Something came back: nothing is dispatched until all that is under way has been heard of.
     recovering: bool,
     paused_until: Option<Instant>,
@@ -84,6 +87,7 @@ impl Lane {
             letters: VecDeque::new(),
             under_way: 0,
             way: None,
+            tally: None,
             recovering: false,
             paused_until: None,
             pauses: 0,
@@ -214,6 +218,9 @@ impl Lane {
 
     fn dispatch(&mut self, now: Instant, index: usize, way: Location, desk: &mut Desk) {
         let after = self.after(index);
+        if let Some(tally) = self.tally_of(&way, desk) {
+            Tally::add(&tally.tried);
+        }
         let delivery = &mut self.letters[index];
         let left = delivery.deadline.saturating_duration_since(now);
         let parcel = Parcel {
@@ -242,6 +249,30 @@ impl Lane {
         self.due_at(times_out);
         self.under_way += 1;
         self.way = Some(way);
+    }
+
+    /// The tally of the way that letters take now: looked up when the way changes, not for each.
+    fn tally_of(&mut self, way: &Location, desk: &mut Desk) -> Option<&Tally> {
+        if self
+            .tally
+            .as_ref()
+            .is_none_or(|(counted, _)| counted != way)
+        {
+            self.tally = Some((way.clone(), desk.tallies.of(way)));
+        }
+        self.tally()
+    }
+
+    fn tally(&self) -> Option<&Tally> {
+        self.tally.as_ref().map(|(_, tally)| &**tally)
+    }
+
+    /// A letter is not under way any more.
+    fn back(&mut self) {
+        self.under_way -= 1;
+        if let Some(tally) = self.tally() {
+            Tally::add(&tally.ended);
+        }
     }
 
     /// The letter that the one at `index` comes after: what it was told, unless that failed here,
@@ -340,14 +371,15 @@ impl Lane {
             } = &delivery.progress.state
             {
                 desk.abandon(location.kind(), *attempt);
+                self.back();
             }
+            let delivery = &self.letters[0];
             let reason = match delivery.reason_at_deadline() {
                 FailureReason::TimedOut => FailureReason::Unreachable,
                 reason => reason,
             };
             self.fail(0, reason, desk);
         }
-        self.under_way = 0;
     }
 
     fn fail(&mut self, index: usize, reason: FailureReason, desk: &mut Desk) {

@@ -1,0 +1,211 @@
+//! Routes and ways as people look at them: which way a letter to somebody would go now, and why;
+//! what has happened on each way so far.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use fipa_sds::{Entry, Reach};
+use fipa_transport::{Incarnation, Location};
+use parking_lot::Mutex;
+use serde::{Deserialize, Serialize};
+
+use super::desk::Desk;
+
+/// How letters to one agent would go now.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Route {
+    /// The agent's name.
+    pub receiver: String,
+    /// This life of it.
+    pub incarnation: Incarnation,
+    /// The gateway that letters go to, when the agent is on another host.
+    pub gateway: Option<Incarnation>,
+    /// The pattern of `[routes]` that decides, or none for the order of `mts.transports`.
+    pub exception: Option<String>,
+    /// Its locations, in the order in which they would be tried. Those that would not be come
+    /// last.
+    pub ways: Vec<Way>,
+}
+
+/// A location of an agent, as seen from one service.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Way {
+    /// The location.
+    pub location: Location,
+    /// Whether letters would go there.
+    pub standing: Standing,
+}
+
+/// Whether letters would go to a location.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "standing", rename_all = "snake_case")]
+#[non_exhaustive]
+pub enum Standing {
+    /// It works as far as is known.
+    Ready,
+    /// It failed, and is tried after all that work, until this time has passed.
+    Failing {
+        /// How long it is put back still.
+        milliseconds: u64,
+        /// How often in a row it failed.
+        failures: u32,
+        /// Why it failed last.
+        error: String,
+    },
+    /// Its transport is not in the order for this receiver.
+    NotInOrder,
+}
+
+/// What has happened on one way since the service started, or since the way was last forgotten:
+/// the least used are, when there are more than 4096.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WayState {
+    /// Where to.
+    pub location: Location,
+    /// How it stands now.
+    #[serde(flatten)]
+    pub standing: Standing,
+    /// Letters that were sent there and have no answer yet.
+    pub in_flight: u64,
+    /// Attempts to send a letter there.
+    pub tried: u64,
+    /// Letters that the other side took, into a queue or into custody, or that were handed to a
+    /// peer that cannot confirm.
+    pub taken: u64,
+    /// Letters that the other side did not take: its queue was full, or it had a reason of its own.
+    pub turned_back: u64,
+    /// Attempts that failed: nobody reached, or nothing heard.
+    pub failed: u64,
+    /// Why the last of these failed.
+    pub last_error: Option<String>,
+    /// How many seconds ago that was.
+    pub last_error_seconds: Option<u64>,
+}
+
+/// What happens on one way, counted.
+#[derive(Debug, Default)]
+pub(crate) struct Tally {
+    pub(super) tried: AtomicU64,
+    pub(super) ended: AtomicU64,
+    pub(super) taken: AtomicU64,
+    pub(super) turned_back: AtomicU64,
+    pub(super) failed: AtomicU64,
+    last_error: Mutex<Option<(String, Instant)>>,
+}
+
+/// The tallies of all ways.
+#[derive(Debug, Default)]
+pub(super) struct Tallies(HashMap<Location, Arc<Tally>>);
+
+/// Ways that are counted, at most.
+const MAX_TALLIES: usize = 4096;
+
+impl Tally {
+    pub(super) fn add(counter: &AtomicU64) {
+        counter.fetch_add(1, Ordering::Relaxed);
+    }
+
+    pub(super) fn fail(&self, now: Instant, error: &impl std::fmt::Display) {
+        Self::add(&self.failed);
+        *self.last_error.lock() = Some((error.to_string(), now));
+    }
+
+    fn in_flight(&self) -> u64 {
+        let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        read(&self.tried).saturating_sub(read(&self.ended))
+    }
+}
+
+impl Tallies {
+    /// The tally of this way. Beyond the bound those nothing is under way on are forgotten.
+    pub(super) fn of(&mut self, location: &Location) -> Arc<Tally> {
+        if let Some(tally) = self.0.get(location) {
+            return Arc::clone(tally);
+        }
+        if self.0.len() >= MAX_TALLIES {
+            self.0.retain(|_, tally| tally.in_flight() > 0);
+        }
+        let tally = Arc::default();
+        if self.0.len() < MAX_TALLIES {
+            self.0.insert(location.clone(), Arc::clone(&tally));
+        }
+        tally
+    }
+}
+
+impl Desk {
+    /// How letters to this agent would go now.
+    pub(super) fn route(&self, now: Instant, entry: &Entry) -> Route {
+        let (exception, order) = self.config.route_for(&entry.name);
+        let mut ways = Vec::new();
+        let mut tried: Vec<Location> = Vec::new();
+        while let Some(location) = self.choose(now, entry, &tried) {
+            let standing = self.standing(now, &location);
+            tried.push(location.clone());
+            ways.push(Way { location, standing });
+        }
+        let rest = entry.locations.iter().filter(|it| !tried.contains(it));
+        debug_assert!(rest.clone().all(|it| !order.contains(&it.kind())));
+        ways.extend(rest.map(|location| Way {
+            location: location.clone(),
+            standing: Standing::NotInOrder,
+        }));
+        Route {
+            receiver: entry.name.to_string(),
+            incarnation: entry.incarnation,
+            gateway: match entry.reach {
+                Reach::Local => None,
+                Reach::Remote { gateway } => Some(gateway),
+            },
+            exception: exception.map(ToString::to_string),
+            ways,
+        }
+    }
+
+    fn standing(&self, now: Instant, location: &Location) -> Standing {
+        match self.failing(now, location) {
+            None => Standing::Ready,
+            Some((failures, retry_at)) => {
+                let left = retry_at.saturating_duration_since(now);
+                let tally = self.tallies.0.get(location);
+                let error = tally.and_then(|tally| tally.last_error.lock().clone());
+                Standing::Failing {
+                    milliseconds: u64::try_from(left.as_millis()).unwrap_or(u64::MAX),
+                    failures,
+                    error: error.map(|(text, _)| text).unwrap_or_default(),
+                }
+            }
+        }
+    }
+
+    /// What has happened on each way, by location.
+    pub(super) fn way_states(&self, now: Instant) -> Vec<WayState> {
+        let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        let tallies = self.tallies.0.iter();
+        let mut states: Vec<WayState> = tallies
+            .map(|(location, tally)| {
+                let last_error = tally.last_error.lock().clone();
+                let ago = |at: Instant| now.saturating_duration_since(at);
+                WayState {
+                    location: location.clone(),
+                    standing: self.standing(now, location),
+                    in_flight: tally.in_flight(),
+                    tried: read(&tally.tried),
+                    taken: read(&tally.taken),
+                    turned_back: read(&tally.turned_back),
+                    failed: read(&tally.failed),
+                    last_error_seconds: last_error.as_ref().map(|(_, at)| seconds(ago(*at))),
+                    last_error: last_error.map(|(text, _)| text),
+                }
+            })
+            .collect();
+        states.sort_unstable_by(|a, b| a.location.cmp(&b.location));
+        states
+    }
+}
+
+fn seconds(duration: Duration) -> u64 {
+    duration.as_secs()
+}
