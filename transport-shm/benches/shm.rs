@@ -4,26 +4,170 @@
 //! takes it and answers, the sender has the answer. `letter` is a parcel through the transport,
 //! from dispatch to conclusion; `loaned` is the same with content that is written by nobody, in
 //! memory that was loaned; `raw` is a bare iceoryx2 request of the same size and its response.
+//! `window` keeps eight rounds under way.
+//!
+//! Blocks of rounds of all kinds take turns, so that whatever else the machine does strikes all
+//! alike: compare the percentiles with each other, and never times of different runs.
 
+#![expect(clippy::print_stdout, reason = "what is measured is printed")]
+
+use std::collections::VecDeque;
 use std::hint::{black_box, spin_loop};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::time::Duration;
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use fipa_acl::{Letter, Payload};
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Kind, Parcel, Sink, Stream,
-    Transport, Verdict,
+    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Kind, Location, Parcel, Sink,
+    Stream, Transport, Verdict,
 };
 use fipa_transport_shm::{ShmConfig, ShmTransport};
+use iceoryx2::pending_response::PendingResponse;
+use iceoryx2::port::client::Client;
+use iceoryx2::port::server::Server;
 use iceoryx2::prelude::{
     AllocationStrategy, BackpressureStrategy, Config, FileName, NodeBuilder, Path, SemanticString,
     ServiceName, SignalHandlingMode, ipc_threadsafe,
 };
 
-const SIZES: [usize; 4] = [100, 1 << 10, 64 << 10, 1 << 20];
+/// How many rounds are measured before another kind has its turn.
+const BLOCK: usize = 500;
+
+/// How many rounds are under way in `window`.
+const WINDOW: usize = 8;
+
+/// Name, envelope and head of a message; and what follows the content.
+const FRONT: usize = 8 + 80 + 120;
+const TAIL: usize = 1;
+
+/// An answer of iceoryx2's as long as the transport's.
+type RawAck = [u8; 184];
+type RawHeader = [u64; 11];
+type RawClient = Client<ipc_threadsafe::Service, [u8], RawHeader, RawAck, ()>;
+type RawPending = PendingResponse<ipc_threadsafe::Service, [u8], RawHeader, RawAck, ()>;
+type RawServer = Server<ipc_threadsafe::Service, [u8], RawHeader, RawAck, ()>;
+
+fn main() {
+    // `cargo bench` passes `--bench`, and what was given behind `--`: how many blocks of each.
+    let mut blocks = std::env::args().filter_map(|argument| argument.parse().ok());
+    let blocks: usize = blocks.next_back().unwrap_or(40);
+    let directory = tempfile::tempdir().expect("a directory");
+    let (raw, ours) = (Raw::new(directory.path()), Ours::new(directory.path()));
+    let (raw, ours) = (&raw, &ours);
+    let mut kinds = Vec::new();
+    for size in [100, 1 << 10, 64 << 10, 1 << 20] {
+        let payload = vec![7; FRONT + size + TAIL];
+        let letter = parcel(Bytes::from(vec![7; size]));
+        let round = move || raw.end(raw.begin(&payload));
+        kinds.push(Measured::new("raw", size, RAW, 1, round));
+        let round = move || ours.round(letter.clone());
+        kinds.push(Measured::new("letter", size, OURS, 1, round));
+    }
+    for size in [1 << 10, 1 << 20, 4 << 20] {
+        let round = move || ours.round(ours.loaned(size));
+        kinds.push(Measured::new("loaned", size, OURS, 1, round));
+    }
+    let size = 1 << 10;
+    let payload = vec![7; FRONT + size + TAIL];
+    let round = move || raw.many(&payload, BLOCK);
+    kinds.push(Measured::new("raw window", size, RAW, BLOCK, round));
+    let letter = parcel(Bytes::from(vec![7; size]));
+    let round = move || ours.many(&letter, BLOCK);
+    kinds.push(Measured::new("window", size, OURS, BLOCK, round));
+
+    let turn = AtomicUsize::new(RAW);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            loop {
+                match turn.load(Ordering::Acquire) {
+                    RAW => raw.serve(),
+                    OURS => ours.serve(),
+                    _ => return,
+                }
+            }
+        });
+        for block in 0..=blocks {
+            for kind in &mut kinds {
+                turn.store(kind.turn, Ordering::Release);
+                // The first block warms up.
+                kind.measure(block > 0);
+            }
+        }
+        turn.store(END, Ordering::Release);
+    });
+    report(&mut kinds);
+}
+
+/// Whom the receiving thread serves.
+const RAW: usize = 0;
+const OURS: usize = 1;
+const END: usize = 2;
+
+/// A kind of round, and how long each took.
+struct Measured<'a> {
+    name: &'static str,
+    size: usize,
+    turn: usize,
+    /// How many letters a call of `round` moves.
+    letters: usize,
+    round: Box<dyn FnMut() + 'a>,
+    times: Vec<Duration>,
+}
+
+impl<'a> Measured<'a> {
+    fn new(
+        name: &'static str,
+        size: usize,
+        turn: usize,
+        letters: usize,
+        round: impl FnMut() + 'a,
+    ) -> Self {
+        Self {
+            name,
+            size,
+            turn,
+            letters,
+            round: Box::new(round),
+            times: Vec::new(),
+        }
+    }
+
+    fn measure(&mut self, counts: bool) {
+        // What is long is done less often.
+        let rounds = (BLOCK / self.letters).min((256 << 20) / self.size).max(1);
+        for _ in 0..rounds {
+            let began = Instant::now();
+            (self.round)();
+            let took = began.elapsed() / self.letters as u32;
+            if counts {
+                self.times.push(took);
+            }
+        }
+    }
+}
+
+fn report(kinds: &mut [Measured<'_>]) {
+    println!("microseconds per letter   size      p50      p90      p99    p99.9   p50 to raw");
+    let mut raw = Vec::new();
+    for kind in kinds {
+        kind.times.sort_unstable();
+        let last = kind.times.len() - 1;
+        let at = |share: f64| kind.times[(last as f64 * share) as usize].as_nanos() as f64 / 1e3;
+        let (name, size) = (kind.name, kind.size);
+        let [p50, p90, p99, p999] = [0.5, 0.9, 0.99, 0.999].map(at);
+        print!("{name:<20} {size:>9} {p50:>8.2} {p90:>8.2} {p99:>8.2} {p999:>8.2}");
+        let many = kind.letters > 1;
+        match raw.iter().find(|(m, s, _)| (*m, *s) == (many, size)) {
+            Some((_, _, raw)) => println!(" {:>12.2}", p50 / raw),
+            None => println!(),
+        }
+        if kind.turn == RAW {
+            raw.push((many, size, p50));
+        }
+    }
+}
 
 /// Counts what was accepted.
 #[derive(Default)]
@@ -47,7 +191,7 @@ fn parcel(content: Bytes) -> Parcel {
     let payload = Payload {
         head: Bytes::from_static(&[1; 120]),
         content,
-        tail: Bytes::from_static(&[1]),
+        tail: Bytes::from_static(&[1; TAIL]),
     };
     Parcel {
         receiver: "arm_left".into(),
@@ -63,66 +207,159 @@ fn parcel(content: Bytes) -> Parcel {
     }
 }
 
-const FRONT: usize = 8 + 80 + 120;
+/// Two endpoints of a transport.
+struct Ours {
+    sender: ShmTransport,
+    sent: Arc<Count>,
+    receiver: ShmTransport,
+    to: Location,
+    // After the endpoints, which have tasks here.
+    _runtime: tokio::runtime::Runtime,
+}
 
-fn transport(criterion: &mut Criterion) {
-    let directory = tempfile::tempdir().expect("a directory");
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(1)
-        .enable_all()
-        .build()
-        .expect("a runtime");
-    let prefix = format!("fipabench-{}", Incarnation::random());
-    let endpoint = || {
-        let config = ShmConfig::new(
-            directory.path().join("domain"),
-            &prefix,
-            Incarnation::random(),
-        );
-        let endpoint = ShmTransport::new(config, runtime.handle().clone()).expect("an endpoint");
-        let sink = Arc::new(Count::default());
-        endpoint.listen(sink.clone()).expect("listening");
-        (endpoint, sink)
-    };
-    let (sender, sent) = endpoint();
-    let (receiver, _) = endpoint();
-    let to = receiver.location();
-    let done = AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        scope.spawn(|| {
-            while !done.load(Ordering::Relaxed) {
-                receiver.drive();
-            }
-        });
-        let round = |parcel: Parcel| {
-            let before = sent.0.load(Ordering::Acquire);
-            sender
-                .dispatch(AttemptId(before), &to, parcel)
-                .expect("room");
-            while sent.0.load(Ordering::Acquire) == before {
-                sender.drive();
-            }
+impl Ours {
+    fn new(directory: &std::path::Path) -> Self {
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()
+            .expect("a runtime");
+        let prefix = format!("fipabench-{}", Incarnation::random());
+        let endpoint = || {
+            let root = directory.join("domain");
+            let config = ShmConfig::new(root, &prefix, Incarnation::random());
+            let endpoint =
+                ShmTransport::new(config, runtime.handle().clone()).expect("an endpoint");
+            let sink = Arc::new(Count::default());
+            endpoint.listen(sink.clone()).expect("listening");
+            (endpoint, sink)
         };
-        let mut group = criterion.benchmark_group("shm");
-        for size in SIZES {
-            let letter = parcel(Bytes::from(vec![7; size]));
-            group.throughput(Throughput::Bytes(size as u64));
-            group.bench_function(BenchmarkId::new("letter", size), |bencher| {
-                bencher.iter(|| round(letter.clone()));
-            });
+        let (sender, sent) = endpoint();
+        let (receiver, _) = endpoint();
+        let to = receiver.location();
+        Self {
+            sender,
+            sent,
+            receiver,
+            to,
+            _runtime: runtime,
         }
-        for size in [1 << 10, 1 << 20, 4 << 20] {
-            group.throughput(Throughput::Bytes(size as u64));
-            group.bench_function(BenchmarkId::new("loaned", size), |bencher| {
-                bencher.iter(|| {
-                    let loan = sender.loan(&to, FRONT, size, 1).expect("room");
-                    round(parcel(loan.expect("shared memory loans").freeze()));
-                });
-            });
+    }
+
+    fn serve(&self) {
+        self.receiver.drive();
+    }
+
+    fn loaned(&self, size: usize) -> Parcel {
+        let loan = self.sender.loan(&self.to, FRONT, size, TAIL).expect("room");
+        parcel(loan.expect("shared memory loans").freeze())
+    }
+
+    fn round(&self, parcel: Parcel) {
+        let before = self.sent.0.load(Ordering::Acquire);
+        self.dispatch(parcel);
+        while self.sent.0.load(Ordering::Acquire) == before {
+            self.sender.drive();
         }
-        group.finish();
-        done.store(true, Ordering::Relaxed);
-    });
+    }
+
+    fn many(&self, parcel: &Parcel, total: usize) {
+        let before = self.sent.0.load(Ordering::Acquire);
+        let done = || (self.sent.0.load(Ordering::Acquire) - before) as usize;
+        let mut begun = 0;
+        while done() < total {
+            if begun < total && begun < done() + WINDOW {
+                self.dispatch(parcel.clone());
+                begun += 1;
+            } else {
+                self.sender.drive();
+            }
+        }
+    }
+
+    fn dispatch(&self, parcel: Parcel) {
+        let dispatched = self.sender.dispatch(AttemptId(1), &self.to, parcel);
+        dispatched.expect("room");
+    }
+}
+
+/// A bare iceoryx2 service.
+struct Raw {
+    client: RawClient,
+    server: RawServer,
+    _leftovers: Leftovers,
+}
+
+impl Raw {
+    fn new(directory: &std::path::Path) -> Self {
+        let mut config = Config::default();
+        let root = directory.to_str().expect("an ASCII path");
+        config
+            .global
+            .set_root_path(&Path::new(root.as_bytes()).expect("a path"));
+        let prefix = format!("fipabench-{}_", Incarnation::random());
+        let leftovers = Leftovers(prefix.clone());
+        config.global.prefix = FileName::new(prefix.as_bytes()).expect("a prefix");
+        let node = NodeBuilder::new()
+            .config(&config)
+            .signal_handling_mode(SignalHandlingMode::Disabled)
+            .create::<ipc_threadsafe::Service>()
+            .expect("a node");
+        let service = node
+            .service_builder(&ServiceName::new("raw").expect("a name"))
+            .request_response::<[u8], RawAck>()
+            .request_user_header::<RawHeader>()
+            .max_servers(1)
+            .max_clients(64)
+            .max_active_requests_per_client(16)
+            .max_response_buffer_size(1)
+            .enable_safe_overflow_for_requests(false)
+            .create();
+        let service = service.expect("a service");
+        Self {
+            server: service.server_builder().create().expect("a server"),
+            client: service
+                .client_builder()
+                .initial_max_slice_len(4096)
+                .allocation_strategy(AllocationStrategy::PowerOfTwo)
+                .backpressure_strategy(BackpressureStrategy::DiscardData)
+                .create()
+                .expect("a client"),
+            _leftovers: leftovers,
+        }
+    }
+
+    fn serve(&self) {
+        // Several times, as the transport does between two looks at whose turn it is.
+        for _ in 0..8 {
+            match self.server.receive().expect("requests") {
+                Some(request) => request.send_copy([1; 184]).expect("a response"),
+                None => spin_loop(),
+            }
+        }
+    }
+
+    fn begin(&self, payload: &[u8]) -> RawPending {
+        let request = self.client.loan_slice_uninit(payload.len()).expect("room");
+        request.write_from_slice(payload).send().expect("room")
+    }
+
+    fn end(&self, pending: RawPending) {
+        while pending.receive().expect("responses").is_none() {
+            spin_loop();
+        }
+    }
+
+    fn many(&self, payload: &[u8], total: usize) {
+        let mut pending = VecDeque::new();
+        for _ in 0..total {
+            if pending.len() == WINDOW {
+                self.end(pending.pop_front().expect("a window"));
+            }
+            pending.push_back(self.begin(payload));
+        }
+        pending.into_iter().for_each(|pending| self.end(pending));
+    }
 }
 
 /// Removes what a bare iceoryx2 leaves in shared memory.
@@ -130,86 +367,11 @@ struct Leftovers(String);
 
 impl Drop for Leftovers {
     fn drop(&mut self) {
-        for file in std::fs::read_dir("/dev/shm")
-            .into_iter()
-            .flatten()
-            .flatten()
-        {
+        let files = std::fs::read_dir("/dev/shm");
+        for file in files.into_iter().flatten().flatten() {
             if file.file_name().to_string_lossy().starts_with(&self.0) {
                 let _ = std::fs::remove_file(file.path());
             }
         }
     }
 }
-
-fn raw(criterion: &mut Criterion) {
-    let directory = tempfile::tempdir().expect("a directory");
-    let mut config = Config::default();
-    let root = directory.path().to_str().expect("an ASCII path");
-    config
-        .global
-        .set_root_path(&Path::new(root.as_bytes()).expect("a path"));
-    let prefix = format!("fipabench-{}_", Incarnation::random());
-    let _leftovers = Leftovers(prefix.clone());
-    config.global.prefix = FileName::new(prefix.as_bytes()).expect("a prefix");
-    let node = NodeBuilder::new()
-        .config(&config)
-        .signal_handling_mode(SignalHandlingMode::Disabled)
-        .create::<ipc_threadsafe::Service>()
-        .expect("a node");
-    let service = node
-        .service_builder(&ServiceName::new("raw").expect("a name"))
-        .request_response::<[u8], [u8; 184]>()
-        .request_user_header::<[u64; 11]>()
-        .max_servers(1)
-        .max_clients(64)
-        .max_active_requests_per_client(16)
-        .max_response_buffer_size(1)
-        .enable_safe_overflow_for_requests(false)
-        .create();
-    let service = service.expect("a service");
-    let server = service.server_builder().create().expect("a server");
-    let client = service
-        .client_builder()
-        .initial_max_slice_len(4096)
-        .allocation_strategy(AllocationStrategy::PowerOfTwo)
-        .backpressure_strategy(BackpressureStrategy::DiscardData)
-        .create()
-        .expect("a client");
-    let done = AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        scope.spawn(|| {
-            while !done.load(Ordering::Relaxed) {
-                match server.receive().expect("requests") {
-                    Some(request) => request.send_copy([1; 184]).expect("a response"),
-                    None => spin_loop(),
-                }
-            }
-        });
-        let mut group = criterion.benchmark_group("shm");
-        for size in SIZES {
-            let payload = vec![7; FRONT + size + 1];
-            group.throughput(Throughput::Bytes(size as u64));
-            group.bench_function(BenchmarkId::new("raw", size), |bencher| {
-                bencher.iter(|| {
-                    let request = client.loan_slice_uninit(payload.len()).expect("room");
-                    let pending = request.write_from_slice(&payload).send().expect("room");
-                    while pending.receive().expect("responses").is_none() {
-                        spin_loop();
-                    }
-                });
-            });
-        }
-        group.finish();
-        done.store(true, Ordering::Relaxed);
-    });
-}
-
-criterion_group! {
-    name = benches;
-    config = Criterion::default()
-        .warm_up_time(Duration::from_secs(1))
-        .measurement_time(Duration::from_secs(2));
-    targets = raw, transport
-}
-criterion_main!(benches);

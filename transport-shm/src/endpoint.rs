@@ -1,9 +1,10 @@
 //! An endpoint: who is known, and who does what when.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 use std::io::ErrorKind;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
+use std::time::Instant;
 
 use fipa_transport::{
     AttemptId, Conclusion, Incarnation, Location, Parcel, Sink, WayError, WayFault,
@@ -21,7 +22,7 @@ use crate::loan::ShmLoan;
 use crate::memory::Budget;
 use crate::outbox::{Opening, Outbox, Posted};
 use crate::peers::Peer;
-use crate::presence::{Bell, Neighbour, Presence};
+use crate::presence::{Bell, GLANCE, Neighbour, Presence};
 use crate::{ShmConfig, ShmError};
 
 /// What a transport and its tasks share.
@@ -34,7 +35,13 @@ pub(crate) struct Endpoint {
     wanted: AtomicBool,
     /// The mailbox; whoever has the lock does the work.
     inbox: Mutex<Option<Inbox>>,
-    peers: RwLock<HashMap<Incarnation, Arc<Peer>>>,
+    /// How many parcels have no answer yet.
+    waiting: Arc<AtomicUsize>,
+    /// Who has been answered, and has not been made to look for it yet.
+    answered: Mutex<Vec<Incarnation>>,
+    /// A peer has ended that is not forgotten yet.
+    ended: AtomicBool,
+    peers: RwLock<BTreeMap<Incarnation, Arc<Peer>>>,
     /// Counts uses of peers, to find the one not used for longest.
     uses: AtomicU64,
     node: Mutex<Option<Node<Svc>>>,
@@ -93,6 +100,9 @@ impl Endpoint {
             closed: AtomicBool::new(false),
             wanted: AtomicBool::new(false),
             inbox: Mutex::new(Some(inbox)),
+            waiting: Arc::default(),
+            answered: Mutex::default(),
+            ended: AtomicBool::new(false),
             peers: RwLock::default(),
             uses: AtomicU64::new(0),
             node: Mutex::new(Some(node)),
@@ -134,9 +144,79 @@ impl Endpoint {
     /// Works on the calling thread; meanwhile nobody needs to ring.
     pub(crate) fn drive(self: &Arc<Self>) -> bool {
         let presence = self.presence.read();
-        presence
-            .as_ref()
-            .is_some_and(|presence| presence.look(|| self.work()))
+        let Some(presence) = presence.as_ref() else {
+            return false;
+        };
+        let mut found = false;
+        for _ in 0..ROUNDS {
+            let looking = presence.looking();
+            // Several times, so that in a caller's loop the page says "looking" most of the time.
+            found |= (0..LOOKS).any(|_| self.work());
+            self.wait_for_answered();
+            drop(looking);
+            // What is found now is worked on while the page says so again.
+            if !self.has_work() {
+                self.wake_answered();
+                return found;
+            }
+        }
+        found |= self.work();
+        self.wake_answered();
+        found
+    }
+
+    /// Works because the bell has been rung, and was silenced.
+    pub(crate) fn work_after_bell(self: &Arc<Self>) {
+        let looked_after = self.presence.read().as_ref().is_some_and(|presence| {
+            presence.heard();
+            presence.is_looking()
+        });
+        // Whoever is at it is not disturbed.
+        if !looked_after {
+            self.work();
+            self.wake_answered();
+        }
+    }
+
+    /// Gives those who were answered a moment to look by themselves, or to send something more.
+    fn wait_for_answered(&self) {
+        let mut began = None;
+        loop {
+            let mut answered = self.answered.lock();
+            let peers = self.peers.read();
+            let lively = |one| peers.get(one).is_some_and(|peer| peer.was_looking());
+            answered.retain(|one| !peers.get(one).is_some_and(|peer| peer.is_awake()));
+            if !answered.iter().any(lively) {
+                return;
+            }
+            drop((peers, answered));
+            if began.get_or_insert_with(Instant::now).elapsed() > GLANCE || self.has_work() {
+                return;
+            }
+        }
+    }
+
+    /// Makes those look for an answer who do not by themselves.
+    fn wake_answered(self: &Arc<Self>) {
+        let answered = std::mem::take(&mut *self.answered.lock());
+        for sender in answered {
+            self.wake(sender);
+        }
+    }
+
+    /// Whether `work` would find something. When another thread is working, that one looks again.
+    fn has_work(&self) -> bool {
+        self.wanted.store(true, Ordering::SeqCst);
+        let Some(inbox) = self.inbox.try_lock() else {
+            return false;
+        };
+        self.wanted.store(false, Ordering::SeqCst);
+        inbox.as_ref().is_some_and(Inbox::has_parcels)
+            || self.waits_for_answers() && self.peers.read().values().any(|peer| peer.has_answer())
+    }
+
+    fn waits_for_answers(&self) -> bool {
+        self.waiting.load(Ordering::SeqCst) > 0
     }
 
     /// Looks into the mailbox and after answers. Says whether there was anything.
@@ -159,27 +239,25 @@ impl Endpoint {
     }
 
     fn work_once(self: &Arc<Self>, inbox: &mut Inbox, sink: &dyn Sink) -> bool {
-        let mut answered = Vec::new();
-        let mut found = inbox.drain(sink, &mut answered);
-        for sender in answered {
-            self.wake(sender);
-        }
-        let mut concluded = Vec::new();
-        let mut ended = Vec::new();
-        for peer in self.peers.read().values() {
-            if peer.collect(&mut concluded) {
-                ended.push(peer.incarnation());
+        let mut found = inbox.drain(sink, &self.answered);
+        if self.ended.swap(false, Ordering::SeqCst) || self.waits_for_answers() {
+            let mut concluded = Vec::new();
+            let mut ended = Vec::new();
+            for peer in self.peers.read().values() {
+                if peer.collect(&mut concluded) {
+                    ended.push(peer.incarnation());
+                }
             }
+            for incarnation in ended {
+                self.peers.write().remove(&incarnation);
+            }
+            found |= !concluded.is_empty();
+            tell(sink, concluded);
         }
-        for incarnation in ended {
-            self.peers.write().remove(&incarnation);
-        }
-        found |= !concluded.is_empty();
-        tell(sink, concluded);
         found
     }
 
-    /// Makes a process look after its answers.
+    /// Makes a process look for its answers.
     fn wake(self: &Arc<Self>, sender: Incarnation) {
         let rung = match self.peer(sender) {
             Ok(peer) => peer.wake(),
@@ -250,6 +328,7 @@ impl Endpoint {
                 node: node.as_ref().ok_or_else(closed)?,
                 service: &service,
                 own: self.config.incarnation,
+                waiting: self.waiting.clone(),
                 max_loans: self.config.max_loans,
                 budget: self.budget.clone(),
                 tally: self.tally.clone(),
@@ -338,10 +417,12 @@ impl Endpoint {
         let peer = self.peers.read().get(&incarnation).cloned();
         if let Some(peer) = peer {
             peer.end();
+            self.ended.store(true, Ordering::SeqCst);
             count(&self.tally.peers_gone);
         }
         // Its last letters are taken, and its answers.
         self.work();
+        self.wake_answered();
         self.clean_soon();
     }
 
@@ -404,6 +485,12 @@ impl Endpoint {
         let _ = self.domain.leave();
     }
 }
+
+/// How often [`Endpoint::drive`] looks at a time: a microsecond or two.
+const LOOKS: usize = 8;
+
+/// How often [`Endpoint::drive`] begins again when there is more.
+const ROUNDS: usize = 4;
 
 fn tell(sink: &dyn Sink, concluded: Vec<(AttemptId, Conclusion)>) {
     for (attempt, conclusion) in concluded {

@@ -1,6 +1,5 @@
 //! The receiving side: this process's mailbox.
 
-use std::collections::HashMap;
 use std::ptr::NonNull;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -112,14 +111,15 @@ impl Inbox {
 
     /// Takes what is in the mailbox and answers it. Says whether there was anything, and adds
     /// who should look for an answer.
-    pub(crate) fn drain(&mut self, sink: &dyn Sink, answered: &mut Vec<Incarnation>) -> bool {
+    pub(crate) fn drain(&mut self, sink: &dyn Sink, answered: &Mutex<Vec<Incarnation>>) -> bool {
         for done in 0..BATCH {
             match self.server.receive() {
                 Ok(Some(active)) => {
-                    if let Some(sender) = self.take(active, sink)
-                        && !answered.contains(&sender)
-                    {
-                        answered.push(sender);
+                    if let Some(sender) = self.take(active, sink) {
+                        let mut answered = answered.lock();
+                        if !answered.contains(&sender) {
+                            answered.push(sender);
+                        }
                     }
                 }
                 Ok(None) => return done > 0,
@@ -138,6 +138,11 @@ impl Inbox {
         // There may be more; others get their turn first.
         self.lending.bell.ring();
         true
+    }
+
+    /// Whether something is in the mailbox, as far as it can be told.
+    pub(crate) fn has_parcels(&self) -> bool {
+        self.server.has_requests().unwrap_or(false)
     }
 
     fn take(&mut self, active: Active, sink: &dyn Sink) -> Option<Incarnation> {
@@ -239,42 +244,56 @@ impl Inbox {
             let detail = format!("{} bytes are the most here", self.max_letter);
             return refused(active, FailureReason::TooLarge, &detail);
         }
-        let front = Bytes::copy_from_slice(&payload[places.start..places.content]);
-        let tail = Bytes::copy_from_slice(&payload[places.tail..places.end]);
         let content = &payload[places.content..places.tail];
-        let (content, owner) = self.lend(NonNull::from(content), active);
-        let parcel = parcel.parcel_of_pieces(front, content, tail);
+        let (parcel, owner) = if self.may_lend(content.len(), &active) {
+            // What is copied, in one piece of memory.
+            let around = [
+                &payload[places.start..places.content],
+                &payload[places.tail..places.end],
+            ];
+            let mut front = Bytes::from(around.concat());
+            let tail = front.split_off(places.content - places.start);
+            let (content, held) = self.lend(NonNull::from(content), active);
+            let parcel = parcel.parcel_of_pieces(front, content, tail);
+            (parcel, Owner::Shared(held))
+        } else {
+            let body = Bytes::copy_from_slice(&payload[places.start..places.end]);
+            (parcel.parcel(body), Owner::Unshared(active))
+        };
         let parcel = parcel.map_err(|e| Answer::failed(FailureReason::Refused, e.to_string()));
         (parcel, owner)
     }
 
-    /// Content, in place if that is allowed, else copied. `content` must lie in the payload of
-    /// `active`.
-    fn lend(&self, content: NonNull<[u8]>, active: Active) -> (Bytes, Owner) {
-        let sender = active.origin().value();
-        if content.len() >= self.copy_below && self.lending.begin(sender) {
-            count(&self.tally.in_place);
-            let held = Arc::new(Held {
-                active: Mutex::new(Some(active)),
-                sender,
-                lending: self.lending.clone(),
-            });
-            let bytes = Bytes::from_owner(Content {
-                bytes: content,
-                _held: held.clone(),
-            });
-            return (bytes, Owner::Shared(held));
+    /// Whether content is handed out in place. If so, it is counted as handed out.
+    fn may_lend(&self, len: usize, active: &Active) -> bool {
+        let small = len < self.copy_below;
+        if !small && self.lending.begin(active.origin().value()) {
+            return true;
         }
-        if !content.is_empty() {
-            count(if content.len() < self.copy_below {
+        if len > 0 {
+            count(if small {
                 &self.tally.copied_small
             } else {
                 &self.tally.copied_full
             });
         }
-        // SAFETY: the range is in the payload of `active`, which keeps it mapped and is alive.
-        let copied = Bytes::copy_from_slice(unsafe { content.as_ref() });
-        (copied, Owner::Unshared(active))
+        false
+    }
+
+    /// Content, in place. It must lie in the payload of `active`, and [`Self::may_lend`] must
+    /// have said so.
+    fn lend(&self, content: NonNull<[u8]>, active: Active) -> (Bytes, Arc<Held>) {
+        count(&self.tally.in_place);
+        let held = Arc::new(Held {
+            sender: active.origin().value(),
+            active: Mutex::new(Some(active)),
+            lending: self.lending.clone(),
+        });
+        let bytes = Bytes::from_owner(Content {
+            bytes: content,
+            _held: held.clone(),
+        });
+        (bytes, held)
     }
 }
 
@@ -328,7 +347,8 @@ impl AsRef<[u8]> for Content {
 struct Lending {
     per_sender: usize,
     total: usize,
-    held: Mutex<HashMap<u128, usize>>,
+    /// Of which senders, and how much of each. Few enough to be looked through.
+    held: Mutex<Vec<(u128, usize)>>,
     /// The mailbox could not be drained until something is given back.
     waiting: AtomicBool,
     bell: Arc<Bell>,
@@ -341,31 +361,28 @@ impl Lending {
     /// One more content of this sender, if that leaves a slot free for its next letter.
     fn begin(&self, sender: u128) -> bool {
         let mut held = self.held.lock();
-        let total: usize = held.values().sum();
-        let senders = held.len();
-        let of_sender = held.get(&sender).copied().unwrap_or(0);
-        let allowed = of_sender < self.per_sender
-            && total < self.total
-            && (of_sender > 0 || senders < ShmConfig::MAX_LENDERS);
-        if allowed {
-            held.insert(sender, of_sender + 1);
-            self.tally
-                .borrowed
-                .store(total as u64 + 1, Ordering::Relaxed);
+        // Changed under the lock only.
+        if self.tally.borrowed.load(Ordering::Relaxed) >= self.total as u64 {
+            return false;
         }
-        allowed
+        match held.iter().position(|(one, _)| *one == sender) {
+            Some(place) if held[place].1 < self.per_sender => held[place].1 += 1,
+            None if held.len() < ShmConfig::MAX_LENDERS => held.push((sender, 1)),
+            _ => return false,
+        }
+        self.tally.borrowed.fetch_add(1, Ordering::Relaxed);
+        true
     }
 
     fn end(&self, sender: u128) {
         let mut held = self.held.lock();
-        if let Some(of_sender) = held.get_mut(&sender) {
-            *of_sender -= 1;
-            if *of_sender == 0 {
-                held.remove(&sender);
+        if let Some(place) = held.iter().position(|(one, _)| *one == sender) {
+            held[place].1 -= 1;
+            if held[place].1 == 0 {
+                held.swap_remove(place);
             }
+            self.tally.borrowed.fetch_sub(1, Ordering::Relaxed);
         }
-        let total: usize = held.values().sum();
-        self.tally.borrowed.store(total as u64, Ordering::Relaxed);
         drop(held);
         if self.waiting.swap(false, Ordering::SeqCst) {
             self.bell.ring();

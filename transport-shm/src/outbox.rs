@@ -6,8 +6,9 @@ use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Weak};
 
 use bytes::Bytes;
-use fipa_transport::wire::{ParcelHeader, WireError};
+use fipa_transport::wire::{ParcelHeader, Pieces, WireError};
 use fipa_transport::{AttemptId, Body, Conclusion, Incarnation, Parcel, WayError, WayFault};
+use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::client::RequestSendError;
 use iceoryx2::port::{DegradationAction, LoanError};
 use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, PortFactory, ServiceName};
@@ -26,6 +27,8 @@ const FIRST_CHUNK: usize = 4096;
 
 /// What creating a client and its connection takes at most, with a window of 128.
 const OPENING: u64 = 1 << 20;
+
+static NO_CONTENT: Bytes = Bytes::new();
 
 /// A client of another process's mailbox, and what was sent there and not answered yet.
 ///
@@ -49,7 +52,7 @@ pub(crate) struct Outbox {
     max_loans: usize,
     chunks: usize,
     state: Mutex<State>,
-    waiting: AtomicUsize,
+    waiting: Waiting,
     loans: AtomicUsize,
     retired: AtomicBool,
     token: AtomicU64,
@@ -77,8 +80,8 @@ struct Segment {
     stride: usize,
     /// Longest payload that fits a chunk.
     room: usize,
-    /// By address of a payload, how many of its bytes have their pages.
-    ready: HashMap<usize, usize>,
+    /// By number of a chunk, how many bytes of its payload have their pages.
+    ready: Vec<usize>,
 }
 
 #[derive(Debug)]
@@ -107,6 +110,8 @@ pub(crate) struct Opening<'a> {
     pub(crate) node: &'a Node<Svc>,
     pub(crate) service: &'a ServiceName,
     pub(crate) own: Incarnation,
+    /// How many parcels of all outboxes have no answer yet.
+    pub(crate) waiting: Arc<AtomicUsize>,
     pub(crate) max_loans: usize,
     pub(crate) budget: Arc<Budget>,
     pub(crate) tally: Arc<Tally>,
@@ -152,7 +157,10 @@ impl Outbox {
                 .min(window - 1),
             chunks: 2 * window + most_loans,
             state: Mutex::default(),
-            waiting: AtomicUsize::new(0),
+            waiting: Waiting {
+                here: AtomicUsize::new(0),
+                of_all: opening.waiting,
+            },
             loans: AtomicUsize::new(0),
             retired: AtomicBool::new(false),
             token: AtomicU64::new(start),
@@ -167,7 +175,7 @@ impl Outbox {
 
     /// How many parcels have no answer yet.
     pub(crate) fn waiting(&self) -> usize {
-        self.waiting.load(Ordering::Acquire)
+        self.waiting.here.load(Ordering::Acquire)
     }
 
     /// Whether nothing would be lost by closing it.
@@ -188,14 +196,12 @@ impl Outbox {
 
     /// Puts a parcel into the mailbox.
     pub(crate) fn post(&self, attempt: AttemptId, parcel: &Parcel) -> Result<Posted, WayError> {
-        let (header, pieces) = ParcelHeader::of(parcel).map_err(wire_error)?;
-        let content = match &parcel.body {
-            Body::Letter(letter) => letter.payload().content.clone(),
-            _ => Bytes::new(),
+        let (header, pieces) = ParcelHeader::borrowing(parcel).map_err(wire_error)?;
+        let (content, tail) = match &parcel.body {
+            Body::Letter(letter) => (&letter.payload().content, letter.payload().tail.len()),
+            _ => (&NO_CONTENT, 0),
         };
         let front = usize::try_from(header.front_len()).unwrap_or(usize::MAX);
-        let body: usize = pieces.iter().map(Bytes::len).sum();
-        let tail = body - front - content.len();
         let places = Places::for_lengths(front, content.len(), tail).ok_or_else(too_large)?;
         let token = self.token.fetch_add(1, Ordering::Relaxed);
 
@@ -203,7 +209,7 @@ impl Outbox {
         if self.is_retired() {
             return Ok(Posted::Retired);
         }
-        if let Some(loan) = self.loan_of(&mut state, &content) {
+        if let Some(loan) = self.loan_of(&mut state, content) {
             let fits = loan.has_room(front, tail) && loan.segment == state.segment.number;
             match fits
                 .then(|| self.ready_loan(&state, &loan))
@@ -213,7 +219,7 @@ impl Outbox {
                 Some(blank) => {
                     let start = loan.front() - front;
                     let header = Header::new(&header, offset(start)?, self.own, token);
-                    if !self.send_loan(&loan, blank, header, start, &pieces, &content)? {
+                    if !self.send_loan(&loan, blank, header, start, &pieces, content)? {
                         return Ok(Posted::Retired);
                     }
                     count(&self.tally.loans_sent);
@@ -227,9 +233,9 @@ impl Outbox {
         *blank.user_header_mut() = Header::new(&header, offset(places.start)?, self.own, token);
         let payload = NonNull::from(blank.payload_mut()).cast();
         // SAFETY: the pieces are as long as `places.end - places.start` says (they are what the
-        // places were computed from), and the payload has `places.end` bytes. Nothing refers to
-        // the payload of a request just taken.
-        unsafe { write(payload, places.start, &pieces) };
+        // header and the places were computed from), and the payload has `places.end` bytes.
+        // Nothing refers to the payload of a request just taken.
+        unsafe { write(payload, places.start, &pieces, None) };
         // SAFETY: all bytes from `start` on were just written, and those before are memory of a
         // shared mapping, filled by the kernel or by earlier requests.
         let filled = unsafe { blank.assume_init() };
@@ -247,7 +253,7 @@ impl Outbox {
             token,
             memory,
         });
-        self.waiting.store(state.queue.len(), Ordering::Release);
+        self.waiting.one_more();
     }
 
     fn nobody_reached(&self, pending: &Pending) -> WayError {
@@ -296,19 +302,15 @@ impl Outbox {
         mut blank: Blank,
         header: Header,
         start: usize,
-        pieces: &[Bytes],
+        pieces: &Pieces<'_>,
         content: &Bytes,
     ) -> Result<bool, WayError> {
         *blank.user_header_mut() = header;
-        let behind = content.as_ptr() as usize + content.len() - loan.payload().as_ptr() as usize;
-        let (front, tail) = around(pieces, content);
-        // SAFETY: the loan has room for the front (which ends where the content begins) and for
-        // the tail, as the caller has checked. Neither range overlaps the content, which is all
-        // that anybody else refers to, and whoever has taken the request is the only one to write
-        // to them.
-        unsafe { write(loan.payload(), start, front) };
-        // SAFETY: as above.
-        unsafe { write(loan.payload(), behind, tail) };
+        // SAFETY: the loan has room for the front, which begins at `start` and ends where the
+        // content begins, and for the tail, as the caller has checked. The content, which is all
+        // that anybody else refers to, is not written, and whoever has taken the request is the
+        // only one to write to the rest.
+        unsafe { write(loan.payload(), start, pieces, Some(content)) };
         // SAFETY: front, content and tail are written; the rest is memory of a shared mapping.
         let filled: Filled = unsafe { blank.assume_init() };
         match filled.send() {
@@ -395,12 +397,14 @@ impl Outbox {
             segment.stride = (head + len).max(FIRST_CHUNK).next_power_of_two();
             segment.room = segment.stride - head;
             segment.ready.clear();
+            segment.ready.resize(self.chunks, 0);
             for number in 0..self.chunks {
                 let header = segment.base + number * segment.stride;
                 populate(header as *const u8, head)?;
             }
         }
-        let ready = segment.ready.entry(payload as usize).or_insert(0);
+        let number = (chunk - segment.base) / segment.stride;
+        let ready = segment.ready.get_mut(number).ok_or_else(retired)?;
         if *ready < len {
             let missing = len - *ready;
             if missing > 2 * FIRST_CHUNK && !grows {
@@ -418,24 +422,31 @@ impl Outbox {
         if self.waiting() == 0 {
             return;
         }
-        let mut done = Vec::new();
-        {
-            let mut state = self.state.lock();
-            // The receiver answers in order, or drops what it does not answer.
-            while let Some(sent) = state.queue.front() {
-                let Some(conclusion) = sent.conclusion(ended) else {
-                    break;
-                };
-                let sent = state.queue.pop_front();
-                done.extend(sent.map(|sent| (sent, conclusion)));
-            }
-            self.waiting.store(state.queue.len(), Ordering::Release);
-        }
-        // Dropped only here: the last owner of a letter may be among them.
-        for (sent, conclusion) in done {
+        // The receiver answers in order, or drops what it does not answer.
+        while let Some((sent, conclusion)) = self.concluded(ended) {
             sent.forget();
             concluded.push((sent.attempt, conclusion));
+            // Dropped outside of the lock: the last owner of a letter.
         }
+    }
+
+    fn concluded(&self, ended: bool) -> Option<(Sent, Conclusion)> {
+        let mut state = self.state.lock();
+        let conclusion = state.queue.front()?.conclusion(ended)?;
+        let sent = state.queue.pop_front()?;
+        self.waiting.one_less();
+        Some((sent, conclusion))
+    }
+
+    /// Whether there is an answer, probably.
+    pub(crate) fn has_answer(&self) -> bool {
+        self.waiting() > 0
+            && self
+                .state
+                .lock()
+                .queue
+                .front()
+                .is_some_and(Sent::has_answer)
     }
 
     /// Forgets an attempt, and says whether it was here.
@@ -446,13 +457,42 @@ impl Outbox {
         let mut state = self.state.lock();
         let place = state.queue.iter().position(|sent| sent.attempt == attempt);
         let sent = place.and_then(|place| state.queue.remove(place));
-        self.waiting.store(state.queue.len(), Ordering::Release);
+        if sent.is_some() {
+            self.waiting.one_less();
+        }
         drop(state);
         sent.inspect(Sent::forget).is_some()
     }
 }
 
+/// How many parcels have no answer yet.
+#[derive(Debug)]
+struct Waiting {
+    here: AtomicUsize,
+    of_all: Arc<AtomicUsize>,
+}
+
+impl Waiting {
+    fn one_more(&self) {
+        self.here.fetch_add(1, Ordering::AcqRel);
+        self.of_all.fetch_add(1, Ordering::AcqRel);
+    }
+
+    fn one_less(&self) {
+        self.here.fetch_sub(1, Ordering::AcqRel);
+        self.of_all.fetch_sub(1, Ordering::AcqRel);
+    }
+}
+
 impl Sent {
+    fn has_answer(&self) -> bool {
+        let look = PendingResponse::has_response;
+        match &self.memory {
+            Memory::Own(pending) => look(pending),
+            Memory::Loaned(loan) => loan.with_pending(look).unwrap_or(false),
+        }
+    }
+
     fn conclusion(&self, ended: bool) -> Option<Conclusion> {
         let look = |pending: &Pending| self.conclusion_of(pending, ended);
         match &self.memory {
@@ -468,9 +508,13 @@ impl Sent {
                 detail,
             )))
         };
-        // Asked before the answer is looked for: an answer that came in between is found then.
-        let connected = pending.is_connected();
-        match pending.receive() {
+        let mut answer = pending.receive();
+        let dropped = matches!(answer, Ok(None)) && !pending.is_connected();
+        if dropped {
+            // It may have been answered in between.
+            answer = pending.receive();
+        }
+        match answer {
             Ok(Some(ack)) => Some(match ack.answer(self.token) {
                 Some(answer) => Conclusion::Answered(answer),
                 None => Conclusion::Unconfirmed(WayError::new(
@@ -479,7 +523,7 @@ impl Sent {
                 )),
             }),
             Ok(None) if ended => broken("the other process ended before it answered".into()),
-            Ok(None) if !connected => broken("the other process dropped it unanswered".into()),
+            Ok(None) if dropped => broken("the other process dropped it unanswered".into()),
             Ok(None) => None,
             Err(e) => broken(format!("the answer cannot be received: {e:?}")),
         }
@@ -492,29 +536,21 @@ impl Sent {
     }
 }
 
-/// Writes pieces behind each other, `at` bytes behind `start`.
+/// Writes pieces behind each other, `at` bytes behind `start`; all but `there`, which is in its
+/// place already.
 ///
 /// # Safety
-/// There must be room, and nothing else may refer to it.
-unsafe fn write(start: NonNull<u8>, at: usize, pieces: &[Bytes]) {
+/// There must be room, and nothing else may refer to what is written.
+unsafe fn write(start: NonNull<u8>, at: usize, pieces: &Pieces<'_>, there: Option<&Bytes>) {
     let mut at = at;
-    for piece in pieces {
+    for piece in pieces.iter() {
         let place = start.as_ptr().wrapping_add(at);
-        // SAFETY: the caller vouches for the room; a piece is not in it, because nothing else
-        // refers to it.
-        unsafe { place.copy_from_nonoverlapping(piece.as_ptr(), piece.len()) };
+        if !there.is_some_and(|there| std::ptr::eq(&there[..], piece)) {
+            // SAFETY: the caller vouches for the room; a piece is not in it, because nothing else
+            // refers to it.
+            unsafe { place.copy_from_nonoverlapping(piece.as_ptr(), piece.len()) };
+        }
         at += piece.len();
-    }
-}
-
-/// The pieces in front of the content and those behind it.
-fn around<'a>(pieces: &'a [Bytes], content: &Bytes) -> (&'a [Bytes], &'a [Bytes]) {
-    let place = pieces
-        .iter()
-        .position(|piece| piece.as_ptr() == content.as_ptr() && piece.len() == content.len());
-    match place {
-        Some(place) => (&pieces[..place], &pieces[place + 1..]),
-        None => (pieces, &[]),
     }
 }
 

@@ -41,7 +41,17 @@ impl Peer {
         self.incarnation
     }
 
-    /// Makes it look, unless it is looking. Says whether the bell was rung.
+    /// Whether it will look without being rung at.
+    pub(crate) fn is_awake(&self) -> bool {
+        self.neighbour.is_awake()
+    }
+
+    /// Whether it was looking when it was last asked.
+    pub(crate) fn was_looking(&self) -> bool {
+        self.neighbour.was_looking()
+    }
+
+    /// Makes it look, unless it is awake. Says whether the bell was rung.
     pub(crate) fn wake(&self) -> bool {
         self.neighbour.wake()
     }
@@ -112,14 +122,19 @@ impl Peer {
     pub(crate) fn collect(&self, concluded: &mut Vec<(AttemptId, Conclusion)>) -> bool {
         // Asked before: an answer that came before the end is found then.
         let ended = self.ended.load(Ordering::SeqCst);
-        let outbox = self.outbox.lock().clone();
-        match outbox {
+        match &*self.outbox.lock() {
             Some(outbox) => {
                 outbox.collect(ended, concluded);
                 ended && outbox.is_retired() && outbox.waiting() == 0
             }
             None => ended,
         }
+    }
+
+    /// Whether there is an answer to be collected, probably.
+    pub(crate) fn has_answer(&self) -> bool {
+        let outbox = self.outbox.lock();
+        outbox.as_ref().is_some_and(|outbox| outbox.has_answer())
     }
 
     /// Gives every letter that waits its conclusion, for a transport that closes.

@@ -5,7 +5,8 @@
 //!   kernel when the last writer ends, however it ends. Nothing is ever written to it.
 //! * `bell`, a FIFO that it reads. A byte means: look into your mailbox, and after your answers.
 //! * a page of shared memory that says whether it is looking already, so that nobody needs to
-//!   ring. The page and the bell work together as described at [`Presence::look`].
+//!   ring, and how often it has heard its bell. The page and the bell work together as described
+//!   at [`Presence::looking`] and [`Neighbour::is_awake`].
 
 use std::fs::File;
 use std::io::{self, ErrorKind, Read, Write};
@@ -13,7 +14,8 @@ use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering, fence};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering, fence};
+use std::time::{Duration, Instant};
 
 use fipa_transport::Incarnation;
 use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
@@ -154,35 +156,46 @@ impl Presence {
         &self.bell
     }
 
-    /// Looks, through `work`, without others having to ring meanwhile.
+    /// Says to others, until the result is dropped, that they need not ring.
     ///
-    /// Whoever has put something where `work` looks then reads the page, and rings if nobody is
-    /// looking ([`Neighbour::wake`]). Between their write and read, and between our write and last
-    /// look, stands a sequentially consistent fence: so either they see that nobody looks, and
-    /// ring, or the last look finds what they put there.
-    pub(crate) fn look(&self, mut work: impl FnMut() -> bool) -> bool {
-        let lookers = self.page.lookers();
+    /// Whoever has put something into the mailbox then reads the page, and rings if nobody is
+    /// looking ([`Neighbour::is_awake`]). Between their write and read, and between our write and
+    /// next look, stands a sequentially consistent fence: so either they see that nobody looks,
+    /// and ring, or a look after the drop finds what they put there. There must be such a look.
+    pub(crate) fn looking(&self) -> Looking<'_> {
+        let lookers = &self.page.words().lookers;
         lookers.fetch_add(1, Ordering::SeqCst);
-        // Several times, so that in a caller's loop the page says "looking" most of the time.
-        let mut found = false;
-        for _ in 0..LOOKS {
-            found = work();
-            if found {
-                break;
-            }
-            std::hint::spin_loop();
-        }
-        lookers.fetch_sub(1, Ordering::SeqCst);
-        fence(Ordering::SeqCst);
-        work() || found
+        Looking(lookers)
+    }
+
+    /// Whether some thread says so. If so, it will look once more.
+    pub(crate) fn is_looking(&self) -> bool {
+        self.page.words().lookers.load(Ordering::SeqCst) != 0
+    }
+
+    /// The bell has been silenced, and what it rang for is about to be looked at.
+    pub(crate) fn heard(&self) {
+        self.page.words().heard.fetch_add(1, Ordering::SeqCst);
     }
 }
 
-/// How often [`Presence::look`] looks: a microsecond or two.
-const LOOKS: usize = 8;
+/// A thread of this process is looking.
+pub(crate) struct Looking<'a>(&'a AtomicU32);
 
-/// How often [`Neighbour::wake`] reads the page before it rings: a few hundred nanoseconds.
-const GLANCES: usize = 256;
+impl Drop for Looking<'_> {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::SeqCst);
+        fence(Ordering::SeqCst);
+    }
+}
+
+/// How long to wait before ringing at somebody who was looking lately: who has just sent
+/// something is about to look for the answer, and a bell costs both sides more than that moment.
+/// Who sleeps between letters is not kept waiting.
+pub(crate) const GLANCE: Duration = Duration::from_nanos(1500);
+
+/// How many looks at a page lie between two looks at the clock.
+const GLANCES: usize = 16;
 
 impl Drop for Presence {
     fn drop(&mut self) {
@@ -246,7 +259,14 @@ pub(crate) struct Neighbour {
     live: Arc<OwnedFd>,
     bell: File,
     page: Page,
+    /// What the page's `heard` was when the bell was rung last.
+    rung: AtomicU64,
+    /// Whether the process was looking when this was asked last.
+    looked: AtomicBool,
 }
+
+/// No count of what was heard.
+const NEVER: u64 = u64::MAX;
 
 impl Neighbour {
     /// Opens the files of a process; `NotFound` when it is not there.
@@ -266,6 +286,8 @@ impl Neighbour {
             live: Arc::new(live.into()),
             bell: open_bell(&names.bell(of))?,
             page: Page::map(&page, ProtFlags::READ)?,
+            rung: AtomicU64::new(NEVER),
+            looked: AtomicBool::new(false),
         })
     }
 
@@ -274,17 +296,43 @@ impl Neighbour {
         &self.live
     }
 
-    /// Makes the process look, unless it is looking. Says whether the bell was rung.
-    pub(crate) fn wake(&self) -> bool {
+    /// Whether the process will look without being rung at: because it is looking, or because its
+    /// bell rings already.
+    ///
+    /// The latter is so when `heard` has not moved since before it was rung: the process moves it
+    /// between silencing its bell and looking, so a look is still to come. Only this process's own
+    /// ringing counts, so nobody who is killed in between leaves a bell that is believed to ring.
+    pub(crate) fn is_awake(&self) -> bool {
         fence(Ordering::SeqCst);
-        // For a moment, because who has just sent something may be about to look for the answer,
-        // and a bell costs both sides more than that moment.
-        for _ in 0..GLANCES {
-            if self.page.lookers().load(Ordering::SeqCst) != 0 {
-                return false;
+        let words = self.page.words();
+        if words.lookers.load(Ordering::SeqCst) != 0 {
+            self.looked.store(true, Ordering::Relaxed);
+            return true;
+        }
+        self.rung.load(Ordering::Relaxed) == words.heard.load(Ordering::SeqCst)
+    }
+
+    /// Whether it was looking when it was last asked.
+    pub(crate) fn was_looking(&self) -> bool {
+        self.looked.load(Ordering::Relaxed)
+    }
+
+    /// Makes the process look, unless it is awake. Says whether the bell was rung.
+    pub(crate) fn wake(&self) -> bool {
+        if self.is_awake() {
+            return false;
+        }
+        if self.looked.swap(false, Ordering::Relaxed) {
+            let began = Instant::now();
+            while began.elapsed() < GLANCE {
+                if (0..GLANCES).any(|_| self.is_awake()) {
+                    return false;
+                }
             }
         }
+        let heard = self.page.words().heard.load(Ordering::SeqCst);
         ring(&self.bell);
+        self.rung.store(heard, Ordering::Relaxed);
         true
     }
 }
@@ -319,9 +367,19 @@ fn ring(mut bell: &File) {
     let _ = bell.write(&[1]);
 }
 
-/// A mapped page: how many threads of a process are looking.
+/// What stands in a page. Written by its process, read by others.
 #[derive(Debug)]
-struct Page(*mut AtomicU32);
+#[repr(C)]
+struct Words {
+    /// How many threads of the process are looking.
+    lookers: AtomicU32,
+    /// How often the process has silenced its bell before it looked.
+    heard: AtomicU64,
+}
+
+/// A mapped page.
+#[derive(Debug)]
+struct Page(*mut Words);
 
 // SAFETY: the page is memory of this process's address space, not of a thread, and is only
 // accessed atomically.
@@ -345,16 +403,17 @@ impl Page {
         Ok(Self(start.cast()))
     }
 
-    fn lookers(&self) -> &AtomicU32 {
-        // SAFETY: the mapping lives as long as self, is aligned to a page, and every process
-        // accesses this word atomically only. Neighbours map it for reading and only load.
+    fn words(&self) -> &Words {
+        // SAFETY: the mapping lives as long as self, is aligned to a page and longer than `Words`,
+        // whose every value is valid, and every process accesses these words atomically only.
+        // Neighbours map it for reading and only load.
         unsafe { &*self.0 }
     }
 }
 
 impl Drop for Page {
     fn drop(&mut self) {
-        // SAFETY: mapped by `map` with this length, and nothing refers to it any more: `lookers`
+        // SAFETY: mapped by `map` with this length, and nothing refers to it any more: `words`
         // lends for the life of self only.
         let _ = unsafe { munmap(self.0.cast(), PAGE_LEN) };
     }

@@ -176,6 +176,6 @@ async fn answer_the_bell(bell: AsyncFd<Watched<Bell>>, endpoint: Weak<Endpoint>)
         let Some(endpoint) = endpoint.upgrade() else {
             return;
         };
-        endpoint.work();
+        endpoint.work_after_bell();
     }
 }

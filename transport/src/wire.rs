@@ -74,6 +74,26 @@ pub enum WireError {
     Report,
 }
 
+/// The body of a parcel, where it is: most of it in the parcel.
+#[derive(Debug)]
+pub struct Pieces<'a> {
+    name: &'a str,
+    letter: Option<&'a Letter>,
+    report: Option<Bytes>,
+}
+
+impl Pieces<'_> {
+    /// What is to be written behind the header, in order; none of it is empty.
+    pub fn iter(&self) -> impl Iterator<Item = &[u8]> {
+        std::iter::once(self.name.as_bytes()).chain(self.rest().map(|piece| &piece[..]))
+    }
+
+    fn rest(&self) -> impl Iterator<Item = &Bytes> {
+        let letter = self.letter.into_iter().flat_map(Letter::pieces);
+        letter.chain(&self.report)
+    }
+}
+
 impl ParcelHeader {
     /// The header of a parcel, and its body: the pieces to be written behind the header, in order
     /// and none of them empty. The memory of a letter is shared, not copied.
@@ -81,6 +101,17 @@ impl ParcelHeader {
     /// # Errors
     /// When the name or a piece in front of the content is longer than the header can say.
     pub fn of(parcel: &Parcel) -> Result<(Self, Vec<Bytes>), WireError> {
+        let (header, body) = Self::borrowing(parcel)?;
+        let name = Bytes::copy_from_slice(body.name.as_bytes());
+        let pieces = std::iter::once(name).chain(body.rest().cloned());
+        Ok((header, pieces.collect()))
+    }
+
+    /// The header of a parcel, and its body where it is.
+    ///
+    /// # Errors
+    /// When the name or a piece in front of the content is longer than the header can say.
+    pub fn borrowing(parcel: &Parcel) -> Result<(Self, Pieces<'_>), WireError> {
         if parcel.receiver.is_empty() || parcel.receiver.len() > Parcel::MAX_NAME {
             return Err(WireError::Name);
         }
@@ -103,7 +134,11 @@ impl ParcelHeader {
             after: U64::new(parcel.after),
             remaining_us: U64::new(parcel.remaining.min(MAX_REMAINING).as_micros() as u64),
         };
-        let mut pieces = vec![Bytes::copy_from_slice(parcel.receiver.as_bytes())];
+        let mut pieces = Pieces {
+            name: &parcel.receiver,
+            letter: None,
+            report: None,
+        };
         match &parcel.body {
             Body::Letter(letter) => {
                 header.kind = LETTER;
@@ -111,13 +146,13 @@ impl ParcelHeader {
                 header.head_len = u32_of(letter.payload().head.len())?;
                 header.tail_len = u32_of(letter.payload().tail.len())?;
                 header.content_len = U64::new(letter.payload().content.len() as u64);
-                pieces.extend(letter.pieces().cloned());
+                pieces.letter = Some(letter);
             }
             Body::Report(report) => {
                 let body = write_report(report);
                 header.kind = REPORT;
                 header.head_len = u32_of(body.len())?;
-                pieces.push(body);
+                pieces.report = Some(body);
             }
             Body::Credit => {}
         }
