@@ -1,0 +1,221 @@
+//! Performatives as the machines use them: a number for the 22 of the standard, and sets of them.
+
+use fipa_acl::Performative;
+use regex::Regex;
+
+/// The bit of every standard performative.
+const STANDARD: u32 = (1 << 22) - 1;
+
+/// What a message does, ready to be compared.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Act<'a> {
+    /// One of the 22 of FIPA00037, by its place in [`Performative::STANDARD`].
+    Standard(u8),
+    /// A user-defined one.
+    Other(&'a str),
+}
+
+pub(crate) const CANCEL: Act<'static> = Act::Standard(2);
+pub(crate) const FAILURE: Act<'static> = Act::Standard(6);
+pub(crate) const INFORM: Act<'static> = Act::Standard(7);
+pub(crate) const NOT_UNDERSTOOD: Act<'static> = Act::Standard(10);
+
+impl<'a> Act<'a> {
+    pub(crate) fn of(performative: &'a Performative) -> Self {
+        use Performative as P;
+        Self::Standard(match performative {
+            P::AcceptProposal => 0,
+            P::Agree => 1,
+            P::Cancel => 2,
+            P::Cfp => 3,
+            P::Confirm => 4,
+            P::Disconfirm => 5,
+            P::Failure => 6,
+            P::Inform => 7,
+            P::InformIf => 8,
+            P::InformRef => 9,
+            P::NotUnderstood => 10,
+            P::Propagate => 11,
+            P::Propose => 12,
+            P::Proxy => 13,
+            P::QueryIf => 14,
+            P::QueryRef => 15,
+            P::Refuse => 16,
+            P::RejectProposal => 17,
+            P::Request => 18,
+            P::RequestWhen => 19,
+            P::RequestWhenever => 20,
+            P::Subscribe => 21,
+            P::Other(user) => return Self::Other(user.as_str()),
+        })
+    }
+
+    pub(crate) fn named(name: &'a str) -> Self {
+        let mut standard = (0..).zip(&Performative::STANDARD);
+        match standard.find(|(_, act)| act.as_str().eq_ignore_ascii_case(name)) {
+            Some((number, _)) => Self::Standard(number),
+            None => Self::Other(name),
+        }
+    }
+
+    pub(crate) fn name(self) -> &'a str {
+        match self {
+            Self::Standard(number) => standard_name(number),
+            Self::Other(name) => name,
+        }
+    }
+}
+
+fn standard_name(number: u8) -> &'static str {
+    static NAMES: std::sync::LazyLock<Vec<String>> = std::sync::LazyLock::new(|| {
+        let names = Performative::STANDARD.iter();
+        names.map(|act| act.as_str().to_owned()).collect()
+    });
+    NAMES.get(usize::from(number)).map_or("", String::as_str)
+}
+
+/// A set of performatives, written as a regular expression that matches the whole of their names.
+#[derive(Debug, Clone)]
+pub(crate) struct Acts {
+    text: String,
+    standard: u32,
+    /// Of user-defined ones.
+    other: Option<Regex>,
+}
+
+impl Acts {
+    /// # Errors
+    /// When the text is no regular expression.
+    pub(crate) fn new(text: &str) -> Result<Self, regex::Error> {
+        let pattern = whole(text, true)?;
+        let mut standard = 0;
+        for (number, act) in Performative::STANDARD.iter().enumerate() {
+            if pattern.is_match(act.as_str()) {
+                standard |= 1 << number;
+            }
+        }
+        // A plain standard name needs no pattern at run time.
+        let names_one = matches!(Act::named(text), Act::Standard(_));
+        Ok(Self {
+            text: text.to_owned(),
+            standard,
+            other: (!names_one).then_some(pattern),
+        })
+    }
+
+    #[inline]
+    pub(crate) fn contains(&self, act: Act<'_>) -> bool {
+        match act {
+            Act::Standard(number) => self.standard & (1 << number) != 0,
+            Act::Other(name) => match &self.other {
+                Some(pattern) => pattern.is_match(name),
+                None => false,
+            },
+        }
+    }
+
+    /// A performative that both sets have, as far as that can be told: of user-defined ones, one
+    /// that either text spells out.
+    pub(crate) fn common(&self, other: &Self) -> Option<String> {
+        let both = self.standard & other.standard & STANDARD;
+        if both != 0 {
+            return Some(standard_name(both.trailing_zeros().try_into().ok()?).to_owned());
+        }
+        let shared = |mine: &Self, theirs: &Self| {
+            let text = Act::Other(&mine.text);
+            (is_word(&mine.text) && theirs.contains(text) && mine.contains(text))
+                .then(|| mine.text.clone())
+        };
+        let same = (self.text == other.text).then(|| self.text.clone());
+        same.or_else(|| shared(self, other))
+            .or_else(|| shared(other, self))
+    }
+
+    /// The names, as far as they are finite: `agree, refuse`; else as written.
+    pub(crate) fn shown(&self) -> String {
+        if is_word(&self.text) || self.standard == 0 || self.standard == STANDARD {
+            return match self.text.as_str() {
+                ".*" => "any performative".to_owned(),
+                text => text.to_owned(),
+            };
+        }
+        let names = (0..22_u8).filter(|number| self.standard & (1 << number) != 0);
+        let names: Vec<&str> = names.map(standard_name).collect();
+        names.join(", ")
+    }
+
+    pub(crate) fn text(&self) -> &str {
+        &self.text
+    }
+}
+
+/// Largest compiled pattern, in bytes.
+const MAX_COMPILED: usize = 64 << 10;
+
+/// A pattern that matches whole texts only.
+pub(crate) fn whole(text: &str, any_case: bool) -> Result<Regex, regex::Error> {
+    regex::RegexBuilder::new(&format!("^(?:{text})$"))
+        .case_insensitive(any_case)
+        .size_limit(MAX_COMPILED)
+        .nest_limit(32)
+        .build()
+}
+
+/// Whether the text stands for itself as a pattern.
+pub(crate) fn is_word(text: &str) -> bool {
+    let literal = |c: char| c.is_alphanumeric() || matches!(c, '-' | '_' | ':' | ' ' | '@' | '/');
+    text.chars().all(literal)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_places_in_the_standard() {
+        for (number, act) in (0..).zip(&Performative::STANDARD) {
+            assert_eq!(Act::of(act), Act::Standard(number));
+            assert_eq!(Act::named(act.as_str()), Act::Standard(number));
+            assert_eq!(Act::of(act).name(), act.as_str());
+        }
+        for (act, name) in [
+            (CANCEL, "cancel"),
+            (FAILURE, "failure"),
+            (INFORM, "inform"),
+            (NOT_UNDERSTOOD, "not-understood"),
+        ] {
+            assert_eq!(act.name(), name);
+        }
+        assert_eq!(Act::named("INFORM"), INFORM);
+        assert_eq!(Act::named("ping"), Act::Other("ping"));
+    }
+
+    #[test]
+    fn sets_match_whole_names() {
+        let inform = Acts::new("inform").unwrap();
+        assert!(inform.contains(INFORM));
+        assert!(!inform.contains(Act::named("inform-if")));
+        assert!(!inform.contains(Act::Other("informs")));
+        let several = Acts::new("agree|refuse|my-.*").unwrap();
+        assert!(several.contains(Act::named("refuse")));
+        assert!(several.contains(Act::Other("my-act")));
+        assert!(!several.contains(Act::Other("not-my-act")));
+        assert_eq!(several.shown(), "agree, refuse");
+        assert_eq!(Acts::new(".*").unwrap().shown(), "any performative");
+        assert!(Acts::new("(").is_err());
+        assert!(Acts::new(r"(?:\w{1000}){1000}").is_err(), "too large");
+    }
+
+    #[test]
+    fn common_members_are_found() {
+        let set = |text| Acts::new(text).unwrap();
+        assert_eq!(
+            set("inform.*").common(&set("inform-if|agree")).as_deref(),
+            Some("inform-if")
+        );
+        assert_eq!(set("agree").common(&set("refuse")), None);
+        assert_eq!(set("ping").common(&set("p.*g")).as_deref(), Some("ping"));
+        assert_eq!(set("ping").common(&set("pong")), None);
+        assert_eq!(set("ping").common(&set("ping")).as_deref(), Some("ping"));
+    }
+}

@@ -1,0 +1,79 @@
+//! When messages are due.
+
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
+
+/// When a message is due, and in which conversation with whom.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct Deadline {
+    /// Milliseconds since 1970.
+    pub(crate) due: u64,
+    pub(crate) at: u32,
+    pub(crate) generation: u32,
+    pub(crate) party: u32,
+}
+
+/// Deadlines, the earliest first. Those that no longer count stay until they are due, or until
+/// there are too many of them.
+#[derive(Debug, Default)]
+pub(crate) struct Deadlines {
+    heap: BinaryHeap<Reverse<Deadline>>,
+    /// How many there were when those that did not count were last removed.
+    counted: usize,
+}
+
+impl Deadlines {
+    pub(crate) fn push(&mut self, deadline: Deadline) {
+        self.heap.push(Reverse(deadline));
+    }
+
+    pub(crate) fn next(&self) -> Option<u64> {
+        self.heap.peek().map(|Reverse(deadline)| deadline.due)
+    }
+
+    /// The earliest, if it is before this time.
+    pub(crate) fn pop_before(&mut self, now: u64) -> Option<Deadline> {
+        if self.next()? >= now {
+            return None;
+        }
+        self.heap.pop().map(|Reverse(deadline)| deadline)
+    }
+
+    /// Removes those that do not count when they could be more than those that do.
+    pub(crate) fn keep_few(&mut self, counts: impl Fn(&Deadline) -> bool) {
+        const SOME: usize = 1_024;
+        if self.heap.len() > 2 * self.counted + SOME {
+            self.heap.retain(|Reverse(deadline)| counts(deadline));
+            self.counted = self.heap.len();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn deadlines_come_in_order_and_do_not_pile_up() {
+        let mut deadlines = Deadlines::default();
+        let deadline = |due| Deadline {
+            due,
+            at: 0,
+            generation: 0,
+            party: 0,
+        };
+        for due in [7, 3, 5] {
+            deadlines.push(deadline(due));
+        }
+        assert_eq!(deadlines.next(), Some(3));
+        assert_eq!(deadlines.pop_before(3), None);
+        assert_eq!(deadlines.pop_before(6), Some(deadline(3)));
+        assert_eq!(deadlines.pop_before(6), Some(deadline(5)));
+        assert_eq!(deadlines.pop_before(6), None);
+        for due in 0..100_000 {
+            deadlines.push(deadline(due));
+            deadlines.keep_few(|deadline| deadline.due % 100 == 0);
+        }
+        assert!(deadlines.heap.len() < 4_000, "{}", deadlines.heap.len());
+    }
+}

@@ -1,0 +1,179 @@
+//! What a monitor reads of a message: all but the content.
+
+use std::borrow::Cow;
+use std::time::SystemTime;
+
+use fipa_acl::{Message, MessageView, Performative};
+use smallvec::SmallVec;
+
+use crate::act::Act;
+
+/// The parameters of a message that decide whether it fits its conversation.
+///
+/// Made from a [`Message`], from a [`MessageView`], or part by part from whatever else was read.
+/// Whoever watches letters rather than messages says with [`receivers`](Self::receivers) to whom this copy goes.
+/// Nothing is allocated for up to two receivers.
+#[derive(Debug, Clone)]
+pub struct Header<'a> {
+    performative: Cow<'a, Performative>,
+    sender: Option<Cow<'a, str>>,
+    receivers: SmallVec<[Cow<'a, str>; 2]>,
+    reply_to: SmallVec<[Cow<'a, str>; 1]>,
+    protocol: Option<Cow<'a, str>>,
+    conversation_id: Option<Cow<'a, str>>,
+    reply_with: Option<Cow<'a, str>>,
+    in_reply_to: Option<Cow<'a, str>>,
+    reply_by: Option<fipa_acl::Time>,
+}
+
+impl<'a> Header<'a> {
+    /// A header that says only what the message does.
+    #[must_use]
+    pub fn new(performative: Performative) -> Self {
+        Self::of_act(Cow::Owned(performative))
+    }
+
+    fn of_act(performative: Cow<'a, Performative>) -> Self {
+        Self {
+            performative,
+            sender: None,
+            receivers: SmallVec::new(),
+            reply_to: SmallVec::new(),
+            protocol: None,
+            conversation_id: None,
+            reply_with: None,
+            in_reply_to: None,
+            reply_by: None,
+        }
+    }
+
+    /// The same with a sender.
+    #[must_use]
+    pub fn sender(mut self, sender: impl Into<Cow<'a, str>>) -> Self {
+        self.sender = Some(sender.into());
+        self
+    }
+
+    /// The same with these receivers, and no others: of a letter, those in its envelope.
+    #[must_use]
+    pub fn receivers<N: Into<Cow<'a, str>>>(
+        mut self,
+        receivers: impl IntoIterator<Item = N>,
+    ) -> Self {
+        self.receivers = receivers.into_iter().map(Into::into).collect();
+        self
+    }
+
+    /// The same with agents to whom replies go instead of the sender.
+    #[must_use]
+    pub fn reply_to<N: Into<Cow<'a, str>>>(mut self, agents: impl IntoIterator<Item = N>) -> Self {
+        self.reply_to = agents.into_iter().map(Into::into).collect();
+        self
+    }
+
+    /// The same with a protocol.
+    #[must_use]
+    pub fn protocol(mut self, name: impl Into<Cow<'a, str>>) -> Self {
+        self.protocol = Some(name.into());
+        self
+    }
+
+    /// The same with a conversation id.
+    #[must_use]
+    pub fn conversation_id(mut self, id: impl Into<Cow<'a, str>>) -> Self {
+        self.conversation_id = Some(id.into());
+        self
+    }
+
+    /// The same with a `reply-with`.
+    #[must_use]
+    pub fn reply_with(mut self, text: impl Into<Cow<'a, str>>) -> Self {
+        self.reply_with = Some(text.into());
+        self
+    }
+
+    /// The same with an `in-reply-to`.
+    #[must_use]
+    pub fn in_reply_to(mut self, text: impl Into<Cow<'a, str>>) -> Self {
+        self.in_reply_to = Some(text.into());
+        self
+    }
+
+    /// The same with a `reply-by`.
+    #[must_use]
+    pub fn reply_by(mut self, time: fipa_acl::Time) -> Self {
+        self.reply_by = Some(time);
+        self
+    }
+
+    pub(crate) fn act(&self) -> Act<'_> {
+        Act::of(&self.performative)
+    }
+
+    pub(crate) fn sender_name(&self) -> Option<&str> {
+        self.sender.as_deref()
+    }
+
+    pub(crate) fn receiver_names(&self) -> &[Cow<'a, str>] {
+        &self.receivers
+    }
+
+    pub(crate) fn reply_to_names(&self) -> &[Cow<'a, str>] {
+        &self.reply_to
+    }
+
+    pub(crate) fn protocol_name(&self) -> Option<&str> {
+        self.protocol.as_deref()
+    }
+
+    pub(crate) fn conversation(&self) -> Option<&str> {
+        self.conversation_id.as_deref()
+    }
+
+    pub(crate) fn reply_with_text(&self) -> Option<&str> {
+        self.reply_with.as_deref()
+    }
+
+    pub(crate) fn in_reply_to_text(&self) -> Option<&str> {
+        self.in_reply_to.as_deref()
+    }
+
+    pub(crate) fn reply_by_time(&self, now: SystemTime) -> Option<SystemTime> {
+        self.reply_by.map(|time| time.to_system_time(now))
+    }
+}
+
+impl<'a> From<&'a Message> for Header<'a> {
+    fn from(message: &'a Message) -> Self {
+        let names = |agents: &'a [fipa_acl::AgentId]| {
+            agents.iter().map(|agent| Cow::Borrowed(agent.name()))
+        };
+        Self {
+            sender: message.sender().map(|sender| sender.name().into()),
+            receivers: names(message.receivers()).collect(),
+            reply_to: names(message.reply_to()).collect(),
+            protocol: message.protocol().map(Cow::Borrowed),
+            conversation_id: message.conversation_id().map(Cow::Borrowed),
+            reply_with: message.reply_with().map(Cow::Borrowed),
+            in_reply_to: message.in_reply_to().map(Cow::Borrowed),
+            reply_by: message.reply_by(),
+            ..Self::of_act(Cow::Borrowed(message.performative()))
+        }
+    }
+}
+
+impl<'a> From<&MessageView<'a>> for Header<'a> {
+    fn from(view: &MessageView<'a>) -> Self {
+        Self {
+            sender: view.sender().map(|sender| sender.name().into()),
+            receivers: view.receivers().map(|agent| agent.name().into()).collect(),
+            reply_to: view.reply_to().map(|agent| agent.name().into()).collect(),
+            protocol: view.protocol().map(Cow::Borrowed),
+            conversation_id: view.conversation_id().map(|text| text.as_str()),
+            reply_with: view.reply_with().map(|text| text.as_str()),
+            in_reply_to: view.in_reply_to().map(|text| text.as_str()),
+            reply_by: view.reply_by(),
+            ..Self::of_act(Cow::Owned(view.performative()))
+        }
+    }
+}

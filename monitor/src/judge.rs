@@ -1,0 +1,333 @@
+//! What a message would do to its conversation, with every participant it concerns; nothing is
+//! changed here.
+
+use std::borrow::Cow;
+
+use crate::act::{Act, FAILURE};
+use crate::conversation::{Conversation, FAILED, Lead, NONE, Party, Said, Side, lead};
+use crate::machine::{Machine, Scope};
+use crate::names::{Name, Names};
+use crate::verdict::ViolationKind as Kind;
+
+/// A message, and what it has to do with one conversation.
+pub(crate) struct Heard<'a> {
+    pub(crate) act: Act<'a>,
+    pub(crate) sender: &'a str,
+    pub(crate) receivers: &'a [Cow<'a, str>],
+    pub(crate) reply_with: u64,
+    pub(crate) in_reply_to: u64,
+    /// Whether the sender is the agent that watches itself.
+    pub(crate) own: bool,
+}
+
+/// One change.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Move {
+    pub(crate) who: Who,
+    pub(crate) side: Side,
+    pub(crate) lead: Lead,
+}
+
+/// Whose state changes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Who {
+    /// The party of this number.
+    Party(usize),
+    /// The receiver of this number, who is new.
+    Receiver(usize),
+    /// The members of a multicast who have not answered yet.
+    Unnamed,
+    /// The sender, who was one of those.
+    Sender,
+}
+
+/// Why a message is wrong, and with whom.
+#[derive(Debug, Clone)]
+pub(crate) struct Fault {
+    pub(crate) kind: Kind,
+    pub(crate) state: Option<u16>,
+    pub(crate) participant: Option<String>,
+}
+
+impl Fault {
+    pub(crate) fn plain(kind: Kind) -> Self {
+        Self {
+            kind,
+            state: None,
+            participant: None,
+        }
+    }
+}
+
+/// Writes all changes, or tells the first fault.
+pub(crate) fn judge(
+    machine: &Machine,
+    conversation: &Conversation,
+    names: &Names,
+    heard: &Heard<'_>,
+    moves: &mut Vec<Move>,
+) -> Result<(), Fault> {
+    moves.clear();
+    let judge = Judge {
+        machine,
+        conversation,
+        names,
+        heard,
+    };
+    match machine.scope {
+        Scope::Participant => judge.with_each(moves),
+        Scope::Conversation => judge.with_all(moves),
+    }
+}
+
+/// Whether a receiver is a pattern of names: what of a multicast is not known beforehand.
+fn is_pattern(receiver: &str) -> bool {
+    receiver.contains(['*', '+', '?', '[', '(', '{', '|', '^', '$', '\\'])
+}
+
+struct Judge<'a> {
+    machine: &'a Machine,
+    conversation: &'a Conversation,
+    names: &'a Names,
+    heard: &'a Heard<'a>,
+}
+
+impl Judge<'_> {
+    fn with_each(&self, moves: &mut Vec<Move>) -> Result<(), Fault> {
+        let sender = self.heard.sender;
+        if self.names.is(self.conversation.initiator, sender) {
+            return self.by_initiator(moves);
+        }
+        if let Some((at, party)) = self.party(sender) {
+            return self.by_participant(Who::Party(at), party, moves);
+        }
+        if let Some(unnamed) = &self.conversation.unnamed {
+            return self.by_participant(Who::Sender, unnamed, moves);
+        }
+        if self.heard.act == FAILURE && self.all_take_part() {
+            self.reported_failure(moves);
+            return Ok(());
+        }
+        Err(Fault::plain(Kind::Stranger))
+    }
+
+    fn by_initiator(&self, moves: &mut Vec<Move>) -> Result<(), Fault> {
+        let fresh = Party::new(NONE, self.machine.initial);
+        for (number, receiver) in self.heard.receivers.iter().enumerate() {
+            let (who, party) = match self.party(receiver) {
+                Some((at, party)) => (Who::Party(at), party),
+                None if is_pattern(receiver) => {
+                    let unnamed = self.conversation.unnamed.as_deref();
+                    (Who::Unnamed, unnamed.unwrap_or(&fresh))
+                }
+                None => (Who::Receiver(number), &fresh),
+            };
+            let said = self.said(Side::Initiator);
+            let mut led = lead(self.machine, party, &said).map(|lead| (Side::Initiator, lead));
+            // Who talks to himself has both roles.
+            if led.is_err() && **receiver == *self.heard.sender {
+                let answer = lead(self.machine, party, &self.said(Side::Other));
+                led = answer.map(|lead| (Side::Other, lead)).or(led);
+            }
+            let (side, lead) = led.map_err(|kind| self.fault(kind, party, receiver))?;
+            // Somebody named twice is told once.
+            let again = match who {
+                Who::Receiver(_) => self.heard.receivers[..number].contains(receiver),
+                who => moves.iter().any(|made| made.who == who),
+            };
+            if !again {
+                moves.push(Move { who, side, lead });
+            }
+        }
+        Ok(())
+    }
+
+    fn by_participant(&self, who: Who, party: &Party, moves: &mut Vec<Move>) -> Result<(), Fault> {
+        let conversation = self.conversation;
+        let elsewhere = self.heard.receivers.iter().any(|receiver| {
+            let designated = || {
+                let mut designated = conversation.reply_to.iter();
+                designated.any(|agent| self.names.is(*agent, receiver))
+            };
+            !self.names.is(conversation.initiator, receiver) && !designated()
+        });
+        let name = self.heard.sender;
+        if elsewhere {
+            return Err(self.fault(Kind::WrongReceiver, party, name));
+        }
+        let lead = lead(self.machine, party, &self.said(Side::Other))
+            .map_err(|kind| self.fault(kind, party, name))?;
+        moves.push(Move {
+            who,
+            side: Side::Other,
+            lead,
+        });
+        Ok(())
+    }
+
+    /// Somebody outside, a message transport service, tells a party that something it said was
+    /// not delivered. To whom is in the content: where it can be only one, the protocol has ended
+    /// with that one.
+    fn reported_failure(&self, moves: &mut Vec<Move>) {
+        let told_initiator = |receiver: &str| self.names.is(self.conversation.initiator, receiver);
+        for receiver in self.heard.receivers {
+            let concerns = |(_, party): &(usize, &Party)| {
+                let side = if told_initiator(receiver) {
+                    Side::Initiator
+                } else if self.names.is(party.peer, receiver) {
+                    Side::Other
+                } else {
+                    return false;
+                };
+                let asked = party.asked[crate::conversation::side_index(side)];
+                let answers =
+                    self.heard.in_reply_to == 0 || asked == 0 || self.heard.in_reply_to == asked;
+                party.last == side && answers
+            };
+            let mut concerned = self
+                .conversation
+                .parties
+                .iter()
+                .enumerate()
+                .filter(concerns);
+            if let (Some((at, party)), None) = (concerned.next(), concerned.next()) {
+                moves.push(failed(at, party));
+            }
+        }
+    }
+
+    fn all_take_part(&self) -> bool {
+        self.heard.receivers.iter().all(|receiver| {
+            self.names.is(self.conversation.initiator, receiver) || self.party(receiver).is_some()
+        })
+    }
+
+    fn with_all(&self, moves: &mut Vec<Move>) -> Result<(), Fault> {
+        let conversation = self.conversation;
+        let Some(party) = conversation.parties.first() else {
+            return Err(Fault::plain(Kind::NotOpened));
+        };
+        let sender = self.heard.sender;
+        let side = if self.names.is(conversation.initiator, sender) {
+            Side::Initiator
+        } else {
+            Side::Other
+        };
+        let unbound = unbound(self.machine, conversation);
+        let has = self.roles_of(sender);
+        let (mut to, mut all_bound, mut stranger) = (u32::MAX, has != 0, false);
+        for receiver in self.heard.receivers {
+            let roles = self.roles_of(receiver);
+            to &= roles | unbound;
+            all_bound &= roles != 0;
+            stranger |= roles | unbound == 0;
+        }
+        let said = Said {
+            from: has | unbound,
+            to,
+            known: all_bound,
+            answers: conversation.bound.len() == 2,
+            ..self.said(side)
+        };
+        let outside = has == 0 && unbound == 0;
+        let lead = match lead(self.machine, party, &said) {
+            Ok(lead) => lead,
+            Err(_) if outside && self.heard.act == FAILURE && !stranger => {
+                moves.push(failed(0, party));
+                return Ok(());
+            }
+            Err(kind) => {
+                let kind = match kind {
+                    _ if outside => Kind::Stranger,
+                    Kind::Unexpected | Kind::OutOfOrder if stranger => Kind::WrongReceiver,
+                    kind => kind,
+                };
+                let state = Some(party.state);
+                let participant = None;
+                return Err(Fault {
+                    kind,
+                    state,
+                    participant,
+                });
+            }
+        };
+        moves.push(Move {
+            who: Who::Party(0),
+            side,
+            lead,
+        });
+        Ok(())
+    }
+
+    fn roles_of(&self, agent: &str) -> u32 {
+        let bound = self.conversation.bound.iter();
+        let held = bound.filter(|bound| self.names.is(bound.agent, agent));
+        let roles = held.fold(0, |mask, bound| mask | (1 << bound.role));
+        let mut designated = self.conversation.reply_to.iter();
+        if designated.any(|name| self.names.is(*name, agent)) {
+            return roles | (1 << self.machine.initiator);
+        }
+        roles
+    }
+
+    fn said(&self, side: Side) -> Said<'_> {
+        let initiator = 1 << self.machine.initiator;
+        let (from, to) = match side {
+            Side::Initiator => (initiator, !initiator),
+            Side::Other => (!initiator, initiator),
+        };
+        Said {
+            act: self.heard.act,
+            side,
+            from,
+            to,
+            reply_with: self.heard.reply_with,
+            in_reply_to: self.heard.in_reply_to,
+            answers: true,
+            own: self.heard.own,
+            known: true,
+        }
+    }
+
+    fn party(&self, name: &str) -> Option<(usize, &Party)> {
+        const FEW: usize = 8;
+        let parties = &self.conversation.parties;
+        if parties.len() <= FEW {
+            let mut parties = parties.iter().enumerate();
+            return parties.find(|(_, party)| self.names.is(party.peer, name));
+        }
+        let known: Name = self.names.known(name)?;
+        let mut parties = parties.iter().enumerate();
+        parties.find(|(_, party)| party.peer == known)
+    }
+
+    fn fault(&self, kind: Kind, party: &Party, participant: &str) -> Fault {
+        Fault {
+            kind,
+            state: Some(party.state),
+            participant: Some(participant.to_owned()),
+        }
+    }
+}
+
+/// The roles that nobody has yet.
+pub(crate) fn unbound(machine: &Machine, conversation: &Conversation) -> u32 {
+    let all = 1_u64.checked_shl(machine.roles.len().try_into().unwrap_or(32));
+    let all = u32::try_from(all.unwrap_or(0).wrapping_sub(1)).unwrap_or(u32::MAX);
+    let bound = conversation.bound.iter();
+    all & !bound.fold(0, |mask, bound| mask | (1 << bound.role))
+}
+
+fn failed(at: usize, party: &Party) -> Move {
+    Move {
+        who: Who::Party(at),
+        side: party.last,
+        lead: Lead {
+            resume: match party.state {
+                FAILED => party.resume,
+                state => state,
+            },
+            ..Lead::to(FAILED)
+        },
+    }
+}

@@ -1,0 +1,199 @@
+//! The protocols that are known by name.
+
+use crate::Machine;
+use crate::scxml::ScxmlError;
+
+/// Most protocols in a library.
+const MAX_MACHINES: usize = 256;
+
+macro_rules! standard {
+    ($name:literal) => {
+        (
+            concat!($name, ".scxml"),
+            include_str!(concat!("../protocols/", $name, ".scxml")),
+        )
+    };
+}
+
+/// The files of the standard's protocols; each says its name itself.
+const STANDARD: [(&str, &str); 13] = [
+    standard!("request"),
+    standard!("query"),
+    standard!("request-when"),
+    standard!("propose"),
+    standard!("subscribe"),
+    standard!("contract-net"),
+    standard!("iterated-contract-net"),
+    standard!("english-auction"),
+    standard!("dutch-auction"),
+    standard!("brokering"),
+    standard!("recruiting"),
+    standard!("cancel"),
+    standard!("rock-query"),
+];
+
+/// The protocols that are known by name.
+#[derive(Debug, Clone, Default)]
+pub struct Library {
+    machines: Vec<Machine>,
+}
+
+impl Library {
+    /// A library without protocols.
+    #[must_use]
+    pub fn empty() -> Self {
+        Self::default()
+    }
+
+    /// The protocols of the FIPA standards.
+    #[must_use]
+    pub fn standard() -> Self {
+        let read = |(file, text): &(&str, &str)| Machine::read(file, text);
+        // A file of this crate with a mistake fails the tests below.
+        let machines = STANDARD.iter().filter_map(|file| read(file).ok());
+        Self {
+            machines: machines.collect(),
+        }
+    }
+
+    /// Adds a protocol. Its name and aliases come before those of the protocols that are there
+    /// already: one of the same name is replaced.
+    ///
+    /// # Errors
+    /// When the library is full.
+    pub fn add(&mut self, machine: Machine) -> Result<(), LibraryFull> {
+        let same = |known: &Machine| known.name().eq_ignore_ascii_case(machine.name());
+        self.machines.retain(|known| !same(known));
+        if self.machines.len() == MAX_MACHINES {
+            return Err(LibraryFull);
+        }
+        self.machines.insert(0, machine);
+        Ok(())
+    }
+
+    /// Reads a protocol and adds it; see [`Machine::read`] and [`add`](Self::add).
+    ///
+    /// # Errors
+    /// When the file has mistakes, or the library is full.
+    pub fn read(&mut self, file: &str, text: &str) -> Result<(), LibraryError> {
+        self.add(Machine::read(file, text)?)?;
+        Ok(())
+    }
+
+    /// The protocol with this name or alias; names come first. Case does not matter.
+    #[must_use]
+    pub fn find(&self, name: &str) -> Option<&Machine> {
+        self.machine(self.index_of(name)?)
+    }
+
+    /// All protocols, those added last first.
+    pub fn iter(&self) -> impl Iterator<Item = &Machine> {
+        self.machines.iter()
+    }
+
+    pub(crate) fn index_of(&self, name: &str) -> Option<u16> {
+        let named = |machine: &Machine| machine.name().eq_ignore_ascii_case(name);
+        let mut machines = self.machines.iter();
+        let found = machines.position(named).or_else(|| {
+            let mut machines = self.machines.iter();
+            machines.position(|machine| machine.is_called(name))
+        });
+        found.and_then(|index| u16::try_from(index).ok())
+    }
+
+    #[inline]
+    pub(crate) fn machine(&self, index: u16) -> Option<&Machine> {
+        self.machines.get(usize::from(index))
+    }
+}
+
+/// A library takes no more protocols.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("a library holds at most {MAX_MACHINES} protocols")]
+pub struct LibraryFull;
+
+/// Why a protocol was not added.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum LibraryError {
+    /// Its file has mistakes.
+    #[error(transparent)]
+    Scxml(#[from] ScxmlError),
+    /// The library is full.
+    #[error(transparent)]
+    Full(#[from] LibraryFull),
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_files_have_no_mistakes() {
+        for (file, text) in STANDARD {
+            if let Err(error) = Machine::read(file, text) {
+                panic!("{error}");
+            }
+        }
+        assert_eq!(Library::standard().iter().count(), STANDARD.len());
+    }
+
+    #[test]
+    fn protocols_have_their_standard_names_and_those_of_peers() {
+        let library = Library::standard();
+        for (name, aliases) in [
+            ("fipa-request", &["request"][..]),
+            ("fipa-query", &[]),
+            ("query", &[]),
+            ("fipa-request-when", &["request-when"]),
+            ("fipa-propose", &["propose"]),
+            ("fipa-subscribe", &["subscribe"]),
+            ("fipa-contract-net", &["contractNet"]),
+            ("fipa-iterated-contract-net", &["iteratedContractNet"]),
+            ("fipa-auction-english", &["fipa-english-auction"]),
+            (
+                "fipa-auction-dutch",
+                &["dutchAuction", "fipa-dutch-auction"],
+            ),
+            ("fipa-brokering", &["brokering"]),
+            ("fipa-recruiting", &["recruiting"]),
+            ("fipa-cancel", &["cancel"]),
+        ] {
+            let upper = name.to_uppercase();
+            for called in aliases.iter().copied().chain([name, &upper]) {
+                let found = library.find(called).map(Machine::name);
+                assert_eq!(found, Some(name), "{called}");
+            }
+        }
+        assert!(library.find("fipa").is_none());
+    }
+
+    #[test]
+    fn what_is_added_comes_first() {
+        let mut library = Library::standard();
+        let own = r#"<scxml initial="1">
+            <state id="1"><transition performative="inform" from="a" to="b" target="2"/></state>
+            <state id="2" final="yes"/></scxml>"#;
+        library.read("protocols/request", own).unwrap();
+        assert_eq!(
+            library.find("request").map(|own| own.states().len()),
+            Some(2)
+        );
+        assert_eq!(
+            library.find("fipa-request").map(Machine::name),
+            Some("fipa-request")
+        );
+        library.read("fipa-request.scxml", own).unwrap();
+        assert_eq!(
+            library.find("fipa-request").map(|own| own.states().len()),
+            Some(2)
+        );
+        assert_eq!(library.iter().count(), STANDARD.len() + 1);
+        for number in 0.. {
+            match library.read(&format!("p{number}"), own) {
+                Ok(()) => assert!(number < MAX_MACHINES),
+                Err(error) => return assert_eq!(error, LibraryError::Full(LibraryFull)),
+            }
+        }
+    }
+}

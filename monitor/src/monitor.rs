@@ -1,0 +1,579 @@
+//! The monitor: messages in, verdicts out.
+
+use std::hash::{BuildHasher, RandomState};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use crate::change::{Change, expire, expire_party, millis, span_millis};
+use crate::conversation::{NONE, Party, is_final, is_over, state_name};
+use crate::deadlines::{Deadline, Deadlines};
+use crate::judge::{Fault, Heard, Move, Who, judge};
+use crate::limits::MAX_TEXT;
+use crate::machine::{Machine, Scope, step};
+use crate::names::Names;
+use crate::report::violation;
+use crate::table::{List, Table};
+use crate::verdict::{Accepted, Unchecked, Verdict, ViolationKind as Kind};
+use crate::{Header, Library, Limits};
+
+/// Checks messages against the protocols of their conversations.
+///
+/// Messages go in with [`check`](Self::check), in the order in which they were sent or seen, and
+/// a verdict comes out; a message that violates its protocol changes nothing. Time comes in with
+/// every call: there is no clock here. [`handle_timeout`](Self::handle_timeout) tells of
+/// conversations in which a message is overdue, and forgets those that are over or abandoned.
+#[derive(Debug)]
+pub struct Monitor {
+    library: Arc<Library>,
+    limits: Limits,
+    /// The agent that watches its own conversations; none for an observer.
+    agent: Option<String>,
+    names: Names,
+    table: Table,
+    deadlines: Deadlines,
+    hasher: RandomState,
+    /// Room that is used again.
+    moves: Vec<Move>,
+    forgotten: u64,
+}
+
+/// What a monitor noticed without a message.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Event {
+    /// No message came by the `reply-by` of the last one, or within the time of the state.
+    Overdue {
+        /// The standard name of the protocol.
+        protocol: String,
+        /// The conversation.
+        conversation_id: String,
+        /// The participant, where each has a state of its own.
+        participant: Option<String>,
+        /// The state in which no message came.
+        state: String,
+        /// The state that follows, if the protocol says one.
+        next: Option<String>,
+    },
+    /// Nothing had happened for so long that the conversation was forgotten, though it was not
+    /// over.
+    Abandoned {
+        /// The standard name of the protocol.
+        protocol: String,
+        /// The conversation.
+        conversation_id: String,
+    },
+}
+
+/// Why a message was not accepted.
+pub(crate) enum Denied {
+    Fault(Fault, u32),
+    NotOpened(u16),
+    Unchecked(Unchecked),
+}
+
+/// What is left to say about a message that was accepted.
+struct Passed {
+    machine: u16,
+    state: u16,
+    opened: bool,
+    complete: bool,
+    late: bool,
+}
+
+impl Monitor {
+    /// A monitor of everybody's conversations.
+    #[must_use]
+    pub fn observer(library: Arc<Library>) -> Self {
+        Self::with(library, None)
+    }
+
+    /// A monitor of one agent's conversations, which is shown all that the agent sends and
+    /// receives, in that order. It knows what the agent knew when it sent something, so that it is
+    /// stricter than an observer about messages that could have crossed.
+    #[must_use]
+    pub fn agent(library: Arc<Library>, name: &str) -> Self {
+        Self::with(library, Some(name.to_owned()))
+    }
+
+    fn with(library: Arc<Library>, agent: Option<String>) -> Self {
+        let hasher = RandomState::new();
+        Self {
+            library,
+            limits: Limits::default(),
+            agent,
+            names: Names::new(hasher.clone()),
+            table: Table::new(hasher.clone()),
+            deadlines: Deadlines::default(),
+            hasher,
+            moves: Vec::new(),
+            forgotten: 0,
+        }
+    }
+
+    /// The same with other limits.
+    #[must_use]
+    pub fn with_limits(mut self, limits: Limits) -> Self {
+        self.limits = limits;
+        self
+    }
+
+    /// The protocols it knows.
+    #[must_use]
+    pub fn library(&self) -> &Library {
+        &self.library
+    }
+
+    /// How many conversations it knows, those within others included.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.table.len()
+    }
+
+    /// Whether it knows no conversation.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// How many conversations that were not over it has forgotten to keep within its limits.
+    #[must_use]
+    pub fn forgotten(&self) -> u64 {
+        self.forgotten
+    }
+
+    /// Checks a message, and moves its conversation on if it fits.
+    pub fn check(&mut self, header: &Header<'_>, now: SystemTime) -> Verdict<'_> {
+        match self.take(header, now) {
+            Ok(passed) => self.accepted(&passed),
+            Err(Denied::Unchecked(why)) => Verdict::Unchecked(why),
+            Err(denied) => {
+                let violation = violation(&self.library, &self.table, &self.names, header, denied);
+                Verdict::Violation(Box::new(violation))
+            }
+        }
+    }
+
+    fn accepted(&self, passed: &Passed) -> Verdict<'_> {
+        let Some(machine) = self.library.machine(passed.machine) else {
+            return Verdict::Unchecked(Unchecked::UnknownProtocol);
+        };
+        Verdict::Accepted(Accepted {
+            protocol: machine.name(),
+            state: state_name(machine, passed.state),
+            opened: passed.opened,
+            ended: is_final(machine, passed.state),
+            complete: passed.complete,
+            late: passed.late,
+        })
+    }
+
+    fn take(&mut self, header: &Header<'_>, now: SystemTime) -> Result<Passed, Denied> {
+        let unchecked = |why| Err(Denied::Unchecked(why));
+        let Some(id) = header.conversation() else {
+            return unchecked(Unchecked::NoConversation);
+        };
+        let Some(sender) = header.sender_name() else {
+            return unchecked(Unchecked::NoSender);
+        };
+        let receivers = header.receiver_names();
+        if receivers.is_empty() {
+            return unchecked(Unchecked::NoReceiver);
+        }
+        let named = receivers.iter().chain(header.reply_to_names());
+        let too_long = |text: &str| text.len() > MAX_TEXT;
+        if too_long(id)
+            || too_long(sender)
+            || receivers.len() + header.reply_to_names().len() > self.limits.participants
+            || named.into_iter().any(|name| too_long(name))
+        {
+            return unchecked(Unchecked::TooLarge);
+        }
+        let fingerprint = |text: Option<&str>| text.map_or(0, |text| self.hasher.hash_one(text));
+        let heard = Heard {
+            act: header.act(),
+            sender,
+            receivers,
+            reply_with: fingerprint(header.reply_with_text()),
+            in_reply_to: fingerprint(header.in_reply_to_text()),
+            own: self.agent.as_deref() == Some(sender),
+        };
+        let Some(main) = self.table.find(id) else {
+            let Some(protocol) = header.protocol_name() else {
+                return unchecked(Unchecked::NoProtocol);
+            };
+            let Some(machine) = self.library.index_of(protocol) else {
+                return unchecked(Unchecked::UnknownProtocol);
+            };
+            return self.open(id, NONE, machine, header, &heard, now);
+        };
+        let library = Arc::clone(&self.library);
+        let machine = self.machine_of(&library, main);
+        let follows = |name| machine.is_some_and(|machine: &Machine| machine.is_called(name));
+        if header.protocol_name().is_none_or(follows) {
+            return self.go_on(main, header, &heard, now);
+        }
+        self.embedded(&library, main, header, &heard, now)
+    }
+
+    /// A message of another protocol than its conversation's: it belongs to one within.
+    fn embedded(
+        &mut self,
+        library: &Library,
+        main: u32,
+        header: &Header<'_>,
+        heard: &Heard<'_>,
+        now: SystemTime,
+    ) -> Result<Passed, Denied> {
+        let name = header.protocol_name().unwrap_or_default();
+        let mut denied = None;
+        let mut children = 0;
+        let mut may_begin = self.may_begin(library, main, name, heard.sender);
+        let mut child = self.table.slot(main).map_or(NONE, |slot| slot.child);
+        while child != NONE {
+            children += 1;
+            may_begin |= self.may_begin(library, child, name, heard.sender);
+            let called = self.machine_of(library, child);
+            if called.is_some_and(|machine| machine.is_called(name)) {
+                match self.go_on(child, header, heard, now) {
+                    Ok(passed) => {
+                        self.touch(main, millis(now));
+                        return Ok(passed);
+                    }
+                    Err(fault) => denied = denied.or(Some(fault)),
+                }
+            }
+            child = self.table.slot(child).map_or(NONE, |slot| slot.sibling);
+        }
+        if !may_begin {
+            let fault = Fault::plain(Kind::WrongProtocol);
+            return Err(denied.unwrap_or(Denied::Fault(fault, main)));
+        }
+        let Some(machine) = library.index_of(name) else {
+            return Err(Denied::Unchecked(Unchecked::UnknownProtocol));
+        };
+        if children >= self.limits.embedded {
+            return Err(Denied::Fault(Fault::plain(Kind::TooMany), main));
+        }
+        let id = header.conversation().unwrap_or_default();
+        match self.open(id, main, machine, header, heard, now) {
+            Ok(passed) => {
+                self.touch(main, millis(now));
+                Ok(passed)
+            }
+            Err(not_opened) => Err(denied.unwrap_or(not_opened)),
+        }
+    }
+
+    /// Whether the agent may begin a conversation of this protocol within another.
+    fn may_begin(&self, library: &Library, at: u32, protocol: &str, sender: &str) -> bool {
+        let Some((slot, machine)) = self.table.slot(at).zip(self.machine_of(library, at)) else {
+            return false;
+        };
+        let conversation = &slot.conversation;
+        let inner = library.find(protocol);
+        let begins = self.names.is(conversation.initiator, sender);
+        conversation.parties.iter().any(|party| {
+            let roles = match machine.scope {
+                Scope::Participant if begins => 1 << machine.initiator,
+                Scope::Participant if self.names.is(party.peer, sender) => {
+                    !(1_u32 << machine.initiator)
+                }
+                Scope::Participant => 0,
+                Scope::Conversation => {
+                    let bound = conversation.bound.iter();
+                    let held = bound.filter(|bound| self.names.is(bound.agent, sender));
+                    held.fold(0, |mask, bound| mask | (1 << bound.role))
+                }
+            };
+            let state = machine.state(party.state);
+            let mut embedded = state.into_iter().flat_map(|state| &state.embedded);
+            embedded.any(|sub| {
+                let named = match inner {
+                    Some(inner) => sub.admits(inner),
+                    None => sub.name.is_match(protocol),
+                };
+                named && sub.from.mask & roles != 0
+            })
+        })
+    }
+
+    fn open(
+        &mut self,
+        id: &str,
+        parent: u32,
+        machine: u16,
+        header: &Header<'_>,
+        heard: &Heard<'_>,
+        now: SystemTime,
+    ) -> Result<Passed, Denied> {
+        let library = Arc::clone(&self.library);
+        let Some(protocol) = library.machine(machine) else {
+            return Err(Denied::Unchecked(Unchecked::UnknownProtocol));
+        };
+        // Looked at first, so that nonsense drives nothing out.
+        let begins = step(&protocol.initial().steps, heard.act, u32::MAX, u32::MAX);
+        if begins.is_none() {
+            return Err(Denied::NotOpened(machine));
+        }
+        self.make_room(parent);
+        let at = self.table.insert(id, parent, machine, millis(now));
+        let initiator = self.names.acquire(heard.sender);
+        if let Some(slot) = self.table.slot_mut(at) {
+            slot.conversation.initiator = initiator;
+            if protocol.scope == Scope::Conversation {
+                let party = Party::new(NONE, protocol.initial);
+                slot.conversation.parties.push(party);
+            }
+        }
+        let passed = self.go_on(at, header, heard, now);
+        passed.map_err(|denied| {
+            self.remove(at);
+            match denied {
+                Denied::Fault(..) => Denied::NotOpened(machine),
+                other => other,
+            }
+        })
+    }
+
+    /// Forgets conversations until there is room for one more.
+    fn make_room(&mut self, keep: u32) {
+        while self.table.len() >= self.limits.conversations.max(1) {
+            let other = |at: &u32| *at != keep;
+            let ended = self.table.oldest(List::Ended).filter(other);
+            let Some(at) = ended.or_else(|| self.table.oldest(List::Open).filter(other)) else {
+                return;
+            };
+            if ended.is_none() {
+                self.forgotten += 1;
+            }
+            self.forget(at);
+        }
+    }
+
+    /// Judges the message in a conversation that is there, and moves it on.
+    fn go_on(
+        &mut self,
+        at: u32,
+        header: &Header<'_>,
+        heard: &Heard<'_>,
+        now: SystemTime,
+    ) -> Result<Passed, Denied> {
+        let now_ms = millis(now);
+        let fault = |kind| Denied::Fault(Fault::plain(kind), at);
+        let Some(slot) = self.table.slot_mut(at) else {
+            return Err(fault(Kind::NotOpened));
+        };
+        let index = slot.conversation.machine;
+        let Some(machine) = self.library.machine(index) else {
+            return Err(Denied::Unchecked(Unchecked::UnknownProtocol));
+        };
+        expire(machine, &mut slot.conversation, now_ms);
+        let conversation = &slot.conversation;
+        judge(machine, conversation, &self.names, heard, &mut self.moves)
+            .map_err(|fault| Denied::Fault(fault, at))?;
+        let new = |made: &&Move| matches!(made.who, Who::Receiver(_) | Who::Sender);
+        let grown = conversation.parties.len() + self.moves.iter().filter(new).count();
+        if grown > self.limits.participants
+            || conversation.bound.len() + heard.receivers.len() > self.limits.participants + 1
+        {
+            return Err(fault(Kind::TooMany));
+        }
+        let due = header.reply_by_time(now).map_or(0, millis);
+        let mut change = Change {
+            machine,
+            names: &mut self.names,
+            deadlines: &mut self.deadlines,
+            heard,
+            place: Deadline {
+                due: 0,
+                at,
+                generation: slot.generation,
+                party: 0,
+            },
+            now: now_ms,
+            due,
+            opened: false,
+            late: false,
+            state: None,
+        };
+        for made in &self.moves {
+            if machine.scope == Scope::Conversation {
+                change.bind(&mut slot.conversation, made.lead.roles);
+            }
+            change.make(&mut slot.conversation, *made);
+        }
+        if change.names_designated(&slot.conversation) {
+            change.designate(&mut slot.conversation, header);
+        }
+        let (opened, late, moved) = (change.opened, change.late, change.state);
+        let parties = &slot.conversation.parties;
+        let first = parties.first().map_or(machine.initial, |party| party.state);
+        let complete = slot.conversation.unnamed.is_none()
+            && parties.iter().all(|party| is_final(machine, party.state));
+        let passed = Passed {
+            machine: index,
+            state: moved.unwrap_or(first),
+            opened,
+            complete,
+            late,
+        };
+        let is_main = slot.parent == NONE;
+        if is_main {
+            self.touch(at, now_ms);
+        }
+        self.keep_deadlines_few();
+        Ok(passed)
+    }
+
+    /// Notes that something happened in a main conversation.
+    fn touch(&mut self, at: u32, now: u64) {
+        let library = &self.library;
+        let over = |slot: &crate::table::Slot| {
+            let conversation = &slot.conversation;
+            let machine = library.machine(conversation.machine);
+            conversation.unnamed.is_none()
+                && machine.is_some_and(|machine| {
+                    let mut parties = conversation.parties.iter();
+                    parties.all(|party| is_over(machine, party.state))
+                })
+        };
+        let Some(slot) = self.table.slot(at) else {
+            return;
+        };
+        let mut all_over = over(slot);
+        let mut child = slot.child;
+        while let Some(slot) = self.table.slot(child) {
+            all_over &= over(slot);
+            child = slot.sibling;
+        }
+        let list = if all_over { List::Ended } else { List::Open };
+        self.table.touch(at, list, now);
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) is to be called next.
+    #[must_use]
+    pub fn poll_timeout(&self) -> Option<SystemTime> {
+        let kept = |list, span: Duration| {
+            let slot = self.table.slot(self.table.oldest(list)?)?;
+            Some(
+                slot.touched
+                    .saturating_add(span_millis(span))
+                    .saturating_add(1),
+            )
+        };
+        let ended = kept(List::Ended, self.limits.ended);
+        let idle = kept(List::Open, self.limits.idle);
+        let due = self.deadlines.next().map(|due| due.saturating_add(1));
+        let next = [ended, idle, due].into_iter().flatten().min()?;
+        UNIX_EPOCH.checked_add(Duration::from_millis(next))
+    }
+
+    /// Time has passed: tells what is overdue, and forgets what is over or abandoned.
+    pub fn handle_timeout(&mut self, now: SystemTime) -> Vec<Event> {
+        let now = millis(now);
+        let mut events = Vec::new();
+        while let Some(deadline) = self.deadlines.pop_before(now) {
+            events.extend(self.overdue(deadline, now));
+        }
+        let spans = [
+            (List::Ended, span_millis(self.limits.ended)),
+            (List::Open, span_millis(self.limits.idle)),
+        ];
+        for (list, span) in spans {
+            while let Some(at) = self.table.oldest(list) {
+                let slot = self.table.slot(at);
+                let Some(slot) = slot.filter(|slot| slot.touched.saturating_add(span) < now) else {
+                    break;
+                };
+                let machine = self.library.machine(slot.conversation.machine);
+                let resting =
+                    |party: &Party| machine.is_some_and(|machine| is_final(machine, party.state));
+                if list == List::Open && !slot.conversation.parties.iter().all(resting) {
+                    events.push(Event::Abandoned {
+                        protocol: machine.map_or("", Machine::name).to_owned(),
+                        conversation_id: slot.conversation.id.clone(),
+                    });
+                }
+                self.forget(at);
+            }
+        }
+        events
+    }
+
+    fn overdue(&mut self, deadline: Deadline, now: u64) -> Option<Event> {
+        let slot = self.table.slot_mut(deadline.at)?;
+        if slot.generation != deadline.generation {
+            return None;
+        }
+        let machine = self.library.machine(slot.conversation.machine)?;
+        let party = slot.conversation.parties.get_mut(deadline.party as usize)?;
+        // A later message has another deadline, or none.
+        if party.deadline != deadline.due || is_over(machine, party.state) {
+            return None;
+        }
+        let before = party.state;
+        let (peer, scope) = (party.peer, machine.scope);
+        expire_party(machine, party, now);
+        let next = (party.state != before).then(|| state_name(machine, party.state).to_owned());
+        let event = Event::Overdue {
+            protocol: machine.name().to_owned(),
+            conversation_id: slot.conversation.id.clone(),
+            participant: (scope == Scope::Participant).then(|| self.names.text(peer).to_owned()),
+            state: state_name(machine, before).to_owned(),
+            next,
+        };
+        let touched = slot.touched;
+        let main = if slot.parent == NONE {
+            deadline.at
+        } else {
+            slot.parent
+        };
+        self.touch(main, touched);
+        Some(event)
+    }
+
+    /// Removes a main conversation, with all that are within it.
+    fn forget(&mut self, at: u32) {
+        while let Some(slot) = self.table.slot(at) {
+            let child = slot.child;
+            if child == NONE {
+                break;
+            }
+            self.remove(child);
+        }
+        self.remove(at);
+    }
+
+    fn remove(&mut self, at: u32) {
+        if let Some(slot) = self.table.slot(at) {
+            let conversation = &slot.conversation;
+            self.names.release(conversation.initiator);
+            let peers = conversation.parties.iter().map(|party| party.peer);
+            let bound = conversation.bound.iter().map(|bound| bound.agent);
+            let named = peers
+                .chain(bound)
+                .chain(conversation.reply_to.iter().copied());
+            for name in named.filter(|name| *name != NONE) {
+                self.names.release(name);
+            }
+        }
+        self.table.remove(at);
+    }
+
+    fn machine_of<'l>(&self, library: &'l Library, at: u32) -> Option<&'l Machine> {
+        library.machine(self.table.slot(at)?.conversation.machine)
+    }
+
+    /// Deadlines that no longer count are left where they are until there are too many.
+    fn keep_deadlines_few(&mut self) {
+        let table = &self.table;
+        let counts = |deadline: &Deadline| {
+            let slot = table.slot(deadline.at);
+            let slot = slot.filter(|slot| slot.generation == deadline.generation);
+            let parties = slot.map(|slot| &slot.conversation.parties);
+            let party = parties.and_then(|parties| parties.get(deadline.party as usize));
+            party.is_some_and(|party| party.deadline == deadline.due)
+        };
+        self.deadlines.keep_few(counts);
+    }
+}

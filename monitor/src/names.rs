@@ -1,0 +1,140 @@
+//! Names of agents, each kept once however many conversations it is part of.
+
+use std::hash::{BuildHasher, RandomState};
+
+use hashbrown::HashTable;
+
+/// A name in [`Names`].
+pub(crate) type Name = u32;
+
+/// Agents by name, counted by use. Room that was given back is used again without allocating.
+#[derive(Debug)]
+pub(crate) struct Names {
+    entries: Vec<Entry>,
+    free: Vec<Name>,
+    by_name: HashTable<Name>,
+    hasher: RandomState,
+}
+
+#[derive(Debug)]
+struct Entry {
+    name: String,
+    uses: u32,
+}
+
+impl Names {
+    pub(crate) fn new(hasher: RandomState) -> Self {
+        Self {
+            entries: Vec::new(),
+            free: Vec::new(),
+            by_name: HashTable::new(),
+            hasher,
+        }
+    }
+
+    /// The name, with one use more; every call is to be followed by [`release`](Self::release).
+    pub(crate) fn acquire(&mut self, name: &str) -> Name {
+        let hash = self.hasher.hash_one(name);
+        if let Some(known) = self.find(hash, name) {
+            if let Some(entry) = self.entry(known) {
+                entry.uses += 1;
+            }
+            return known;
+        }
+        let place = match self.free.pop() {
+            Some(place) => {
+                if let Some(entry) = self.entry(place) {
+                    entry.name.clear();
+                    entry.name.push_str(name);
+                    entry.uses = 1;
+                }
+                place
+            }
+            None => {
+                self.entries.push(Entry {
+                    name: name.to_owned(),
+                    uses: 1,
+                });
+                // Uses are bounded by conversations and their participants, far below.
+                Name::try_from(self.entries.len() - 1).unwrap_or(Name::MAX)
+            }
+        };
+        let (entries, hasher) = (&self.entries, &self.hasher);
+        self.by_name.insert_unique(hash, place, |name| {
+            let entry = entries.get(*name as usize);
+            hasher.hash_one(entry.map_or("", |entry| entry.name.as_str()))
+        });
+        place
+    }
+
+    pub(crate) fn release(&mut self, name: Name) {
+        let Some(entry) = self.entries.get_mut(name as usize) else {
+            return;
+        };
+        entry.uses = entry.uses.saturating_sub(1);
+        if entry.uses > 0 {
+            return;
+        }
+        let hash = self.hasher.hash_one(entry.name.as_str());
+        if let Ok(found) = self.by_name.find_entry(hash, |other| *other == name) {
+            found.remove();
+        }
+        // A name of unusual length is not kept for later.
+        if entry.name.capacity() > 256 {
+            entry.name = String::new();
+        }
+        self.free.push(name);
+    }
+
+    #[inline]
+    pub(crate) fn is(&self, name: Name, text: &str) -> bool {
+        let entry = self.entries.get(name as usize);
+        entry.is_some_and(|entry| entry.name == text)
+    }
+
+    pub(crate) fn text(&self, name: Name) -> &str {
+        let entry = self.entries.get(name as usize);
+        entry.map_or("", |entry| entry.name.as_str())
+    }
+
+    /// The name, if somebody uses it.
+    pub(crate) fn known(&self, text: &str) -> Option<Name> {
+        self.find(self.hasher.hash_one(text), text)
+    }
+
+    #[cfg(test)]
+    pub(crate) fn len(&self) -> usize {
+        self.by_name.len()
+    }
+
+    fn find(&self, hash: u64, text: &str) -> Option<Name> {
+        self.by_name
+            .find(hash, |name| self.is(*name, text))
+            .copied()
+    }
+
+    fn entry(&mut self, name: Name) -> Option<&mut Entry> {
+        self.entries.get_mut(name as usize)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_name_lives_as_long_as_it_is_used() {
+        let mut names = Names::new(RandomState::new());
+        let alice = names.acquire("alice");
+        assert_eq!(names.acquire("alice"), alice);
+        let bob = names.acquire("bob");
+        assert_ne!(bob, alice);
+        names.release(alice);
+        assert_eq!(names.known("alice"), Some(alice));
+        names.release(alice);
+        assert_eq!(names.known("alice"), None);
+        assert_eq!(names.acquire("carol"), alice, "its room is used again");
+        assert!(names.is(alice, "carol") && names.is(bob, "bob"));
+        assert_eq!(names.len(), 2);
+    }
+}

@@ -1,0 +1,149 @@
+//! Violations in words: what came, where the conversation is, what would have been right.
+
+use crate::conversation::{CANCELLING, Conversation, FAILED, state_name};
+use crate::judge::Fault;
+use crate::machine::{Machine, Roles, Scope, State};
+use crate::monitor::Denied;
+use crate::names::Names;
+use crate::table::Table;
+use crate::verdict::{Expected, Violation, ViolationKind as Kind};
+use crate::{Header, Library};
+
+/// Most receivers that are named.
+const MAX_NAMED: usize = 16;
+
+pub(crate) fn violation(
+    library: &Library,
+    table: &Table,
+    names: &Names,
+    header: &Header<'_>,
+    denied: Denied,
+) -> Violation {
+    let mut violation = Violation {
+        kind: Kind::NotOpened,
+        protocol: header.protocol_name().unwrap_or_default().to_owned(),
+        conversation_id: header.conversation().unwrap_or_default().to_owned(),
+        performative: header.act().name().to_owned(),
+        sender: header.sender_name().unwrap_or_default().to_owned(),
+        receivers: header
+            .receiver_names()
+            .iter()
+            .take(MAX_NAMED)
+            .map(|name| name.clone().into_owned())
+            .collect(),
+        participant: None,
+        state: None,
+        expected: Vec::new(),
+    };
+    let (fault, at) = match denied {
+        Denied::Fault(fault, at) => (fault, at),
+        Denied::NotOpened(machine) => {
+            if let Some(machine) = library.machine(machine) {
+                machine.name().clone_into(&mut violation.protocol);
+                violation.expected = expected(machine, machine.initial(), None, names, None);
+            }
+            return violation;
+        }
+        // Never asked for.
+        Denied::Unchecked(_) => return violation,
+    };
+    let Fault {
+        kind,
+        state,
+        participant,
+    } = fault;
+    violation.kind = kind;
+    let Some(slot) = table.slot(at) else {
+        return violation;
+    };
+    let conversation = &slot.conversation;
+    let Some(machine) = library.machine(conversation.machine) else {
+        return violation;
+    };
+    machine.name().clone_into(&mut violation.protocol);
+    if let Some(state) = state {
+        violation.state = Some(state_name(machine, state).to_owned());
+        let person = participant.as_deref();
+        let resume = || {
+            let mut parties = conversation.parties.iter();
+            let party = parties.find(|party| party.state == state);
+            party.and_then(|party| machine.state(party.resume))
+        };
+        let own = match state {
+            FAILED => resume(),
+            own => machine.state(own),
+        };
+        if let Some(own) = own {
+            violation.expected = expected(machine, own, Some(conversation), names, person);
+        } else if state == CANCELLING {
+            violation.expected = vec![Expected {
+                performative: "inform, failure".to_owned(),
+                from: "the other side".to_owned(),
+                to: "who cancelled".to_owned(),
+            }];
+        }
+    }
+    violation.participant = participant;
+    violation
+}
+
+/// What a state expects, with agents in place of roles where they are known.
+fn expected(
+    machine: &Machine,
+    state: &State,
+    conversation: Option<&Conversation>,
+    names: &Names,
+    participant: Option<&str>,
+) -> Vec<Expected> {
+    let named = |roles: &Roles| {
+        who(machine, roles, conversation, names, participant).unwrap_or_else(|| roles.text.clone())
+    };
+    let mut all: Vec<Expected> = Vec::new();
+    for step in &state.steps {
+        let (from, to) = (named(&step.from), named(&step.to));
+        let performative = step.acts.shown();
+        let same = all.iter_mut().find(|one| one.from == from && one.to == to);
+        match same {
+            Some(one)
+                if one
+                    .performative
+                    .split(", ")
+                    .any(|part| part == performative) => {}
+            Some(one) => {
+                one.performative.push_str(", ");
+                one.performative.push_str(&performative);
+            }
+            None => all.push(Expected {
+                performative,
+                from,
+                to,
+            }),
+        }
+    }
+    all
+}
+
+fn who(
+    machine: &Machine,
+    roles: &Roles,
+    conversation: Option<&Conversation>,
+    names: &Names,
+    participant: Option<&str>,
+) -> Option<String> {
+    let conversation = conversation?;
+    if roles.anyone || roles.mask.count_ones() != 1 {
+        return None;
+    }
+    let role = roles.mask.trailing_zeros();
+    if role == u32::from(machine.initiator) {
+        return Some(names.text(conversation.initiator).to_owned());
+    }
+    match machine.scope {
+        Scope::Participant => participant.map(str::to_owned),
+        Scope::Conversation => {
+            let mut bound = conversation.bound.iter();
+            let bound = bound.find(|bound| u32::from(bound.role) == role)?;
+            Some(names.text(bound.agent).to_owned())
+        }
+    }
+}

@@ -1,0 +1,565 @@
+//! From a document to a machine: every name resolved, every check made, all mistakes told.
+
+use std::collections::HashMap;
+use std::time::Duration;
+
+use super::document::{self, Document};
+use super::{Ambiguity, Mistake, Problem};
+use crate::act::{Acts, is_word, whole};
+use crate::machine::{
+    After, Cancel, MAX_ROLES, Machine, Roles, Scope, State, Subprotocol, Timeout, Transition,
+};
+
+/// Most transitions that a state may have after optional steps were left out.
+const MAX_STEPS: usize = 100;
+
+pub(super) fn machine(document: &Document, file_name: &str) -> Result<Machine, Vec<Mistake>> {
+    let mut builder = Builder {
+        document,
+        mistakes: Vec::new(),
+        roles: Vec::new(),
+        ids: HashMap::new(),
+        known_acts: HashMap::new(),
+        known_roles: HashMap::new(),
+    };
+    let made = builder.machine(file_name);
+    match made {
+        Some(machine) if builder.mistakes.is_empty() => Ok(machine),
+        _ => Err(builder.mistakes),
+    }
+}
+
+struct Builder<'d> {
+    document: &'d Document,
+    mistakes: Vec<Mistake>,
+    roles: Vec<String>,
+    ids: HashMap<&'d str, u16>,
+    /// What was compiled already: most files say the same few things again and again.
+    known_acts: HashMap<&'d str, Acts>,
+    known_roles: HashMap<&'d str, Roles>,
+}
+
+impl<'d> Builder<'d> {
+    /// The machine; it is wrong if there are mistakes afterwards.
+    fn machine(&mut self, file_name: &str) -> Option<Machine> {
+        let document = self.document;
+        if document.states.is_empty() {
+            self.wrong(document.line, Problem::NoState);
+            return None;
+        }
+        self.name_states();
+        self.name_roles()?;
+        let initial = match &document.initial {
+            Some(id) => self.state(document.line, id),
+            None => {
+                let problem = Problem::Missing {
+                    element: "scxml",
+                    attribute: "initial",
+                };
+                self.wrong(document.line, problem);
+                None
+            }
+        };
+        let mut states = Vec::new();
+        for state in &document.states {
+            states.push(self.build_state(state));
+        }
+        let mut machine = Machine {
+            name: document
+                .name
+                .clone()
+                .unwrap_or_else(|| file_name.to_owned()),
+            aliases: self.aliases(),
+            title: document.title.clone(),
+            scope: self.scope(),
+            cancel: self.cancel(),
+            failure_by_parties: !document.extended,
+            roles: self.roles.clone(),
+            initiator: 0,
+            initial: initial?,
+            states,
+        };
+        self.bound_roles(&machine);
+        self.leave_out_optional(&mut machine);
+        self.reachable(&machine);
+        self.unambiguous(&machine);
+        machine.initiator = self.beginner(&machine)?;
+        Some(machine)
+    }
+
+    fn name_states(&mut self) {
+        for (index, state) in (0_u16..).zip(&self.document.states) {
+            if let Some(first) = self.ids.get(state.id.as_str()) {
+                let first = self.document.states.get(usize::from(*first));
+                let problem = Problem::DuplicateState {
+                    id: state.id.clone(),
+                    first: first.map_or(0, |state| state.line),
+                };
+                self.wrong(state.line, problem);
+            } else {
+                self.ids.insert(&state.id, index);
+            }
+        }
+    }
+
+    /// Roles are all names that stand for themselves.
+    fn name_roles(&mut self) -> Option<()> {
+        let document = self.document;
+        for state in &document.states {
+            let of_transitions = state
+                .transitions
+                .iter()
+                .flat_map(|transition| [&transition.from, &transition.to]);
+            let named = of_transitions.flatten();
+            for role in named.filter(|role| is_word(role)) {
+                if !self.roles.contains(role) {
+                    self.roles.push(role.clone());
+                }
+            }
+            if self.roles.len() > MAX_ROLES {
+                let problem = Problem::TooMany {
+                    what: "roles",
+                    limit: MAX_ROLES,
+                };
+                self.wrong(state.line, problem);
+                return None;
+            }
+        }
+        Some(())
+    }
+
+    fn build_state(&mut self, state: &'d document::State) -> State {
+        let is_final = match &state.is_final {
+            None => false,
+            Some(text) => self.yes_or_no(state.line, "final", text),
+        };
+        let mut transitions = Vec::new();
+        let mut timeout = None;
+        for transition in &state.transitions {
+            if let Some(after) = &transition.after {
+                if timeout.is_some() {
+                    self.wrong(transition.line, Problem::TwoTimeouts(state.id.clone()));
+                }
+                timeout = self.timeout(transition, after);
+            } else if let Some(transition) = self.transition(transition) {
+                transitions.push(transition);
+            }
+        }
+        let mut subprotocols = Vec::new();
+        for subprotocol in &state.subprotocols {
+            subprotocols.extend(self.subprotocol(subprotocol));
+        }
+        let empty = state.transitions.is_empty() && state.subprotocols.is_empty();
+        if empty && !is_final {
+            self.wrong(state.line, Problem::DeadEnd(state.id.clone()));
+        }
+        State {
+            id: state.id.clone(),
+            is_final,
+            steps: transitions.clone(),
+            embedded: subprotocols.clone(),
+            transitions,
+            subprotocols,
+            timeout,
+        }
+    }
+
+    fn transition(&mut self, read: &'d document::Transition) -> Option<Transition> {
+        let acts = self.required(read.line, "performative", &read.performative);
+        let from = self.required(read.line, "from", &read.from);
+        let to = self.required(read.line, "to", &read.to);
+        let target = self.state(read.line, &read.target);
+        let optional = match &read.optional {
+            None => false,
+            Some(text) => self.yes_or_no(read.line, "optional", text),
+        };
+        let acts = acts.and_then(|text| self.acts(read.line, text));
+        let from = from.and_then(|text| self.roles(read.line, "from", text));
+        let to = to.and_then(|text| self.roles(read.line, "to", text));
+        Some(Transition {
+            acts: acts?,
+            from: from?,
+            to: to?,
+            target: target?,
+            optional,
+        })
+    }
+
+    fn timeout(&mut self, read: &'d document::Transition, after: &str) -> Option<Timeout> {
+        let when = match after {
+            "reply-by" => Some(After::ReplyBy),
+            span => duration(span).map(After::Span),
+        };
+        if when.is_none() {
+            self.value(
+                read.line,
+                "after",
+                after,
+                "reply-by, or a span such as 500ms, 30s, 10min or 1h (at most 24h)",
+            );
+        }
+        let target = self.state(read.line, &read.target);
+        Some(Timeout {
+            after: when?,
+            target: target?,
+        })
+    }
+
+    fn subprotocol(&mut self, read: &'d document::Subprotocol) -> Option<Subprotocol> {
+        let name = match whole(&read.name, true) {
+            Ok(name) => Some(name),
+            Err(error) => self.no_pattern(read.line, "name", &read.name, &error),
+        };
+        let from = self.roles(read.line, "from", &read.from);
+        let proxied_to = match &read.proxied_to {
+            Some(text) => Some(self.roles(read.line, "proxied_to", text)?),
+            None => None,
+        };
+        Some(Subprotocol {
+            text: read.name.clone(),
+            name: name?,
+            from: from?,
+            proxied_to,
+        })
+    }
+
+    fn acts(&mut self, line: usize, text: &'d str) -> Option<Acts> {
+        if let Some(known) = self.known_acts.get(text) {
+            return Some(known.clone());
+        }
+        match Acts::new(text) {
+            Ok(acts) => {
+                self.known_acts.insert(text, acts.clone());
+                Some(acts)
+            }
+            Err(error) => self.no_pattern(line, "performative", text, &error),
+        }
+    }
+
+    fn roles(&mut self, line: usize, attribute: &'static str, text: &'d str) -> Option<Roles> {
+        if let Some(known) = self.known_roles.get(text) {
+            return Some(known.clone());
+        }
+        let pattern = match whole(text, false) {
+            Ok(pattern) => pattern,
+            Err(error) => return self.no_pattern(line, attribute, text, &error),
+        };
+        let mut mask = 0;
+        for (number, role) in self.roles.iter().enumerate() {
+            if pattern.is_match(role) {
+                mask |= 1 << number;
+            }
+        }
+        let anyone = text == ".*";
+        if mask == 0 && !anyone {
+            self.wrong(line, Problem::UnboundRole(text.to_owned()));
+            return None;
+        }
+        let roles = Roles {
+            text: text.to_owned(),
+            mask,
+            anyone,
+        };
+        self.known_roles.insert(text, roles.clone());
+        Some(roles)
+    }
+
+    /// Somebody can only speak when he has been spoken to, but for who begins.
+    fn bound_roles(&mut self, machine: &Machine) {
+        let all = || machine.states.iter().flat_map(|state| &state.transitions);
+        let begin = &machine.initial().transitions;
+        for (number, role) in machine.roles.iter().enumerate() {
+            let bit = 1 << number;
+            let first = begin.iter().any(|step| step.from.mask & bit != 0);
+            let addressed = all().any(|step| step.to.includes(bit));
+            let states = machine.states.iter().enumerate();
+            let mut spoken = states.flat_map(|(at, state)| {
+                let steps = state.transitions.iter();
+                steps
+                    .filter(|step| step.from.text == *role)
+                    .map(move |step| (at, step))
+            });
+            if let Some((state, step)) = spoken.next().filter(|_| !first && !addressed) {
+                let line = self.line_of_step(state, step);
+                self.wrong(line, Problem::UnboundRole(role.clone()));
+            }
+        }
+    }
+
+    /// Gives states the transitions of those that are reached by leaving out optional steps.
+    fn leave_out_optional(&mut self, machine: &mut Machine) {
+        for index in 0..machine.states.len() {
+            let (mut steps, mut embedded) = (Vec::new(), Vec::new());
+            let mut reached = vec![index];
+            let mut next = 0;
+            while let Some(state) = reached.get(next).and_then(|at| machine.states.get(*at)) {
+                next += 1;
+                steps.extend(state.transitions.iter().cloned());
+                embedded.extend(state.subprotocols.iter().cloned());
+                for transition in state.transitions.iter().filter(|step| step.optional) {
+                    let target = usize::from(transition.target);
+                    if target == index {
+                        let id = state.id.clone();
+                        self.wrong(self.line_of(index), Problem::OptionalCircle(id));
+                    }
+                    if !reached.contains(&target) {
+                        reached.push(target);
+                    }
+                }
+                if steps.len() > MAX_STEPS {
+                    let problem = Problem::TooMany {
+                        what: "transitions of a state",
+                        limit: MAX_STEPS,
+                    };
+                    self.wrong(self.line_of(index), problem);
+                    return;
+                }
+            }
+            if let Some(state) = machine.states.get_mut(index) {
+                (state.steps, state.embedded) = (steps, embedded);
+            }
+        }
+    }
+
+    fn reachable(&mut self, machine: &Machine) {
+        let mut reached = vec![false; machine.states.len()];
+        let mut next = vec![machine.initial];
+        while let Some(id) = next.pop() {
+            let Some((state, seen)) = machine
+                .state(id)
+                .zip(reached.get_mut(usize::from(id)))
+                .filter(|(_, seen)| !**seen)
+            else {
+                continue;
+            };
+            *seen = true;
+            next.extend(state.transitions.iter().map(|step| step.target));
+            next.extend(state.timeout.map(|timeout| timeout.target));
+        }
+        for (state, _) in self
+            .document
+            .states
+            .iter()
+            .zip(reached)
+            .filter(|(_, reached)| !reached)
+        {
+            let problem = Problem::UnreachableState(state.id.clone());
+            self.mistakes.push(Mistake {
+                line: state.line,
+                problem,
+            });
+        }
+    }
+
+    fn unambiguous(&mut self, machine: &Machine) {
+        for (index, state) in machine.states.iter().enumerate() {
+            for (place, one) in state.steps.iter().enumerate() {
+                for other in state.steps.iter().take(place) {
+                    let apart = one.target == other.target
+                        || !one.from.overlaps(&other.from)
+                        || !one.to.overlaps(&other.to);
+                    if apart {
+                        continue;
+                    }
+                    if let Some(performative) = one.acts.common(&other.acts) {
+                        let problem = Problem::Ambiguous(Box::new(Ambiguity {
+                            state: state.id.clone(),
+                            performative,
+                            from: one.from.text.clone(),
+                            to: one.to.text.clone(),
+                            target: machine.target(one).to_owned(),
+                            other_target: machine.target(other).to_owned(),
+                            other_line: self.line_of_step(index, other),
+                        }));
+                        self.wrong(self.line_of_step(index, one), problem);
+                        // One of a state is enough: others follow from the same mistake.
+                        break;
+                    }
+                }
+            }
+        }
+    }
+
+    fn beginner(&mut self, machine: &Machine) -> Option<u8> {
+        let line = self.line_of(usize::from(machine.initial));
+        let initial = machine.state(machine.initial)?;
+        let mask = initial
+            .steps
+            .iter()
+            .fold(0, |mask, step| mask | step.from.mask);
+        if mask.count_ones() > 1 {
+            let begins = |(number, _): &(usize, &String)| mask & (1 << number) != 0;
+            let roles = self.roles.iter().enumerate().filter(begins);
+            let roles: Vec<&str> = roles.map(|(_, role)| role.as_str()).collect();
+            self.wrong(line, Problem::Beginners(roles.join(", ")));
+        }
+        if machine.scope == Scope::Participant && self.roles.len() != 2 {
+            let problem = Problem::RolesOfScope(self.roles.len(), self.roles.join(", "));
+            self.wrong(self.document.line, problem);
+        }
+        u8::try_from(mask.trailing_zeros() % 32).ok()
+    }
+
+    fn aliases(&mut self) -> Vec<String> {
+        let aliases = self.document.aliases.as_deref().unwrap_or_default();
+        aliases.split_whitespace().map(str::to_owned).collect()
+    }
+
+    fn scope(&mut self) -> Scope {
+        match self.document.scope.as_deref() {
+            None | Some("conversation") => Scope::Conversation,
+            Some("participant") => Scope::Participant,
+            Some(other) => {
+                let line = self.document.line;
+                self.value(line, "scope", other, "participant or conversation");
+                Scope::Conversation
+            }
+        }
+    }
+
+    fn cancel(&mut self) -> Cancel {
+        match self.document.cancel.as_deref() {
+            None if self.document.extended => Cancel::Initiator,
+            None | Some("anyone") => Cancel::Anyone,
+            Some("initiator") => Cancel::Initiator,
+            Some("nobody") => Cancel::Nobody,
+            Some(other) => {
+                let line = self.document.line;
+                self.value(line, "cancel", other, "initiator, anyone or nobody");
+                Cancel::Nobody
+            }
+        }
+    }
+
+    fn yes_or_no(&mut self, line: usize, attribute: &'static str, text: &str) -> bool {
+        match text {
+            "yes" | "true" | "1" => true,
+            "no" | "false" | "0" => false,
+            other => {
+                self.value(line, attribute, other, "yes, true, 1, no, false or 0");
+                false
+            }
+        }
+    }
+
+    fn state(&mut self, line: usize, id: &str) -> Option<u16> {
+        let known = self.ids.get(id).copied();
+        if known.is_none() {
+            let alike = |known: &&&str| known.eq_ignore_ascii_case(id) || one_edit_apart(known, id);
+            let nearest = self.ids.keys().filter(alike).min();
+            let problem = Problem::UnknownState {
+                id: id.to_owned(),
+                nearest: nearest.map(|id| (*id).to_owned()),
+            };
+            self.wrong(line, problem);
+        }
+        known
+    }
+
+    fn required(
+        &mut self,
+        line: usize,
+        attribute: &'static str,
+        value: &'d Option<String>,
+    ) -> Option<&'d str> {
+        let value = value.as_deref().filter(|value| !value.is_empty());
+        if value.is_none() {
+            let element = "transition";
+            self.wrong(line, Problem::Missing { element, attribute });
+        }
+        value
+    }
+
+    fn no_pattern<T>(
+        &mut self,
+        line: usize,
+        attribute: &'static str,
+        text: &str,
+        error: &regex::Error,
+    ) -> Option<T> {
+        let problem = Problem::Pattern {
+            attribute,
+            value: text.to_owned(),
+            reason: match error {
+                regex::Error::CompiledTooBig(_) => "it is too large when compiled".to_owned(),
+                // The last line of what the parser says is the reason; above it is a drawing.
+                other => other
+                    .to_string()
+                    .lines()
+                    .last()
+                    .unwrap_or_default()
+                    .to_owned(),
+            },
+        };
+        self.wrong(line, problem);
+        None
+    }
+
+    fn value(&mut self, line: usize, attribute: &'static str, value: &str, expected: &'static str) {
+        let problem = Problem::Value {
+            attribute,
+            value: value.to_owned(),
+            expected,
+        };
+        self.wrong(line, problem);
+    }
+
+    fn line_of(&self, state: usize) -> usize {
+        let state = self.document.states.get(state);
+        state.map_or(self.document.line, |state| state.line)
+    }
+
+    /// The line of a step: of the transition it stands for, or of the state, if it comes from
+    /// leaving out others.
+    fn line_of_step(&self, state: usize, step: &Transition) -> usize {
+        let own = self.document.states.get(state).and_then(|state| {
+            let mut messages = state.transitions.iter().filter(|one| one.after.is_none());
+            messages.find(|one| {
+                one.performative.as_deref() == Some(step.acts.text())
+                    && one.from.as_deref() == Some(&step.from.text)
+                    && self.ids.get(one.target.as_str()) == Some(&step.target)
+            })
+        });
+        own.map_or(self.line_of(state), |transition| transition.line)
+    }
+
+    fn wrong(&mut self, line: usize, problem: Problem) {
+        self.mistakes.push(Mistake { line, problem });
+    }
+}
+
+/// Reads a span of at most a day.
+fn duration(text: &str) -> Option<Duration> {
+    const DAY: u64 = 24 * 60 * 60 * 1000;
+    let digits = text.find(|c: char| !c.is_ascii_digit())?;
+    let (number, unit) = text.split_at(digits);
+    let factor = match unit {
+        "ms" => 1,
+        "s" => 1000,
+        "min" => 60 * 1000,
+        "h" => 60 * 60 * 1000,
+        _ => return None,
+    };
+    let ms = number.parse::<u64>().ok()?.checked_mul(factor)?;
+    (1..=DAY).contains(&ms).then_some(Duration::from_millis(ms))
+}
+
+/// Whether one inserted, left out or changed character makes one of the other.
+fn one_edit_apart(one: &str, other: &str) -> bool {
+    let (short, long): (Vec<char>, Vec<char>) = if one.len() <= other.len() {
+        (one.chars().collect(), other.chars().collect())
+    } else {
+        (other.chars().collect(), one.chars().collect())
+    };
+    let same = short.iter().zip(&long).take_while(|(a, b)| a == b).count();
+    // Of names of one or two characters, all would be near.
+    if short.len() < 3 {
+        return false;
+    }
+    let (short_rest, long_rest) = (short.get(same + 1..), long.get(same + 1..));
+    match long.len().checked_sub(short.len()) {
+        Some(0) => short_rest == long_rest,
+        Some(1) => short.get(same..) == long_rest,
+        _ => false,
+    }
+}

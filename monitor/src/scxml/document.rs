@@ -1,0 +1,389 @@
+//! From XML to elements with lines, nothing of which is checked against anything else yet.
+
+use std::borrow::Cow;
+
+use quick_xml::XmlVersion;
+use quick_xml::events::{BytesStart, Event};
+use quick_xml::name::{Namespace, ResolveResult};
+use quick_xml::reader::NsReader;
+
+use super::{MAX_FILE, Mistake, NAMESPACE, Problem};
+
+/// Deepest nesting: a protocol needs three levels, and what else is in the file is not looked at.
+const MAX_DEPTH: usize = 32;
+const MAX_STATES: usize = 500;
+const MAX_TRANSITIONS: usize = 2_000;
+/// Longest value of an attribute, in bytes.
+const MAX_VALUE: usize = 256;
+/// Most attributes of an element.
+const MAX_ATTRIBUTES: usize = 64;
+
+/// What an `<scxml>` says.
+#[derive(Debug, Default)]
+pub(super) struct Document {
+    pub(super) line: usize,
+    pub(super) initial: Option<String>,
+    /// Whether our namespace is declared.
+    pub(super) extended: bool,
+    pub(super) name: Option<String>,
+    pub(super) aliases: Option<String>,
+    pub(super) title: Option<String>,
+    pub(super) scope: Option<String>,
+    pub(super) cancel: Option<String>,
+    pub(super) states: Vec<State>,
+}
+
+#[derive(Debug, Default)]
+pub(super) struct State {
+    pub(super) line: usize,
+    pub(super) id: String,
+    pub(super) is_final: Option<String>,
+    pub(super) transitions: Vec<Transition>,
+    pub(super) subprotocols: Vec<Subprotocol>,
+}
+
+#[derive(Debug, Default)]
+pub(super) struct Transition {
+    pub(super) line: usize,
+    pub(super) performative: Option<String>,
+    pub(super) from: Option<String>,
+    pub(super) to: Option<String>,
+    pub(super) target: String,
+    pub(super) optional: Option<String>,
+    pub(super) after: Option<String>,
+}
+
+#[derive(Debug, Default)]
+pub(super) struct Subprotocol {
+    pub(super) line: usize,
+    pub(super) name: String,
+    pub(super) from: String,
+    pub(super) proxied_to: Option<String>,
+}
+
+/// Reads a document; stops at the first thing that is not as it must be.
+pub(super) fn read(text: &str) -> Result<Document, Mistake> {
+    if text.len() > MAX_FILE {
+        let problem = Problem::TooLarge(text.len());
+        return Err(Mistake { line: 1, problem });
+    }
+    let mut reader = Reader {
+        text,
+        xml: NsReader::from_str(text.strip_prefix('\u{feff}').unwrap_or(text)),
+        counted: 0,
+        line: 1,
+        transitions: 0,
+    };
+    reader.document()
+}
+
+struct Reader<'a> {
+    text: &'a str,
+    xml: NsReader<&'a [u8]>,
+    /// Up to which byte lines have been counted, and how many there were.
+    counted: usize,
+    line: usize,
+    transitions: usize,
+}
+
+enum Tag<'a> {
+    /// An element, and whether it has content.
+    Begin(BytesStart<'a>, bool),
+    End,
+    Eof,
+}
+
+impl<'a> Reader<'a> {
+    fn document(&mut self) -> Result<Document, Mistake> {
+        let (root, has_content) = match self.next()? {
+            Tag::Begin(root, has_content) => (root, has_content),
+            Tag::End | Tag::Eof => return Err(self.wrong(Problem::NotScxml(String::new()))),
+        };
+        let name = local(&root);
+        if name != "scxml" {
+            return Err(self.wrong(Problem::NotScxml(shown(&name))));
+        }
+        let mut document = self.root(&root)?;
+        if has_content {
+            self.states(&mut document)?;
+        }
+        match self.next()? {
+            Tag::Eof => Ok(document),
+            Tag::Begin(element, _) => {
+                let element = shown(&local(&element));
+                let problem = Problem::Xml(format!("<{element}> stands behind </scxml>"));
+                Err(self.wrong(problem))
+            }
+            Tag::End => Err(self.wrong(Problem::Xml("an end without a beginning".to_owned()))),
+        }
+    }
+
+    fn states(&mut self, document: &mut Document) -> Result<(), Mistake> {
+        loop {
+            let (element, has_content) = match self.next()? {
+                Tag::Begin(element, has_content) => (element, has_content),
+                Tag::End => return Ok(()),
+                Tag::Eof => return Err(self.truncated()),
+            };
+            match local(&element).as_ref() {
+                name @ ("state" | "final") => {
+                    if document.states.len() == MAX_STATES {
+                        return Err(self.too_many("states", MAX_STATES));
+                    }
+                    let mut state = self.state(&element, name == "final")?;
+                    if has_content {
+                        self.inside(&mut state)?;
+                    }
+                    document.states.push(state);
+                }
+                name @ ("transition" | "subprotocol") => {
+                    return Err(self.misplaced(name, "scxml"));
+                }
+                _ if has_content => self.skip()?,
+                _ => {}
+            }
+        }
+    }
+
+    fn root(&mut self, element: &BytesStart<'a>) -> Result<Document, Mistake> {
+        let mut document = Document {
+            line: self.line,
+            ..Document::default()
+        };
+        const KNOWN: &str = "name, aliases, title, scope, cancel";
+        for (ours, key, value) in self.attributes(element)? {
+            let value = Some(value);
+            match (ours, key.as_ref()) {
+                (false, "initial") => document.initial = value,
+                (true, "name") => document.name = value,
+                (true, "aliases") => document.aliases = value,
+                (true, "title") => document.title = value,
+                (true, "scope") => document.scope = value,
+                (true, "cancel") => document.cancel = value,
+                (true, other) => return Err(self.unknown("scxml", other, KNOWN)),
+                (false, _) => {}
+            }
+        }
+        let mut bindings = self.xml.resolver().bindings();
+        document.extended = bindings.any(|(_, namespace)| namespace == Namespace(NAMESPACE));
+        Ok(document)
+    }
+
+    fn state(&mut self, element: &BytesStart<'a>, is_final: bool) -> Result<State, Mistake> {
+        let mut state = State {
+            line: self.line,
+            is_final: is_final.then(|| "yes".to_owned()),
+            ..State::default()
+        };
+        let mut id = None;
+        for (ours, key, value) in self.attributes(element)? {
+            match (ours, key.as_ref()) {
+                (false, "id") => id = Some(value),
+                (false, "final") => state.is_final = Some(value),
+                (true, other) => return Err(self.unknown("state", other, "none")),
+                (false, _) => {}
+            }
+        }
+        state.id = self.required("state", "id", id)?;
+        Ok(state)
+    }
+
+    fn inside(&mut self, state: &mut State) -> Result<(), Mistake> {
+        loop {
+            let (element, has_content) = match self.next()? {
+                Tag::Begin(element, has_content) => (element, has_content),
+                Tag::End => return Ok(()),
+                Tag::Eof => return Err(self.truncated()),
+            };
+            match local(&element).as_ref() {
+                "transition" => state.transitions.push(self.transition(&element)?),
+                "subprotocol" => state.subprotocols.push(self.subprotocol(&element)?),
+                // Not looked at by fipa_acl, which leaves their authors wondering.
+                name @ ("state" | "final" | "parallel" | "initial" | "history") => {
+                    return Err(self.misplaced(name, "state"));
+                }
+                _ => {}
+            }
+            self.transitions += 1;
+            if self.transitions > MAX_TRANSITIONS {
+                return Err(self.too_many("transitions", MAX_TRANSITIONS));
+            }
+            if has_content {
+                self.skip()?;
+            }
+        }
+    }
+
+    fn transition(&mut self, element: &BytesStart<'a>) -> Result<Transition, Mistake> {
+        let mut transition = Transition {
+            line: self.line,
+            ..Transition::default()
+        };
+        let mut target = None;
+        for (ours, key, value) in self.attributes(element)? {
+            let value = Some(value);
+            match (ours, key.as_ref()) {
+                (false, "performative") => transition.performative = value,
+                (false, "from") => transition.from = value,
+                (false, "to") => transition.to = value,
+                (false, "target") => target = value,
+                (true, "optional") => transition.optional = value,
+                (true, "after") => transition.after = value,
+                (true, other) => return Err(self.unknown("transition", other, "optional, after")),
+                (false, _) => {}
+            }
+        }
+        transition.target = self.required("transition", "target", target)?;
+        Ok(transition)
+    }
+
+    fn subprotocol(&mut self, element: &BytesStart<'a>) -> Result<Subprotocol, Mistake> {
+        let (mut name, mut from, mut proxied_to) = (None, None, None);
+        for (ours, key, value) in self.attributes(element)? {
+            match (ours, key.as_ref()) {
+                (false, "name") => name = Some(value),
+                (false, "from") => from = Some(value),
+                (false, "proxied_to") => proxied_to = Some(value).filter(|role| !role.is_empty()),
+                (true, other) => return Err(self.unknown("subprotocol", other, "none")),
+                (false, _) => {}
+            }
+        }
+        Ok(Subprotocol {
+            line: self.line,
+            name: self.required("subprotocol", "name", name)?,
+            from: self.required("subprotocol", "from", from)?,
+            proxied_to,
+        })
+    }
+
+    /// The attributes: whether of our namespace, local name, value.
+    fn attributes(&self, element: &BytesStart<'a>) -> Result<Vec<(bool, String, String)>, Mistake> {
+        let mut found = Vec::new();
+        // Looking for duplicates takes quadratic time; the last one counts.
+        for attribute in element.attributes().with_checks(false) {
+            let attribute =
+                attribute.map_err(|error| self.wrong(Problem::Xml(error.to_string())))?;
+            if found.len() == MAX_ATTRIBUTES {
+                return Err(self.too_many("attributes of an element", MAX_ATTRIBUTES));
+            }
+            if attribute.value.len() > MAX_VALUE {
+                return Err(self.too_many("bytes in an attribute", MAX_VALUE));
+            }
+            let value = attribute
+                .normalized_value(XmlVersion::Implicit1_0)
+                .map_err(|error| self.wrong(Problem::Xml(error.to_string())))?;
+            let (namespace, key) = self.xml.resolver().resolve_attribute(attribute.key);
+            let ours = namespace == ResolveResult::Bound(Namespace(NAMESPACE));
+            // What another namespace says is not for us.
+            if ours || namespace == ResolveResult::Unbound {
+                found.push((ours, shown(key.into_inner()), value.into_owned()));
+            }
+        }
+        Ok(found)
+    }
+
+    /// Reads the element that began last to its end.
+    fn skip(&mut self) -> Result<(), Mistake> {
+        let mut depth = 1_usize;
+        while depth > 0 {
+            match self.next()? {
+                Tag::Begin(_, true) => depth += 1,
+                Tag::Begin(_, false) => {}
+                Tag::End => depth -= 1,
+                Tag::Eof => return Err(self.truncated()),
+            }
+            if depth > MAX_DEPTH {
+                return Err(self.too_many("levels of elements", MAX_DEPTH));
+            }
+        }
+        Ok(())
+    }
+
+    fn next(&mut self) -> Result<Tag<'a>, Mistake> {
+        loop {
+            let event = self.xml.read_event();
+            // An element is in the line in which it begins, a mistake where it was noticed.
+            let tag = match &event {
+                Ok(Event::Start(tag) | Event::Empty(tag)) => tag.len() + 2,
+                _ => 0,
+            };
+            let place = match &event {
+                Ok(_) => self.xml.buffer_position(),
+                Err(_) => self.xml.error_position(),
+            };
+            self.count_lines(usize::try_from(place).unwrap_or(usize::MAX), tag);
+            match event {
+                Ok(Event::Start(tag)) => return Ok(Tag::Begin(tag, true)),
+                Ok(Event::Empty(tag)) => return Ok(Tag::Begin(tag, false)),
+                Ok(Event::End(_)) => return Ok(Tag::End),
+                Ok(Event::Eof) => return Ok(Tag::Eof),
+                Ok(Event::DocType(_)) => return Err(self.wrong(Problem::DocumentType)),
+                Ok(_) => {}
+                Err(error) => return Err(self.wrong(Problem::Xml(error.to_string()))),
+            }
+        }
+    }
+
+    /// Sets the line to the one in which a tag of `tag` bytes that ends at `place` begins.
+    fn count_lines(&mut self, place: usize, tag: usize) {
+        let mark = self.text.len() - self.text.trim_start_matches('\u{feff}').len();
+        let place = (place + mark).saturating_sub(tag).min(self.text.len());
+        let passed = self.text.as_bytes().get(self.counted..place);
+        self.line += passed
+            .unwrap_or_default()
+            .iter()
+            .filter(|byte| **byte == b'\n')
+            .count();
+        self.counted = self.counted.max(place);
+    }
+
+    fn required(
+        &self,
+        element: &'static str,
+        attribute: &'static str,
+        value: Option<String>,
+    ) -> Result<String, Mistake> {
+        value
+            .filter(|value| !value.is_empty())
+            .ok_or_else(|| self.wrong(Problem::Missing { element, attribute }))
+    }
+
+    fn unknown(&self, element: &'static str, attribute: &str, known: &'static str) -> Mistake {
+        self.wrong(Problem::UnknownAttribute {
+            element,
+            attribute: attribute.to_owned(),
+            known,
+        })
+    }
+
+    fn misplaced(&self, element: &str, inside: &str) -> Mistake {
+        self.wrong(Problem::Misplaced {
+            element: element.to_owned(),
+            inside: inside.to_owned(),
+        })
+    }
+
+    fn too_many(&self, what: &'static str, limit: usize) -> Mistake {
+        self.wrong(Problem::TooMany { what, limit })
+    }
+
+    fn truncated(&self) -> Mistake {
+        self.wrong(Problem::Xml("the file ends within an element".to_owned()))
+    }
+
+    fn wrong(&self, problem: Problem) -> Mistake {
+        Mistake {
+            line: self.line,
+            problem,
+        }
+    }
+}
+
+fn local<'t>(element: &'t BytesStart<'_>) -> Cow<'t, str> {
+    Cow::Borrowed(element.local_name().into_inner())
+}
+
+/// A name from the file, for an error: not without end.
+fn shown(name: &str) -> String {
+    name.chars().take(60).collect()
+}

@@ -1,0 +1,683 @@
+//! What a monitor makes of whole conversations: several participants, crossing and repeated
+//! messages, time, conversations within others, and what it forgets.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use fipa_acl::{AgentId, Message, MessageView, Performative, Time};
+use fipa_monitor::{
+    Event, Header, Library, Limits, Machine, Monitor, Unchecked, Verdict, Violation,
+    ViolationKind as Kind,
+};
+
+const START: Duration = Duration::from_secs(1_700_000_000);
+
+/// A monitor, and a clock that is moved by hand.
+struct Stage {
+    monitor: Monitor,
+    now: SystemTime,
+}
+
+fn library() -> Arc<Library> {
+    Arc::new(Library::standard())
+}
+
+impl Stage {
+    fn new(monitor: Monitor) -> Self {
+        let now = SystemTime::UNIX_EPOCH + START;
+        Self { monitor, now }
+    }
+
+    fn observer() -> Self {
+        Self::new(Monitor::observer(library()))
+    }
+
+    fn check(&mut self, header: &Header<'_>) -> Verdict<'_> {
+        self.monitor.check(header, self.now)
+    }
+
+    /// The new state.
+    fn right(&mut self, header: Header<'_>) -> String {
+        match self.check(&header) {
+            Verdict::Accepted(accepted) => accepted.state.to_owned(),
+            other => panic!("{header:?}: {other:?}"),
+        }
+    }
+
+    fn wrong(&mut self, header: Header<'_>) -> Violation {
+        match self.check(&header) {
+            Verdict::Violation(violation) => *violation,
+            other => panic!("{header:?}: {other:?}"),
+        }
+    }
+
+    fn pass(&mut self, seconds: u64) -> Vec<Event> {
+        self.now += Duration::from_secs(seconds);
+        self.monitor.handle_timeout(self.now)
+    }
+}
+
+fn act(name: &str) -> Performative {
+    name.parse().unwrap()
+}
+
+/// `"cfp ann>ben,cid"` in conversation c of the contract net.
+fn say(words: &'static str) -> Header<'static> {
+    say_in("fipa-contract-net", words)
+}
+
+fn say_in(protocol: &'static str, words: &'static str) -> Header<'static> {
+    let (name, agents) = words.split_once(' ').unwrap();
+    let (from, to) = agents.split_once('>').unwrap();
+    Header::new(act(name))
+        .sender(from)
+        .receivers(to.split(','))
+        .protocol(protocol)
+        .conversation_id("c")
+}
+
+fn request(words: &'static str) -> Header<'static> {
+    say_in("fipa-request", words)
+}
+
+#[test]
+fn each_participant_has_a_state_of_its_own() {
+    let mut stage = Stage::observer();
+    stage.right(say("cfp ann>ben,cid,dan,eve"));
+    stage.right(say("propose ben>ann"));
+    stage.right(say("refuse cid>ann"));
+    stage.right(say("propose dan>ann"));
+    // One message to several is right when it is with all of them, and else moves nobody.
+    let violation = stage.wrong(say("reject-proposal ann>ben,eve"));
+    assert_eq!(violation.participant.as_deref(), Some("eve"));
+    assert_eq!(violation.state.as_deref(), Some("called"));
+    stage.right(say("accept-proposal ann>ben"));
+    stage.right(say("reject-proposal ann>dan"));
+    stage.right(say("propose eve>ann"));
+    let Verdict::Accepted(accepted) = stage.check(&say("inform ben>ann")) else {
+        panic!();
+    };
+    assert!(
+        accepted.ended && !accepted.complete,
+        "eve has no answer yet"
+    );
+    let Verdict::Accepted(accepted) = stage.check(&say("reject-proposal ann>eve")) else {
+        panic!();
+    };
+    assert!(accepted.complete);
+    assert_eq!(stage.wrong(say("inform dan>ann")).kind, Kind::Ended);
+}
+
+#[test]
+fn a_call_may_come_letter_by_letter_or_to_a_pattern() {
+    let mut stage = Stage::observer();
+    stage.right(say("cfp ann>ben"));
+    stage.right(say("cfp ann>cid"));
+    stage.right(say("propose cid>ann"));
+    stage.right(say("propose ben>ann"));
+    assert_eq!(stage.wrong(say("cfp ann>ben")).kind, Kind::Unexpected);
+    let mut stage = Stage::observer();
+    stage.right(say("cfp ann>arm_.*"));
+    stage.right(say("propose arm_1>ann"));
+    stage.right(say("refuse arm_2>ann"));
+    stage.right(say("accept-proposal ann>arm_1"));
+    assert_eq!(stage.wrong(say("inform arm_3>ann")).kind, Kind::OutOfOrder);
+    stage.right(say("inform arm_1>ann"));
+}
+
+#[test]
+fn a_violation_says_all_about_it() {
+    let mut stage = Stage::observer();
+    stage.right(say("cfp ann>ben"));
+    let violation = stage.wrong(say("inform ben>ann"));
+    assert_eq!(violation.kind, Kind::OutOfOrder);
+    assert_eq!(
+        violation.to_string(),
+        "inform from ben to ann breaks fipa-contract-net in conversation \"c\": too early, a step \
+         is missing; state \"called\" with ben; expected refuse, propose from ben to ann"
+    );
+    assert_eq!(stage.wrong(say("propose ann>ben")).kind, Kind::WrongSender);
+    assert_eq!(
+        stage.wrong(say("propose ben>cid")).kind,
+        Kind::WrongReceiver
+    );
+    assert_eq!(
+        stage.wrong(say("propose ben>ann,cid")).kind,
+        Kind::WrongReceiver
+    );
+    assert_eq!(stage.wrong(say("propose cid>ann")).kind, Kind::Stranger);
+    assert_eq!(stage.wrong(say("subscribe ben>ann")).kind, Kind::Unexpected);
+    let other = stage.wrong(request("request ann>ben"));
+    assert_eq!(other.kind, Kind::WrongProtocol);
+    assert_eq!(other.protocol, "fipa-contract-net");
+    let unknown = say("propose ben>ann").conversation_id("another");
+    let unknown = stage.wrong(unknown);
+    assert_eq!(unknown.kind, Kind::NotOpened);
+    assert!(
+        unknown
+            .to_string()
+            .ends_with("expected cfp from initiator to participant")
+    );
+    assert_eq!(stage.right(say("propose ben>ann")), "proposed");
+}
+
+#[test]
+fn what_is_not_checked() {
+    let mut stage = Stage::observer();
+    for (header, why) in [
+        (
+            Header::new(act("cfp")).sender("ann").receivers(["ben"]),
+            Unchecked::NoConversation,
+        ),
+        (
+            Header::new(act("cfp")).conversation_id("c"),
+            Unchecked::NoSender,
+        ),
+        (
+            Header::new(act("cfp")).sender("ann").conversation_id("c"),
+            Unchecked::NoReceiver,
+        ),
+        (
+            Header::new(act("cfp"))
+                .sender("ann")
+                .receivers(["ben"])
+                .conversation_id("c"),
+            Unchecked::NoProtocol,
+        ),
+        (say_in("dance", "cfp ann>ben"), Unchecked::UnknownProtocol),
+        (
+            say("cfp ann>ben").conversation_id("c".repeat(5_000)),
+            Unchecked::TooLarge,
+        ),
+        (
+            say("cfp ann>ben").receivers(vec!["ben"; 2_000]),
+            Unchecked::TooLarge,
+        ),
+    ] {
+        assert_eq!(stage.check(&header), Verdict::Unchecked(why));
+    }
+    assert!(stage.monitor.is_empty());
+}
+
+#[test]
+fn a_message_without_protocol_is_one_of_its_conversation() {
+    let mut stage = Stage::observer();
+    stage.right(say_in("contractNet", "cfp ann>ben"));
+    let header = Header::new(act("propose"))
+        .sender("ben")
+        .receivers(["ann"])
+        .conversation_id("c");
+    stage.right(header);
+    stage.right(say("accept-proposal ann>ben"));
+}
+
+#[test]
+fn messages_and_views_of_them_are_read_alike() {
+    let mut ours = Message::builder(Performative::Request)
+        .sender(AgentId::new("ann").unwrap())
+        .receiver(AgentId::new("ben").unwrap())
+        .protocol("fipa-request")
+        .conversation_id("c 1")
+        .reply_with("r \"1\"");
+    ours = ours.reply_by(Time::after(Duration::from_secs(5)).unwrap());
+    let message = ours.build().unwrap();
+    let payload = message.to_payload();
+    let view = MessageView::parse_payload(&payload).unwrap();
+    let answer = message
+        .reply(Performative::Agree)
+        .sender(AgentId::new("ben").unwrap());
+    let answer = answer.build().unwrap();
+    for first in [Header::from(&message), Header::from(&view)] {
+        let mut stage = Stage::observer();
+        assert_eq!(stage.right(first), "requested");
+        assert_eq!(stage.right(Header::from(&answer)), "agreed");
+    }
+    let mut stage = Stage::observer();
+    stage.right(Header::from(&message).receivers(["cid"]));
+    assert_eq!(
+        stage.wrong(Header::from(&answer)).kind,
+        Kind::Stranger,
+        "the copy went to cid"
+    );
+}
+
+#[test]
+fn answers_name_what_they_answer() {
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben").reply_with("q1"));
+    let wrong = stage.wrong(request("agree ben>ann").in_reply_to("q0"));
+    assert_eq!(wrong.kind, Kind::WrongReply);
+    stage.right(request("agree ben>ann").in_reply_to("q1").reply_with("a1"));
+    let again = request("agree ben>ann").in_reply_to("q1").reply_with("a1");
+    assert_eq!(stage.wrong(again).kind, Kind::Repeated);
+    // fipa_services does not write it.
+    stage.right(request("inform ben>ann"));
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben").reply_with("q1"));
+    let again = request("request ann>ben").reply_with("q1");
+    assert_eq!(stage.wrong(again).kind, Kind::Repeated);
+    let another = request("request ann>ben").reply_with("q2");
+    assert_eq!(stage.wrong(another).kind, Kind::Unexpected);
+}
+
+#[test]
+fn cancel_and_what_crosses_it() {
+    let subscribe = |words| say_in("fipa-subscribe", words);
+    let mut stage = Stage::observer();
+    stage.right(subscribe("subscribe ann>ben").reply_with("s"));
+    stage.right(subscribe("agree ben>ann"));
+    assert_eq!(
+        stage.right(subscribe("cancel ann>ben").reply_with("x")),
+        "cancelling"
+    );
+    // On its way already: the answer to the subscription, not to the cancel.
+    assert_eq!(
+        stage.right(subscribe("inform ben>ann").in_reply_to("s")),
+        "cancelling"
+    );
+    let wrong = stage.wrong(subscribe("refuse ben>ann").in_reply_to("s"));
+    assert_eq!(wrong.state.as_deref(), Some("cancelling"));
+    assert_eq!(
+        stage.right(subscribe("failure ben>ann").in_reply_to("x")),
+        "active"
+    );
+    stage.right(subscribe("inform ben>ann").in_reply_to("s"));
+    stage.right(subscribe("cancel ann>ben").reply_with("y"));
+    assert_eq!(
+        stage.right(subscribe("inform ben>ann").in_reply_to("y")),
+        "cancelled"
+    );
+    assert_eq!(
+        stage
+            .wrong(subscribe("inform ben>ann").in_reply_to("s"))
+            .kind,
+        Kind::Ended
+    );
+    // Without in-reply-to nobody can tell which inform is which: one more may come.
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben"));
+    stage.right(request("cancel ann>ben"));
+    assert_eq!(stage.right(request("inform ben>ann")), "cancelled");
+    assert_eq!(stage.right(request("inform ben>ann")), "cancelled");
+    stage.wrong(request("inform ben>ann"));
+    // The participant does not cancel, by the standard.
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben"));
+    stage.wrong(request("cancel ben>ann"));
+}
+
+#[test]
+fn who_knew_of_the_end_cannot_cancel() {
+    let run = |monitor| {
+        let mut stage = Stage::new(monitor);
+        stage.right(request("request ann>ben"));
+        stage.right(request("inform ben>ann"));
+        stage.check(&request("cancel ann>ben")).is_accepted()
+    };
+    assert!(
+        run(Monitor::observer(library())),
+        "it may have crossed the inform"
+    );
+    assert!(run(Monitor::agent(library(), "ben")), "likewise");
+    assert!(!run(Monitor::agent(library(), "ann")), "she had got it");
+}
+
+#[test]
+fn a_letter_that_was_not_delivered_can_be_sent_again() {
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben").reply_with("1"));
+    assert_eq!(
+        stage.right(request("failure host-mts>ann").in_reply_to("1")),
+        "undelivered"
+    );
+    assert_eq!(
+        stage.right(request("request ann>ben").reply_with("2")),
+        "requested"
+    );
+    stage.right(request("failure host-mts>ann"));
+    assert_eq!(
+        stage.right(request("agree ben>ann")),
+        "agreed",
+        "it had arrived after all"
+    );
+    // Of several participants the content says whom it is about; nobody's state is touched.
+    let mut stage = Stage::observer();
+    stage.right(say("cfp ann>ben,cid"));
+    stage.right(say("failure host-mts>ann"));
+    stage.right(say("propose ben>ann"));
+    stage.right(say("propose cid>ann"));
+    assert_eq!(
+        stage.wrong(say("failure host-mts>dan")).kind,
+        Kind::Stranger
+    );
+}
+
+#[test]
+fn replies_go_to_whom_reply_to_names() {
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben").reply_to(["zoe"]));
+    stage.right(request("agree ben>zoe"));
+    assert_eq!(
+        stage.wrong(request("inform ben>cid")).kind,
+        Kind::WrongReceiver
+    );
+    stage.right(request("inform ben>ann,zoe"));
+}
+
+#[test]
+fn an_agent_may_talk_to_itself() {
+    let mut stage = Stage::observer();
+    for words in ["request ann>ann", "agree ann>ann", "inform ann>ann"] {
+        stage.right(request(words));
+    }
+    stage.wrong(request("inform ann>ann"));
+}
+
+#[test]
+fn time_runs_out() {
+    let mut stage = Stage::observer();
+    let by = |stage: &Stage| Time::from_system_time(stage.now + Duration::from_secs(5)).unwrap();
+    let due = by(&stage);
+    stage.right(say("cfp ann>ben,cid").reply_by(due));
+    stage.right(say("propose ben>ann"));
+    let next = stage.monitor.poll_timeout().unwrap();
+    assert!(next > stage.now + Duration::from_secs(5) && next < stage.now + Duration::from_secs(6));
+    assert_eq!(stage.pass(5), [], "not yet");
+    let overdue = Event::Overdue {
+        protocol: "fipa-contract-net".into(),
+        conversation_id: "c".into(),
+        participant: Some("cid".into()),
+        state: "called".into(),
+        next: Some("expired".into()),
+    };
+    assert_eq!(stage.pass(1), [overdue]);
+    let Verdict::Accepted(late) = stage.check(&say("propose cid>ann")) else {
+        panic!();
+    };
+    assert!(late.late);
+    stage.wrong(say("accept-proposal ann>cid"));
+    stage.right(say("reject-proposal ann>cid"));
+    stage.right(say("accept-proposal ann>ben"));
+    // Where the protocol has no state for it, an answer is just late.
+    let due = by(&stage);
+    let ask = request("request ann>ben")
+        .conversation_id("r")
+        .reply_by(due);
+    stage.right(ask);
+    let events = stage.pass(60);
+    assert!(
+        matches!(&events[..], [Event::Overdue { next: None, .. }]),
+        "{events:?}"
+    );
+    let agree = request("agree ben>ann").conversation_id("r");
+    let Verdict::Accepted(late) = stage.check(&agree) else {
+        panic!();
+    };
+    assert!(late.late && late.state == "agreed");
+    // Also without anybody calling handle_timeout.
+    let due = by(&stage);
+    stage.right(say("cfp ann>ben").conversation_id("d").reply_by(due));
+    stage.now += Duration::from_secs(9);
+    assert_eq!(
+        stage.right(say("propose ben>ann").conversation_id("d")),
+        "late"
+    );
+}
+
+#[test]
+fn states_have_time_outs_of_their_own() {
+    let text = r#"<scxml initial="1" xmlns:f="urn:fipa-rs:protocol" f:scope="participant">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from="b" to="a" target="3"/>
+            <transition f:after="500ms" target="gone"/></state>
+        <state id="3" final="yes"/><state id="gone" final="yes"/></scxml>"#;
+    let mut library = Library::empty();
+    library.read("own", text).unwrap();
+    let mut stage = Stage::new(Monitor::observer(Arc::new(library)));
+    stage.right(say_in("own", "request ann>ben"));
+    let [
+        Event::Overdue {
+            next: Some(next), ..
+        },
+    ] = &stage.pass(1)[..]
+    else {
+        panic!();
+    };
+    assert_eq!(next, "gone");
+    assert_eq!(
+        stage.wrong(say_in("own", "inform ben>ann")).kind,
+        Kind::Ended
+    );
+}
+
+#[test]
+fn brokers_run_protocols_within() {
+    let broker = |words| say_in("fipa-brokering", words);
+    let mut stage = Stage::observer();
+    stage.right(broker("proxy ann>bro"));
+    assert_eq!(
+        stage.wrong(say_in("fipa-query", "query-ref bro>ben")).kind,
+        Kind::WrongProtocol
+    );
+    stage.right(broker("agree bro>ann"));
+    stage.right(say_in("fipa-query", "query-ref bro>ben,cid"));
+    stage.right(say_in("fipa-request", "request bro>dan"));
+    assert_eq!(
+        stage.wrong(say_in("fipa-query", "query-ref ann>ben")).kind,
+        Kind::Stranger
+    );
+    stage.wrong(broker("confirm bro>ann"));
+    stage.right(broker("inform bro>ann"));
+    stage.right(say_in("fipa-query", "inform ben>bro"));
+    stage.right(broker("inform bro>ann"));
+    stage.wrong(say_in("fipa-query", "inform ben>bro"));
+    stage.right(say_in("fipa-query", "refuse cid>bro"));
+    stage.right(broker("refuse bro>ann"));
+    stage.right(say_in("fipa-request", "agree dan>bro"));
+    stage.right(say_in("fipa-query", "query-if bro>eve"));
+    assert_eq!(
+        stage.check(&say_in("dance", "cfp bro>eve")),
+        Verdict::Unchecked(Unchecked::UnknownProtocol)
+    );
+    stage.right(broker("failure bro>ann"));
+    assert_eq!(stage.wrong(broker("inform bro>ann")).kind, Kind::Ended);
+    assert_eq!(
+        stage.monitor.len(),
+        3,
+        "eve came into the query that was there"
+    );
+    stage.pass(100_000);
+    assert!(stage.monitor.is_empty(), "forgotten with all within");
+}
+
+#[test]
+fn the_recruited_answer_whom_they_are_told_to() {
+    let recruit = |words| say_in("fipa-recruiting", words);
+    let mut stage = Stage::observer();
+    stage.right(recruit("proxy ann>rec"));
+    stage.right(recruit("agree rec>ann"));
+    stage.right(say_in("fipa-query", "query-ref rec>ben").reply_to(["ann"]));
+    stage.right(recruit("inform rec>ann"));
+    stage.right(say_in("fipa-query", "agree ben>ann"));
+    stage.right(say_in("fipa-query", "inform ben>ann"));
+    stage.wrong(recruit("inform rec>ann"));
+}
+
+/// The form of fipa_acl has one state for all.
+mod plain {
+    use super::*;
+
+    fn stage(text: &str) -> Stage {
+        let mut library = Library::standard();
+        library.add(Machine::read("lift", text).unwrap()).unwrap();
+        Stage::new(Monitor::observer(Arc::new(library)))
+    }
+
+    fn lift(words: &'static str) -> Header<'static> {
+        say_in("lift", words)
+    }
+
+    const LIFT: &str = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="initiator" to="B" target="2"/></state>
+        <state id="2">
+            <transition performative="refuse" from="B" to="initiator" target="3"/>
+            <transition performative="agree" from="B" to="initiator" target="4"/>
+        </state>
+        <state id="3" final="yes"/>
+        <state id="4" final="yes">
+            <transition performative="inform" from="B" to="initiator" target="4"/>
+            <transition performative="failure" from="B" to="initiator" target="5"/>
+        </state>
+        <state id="5" final="yes"/></scxml>"#;
+
+    #[test]
+    fn a_conversation_has_one_state_for_all() {
+        let mut stage = stage(LIFT);
+        stage.right(lift("request ann>ben,cid"));
+        stage.right(lift("agree ben>ann"));
+        assert_eq!(stage.wrong(lift("agree cid>ann")).kind, Kind::Unexpected);
+        stage.right(lift("inform cid>ann"));
+        assert_eq!(stage.wrong(lift("inform dan>ann")).kind, Kind::Stranger);
+        assert_eq!(
+            stage.wrong(lift("inform ben>dan")).kind,
+            Kind::WrongReceiver
+        );
+        assert_eq!(stage.wrong(lift("inform ann>ben")).kind, Kind::WrongSender);
+        stage.right(lift("inform ben>ann"));
+        assert_eq!(stage.right(lift("failure ben>ann")), "5");
+        assert_eq!(stage.wrong(lift("inform ben>ann")).kind, Kind::Ended);
+    }
+
+    #[test]
+    fn anybody_cancels_and_fails() {
+        for (words, state) in [
+            ("not-understood ann>ben", "not-understood"),
+            ("not-understood ben>ann", "not-understood"),
+            ("cancel ann>ben", "cancelling"),
+            ("cancel ben>ann", "cancelling"),
+            ("failure ben>ann", "undelivered"),
+            ("failure host-mts>ann", "undelivered"),
+        ] {
+            let mut stage = stage(LIFT);
+            stage.right(lift("request ann>ben"));
+            assert_eq!(stage.right(lift(words)), state, "{words}");
+        }
+        let mut stage = stage(LIFT);
+        stage.right(lift("request ann>ben"));
+        stage.right(lift("cancel ben>ann"));
+        assert_eq!(stage.right(lift("inform ann>ben")), "cancelled");
+    }
+
+    #[test]
+    fn roles_are_given_when_they_are_first_used() {
+        let mut stage = stage(
+            r#"<scxml initial="1">
+            <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+            <state id="2"><transition performative="propagate" from="b" to="c" target="3"/></state>
+            <state id="3"><transition performative="inform" from="c" to="a|b" target="4"/></state>
+            <state id="4" final="yes"><transition performative="my-.*" from=".*" to="a" target="4"/></state>
+            </scxml>"#,
+        );
+        stage.right(lift("request ann>ben"));
+        stage.right(lift("propagate ben>cid"));
+        assert_eq!(stage.wrong(lift("inform dan>ann")).kind, Kind::Stranger);
+        stage.wrong(lift("inform cid>dan"));
+        stage.right(lift("inform cid>ann"));
+        stage.right(lift("my-word zoe>ann"));
+        stage.wrong(lift("your-word zoe>ann"));
+        stage.wrong(lift("my-word ann>zoe"));
+    }
+
+    #[test]
+    fn sub_protocols_begin_where_the_file_allows_it() {
+        let mut stage = stage(
+            r#"<scxml initial="1">
+            <state id="1"><transition performative="propagate" from="i" to="B" target="2"/></state>
+            <state id="2" final="yes"><subprotocol name="fipa-.*" from="B"/></state></scxml>"#,
+        );
+        stage.right(lift("propagate ann>ben"));
+        stage.right(request("request ben>cid"));
+        stage.right(request("agree cid>ben"));
+        let query = stage.wrong(say_in("query", "query-if ben>cid"));
+        assert_eq!(query.kind, Kind::WrongProtocol);
+        stage.wrong(request("request ann>cid"));
+        stage.wrong(lift("inform ben>ann"));
+        stage.right(request("inform cid>ben"));
+    }
+}
+
+#[test]
+fn what_is_over_or_abandoned_is_forgotten() {
+    let mut stage = Stage::observer();
+    for id in ["done", "open", "won"] {
+        stage.right(request("request ann>ben").conversation_id(id));
+    }
+    stage.right(request("inform ben>ann").conversation_id("done"));
+    stage.pass(59);
+    assert_eq!(stage.monitor.len(), 3);
+    assert_eq!(stage.pass(2), []);
+    assert_eq!(stage.monitor.len(), 2);
+    let abandoned = |id: &str| Event::Abandoned {
+        protocol: "fipa-request".into(),
+        conversation_id: id.into(),
+    };
+    stage.pass(3_000);
+    stage.right(request("agree ben>ann").conversation_id("won"));
+    assert_eq!(stage.pass(1_000), [abandoned("open")]);
+    assert_eq!(
+        stage
+            .wrong(request("agree ben>ann").conversation_id("open"))
+            .kind,
+        Kind::NotOpened
+    );
+    assert_eq!(stage.pass(3_000), [abandoned("won")]);
+    assert!(stage.monitor.is_empty());
+    assert_eq!(stage.monitor.poll_timeout(), None);
+}
+
+#[test]
+fn there_is_room_for_so_many() {
+    let mut limits = Limits::default();
+    (limits.conversations, limits.participants, limits.embedded) = (3, 4, 2);
+    let mut stage = Stage::new(Monitor::observer(library()).with_limits(limits));
+    for id in ["1", "2", "3"] {
+        stage.right(request("request ann>ben").conversation_id(id));
+    }
+    stage.right(request("inform ben>ann").conversation_id("2"));
+    stage.right(request("request ann>ben").conversation_id("4"));
+    assert_eq!(
+        (stage.monitor.len(), stage.monitor.forgotten()),
+        (3, 0),
+        "2 was over"
+    );
+    // What begins nothing drives nothing out.
+    stage.wrong(request("agree ann>ben").conversation_id("5"));
+    assert_eq!(stage.monitor.forgotten(), 0);
+    stage.right(request("request ann>ben").conversation_id("5"));
+    assert_eq!(stage.monitor.forgotten(), 1, "1 was the oldest");
+    stage.right(request("agree ben>ann").conversation_id("3"));
+    assert_eq!(
+        stage
+            .wrong(request("agree ben>ann").conversation_id("1"))
+            .kind,
+        Kind::NotOpened
+    );
+    // Participants.
+    stage.right(say("cfp ann>1,2,3"));
+    stage.right(say("cfp ann>4"));
+    assert_eq!(stage.wrong(say("cfp ann>5")).kind, Kind::TooMany);
+    // Conversations within.
+    let mut stage = Stage::new(Monitor::observer(library()).with_limits({
+        limits.conversations = 100;
+        limits
+    }));
+    stage.right(say_in("fipa-brokering", "proxy ann>bro"));
+    stage.right(say_in("fipa-brokering", "agree bro>ann"));
+    for _ in 0..2 {
+        stage.right(request("request bro>ben"));
+        stage.right(request("inform ben>bro"));
+    }
+    assert_eq!(stage.wrong(request("request bro>ben")).kind, Kind::TooMany);
+}

@@ -1,0 +1,349 @@
+//! Files as users write them, and the mistakes in them.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::time::Duration;
+
+use fipa_monitor::scxml::{MAX_FILE, Problem, ScxmlError};
+use fipa_monitor::{After, Cancel, Machine, Scope};
+use proptest::prelude::*;
+
+/// A file in the form of fipa_acl, with its blanks, comments and spellings of yes.
+const PLAIN: &str = "<scxml version=\"1.0\" initial=\"1\">
+
+    <!-- lifting things -->
+\t<state id=\"1\">
+\t        <transition performative=\"request\" from=\"initiator\" to=\"B\" target=\"2\"/>
+\t</state>
+    <state id=\"2\" final=\"no\">
+        <transition performative=\"refuse|failure\" from=\"B\" to=\"initiator\" target=\"3\" />
+        <transition performative=\"inform\" from=\"B\" to=\"initiator\" target=\"4\"/>
+    </state>
+    <state id=\"3\" final=\"yes\">
+        
+    </state>
+    <state id=\"4\" final=\"1\">
+        <transition performative=\".*\" from=\"B\" to=\".*\" target=\"4\"/>
+        <subprotocol name=\".*\" from=\"B\" proxied_to=\"initiator\"/> 
+    </state>
+</scxml>
+";
+
+fn mistakes(text: &str) -> Vec<(usize, Problem)> {
+    let error = Machine::read("dir/own.scxml", text).unwrap_err();
+    assert_eq!(error.file, "dir/own.scxml");
+    let mistakes = error.mistakes.into_iter();
+    mistakes
+        .map(|mistake| (mistake.line, mistake.problem))
+        .collect()
+}
+
+fn only(text: &str) -> (usize, Problem) {
+    let mut all = mistakes(text);
+    assert_eq!(all.len(), 1, "{all:?}");
+    all.remove(0)
+}
+
+/// A file whose state "1" has this line 3, and which has a final state "2" in line 5.
+fn with(line: &str) -> String {
+    format!(
+        "<scxml initial=\"1\" xmlns:f=\"urn:fipa-rs:protocol\">\n<state id=\"1\">\n{line}\n\
+         </state>\n<state id=\"2\" final=\"yes\"/>\n</scxml>"
+    )
+}
+
+const GOOD: &str = r#"<transition performative="inform" from="a" to="b" target="2"/>"#;
+
+#[test]
+fn the_form_of_fipa_acl_is_read() {
+    let machine = Machine::read("/robot/protocols/lift", PLAIN).unwrap();
+    assert_eq!((machine.name(), machine.title()), ("lift", None));
+    assert_eq!(machine.roles(), ["initiator", "B"]);
+    assert_eq!(machine.initiator(), "initiator");
+    assert_eq!(machine.scope(), Scope::Conversation);
+    assert_eq!(machine.cancel(), Cancel::Anyone);
+    let finals: Vec<bool> = machine
+        .states()
+        .iter()
+        .map(|state| state.is_final())
+        .collect();
+    assert_eq!(finals, [false, false, true, true]);
+    let refuse = &machine.states()[1].transitions()[0];
+    assert_eq!(
+        (refuse.performative(), refuse.from(), refuse.to()),
+        ("refuse|failure", "B", "initiator")
+    );
+    assert_eq!(machine.target(refuse), "3");
+    let sub = &machine.states()[3].subprotocols()[0];
+    assert_eq!(
+        (sub.name(), sub.from(), sub.proxied_to()),
+        (".*", "B", Some("initiator"))
+    );
+    assert_eq!(machine.initial().id(), "1");
+}
+
+#[test]
+fn our_additions_are_read() {
+    let text = r#"<?xml version="1.0"?>
+<scxml initial="s" xmlns="http://www.w3.org/2005/07/scxml" xmlns:x="urn:fipa-rs:protocol"
+  x:name="own-lift" x:aliases=" lift  heben " x:title="Lifting &amp; more" x:scope="participant" x:cancel="nobody">
+  <state id="s"><transition performative="request" from="i" to="p" target="r"/></state>
+  <state id="r">
+    <transition performative="agree" from="p" to="i" target="a" x:optional="yes"/>
+    <transition x:after="30s" target="f"/>
+  </state>
+  <state id="a"><transition performative="inform" from="p" to="i" target="f"/></state>
+  <final id="f"/>
+</scxml>"#;
+    let machine = Machine::read("f.scxml", text).unwrap();
+    assert_eq!(
+        (machine.name(), machine.title()),
+        ("own-lift", Some("Lifting & more"))
+    );
+    assert_eq!(machine.aliases(), ["lift", "heben"]);
+    assert!(machine.is_called("HEBEN") && !machine.is_called("f"));
+    assert_eq!(
+        (machine.scope(), machine.cancel()),
+        (Scope::Participant, Cancel::Nobody)
+    );
+    let state = &machine.states()[1];
+    assert!(state.transitions()[0].is_optional());
+    let timeout = state.timeout().unwrap();
+    assert_eq!(timeout.after(), After::Span(Duration::from_secs(30)));
+    assert_eq!(machine.timeout_target(timeout), "f");
+    assert!(machine.states()[3].is_final());
+}
+
+#[test]
+fn mistakes_have_their_lines() {
+    for (line, expected) in [
+        (
+            r#"<transition performative="inform" from="a" to="b" target="3"/>"#,
+            "there is no state \"3\"",
+        ),
+        (
+            r#"<transition from="a" to="b" target="2"/>"#,
+            "<transition> lacks the attribute \"performative\"",
+        ),
+        (
+            r#"<transition performative="inform" to="b" target="2"/>"#,
+            "lacks the attribute \"from\"",
+        ),
+        (
+            r#"<transition performative="inform" from="a" target="2"/>"#,
+            "lacks the attribute \"to\"",
+        ),
+        (
+            r#"<transition performative="(" from="a" to="b" target="2"/>"#,
+            "performative=\"(\" is no regular expression: error: unclosed group",
+        ),
+        (
+            r#"<transition performative="inform" from="a" to="b" target="2" f:optional="maybe"/>"#,
+            "optional=\"maybe\" is not understood",
+        ),
+        (
+            r#"<transition f:after="tomorrow" target="2"/>"#,
+            "after=\"tomorrow\" is not understood; expected reply-by",
+        ),
+        (
+            r#"<transition f:after="25h" target="2"/>"#,
+            "after=\"25h\" is not understood",
+        ),
+        (
+            r#"<subprotocol name=".*" from="c"/>"#,
+            "role \"c\" is never bound",
+        ),
+        (
+            r#"<transition performative="agree" from="c" to="a" target="2"/>"#,
+            "the first message has several senders: c, a",
+        ),
+        (
+            r#"<transition performative="inform|agree" from="a" to="b" target="1"/>"#,
+            "\"inform\" from \"a\" to \"b\" leads to \"2\" and also to \"1\"",
+        ),
+    ] {
+        let text = with(&format!("{line}{GOOD}"));
+        let error = Machine::read("own.scxml", &text).unwrap_err();
+        let first = error.to_string();
+        let first = first.lines().next().unwrap();
+        assert!(first.contains(expected), "{line}: {first}");
+        let at = if expected.starts_with("the first") {
+            2
+        } else {
+            3
+        };
+        assert!(first.starts_with(&format!("own.scxml:{at}: ")), "{first}");
+    }
+}
+
+#[test]
+fn what_is_missing_or_left_over() {
+    assert_eq!(only("<scxml initial=\"1\"/>"), (1, Problem::NoState));
+    assert_eq!(
+        only("<statechart/>"),
+        (1, Problem::NotScxml("statechart".into()))
+    );
+    let missing = |element, attribute| Problem::Missing { element, attribute };
+    let text = with(GOOD).replace(" initial=\"1\"", "");
+    assert_eq!(only(&text), (1, missing("scxml", "initial")));
+    assert_eq!(
+        only("<scxml initial=\"1\">\n<state/></scxml>"),
+        (2, missing("state", "id"))
+    );
+    let text = with(GOOD).replace("<state id=\"2\" final=\"yes\"/>", "<state id=\"2\"/>");
+    assert_eq!(only(&text), (5, Problem::DeadEnd("2".into())));
+    let text = with(GOOD).replace("</scxml>", "<final id=\"far\"/></scxml>");
+    assert_eq!(only(&text), (6, Problem::UnreachableState("far".into())));
+    let text = with(GOOD).replace("</scxml>", "<final id=\"2\"/></scxml>");
+    let problems = mistakes(&text);
+    let twice = Problem::DuplicateState {
+        id: "2".into(),
+        first: 5,
+    };
+    assert!(problems.contains(&(6, twice)), "{problems:?}");
+    let text = with(&GOOD.replace("to=", "f:later=\"1\" to="));
+    assert!(matches!(only(&text), (3, Problem::UnknownAttribute { .. })));
+    let text = with(&format!("<state id=\"3\"/>{GOOD}"));
+    assert!(matches!(only(&text), (3, Problem::Misplaced { .. })));
+    let never = format!(
+        "{GOOD}</state><state id=\"3\">\n<transition performative=\"agree\" from=\"x\" to=\"a\" target=\"2\"/>"
+    );
+    let text = with(&never.replace("target=\"2\"/></state>", "target=\"3\"/></state>"));
+    assert_eq!(only(&text), (4, Problem::UnboundRole("x".into())));
+    let roles = with(GOOD).replace("initial", "f:scope=\"participant\" initial");
+    let roles = roles.replace(
+        "</state>",
+        "<transition performative=\"agree\" from=\"a\" to=\"c\" target=\"2\"/></state>",
+    );
+    assert!(matches!(only(&roles), (1, Problem::RolesOfScope(3, _))));
+    let circle =
+        r#"<transition performative="inform" from="a" to="b" target="1" f:optional="yes"/>"#;
+    let circle = with(&format!(
+        "{circle}<transition performative=\"agree\" from=\"a\" to=\"b\" target=\"2\"/>"
+    ));
+    assert_eq!(only(&circle), (2, Problem::OptionalCircle("1".into())));
+    let two = r#"<transition f:after="1s" target="2"/><transition f:after="2s" target="2"/>"#;
+    assert_eq!(
+        only(&with(&format!("{GOOD}{two}"))),
+        (3, Problem::TwoTimeouts("1".into()))
+    );
+}
+
+#[test]
+fn a_near_miss_is_pointed_out() {
+    let text = with(GOOD)
+        .replace("id=\"2\"", "id=\"agreed\"")
+        .replace("target=\"2\"", "target=\"agred\"");
+    let nearest = Some("agreed".to_owned());
+    let unknown = Problem::UnknownState {
+        id: "agred".into(),
+        nearest,
+    };
+    assert_eq!(mistakes(&text)[0], (3, unknown));
+}
+
+#[test]
+fn optional_steps_must_not_make_two_meanings() {
+    let text = with(&format!(
+        "{}<transition performative=\"failure\" from=\"a\" to=\"b\" target=\"3\"/></state>\n<state id=\"3\">{GOOD}",
+        r#"<transition performative="agree" from="a" to="b" target="3" f:optional="yes"/>"#
+    ));
+    assert!(Machine::read("f", &text).is_ok());
+    let text = text.replace("performative=\"failure\"", "performative=\"inform\"");
+    let (line, problem) = only(&text);
+    let Problem::Ambiguous(both) = problem else {
+        panic!("{problem:?}");
+    };
+    assert_eq!(
+        (both.state.as_str(), both.performative.as_str()),
+        ("1", "inform")
+    );
+    assert!(line == 2 || line == 3);
+}
+
+#[test]
+fn hostile_files_end_in_errors() {
+    let is = |text: &str, words: &str| {
+        let error = Machine::read("f", text).unwrap_err().to_string();
+        assert!(error.contains(words), "{words}: {error}");
+    };
+    is(&" ".repeat(MAX_FILE + 1), "at most 1048576");
+    is("", "the outermost element is <>");
+    is(
+        "<scxml initial='1'><state id='1'>",
+        "the file ends within an element",
+    );
+    is(
+        "<!DOCTYPE scxml [<!ENTITY a \"aaaa\">]><scxml initial='&a;'/>",
+        "a document type is not accepted",
+    );
+    is("<scxml initial='&bomb;'/>", "not well-formed XML");
+    is("<scxml initial='1'></state></scxml>", "not well-formed XML");
+    let deep = format!("<scxml initial='1'><a>{}", "<a>".repeat(100_000));
+    is(&deep, "more than 32 levels");
+    let states = "<state id='1'/>".repeat(1000);
+    is(
+        &format!("<scxml initial='1'>{states}</scxml>"),
+        "more than 500 states",
+    );
+    let steps = "<transition target='1'/>".repeat(3000);
+    is(
+        &format!("<scxml initial='1'><state id='1'>{steps}</state></scxml>"),
+        "more than 2000 transitions",
+    );
+    let long = "x".repeat(300);
+    is(
+        &format!("<scxml initial='{long}'/>"),
+        "more than 256 bytes in an attribute",
+    );
+    let many: String = (0..100).map(|number| format!(" a{number}='1'")).collect();
+    is(&format!("<scxml{many}/>"), "more than 64 attributes");
+    let bomb = GOOD.replace("inform", r"(\w{1000}){1000}");
+    is(&with(&bomb), "too large when compiled");
+    let roles: String = (0..40)
+        .map(|role| format!("<transition performative='p' from='a' to='r{role}' target='2'/>"))
+        .collect();
+    is(&with(&roles), "more than 32 roles");
+}
+
+/// The largest file that the limits allow is read, or refused, before anybody gets impatient.
+#[test]
+fn large_files_take_little_time() {
+    use std::fmt::Write as _;
+    let mut text = "<scxml initial=\"s0\">".to_owned();
+    for state in 0..500 {
+        write!(text, "<state id=\"s{state}\">").unwrap();
+        for step in 0..4 {
+            let target = (state + 1) % 500;
+            write!(
+                text,
+                "<transition performative=\"p{state}x{step}.?\" from=\"a.?\" to=\"b\" target=\"s{target}\"/>"
+            )
+            .unwrap();
+        }
+        text.push_str("</state>");
+    }
+    text.push_str("</scxml>");
+    let error: ScxmlError = Machine::read("f", &text).unwrap_err();
+    // No role has a name of its own but b, who never begins.
+    assert!(error.to_string().contains("never bound"), "{error}");
+}
+
+proptest! {
+    #[test]
+    fn any_text_is_a_machine_or_an_error(text in "[ -~\n]{0,200}") {
+        let _ = Machine::read("f", &text);
+    }
+
+    #[test]
+    fn a_damaged_file_is_a_machine_or_an_error(at in 0..PLAIN.len(), len in 0..40_usize, new in "[ -~]{0,6}") {
+        let end = (at + len).min(PLAIN.len());
+        let damaged = format!("{}{new}{}", &PLAIN[..at], &PLAIN[end..]);
+        if let Err(error) = Machine::read("f", &damaged) {
+            let lines = damaged.matches('\n').count() + 1;
+            for mistake in &error.mistakes {
+                prop_assert!((1..=lines).contains(&mistake.line), "{error}");
+            }
+        }
+    }
+}

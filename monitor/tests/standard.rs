@@ -1,0 +1,478 @@
+//! The protocols against the tables of the standard.
+//!
+//! The tables below are written by hand from FIPA00026 to FIPA00036, not made from the files they
+//! check. `>` is what the initiator says, `<` what the participant says, `!` the passing of the
+//! call's `reply-by`. States whose names begin with F are final. Of two rows that fit, the first
+//! counts; `*` is any performative. What goes for all protocols, not-understood and cancel, is in
+//! [`Walk::by_common_rules`].
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::collections::HashSet;
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use fipa_acl::{Performative, Time};
+use fipa_monitor::{Header, Library, Monitor, Verdict};
+
+type Row = (&'static str, char, &'static str, &'static str);
+
+struct Table {
+    name: &'static str,
+    rows: &'static [Row],
+    cancel: bool,
+}
+
+/// FIPA00026: agree may be left out.
+const REQUEST: Table = Table {
+    name: "fipa-request",
+    rows: &[
+        ("0", '>', "request", "1"),
+        ("1", '<', "refuse", "F"),
+        ("1", '<', "agree", "2"),
+        ("1", '<', "inform", "F"),
+        ("1", '<', "failure", "F"),
+        ("2", '<', "failure", "F"),
+        ("2", '<', "inform", "F"),
+    ],
+    cancel: true,
+};
+
+/// FIPA00027.
+const QUERY: Table = Table {
+    name: "fipa-query",
+    rows: &[
+        ("0", '>', "query-if", "1"),
+        ("0", '>', "query-ref", "1"),
+        ("1", '<', "refuse", "F"),
+        ("1", '<', "agree", "2"),
+        ("1", '<', "failure", "F"),
+        ("1", '<', "inform", "F"),
+        ("2", '<', "failure", "F"),
+        ("2", '<', "inform", "F"),
+    ],
+    cancel: true,
+};
+
+/// What the agents of fipa_acl answer besides.
+const ROCK_QUERY: Table = Table {
+    name: "query",
+    rows: &[
+        ("0", '>', "query-if", "1"),
+        ("0", '>', "query-ref", "1"),
+        ("1", '<', "refuse", "F"),
+        ("1", '<', "agree", "2"),
+        ("1", '<', "failure", "F"),
+        ("1", '<', "inform", "F"),
+        ("1", '<', "inform-if", "F"),
+        ("1", '<', "inform-ref", "F"),
+        ("2", '<', "failure", "F"),
+        ("2", '<', "inform", "F"),
+        ("2", '<', "inform-if", "F"),
+        ("2", '<', "inform-ref", "F"),
+    ],
+    cancel: true,
+};
+
+/// FIPA00028: agree may not be left out.
+const REQUEST_WHEN: Table = Table {
+    name: "fipa-request-when",
+    rows: &[
+        ("0", '>', "request-when", "1"),
+        ("1", '<', "refuse", "F"),
+        ("1", '<', "agree", "2"),
+        ("2", '<', "failure", "F"),
+        ("2", '<', "inform", "F"),
+    ],
+    cancel: true,
+};
+
+/// FIPA00036.
+const PROPOSE: Table = Table {
+    name: "fipa-propose",
+    rows: &[
+        ("0", '>', "propose", "1"),
+        ("1", '<', "accept-proposal", "F"),
+        ("1", '<', "reject-proposal", "F"),
+    ],
+    cancel: true,
+};
+
+/// FIPA00035: informs repeat.
+const SUBSCRIBE: Table = Table {
+    name: "fipa-subscribe",
+    rows: &[
+        ("0", '>', "subscribe", "1"),
+        ("1", '<', "refuse", "F"),
+        ("1", '<', "agree", "2"),
+        ("1", '<', "inform", "2"),
+        ("1", '<', "failure", "F"),
+        ("2", '<', "inform", "2"),
+        ("2", '<', "failure", "F"),
+    ],
+    cancel: true,
+};
+
+/// FIPA00029. Late proposals are rejected.
+const CONTRACT_NET: Table = Table {
+    name: "fipa-contract-net",
+    rows: &[
+        ("0", '>', "cfp", "1"),
+        ("1", '<', "refuse", "F"),
+        ("1", '<', "propose", "2"),
+        ("1", '!', "", "Fexpired"),
+        ("2", '>', "reject-proposal", "F"),
+        ("2", '>', "accept-proposal", "3"),
+        ("3", '<', "failure", "F"),
+        ("3", '<', "inform", "F"),
+        ("Fexpired", '<', "refuse", "F"),
+        ("Fexpired", '<', "propose", "late"),
+        ("late", '>', "reject-proposal", "F"),
+    ],
+    cancel: true,
+};
+
+/// FIPA00030: a proposal may be answered with a revised call.
+const ITERATED_CONTRACT_NET: Table = Table {
+    name: "fipa-iterated-contract-net",
+    rows: &[
+        ("0", '>', "cfp", "1"),
+        ("1", '<', "refuse", "F"),
+        ("1", '<', "propose", "2"),
+        ("1", '!', "", "Fexpired"),
+        ("2", '>', "reject-proposal", "F"),
+        ("2", '>', "accept-proposal", "3"),
+        ("2", '>', "cfp", "1"),
+        ("3", '<', "failure", "F"),
+        ("3", '<', "inform", "F"),
+        ("Fexpired", '<', "refuse", "F"),
+        ("Fexpired", '<', "propose", "late"),
+        ("late", '>', "reject-proposal", "F"),
+    ],
+    cancel: true,
+};
+
+/// FIPA00031, as one bidder sees it. A second call after his bid was accepted says that somebody
+/// else leads.
+const ENGLISH: Table = Table {
+    name: "fipa-auction-english",
+    rows: &[
+        ("0", '>', "inform", "1"),
+        ("1", '>', "cfp", "2"),
+        ("2", '<', "propose", "bid"),
+        ("2", '>', "cfp", "2"),
+        ("2", '>', "inform", "F"),
+        ("bid", '>', "accept-proposal", "leads"),
+        ("bid", '>', "reject-proposal", "lost"),
+        ("lost", '>', "cfp", "2"),
+        ("lost", '>', "inform", "F"),
+        ("leads", '>', "cfp", "2 leading"),
+        ("leads", '>', "inform", "F3"),
+        ("2 leading", '<', "propose", "bid"),
+        ("2 leading", '>', "cfp", "2"),
+        ("2 leading", '>', "inform", "F3"),
+        ("F3", '>', "request", "F"),
+    ],
+    cancel: false,
+};
+
+/// FIPA00032, as one bidder sees it.
+const DUTCH: Table = Table {
+    name: "fipa-auction-dutch",
+    rows: &[
+        ("0", '>', "inform", "1"),
+        ("1", '>', "cfp", "2"),
+        ("2", '>', "cfp", "2"),
+        ("2", '<', "propose", "3"),
+        ("2", '>', "inform", "F"),
+        ("3", '>', "accept-proposal", "Fbought"),
+        ("3", '>', "reject-proposal", "Flate"),
+        ("Fbought", '>', "cfp", "2"),
+        ("Fbought", '>', "inform", "F"),
+        ("Flate", '>', "cfp", "2"),
+        ("Flate", '>', "inform", "F"),
+    ],
+    cancel: false,
+};
+
+/// FIPA00033: in 3, whatever the targets answered is passed on.
+const BROKERING: Table = Table {
+    name: "fipa-brokering",
+    rows: &[
+        ("0", '>', "proxy", "1"),
+        ("1", '<', "refuse", "F"),
+        ("1", '<', "agree", "2"),
+        ("2", '<', "failure", "F"),
+        ("2", '<', "inform", "F3"),
+        ("F3", '<', "failure", "F"),
+        ("F3", '<', "*", "F3"),
+    ],
+    cancel: true,
+};
+
+/// FIPA00034: the answers of the recruited are no part of it.
+const RECRUITING: Table = Table {
+    name: "fipa-recruiting",
+    rows: &[
+        ("0", '>', "proxy", "1"),
+        ("1", '<', "refuse", "F"),
+        ("1", '<', "agree", "2"),
+        ("2", '<', "failure", "F"),
+        ("2", '<', "inform", "Fproxied"),
+        // Nothing more is said between the two, but within the embedded protocol.
+        ("Fproxied", '#', "", "Fproxied"),
+    ],
+    cancel: true,
+};
+
+/// The cancel meta-protocol by itself.
+const CANCEL: Table = Table {
+    name: "fipa-cancel",
+    rows: &[
+        ("0", '>', "cancel", "1"),
+        ("1", '<', "inform", "F"),
+        ("1", '<', "failure", "F"),
+    ],
+    cancel: false,
+};
+
+const TABLES: [Table; 13] = [
+    REQUEST,
+    QUERY,
+    ROCK_QUERY,
+    REQUEST_WHEN,
+    PROPOSE,
+    SUBSCRIBE,
+    CONTRACT_NET,
+    ITERATED_CONTRACT_NET,
+    ENGLISH,
+    DUTCH,
+    BROKERING,
+    RECRUITING,
+    CANCEL,
+];
+
+/// A conversation of its own, and where the table says it is.
+struct Walk<'t> {
+    table: &'t Table,
+    monitor: Monitor,
+    now: SystemTime,
+    state: &'static str,
+    last: char,
+}
+
+impl<'t> Walk<'t> {
+    fn new(table: &'t Table, library: &Arc<Library>) -> Self {
+        Self {
+            table,
+            monitor: Monitor::observer(Arc::clone(library)),
+            now: SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000),
+            state: "0",
+            last: '-',
+        }
+    }
+
+    fn along(table: &'t Table, library: &Arc<Library>, path: &[Row]) -> Self {
+        let mut walk = Self::new(table, library);
+        for row in path {
+            walk.step(*row);
+        }
+        walk
+    }
+
+    /// Goes along a row, which must be right.
+    fn step(&mut self, (_, side, act, to): Row) {
+        let before = self.state;
+        if side == '!' {
+            self.now += Duration::from_secs(10);
+            self.state = to;
+            return;
+        }
+        let act = if act == "*" { "request" } else { act };
+        let name = self.table.name;
+        let verdict = self.say(side, &act.parse().unwrap());
+        match verdict {
+            Verdict::Accepted(accepted) => {
+                assert_eq!(accepted.protocol, name);
+                let ended = to.starts_with('F');
+                let so = (accepted.ended, accepted.complete, accepted.opened);
+                assert_eq!(
+                    so,
+                    (ended, ended, before == "0"),
+                    "{name}: {before} {side}{act}"
+                );
+            }
+            other => panic!("{name}: {before} {side}{act}: {other:?}"),
+        }
+        self.state = to;
+        self.last = side;
+    }
+
+    fn say(&mut self, side: char, act: &Performative) -> Verdict<'_> {
+        let (from, to) = match side {
+            '>' => ("ann", "ben"),
+            _ => ("ben", "ann"),
+        };
+        let mut header = Header::new(act.clone())
+            .sender(from)
+            .receivers([to])
+            .protocol(self.table.name)
+            .conversation_id("c");
+        if side == '>' {
+            let due = Time::from_system_time(self.now + Duration::from_secs(5)).unwrap();
+            header = header.reply_by(due);
+        }
+        self.monitor.check(&header, self.now)
+    }
+
+    fn row(&self, side: char, act: &str) -> Option<Row> {
+        let here = |row: &&Row| row.0 == self.state && row.1 == side;
+        let mut rows = self.table.rows.iter().filter(here);
+        rows.find(|row| row.2 == act || row.2 == "*").copied()
+    }
+
+    /// What goes for every protocol.
+    fn by_common_rules(&self, side: char, act: &str) -> bool {
+        let ended = self.state.starts_with('F');
+        let over = ended && !self.table.rows.iter().any(|row| row.0 == self.state);
+        if self.state == "0" {
+            return false;
+        }
+        match act {
+            // Anybody may say so at any time; of the last message, only who got it.
+            "not-understood" => !ended || side != self.last,
+            // The initiator, before the end or before he could know of it.
+            "cancel" => self.table.cancel && side == '>' && (!over || self.last == '<'),
+            _ => false,
+        }
+    }
+}
+
+/// The shortest way to each state, for each side that may have spoken last.
+fn ways(table: &Table) -> Vec<Vec<Row>> {
+    let mut seen = HashSet::from([("0", '-')]);
+    let mut ways: Vec<Vec<Row>> = vec![Vec::new()];
+    let mut next = 0;
+    while let Some(way) = ways.get(next).cloned() {
+        next += 1;
+        let state = way.last().map_or("0", |row| row.3);
+        let last = way.iter().rev().find(|row| row.1 != '!');
+        for row in table.rows.iter().filter(|row| row.0 == state) {
+            let last = match row.1 {
+                '#' => continue,
+                '!' => last.map_or('-', |row| row.1),
+                side => side,
+            };
+            if seen.insert((row.3, last)) {
+                let mut longer = way.clone();
+                longer.push(*row);
+                ways.push(longer);
+            }
+        }
+    }
+    ways
+}
+
+#[test]
+fn every_performative_in_every_state() {
+    let library = Arc::new(Library::standard());
+    let mut wrong = 0;
+    for table in &TABLES {
+        for way in ways(table) {
+            for side in ['>', '<'] {
+                for act in &Performative::STANDARD {
+                    let mut walk = Walk::along(table, &library, &way);
+                    let right = walk.row(side, act.as_str()).is_some()
+                        || walk.by_common_rules(side, act.as_str());
+                    let (name, state) = (table.name, walk.state);
+                    let opened_by_other = state == "0" && side == '<';
+                    let verdict = walk.say(side, act);
+                    if opened_by_other && walk_begins(table, act) {
+                        // Who speaks first is the initiator, whatever he is called here.
+                        assert!(verdict.is_accepted());
+                        continue;
+                    }
+                    let what = format!("{name}: {side}{act} in {state}: {verdict:?}");
+                    assert_eq!(verdict.is_accepted(), right, "{what}");
+                    assert_eq!(verdict.violation().is_some(), !right, "{what}");
+                    wrong += usize::from(!right);
+                }
+            }
+        }
+    }
+    assert!(wrong > 2_000, "{wrong}");
+}
+
+fn walk_begins(table: &Table, act: &Performative) -> bool {
+    let mut rows = table.rows.iter();
+    rows.any(|row| row.0 == "0" && row.2 == act.as_str())
+}
+
+#[test]
+fn every_path_to_an_end() {
+    let library = Arc::new(Library::standard());
+    for table in &TABLES {
+        let mut used = HashSet::new();
+        let mut paths = vec![Vec::<Row>::new()];
+        let mut walked = 0;
+        while let Some(path) = paths.pop() {
+            let state = path.last().map_or("0", |row| row.3);
+            if state.starts_with('F') {
+                Walk::along(table, &library, &path);
+                walked += 1;
+            }
+            let onwards = table
+                .rows
+                .iter()
+                .filter(|row| row.0 == state && row.1 != '#');
+            for row in onwards {
+                used.insert((row.0, row.1, row.2));
+                // Every loop up to twice.
+                let times = path.iter().filter(|other| *other == row).count();
+                if times < 2 && path.len() < 10 {
+                    let mut longer = path.clone();
+                    longer.push(*row);
+                    paths.push(longer);
+                }
+            }
+        }
+        let rows = table.rows.iter().filter(|row| row.1 != '#').count();
+        assert_eq!(used.len(), rows, "{}", table.name);
+        assert!(walked > 1, "{}", table.name);
+    }
+}
+
+#[test]
+fn cancelling_and_what_follows() {
+    let library = Arc::new(Library::standard());
+    let [inform, failure, cancel] =
+        ["inform", "failure", "cancel"].map(|act| act.parse::<Performative>().unwrap());
+    for table in TABLES.iter().filter(|table| table.cancel) {
+        for way in ways(table) {
+            let state = way.last().map_or("0", |row| row.3);
+            if state == "0" || state.starts_with('F') {
+                continue;
+            }
+            let name = table.name;
+            // It worked: nothing more comes, but for what may have been under way.
+            let mut walk = Walk::along(table, &library, &way);
+            assert!(walk.say('>', &cancel).is_accepted(), "{name} {state}");
+            assert!(!walk.say('>', &cancel).is_accepted(), "{name} {state}");
+            let verdict = walk.say('<', &inform);
+            let Verdict::Accepted(accepted) = verdict else {
+                panic!("{name} {state}: {verdict:?}");
+            };
+            assert_eq!((accepted.state, accepted.ended), ("cancelled", true));
+            for act in &Performative::STANDARD {
+                assert!(!walk.say('>', act).is_accepted(), "{name} {state} {act}");
+            }
+            // It did not: the protocol goes on where it was.
+            let mut walk = Walk::along(table, &library, &way);
+            walk.say('>', &cancel);
+            assert!(walk.say('<', &failure).is_accepted(), "{name} {state}");
+            let onwards = table.rows.iter().filter(|row| row.0 == state);
+            let row = onwards.clone().find(|row| !matches!(row.1, '!' | '#'));
+            walk.step(*row.unwrap());
+        }
+    }
+}
