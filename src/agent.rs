@@ -81,21 +81,24 @@ impl Agent {
     ///
     /// # Errors
     /// When the message cannot be sent at all. What happened on the way is in the outcomes.
-    pub async fn send(&self, message: Message) -> Result<Deliveries, SendError> {
-        self.send_within(message, self.domain.inner.deadline).await
+    pub fn send(
+        &self,
+        message: Message,
+    ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
+        self.send_within(message, self.domain.inner.deadline)
     }
 
     /// Sends a message with a deadline of its own.
     ///
     /// # Errors
     /// See [`send`](Self::send).
-    pub async fn send_within(
+    pub fn send_within(
         &self,
         message: Message,
         deadline: Duration,
-    ) -> Result<Deliveries, SendError> {
-        let letter = letter_for(&message, SystemTime::now())?;
-        self.post(&message, letter, deadline).await
+    ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
+        let letter = letter_for(&message, SystemTime::now());
+        self.post(&message, letter, deadline)
     }
 
     /// Memory for the content of a message to one agent of this host, in shared memory where
@@ -126,36 +129,38 @@ impl Agent {
     ///
     /// # Errors
     /// See [`send`](Self::send).
-    pub async fn send_loan(&self, loan: Loan) -> Result<Deliveries, SendError> {
+    pub fn send_loan(
+        &self,
+        loan: Loan,
+    ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
         let Loan { message, content } = loan;
-        let letter = letter_around(&message, content.freeze(), SystemTime::now())?;
+        let letter = letter_around(&message, content.freeze(), SystemTime::now());
         self.post(&message, letter, self.domain.inner.deadline)
-            .await
     }
 
-    async fn post(
+    /// The letter is on its way when this returns.
+    fn post(
         &self,
         message: &Message,
-        letter: Letter,
+        letter: Result<Letter, PostError>,
         deadline: Duration,
-    ) -> Result<Deliveries, SendError> {
-        self.check(message)?;
-        let receivers = message
-            .receivers()
-            .iter()
-            .map(|id| id.name().into())
-            .collect();
-        let submission = Submission {
-            sender: self.incarnation,
-            letter,
-            receivers,
-            deadline,
-        };
-        let outcomes = self.domain.inner.service.mts.send(submission).await;
-        let deliveries = outcomes
-            .into_iter()
-            .map(|(receiver, outcome)| Delivery { receiver, outcome });
-        Ok(Deliveries(deliveries.collect()))
+    ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
+        let sending = self.check(message).and_then(|()| {
+            let receivers = message.receivers().iter();
+            Ok(self.domain.inner.service.mts.send(Submission {
+                sender: self.incarnation,
+                letter: letter?,
+                receivers: receivers.map(|id| id.name().into()).collect(),
+                deadline,
+            }))
+        });
+        async move {
+            let outcomes = sending?.outcomes().await;
+            let deliveries = outcomes
+                .into_iter()
+                .map(|(receiver, outcome)| Delivery { receiver, outcome });
+            Ok(Deliveries(deliveries.collect()))
+        }
     }
 
     fn check(&self, message: &Message) -> Result<(), SendError> {

@@ -1,6 +1,7 @@
 //! The commands, one per file: its arguments, with the help that documents it, and `run`.
 
 mod agents;
+mod bench;
 mod config;
 mod decode;
 mod demo;
@@ -24,6 +25,7 @@ pub(crate) enum Command {
     Echo(echo::Arguments),
     Routes(routes::Arguments),
     Demo(demo::Arguments),
+    Bench(bench::Arguments),
     Decode(decode::Arguments),
     Encode(encode::Arguments),
     Config(config::Arguments),
@@ -38,6 +40,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Echo(arguments) => echo::run(arguments, global),
         Command::Routes(arguments) => routes::run(arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),
+        Command::Bench(arguments) => bench::run(arguments, global),
         Command::Decode(arguments) => decode::run(arguments, global),
         Command::Encode(arguments) => encode::run(arguments, global),
         Command::Config(arguments) => config::run(arguments, global),

@@ -12,7 +12,8 @@
 //! Inside: `layout` is what lies in shared memory, `inbox` the receiving and `outbox` the sending
 //! side of mailboxes, `loan` memory handed out before it is sent, `presence` how processes wake
 //! each other and notice each other's end, `memory` where room comes from, `domain` the traces in
-//! the file system, `peers` the other processes known, `endpoint` what ties all together.
+//! the file system, `peers` the other processes known, `endpoint` what ties all together. `raw`
+//! (feature `raw`) is the bare iceoryx2 that benches compare with.
 //!
 //! What must not live here: routes, retries, names of agents, deduplication. And no `unsafe` that
 //! does not say why it is sound; no other crate of this project has any.
@@ -34,6 +35,8 @@ mod memory;
 mod outbox;
 mod peers;
 mod presence;
+#[cfg(feature = "raw")]
+pub mod raw;
 mod transport;
 
 pub use config::{ShmConfig, ShmError};

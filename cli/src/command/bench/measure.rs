@@ -1,0 +1,361 @@
+//! Measuring: all ways in turns, so that whatever else the machine does hits them alike.
+
+use std::collections::HashMap;
+use std::time::Duration;
+
+use hdrhistogram::Histogram;
+use serde::Serialize;
+
+use super::part::{Fill, Letters, Wait};
+use super::stage::Stage;
+use super::way::{Sort, Turn, Way};
+
+/// How much is measured.
+#[derive(Debug, Clone)]
+pub(super) struct Effort {
+    pub(super) sizes: Vec<usize>,
+    /// Turns of every way with letters of one sort.
+    pub(super) rounds: usize,
+    /// How long a turn may take.
+    pub(super) turn: Duration,
+    /// Turns for throughput.
+    pub(super) rate_rounds: usize,
+}
+
+impl Effort {
+    pub(super) fn full(sizes: Vec<usize>) -> Self {
+        Self {
+            sizes,
+            rounds: 15,
+            turn: Duration::from_millis(25),
+            rate_rounds: 3,
+        }
+    }
+
+    pub(super) fn quick(sizes: Vec<usize>) -> Self {
+        Self {
+            sizes,
+            rounds: 5,
+            turn: Duration::from_millis(8),
+            rate_rounds: 1,
+        }
+    }
+}
+
+/// Letters of a turn, at least and at most.
+const LEAST: usize = 8;
+const MOST: usize = 2000;
+/// Letters at the beginning of a turn that do not count: whoever slept is awake after them.
+const WARMING: usize = 3;
+/// A throughput turn takes this many times as long.
+const RATE_TURN: u32 = 3;
+
+/// Percentiles of a time, in microseconds.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub(super) struct Percentiles {
+    pub(super) p50: f64,
+    pub(super) p99: f64,
+    pub(super) p999: f64,
+}
+
+/// What one way did with letters of one sort.
+#[derive(Debug, Clone, Serialize)]
+pub(super) struct Row {
+    pub(super) path: String,
+    pub(super) wait: Wait,
+    pub(super) size: usize,
+    pub(super) fill: Fill,
+    pub(super) samples: u64,
+    /// From before sending until the receiver has the letter, decoded.
+    pub(super) one_way_us: Percentiles,
+    /// From before sending until the sender knows that it has arrived.
+    pub(super) round_trip_us: Percentiles,
+    /// Letters a second with a window of letters under way.
+    pub(super) rate_per_s: Option<f64>,
+    /// Of all processes of the way together, one letter at a time.
+    pub(super) cpu_us_per_letter: f64,
+    pub(super) limit: Option<Limit>,
+    /// One way, to the limit's: the median over all rounds of the ratio of medians.
+    pub(super) ratio: Option<f64>,
+    /// The middle half of those ratios.
+    pub(super) ratio_spread: Option<[f64; 2]>,
+    pub(super) round_trip_ratio: Option<f64>,
+    pub(super) rate_ratio: Option<f64>,
+    pub(super) cpu_ratio: Option<f64>,
+    #[serde(skip)]
+    pub(super) sort: Sort,
+}
+
+/// What the same bytes need at least.
+#[derive(Debug, Clone, Serialize)]
+pub(super) struct Limit {
+    pub(super) name: String,
+    pub(super) p50_us: f64,
+    pub(super) round_trip_p50_us: f64,
+    pub(super) rate_per_s: Option<f64>,
+    pub(super) cpu_us_per_letter: f64,
+}
+
+/// What all ways did, and what could not be measured.
+#[derive(Debug, Default)]
+pub(super) struct Measured {
+    pub(super) rows: Vec<Row>,
+    pub(super) notes: Vec<String>,
+}
+
+/// Measures all ways with letters of all sorts. `told` hears of every step.
+pub(super) async fn all(
+    stage: &mut Stage,
+    ways: &mut Vec<Way>,
+    effort: &Effort,
+    told: &impl Fn(&str),
+) -> Measured {
+    let mut measured = Measured::default();
+    for &size in &effort.sizes {
+        let mut able = Vec::new();
+        for (index, way) in ways.iter().enumerate() {
+            match way.takes(stage, size).await {
+                Ok(()) => able.push(index),
+                Err(why) => {
+                    let name = way.sort.name();
+                    measured.notes.push(format!("{name}: {size} bytes: {why}"));
+                }
+            }
+        }
+        for fill in [Fill::Loaned, Fill::Filled, Fill::Copied] {
+            told(&format!("{} {}", super::report::size(size), name_of(fill)));
+            let mut cells = HashMap::new();
+            for index in able.clone() {
+                let sort = ways[index].sort;
+                if fill != Fill::Loaned || sort.loans() {
+                    cells.insert(index, Cell::default());
+                }
+            }
+            let failed = cell(stage, ways, size, fill, effort, &mut cells).await;
+            measured.rows.extend(rows(ways, size, fill, &cells));
+            // Where something went wrong, the processes wait for what will not come.
+            for (index, why) in failed.into_iter().rev() {
+                let way = ways.remove(index);
+                let name = way.sort.name();
+                measured.notes.push(format!("{name}: given up: {why}"));
+                able.retain(|other| *other != index);
+                for other in &mut able {
+                    *other -= usize::from(*other > index);
+                }
+            }
+        }
+    }
+    measured
+}
+
+pub(super) fn name_of(fill: Fill) -> &'static str {
+    match fill {
+        Fill::Loaned => "loaned",
+        Fill::Filled => "filled",
+        Fill::Copied => "copied",
+    }
+}
+
+/// What is known of one way with letters of one sort.
+struct Cell {
+    letters: usize,
+    one_way: Histogram<u64>,
+    round_trip: Histogram<u64>,
+    /// By round.
+    one_way_medians: Vec<f64>,
+    round_trip_medians: Vec<f64>,
+    cpu: Vec<f64>,
+    rates: Vec<f64>,
+}
+
+impl Default for Cell {
+    fn default() -> Self {
+        let histogram = || Histogram::new_with_bounds(1, 60_000_000_000, 3);
+        let [one_way, round_trip] = [histogram(), histogram()].map(|made| match made {
+            Ok(histogram) => histogram,
+            Err(error) => unreachable!("three digits up to a minute: {error}"),
+        });
+        Self {
+            letters: LEAST,
+            one_way,
+            round_trip,
+            one_way_medians: Vec::new(),
+            round_trip_medians: Vec::new(),
+            cpu: Vec::new(),
+            rates: Vec::new(),
+        }
+    }
+}
+
+/// Measures letters of one sort, and returns which ways have failed, in order.
+async fn cell(
+    stage: &mut Stage,
+    ways: &[Way],
+    size: usize,
+    fill: Fill,
+    effort: &Effort,
+    cells: &mut HashMap<usize, Cell>,
+) -> Vec<(usize, String)> {
+    let mut failed = Vec::new();
+    let letters = |count, window| Letters {
+        count,
+        size,
+        fill,
+        window,
+    };
+    for round in 0..=effort.rounds + effort.rate_rounds {
+        for (index, way) in ways.iter().enumerate() {
+            let Some(cell) = cells.get_mut(&index) else {
+                continue;
+            };
+            let is_rate = round > effort.rounds;
+            let window = match way.sort.window(fill) {
+                _ if !is_rate => 1,
+                Some(window) => window,
+                None => continue,
+            };
+            let count = match is_rate {
+                true => (cell.letters * RATE_TURN as usize).max(4 * window),
+                false => cell.letters + WARMING,
+            };
+            match way.turn(stage, letters(count, window)).await {
+                // The first is for finding out how many make a turn.
+                Ok(turn) if round == 0 => cell.letters = letters_for(&turn, effort.turn),
+                Ok(turn) if is_rate => cell.rates.push(rate(&turn)),
+                Ok(turn) => cell.add(&turn),
+                Err(why) => {
+                    cells.remove(&index);
+                    failed.push((index, why));
+                }
+            }
+        }
+    }
+    failed.sort_by_key(|(index, _)| *index);
+    failed
+}
+
+fn letters_for(turn: &Turn, time: Duration) -> usize {
+    let typical = median(&times(&turn.began, &turn.ended)).max(1.0);
+    let fit = time.as_nanos() as f64 / typical;
+    (fit as usize).clamp(LEAST, MOST)
+}
+
+/// Letters a second, without those at the beginning.
+fn rate(turn: &Turn) -> f64 {
+    let from = turn.began.get(WARMING).copied().unwrap_or(0);
+    let until = turn.ended.last().copied().unwrap_or(0);
+    let letters = turn.began.len().saturating_sub(WARMING);
+    letters as f64 * 1e9 / until.saturating_sub(from).max(1) as f64
+}
+
+impl Cell {
+    fn add(&mut self, turn: &Turn) {
+        let one_way = times(&turn.began, &turn.arrived);
+        let round_trip = times(&turn.began, &turn.ended);
+        for time in &one_way {
+            self.one_way.saturating_record(*time as u64);
+        }
+        for time in &round_trip {
+            self.round_trip.saturating_record(*time as u64);
+        }
+        self.one_way_medians.push(median(&one_way));
+        self.round_trip_medians.push(median(&round_trip));
+        let per_letter = turn.cpu_ns as f64 / turn.began.len().max(1) as f64;
+        self.cpu.push(per_letter / 1e3);
+    }
+
+    fn cpu_us(&self) -> f64 {
+        median(&self.cpu)
+    }
+
+    fn rate(&self) -> Option<f64> {
+        (!self.rates.is_empty()).then(|| median(&self.rates))
+    }
+}
+
+/// In nanoseconds. What counts begins after the warming letters.
+fn times(from: &[u64], until: &[u64]) -> Vec<f64> {
+    let pairs = from.iter().zip(until).skip(WARMING);
+    pairs
+        .map(|(from, until)| until.saturating_sub(*from) as f64)
+        .collect()
+}
+
+fn median(values: &[f64]) -> f64 {
+    quantile(values, 0.5)
+}
+
+fn quantile(values: &[f64], at: f64) -> f64 {
+    let mut values = values.to_vec();
+    values.sort_by(f64::total_cmp);
+    let last = values.len().saturating_sub(1);
+    let index = (last as f64 * at).round() as usize;
+    values.get(index).copied().unwrap_or(f64::NAN)
+}
+
+fn rows(ways: &[Way], size: usize, fill: Fill, cells: &HashMap<usize, Cell>) -> Vec<Row> {
+    let mut rows = Vec::new();
+    for (index, way) in ways.iter().enumerate() {
+        let Some(cell) = cells.get(&index) else {
+            continue;
+        };
+        let limit = way.sort.limit().and_then(|sort| {
+            let is_it = |other: &Way| other.sort == sort && other.wait == way.wait;
+            let index = ways.iter().position(is_it)?;
+            Some((sort, cells.get(&index)?))
+        });
+        rows.push(row(way, size, fill, cell, limit));
+    }
+    rows
+}
+
+fn row(way: &Way, size: usize, fill: Fill, cell: &Cell, limit: Option<(Sort, &Cell)>) -> Row {
+    let ratios = limit.map(|(_, limit)| {
+        let ratio = |(own, least): (&f64, &f64)| own / least;
+        let pairs = cell.one_way_medians.iter().zip(&limit.one_way_medians);
+        let one_way: Vec<f64> = pairs.map(ratio).collect();
+        let pairs = cell
+            .round_trip_medians
+            .iter()
+            .zip(&limit.round_trip_medians);
+        let round_trip: Vec<f64> = pairs.map(ratio).collect();
+        let cpu: Vec<f64> = cell.cpu.iter().zip(&limit.cpu).map(ratio).collect();
+        (one_way, round_trip, cpu)
+    });
+    let rate_ratio = limit.and_then(|(_, limit)| Some(cell.rate()? / limit.rate()?));
+    Row {
+        path: way.sort.name(),
+        wait: way.wait,
+        size,
+        fill,
+        samples: cell.one_way.len(),
+        one_way_us: percentiles(&cell.one_way),
+        round_trip_us: percentiles(&cell.round_trip),
+        rate_per_s: cell.rate(),
+        cpu_us_per_letter: cell.cpu_us(),
+        limit: limit.map(|(sort, limit)| Limit {
+            name: sort.name(),
+            p50_us: percentiles(&limit.one_way).p50,
+            round_trip_p50_us: percentiles(&limit.round_trip).p50,
+            rate_per_s: limit.rate(),
+            cpu_us_per_letter: limit.cpu_us(),
+        }),
+        ratio: ratios.as_ref().map(|(one_way, ..)| median(one_way)),
+        ratio_spread: ratios
+            .as_ref()
+            .map(|(one_way, ..)| [0.25, 0.75].map(|at| quantile(one_way, at))),
+        round_trip_ratio: ratios.as_ref().map(|(_, round_trip, _)| median(round_trip)),
+        rate_ratio,
+        cpu_ratio: ratios.map(|(.., cpu)| median(&cpu)),
+        sort: way.sort,
+    }
+}
+
+fn percentiles(histogram: &Histogram<u64>) -> Percentiles {
+    let at = |quantile| histogram.value_at_quantile(quantile) as f64 / 1e3;
+    Percentiles {
+        p50: at(0.5),
+        p99: at(0.99),
+        p999: at(0.999),
+    }
+}

@@ -1,0 +1,237 @@
+//! `fipa bench`: how fast letters go here, beside what the bare mechanisms can do.
+//!
+//! Every way is a set of real processes: this command starts itself again as their ends, in a
+//! place of their own, so that nothing of this user's domains is touched. They are all kept ready
+//! and take turns, a few milliseconds each, so that whatever else the machine does hits a way and
+//! what it is compared with alike.
+//!
+//! * [`way`] has the ways, [`part`] what a process of one does.
+//! * [`stage`] starts, tells and ends the processes.
+//! * [`measure`] takes the turns and makes rows of them.
+//! * [`report`] and [`plot`] show them; [`machine`] says on what machine that was.
+
+mod machine;
+mod measure;
+mod part;
+mod plot;
+mod report;
+mod stage;
+mod way;
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use bytesize::ByteSize;
+use clap::{Args, ValueEnum};
+use fipa::{Config, Kind};
+use indicatif::{ProgressBar, ProgressStyle};
+
+use self::machine::Machine;
+use self::measure::{Effort, Measured};
+use self::part::{Part, Socket, Wait};
+use self::stage::Stage;
+use self::way::{Sort, Way};
+use crate::options::Global;
+use crate::report::{Failure, warn};
+use crate::{membership, output};
+
+/// Measure how fast letters go on this machine, beside what the bare mechanisms can do
+///
+/// Compares every configured transport: latency one way and round trip, throughput and processor
+/// time, for content from 100 bytes to 4 MB, each beside its limit (bare iceoryx2, TCP, UDP, Unix
+/// socket, a bare relay) measured in the same rounds, with the ratio. All traffic stays on this
+/// machine, and nothing is left behind.
+///
+/// Times are worth little on a busy machine; ratios more.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  fipa bench
+  fipa bench shm --quick
+  fipa bench net --json | jq '.rows[] | {path, size, p50: .one_way_us.p50, ratio}'
+  fipa bench --svg latency.svg")]
+pub(crate) struct Arguments {
+    /// What to compare; everything unless given
+    #[arg(value_enum)]
+    what: Option<What>,
+    /// Print JSON instead of a table
+    #[arg(long)]
+    json: bool,
+    /// Draw latency over size into this file too
+    #[arg(long, value_name = "FILE")]
+    svg: Option<PathBuf>,
+    /// Measure less, in a few seconds: figures scatter more
+    #[arg(long)]
+    quick: bool,
+    /// Sizes of content
+    #[arg(
+        long,
+        value_delimiter = ',',
+        value_name = "SIZE",
+        default_value = "100B,1KiB,64KiB,1MiB,4MiB"
+    )]
+    sizes: Vec<ByteSize>,
+    /// Play a part in somebody else's measurement
+    #[arg(long, hide = true)]
+    part: Option<String>,
+    /// Play it on this processor
+    #[arg(long, hide = true, requires = "part")]
+    core: Option<usize>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum What {
+    /// Two agents on one host, through shared memory
+    Shm,
+    /// Over the network: two agents directly, and through a gateway on either side
+    Net,
+}
+
+/// Largest content that can be asked for.
+const MOST: u64 = 32 << 20;
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
+    let config = global.config()?;
+    if let Some(part) = &arguments.part {
+        let kept = arguments.core.map_or(Ok(()), machine::keep_to);
+        let part = serde_json::from_str::<Part>(part).map_err(|error| error.to_string());
+        let played = kept.and(part).and_then(|part| part::play(part, &config));
+        let advice = "see what the measurement itself reports";
+        return played.map_err(|error| Failure::failed(error, "a part of fipa bench", advice));
+    }
+    let effort = effort(&arguments)?;
+    let (machine, measured) = membership::run(measure(&arguments, &config, &effort))?;
+    for note in &measured.notes {
+        tracing::info!("{note}");
+    }
+    if measured.rows.is_empty() {
+        return Err(Failure::failed(
+            format!("nothing could be measured: {}", measured.notes.join("; ")),
+            "fipa bench",
+            "see `fipa config show` for mts.transports, and run it with -v for the logs",
+        ));
+    }
+    if let Some(file) = &arguments.svg {
+        draw(file, &machine, &measured)?;
+    }
+    if arguments.json {
+        return output::json(&report::json(&machine, &effort, &measured));
+    }
+    output::text(&report::text(&machine, &effort, &measured))
+}
+
+fn effort(arguments: &Arguments) -> Result<Effort, Failure> {
+    let mut sizes = Vec::new();
+    for size in &arguments.sizes {
+        let bytes = usize::try_from(size.as_u64()).unwrap_or(usize::MAX);
+        if !(1..=MOST).contains(&size.as_u64()) {
+            return Err(Failure::wrong_usage(
+                format!("content of {size} cannot be measured"),
+                "--sizes",
+                format!("use 1 byte to {}", ByteSize(MOST)),
+            ));
+        }
+        sizes.push(bytes);
+    }
+    sizes.sort_unstable();
+    sizes.dedup();
+    Ok(if arguments.quick {
+        Effort::quick(sizes)
+    } else {
+        Effort::full(sizes)
+    })
+}
+
+async fn measure(
+    arguments: &Arguments,
+    config: &Config,
+    effort: &Effort,
+) -> Result<(Machine, Measured), Failure> {
+    let machine = Machine::look().await;
+    for warning in machine.warnings() {
+        warn(&warning);
+    }
+    let mut stage = Stage::new().map_err(|error| {
+        Failure::failed(
+            error,
+            "fipa bench",
+            "see whether this user can write to $TMPDIR",
+        )
+    })?;
+    let wanted = wanted(arguments.what, &config.mts.transports);
+    // Hidden by itself when standard error is no terminal.
+    let progress = ProgressBar::new((wanted.len() + effort.sizes.len() * 3) as u64);
+    progress.set_style(style());
+    progress.enable_steady_tick(Duration::from_millis(200));
+    let told = |what: &str| {
+        progress.inc(1);
+        progress.set_message(what.to_owned());
+    };
+    let mut ways = Vec::new();
+    let mut notes = Vec::new();
+    for (sort, wait) in wanted {
+        told(&format!("starting {}", sort.name()));
+        match Way::open(&mut stage, sort, wait).await {
+            Ok(way) => ways.push(way),
+            Err(why) => notes.push(format!("{}: cannot be measured: {why}", sort.name())),
+        }
+    }
+    let mut measured = measure::all(&mut stage, &mut ways, effort, &told).await;
+    progress.set_message("ending");
+    drop(stage);
+    progress.finish_and_clear();
+    notes.append(&mut measured.notes);
+    measured.notes = notes;
+    Ok((machine, measured))
+}
+
+fn style() -> ProgressStyle {
+    ProgressStyle::with_template("{bar:30} {pos}/{len} {elapsed} {msg}")
+        .unwrap_or_else(|_| ProgressStyle::default_bar())
+}
+
+/// The ways to be measured, each followed by what it is compared with.
+fn wanted(what: Option<What>, transports: &[Kind]) -> Vec<(Sort, Wait)> {
+    let mut wanted = Vec::new();
+    let mut add = |sort: Sort, wait: Wait| {
+        for sort in [Some(sort), sort.limit()].into_iter().flatten() {
+            if !wanted.contains(&(sort, wait)) {
+                wanted.push((sort, wait));
+            }
+        }
+    };
+    let shm = what != Some(What::Net) && transports.contains(&Kind::Shm);
+    let net = what != Some(What::Shm);
+    if shm {
+        add(Sort::Agents(Kind::Shm), Wait::Spin);
+        add(Sort::Agents(Kind::Shm), Wait::Block);
+    }
+    for kind in transports.iter().filter(|kind| **kind != Kind::Shm) {
+        if net {
+            add(Sort::Agents(*kind), Wait::Block);
+            add(Sort::Gateways(*kind), Wait::Block);
+        }
+    }
+    // What people know.
+    add(Sort::Socket(Socket::Unix), Wait::Block);
+    add(Sort::Socket(Socket::Tcp), Wait::Block);
+    wanted
+}
+
+fn draw(file: &PathBuf, machine: &Machine, measured: &Measured) -> Result<(), Failure> {
+    let subtitle = format!(
+        "{}, {} cores, {}; others used {:.0} % of it",
+        machine.processor,
+        machine.cores,
+        machine.system,
+        machine.busy * 100.0
+    );
+    let failed = |error: String| {
+        Failure::failed(
+            format!("cannot draw the picture: {error}"),
+            file.display().to_string(),
+            "see whether this user can write there",
+        )
+    };
+    let picture = plot::svg(&measured.rows, &subtitle).map_err(failed)?;
+    std::fs::write(file, picture).map_err(|error| failed(error.to_string()))
+}

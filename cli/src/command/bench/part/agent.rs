@@ -1,0 +1,236 @@
+//! Agents, and the gateways between them: what is measured.
+//!
+//! An agent's process has one thread, with tokio's current-thread runtime, and sends and receives
+//! in a task, as an application would: tasks get their turn before the future of `block_on` does.
+
+use std::collections::VecDeque;
+use std::pin::Pin;
+
+use bytes::{Bytes, BytesMut};
+use fipa::{AgentId, Config, Deliveries, Domain, Gateway, MessageBuilder, Performative, SendError};
+use tokio::io::{AsyncBufReadExt, BufReader, Lines, Stdin};
+use tokio::runtime::{Builder, Runtime};
+
+use super::{Fill, Letters, Peer, Sent, byte_of, check, now_ns, told};
+
+/// One agent.
+pub(super) struct Agent {
+    agent: fipa::Agent,
+    /// A message to the other end, without content.
+    message: Option<MessageBuilder>,
+    orders: Lines<BufReader<Stdin>>,
+    /// Content that is ready to be sent, used again and again.
+    ready: Bytes,
+}
+
+type Sending = Pin<Box<dyn Future<Output = Result<Deliveries, SendError>> + Send>>;
+
+/// An agent with what runs it. The agent is there whenever no task of it is running.
+struct Running {
+    agent: Option<Agent>,
+    runtime: Runtime,
+}
+
+impl Agent {
+    pub(super) fn play(config: &Config, name: &str) -> Result<(), String> {
+        let runtime = runtime()?;
+        let domain = runtime.block_on(Domain::open(config)).map_err(told)?;
+        let agent = domain.register(name).map_err(told)?;
+        let orders = runtime.block_on(async { orders() });
+        let agent = Self {
+            agent,
+            message: None,
+            orders,
+            ready: Bytes::new(),
+        };
+        let mut running = Running {
+            agent: Some(agent),
+            runtime,
+        };
+        super::obey(&mut running, name.to_owned());
+        let Running { agent, runtime } = running;
+        drop(agent);
+        runtime.block_on(domain.close());
+        // Whoever reads standard input is not waited for.
+        runtime.shutdown_background();
+        Ok(())
+    }
+
+    async fn find(&mut self, to: &str) -> Result<(), String> {
+        let directory = self.agent.domain().directory();
+        let mut changes = directory.watch();
+        while directory.lookup(to).is_none() {
+            changes.next().await.ok_or("the directory was closed")?;
+        }
+        let receiver = AgentId::new(to).map_err(told)?;
+        let message = self.agent.message(Performative::Inform);
+        self.message = Some(message.receiver(receiver));
+        Ok(())
+    }
+
+    async fn receive(&mut self, letters: &Letters) -> Result<Vec<u64>, String> {
+        let mut at = Vec::with_capacity(letters.count);
+        for number in 0..letters.count {
+            let incoming = self.agent.receive().await.map_err(told)?;
+            at.push(now_ns());
+            let content = incoming.message.content().ok_or("no content")?;
+            check(content, letters, number)?;
+        }
+        Ok(at)
+    }
+
+    async fn send(&mut self, letters: &Letters) -> Result<Sent, String> {
+        let mut sent = Sent::with_room(letters);
+        let mut under_way: VecDeque<Sending> = VecDeque::with_capacity(letters.window);
+        for number in 0..letters.count {
+            if under_way.len() >= letters.window
+                && let Some(first) = under_way.pop_front()
+            {
+                delivered(first.await)?;
+                sent.ended.push(now_ns());
+            }
+            under_way.push_back(self.begin(letters, number, &mut sent)?);
+        }
+        for rest in under_way {
+            delivered(rest.await)?;
+            sent.ended.push(now_ns());
+        }
+        Ok(sent)
+    }
+
+    fn begin(
+        &mut self,
+        letters: &Letters,
+        number: usize,
+        sent: &mut Sent,
+    ) -> Result<Sending, String> {
+        let message = self.message.clone().ok_or("nobody to send to")?;
+        let byte = byte_of(number);
+        if letters.fill == Fill::Copied {
+            let content = self.content(letters.size, byte);
+            let message = message.content(content).build().map_err(told)?;
+            sent.began.push(now_ns());
+            return Ok(Box::pin(self.agent.send(message)));
+        }
+        let message = message.build().map_err(told)?;
+        sent.began.push(now_ns());
+        let mut loan = self.agent.loan(message, letters.size).map_err(told)?;
+        if letters.fill == Fill::Filled {
+            loan.content_mut().fill(byte);
+        }
+        Ok(Box::pin(self.agent.send_loan(loan)))
+    }
+
+    /// Content whose first and last byte are this one. Only what no letter refers to any more is
+    /// used again.
+    fn content(&mut self, size: usize, byte: u8) -> Bytes {
+        let before = std::mem::take(&mut self.ready);
+        let mut content = match before.try_into_mut() {
+            Ok(content) if content.len() == size => content,
+            _ => BytesMut::zeroed(size),
+        };
+        for at in [0, size.saturating_sub(1)] {
+            if let Some(place) = content.get_mut(at) {
+                *place = byte;
+            }
+        }
+        let content = content.freeze();
+        self.ready = content.clone();
+        content
+    }
+}
+
+impl Running {
+    /// Does something in a task.
+    fn run<T: Send + 'static, F>(
+        &mut self,
+        work: impl FnOnce(Agent) -> F + Send + 'static,
+    ) -> Result<T, String>
+    where
+        F: Future<Output = (Agent, T)> + Send + 'static,
+    {
+        let agent = self.agent.take().ok_or("the agent is gone")?;
+        let task = self.runtime.spawn(async move { work(agent).await });
+        let (agent, done) = self.runtime.block_on(task).map_err(told)?;
+        self.agent = Some(agent);
+        Ok(done)
+    }
+}
+
+impl Peer for Running {
+    /// The runtime goes on meanwhile: an agent answers for itself at any time.
+    fn next_order(&mut self) -> Option<String> {
+        self.run(|mut agent| async move {
+            let line = agent.orders.next_line().await;
+            (agent, line)
+        })
+        .ok()?
+        .ok()?
+    }
+
+    fn find(&mut self, to: &str) -> Result<(), String> {
+        let to = to.to_owned();
+        self.run(|mut agent| async move {
+            let found = agent.find(&to).await;
+            (agent, found)
+        })?
+    }
+
+    fn receive(&mut self, letters: &Letters) -> Result<Vec<u64>, String> {
+        let letters = *letters;
+        self.run(move |mut agent| async move {
+            let received = agent.receive(&letters).await;
+            (agent, received)
+        })?
+    }
+
+    fn send(&mut self, letters: &Letters) -> Result<Sent, String> {
+        let letters = *letters;
+        self.run(move |mut agent| async move {
+            let sent = agent.send(&letters).await;
+            (agent, sent)
+        })?
+    }
+}
+
+/// A gateway, which only answers how much processor time it took.
+struct Forwarding {
+    orders: Lines<BufReader<Stdin>>,
+    runtime: Runtime,
+}
+
+impl Peer for Forwarding {
+    fn next_order(&mut self) -> Option<String> {
+        let Self { orders, runtime } = self;
+        runtime.block_on(orders.next_line()).ok().flatten()
+    }
+}
+
+pub(super) fn gateway(config: &Config) -> Result<(), String> {
+    let runtime = runtime()?;
+    let gateway = runtime.block_on(Gateway::open(config)).map_err(told)?;
+    let orders = runtime.block_on(async { orders() });
+    let mut forwarding = Forwarding { orders, runtime };
+    super::obey(&mut forwarding, String::new());
+    let runtime = forwarding.runtime;
+    runtime.block_on(gateway.close());
+    runtime.shutdown_background();
+    Ok(())
+}
+
+fn runtime() -> Result<Runtime, String> {
+    let runtime = Builder::new_current_thread().enable_all().build();
+    runtime.map_err(|error| format!("no runtime: {error}"))
+}
+
+fn orders() -> Lines<BufReader<Stdin>> {
+    BufReader::new(tokio::io::stdin()).lines()
+}
+
+fn delivered(result: Result<Deliveries, SendError>) -> Result<(), String> {
+    let deliveries = result.map_err(told)?;
+    if deliveries.all_succeeded() {
+        return Ok(());
+    }
+    Err(deliveries.to_string())
+}

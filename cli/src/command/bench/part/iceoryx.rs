@@ -1,0 +1,136 @@
+//! Bare iceoryx2: a request, and its response as the acknowledgement.
+
+use std::collections::VecDeque;
+use std::ffi::OsStr;
+use std::path::PathBuf;
+
+use fipa::Config;
+use fipa_transport::Incarnation;
+use fipa_transport_shm::ShmConfig;
+use fipa_transport_shm::raw::{RawClient, RawNode, RawPending, RawServer, Wait};
+
+use super::{End, Fill, Letters, Peer, Sent, byte_of, check, now_ns, told};
+
+/// The name of the service between the two.
+const NAME: &str = "raw";
+
+pub(super) fn play(config: &Config, end: End, wait: Wait) -> Result<(), String> {
+    let node = node(config)?;
+    match end {
+        End::Receiver => {
+            let server = node.serve(NAME).map_err(told)?;
+            super::obey(&mut Receiver { server, wait }, String::new());
+        }
+        End::Sender => {
+            let client = node.connect(NAME).map_err(told)?;
+            let ready = Vec::new();
+            let mut sender = Sender {
+                client,
+                wait,
+                ready,
+            };
+            super::obey(&mut sender, String::new());
+        }
+    }
+    Ok(())
+}
+
+/// A node in a place of its own below that of the measurement.
+pub(super) fn node(config: &Config) -> Result<RawNode, String> {
+    let place = std::env::var_os("FIPA_RUNTIME_DIR")
+        .filter(|place| place != OsStr::new(""))
+        .ok_or("a part needs FIPA_RUNTIME_DIR")?;
+    let root = PathBuf::from(place).join(format!("raw-{}", config.domain));
+    let shm = &config.transport.shm;
+    let config = ShmConfig {
+        capacity: shm.capacity,
+        // A mark that those of real domains have too.
+        ..ShmConfig::new(
+            root,
+            format!("fipa_{}_raw", config.domain),
+            Incarnation::random(),
+        )
+    };
+    RawNode::open(&config).map_err(told)
+}
+
+struct Receiver {
+    server: RawServer,
+    wait: Wait,
+}
+
+impl Peer for Receiver {
+    fn receive(&mut self, letters: &Letters) -> Result<Vec<u64>, String> {
+        let mut at = Vec::with_capacity(letters.count);
+        for number in 0..letters.count {
+            let request = self.server.receive(self.wait).map_err(told)?;
+            at.push(now_ns());
+            check(request.payload(), letters, number)?;
+            self.server.answer(request, self.wait).map_err(told)?;
+        }
+        Ok(at)
+    }
+}
+
+struct Sender<'a> {
+    client: RawClient<'a>,
+    wait: Wait,
+    ready: Vec<u8>,
+}
+
+impl Sender<'_> {
+    fn begin(
+        &mut self,
+        letters: &Letters,
+        number: usize,
+        sent: &mut Sent,
+    ) -> Result<RawPending, String> {
+        let byte = byte_of(number);
+        if letters.fill == Fill::Copied {
+            make_ready(&mut self.ready, letters.size, byte);
+        }
+        sent.began.push(now_ns());
+        let mut loan = self.client.loan(letters.size).map_err(told)?;
+        match letters.fill {
+            Fill::Loaned => {}
+            Fill::Filled => loan.content_mut().fill(byte),
+            Fill::Copied => loan.content_mut().copy_from_slice(&self.ready),
+        }
+        self.client.send(loan, self.wait).map_err(told)
+    }
+
+    fn end(&self, pending: &RawPending, sent: &mut Sent) -> Result<(), String> {
+        self.client.answered(pending, self.wait).map_err(told)?;
+        sent.ended.push(now_ns());
+        Ok(())
+    }
+}
+
+impl Peer for Sender<'_> {
+    fn send(&mut self, letters: &Letters) -> Result<Sent, String> {
+        let mut sent = Sent::with_room(letters);
+        let mut under_way = VecDeque::with_capacity(letters.window);
+        for number in 0..letters.count {
+            if under_way.len() >= letters.window
+                && let Some(first) = under_way.pop_front()
+            {
+                self.end(&first, &mut sent)?;
+            }
+            under_way.push_back(self.begin(letters, number, &mut sent)?);
+        }
+        for rest in under_way {
+            self.end(&rest, &mut sent)?;
+        }
+        Ok(sent)
+    }
+}
+
+/// Content that begins and ends with this byte.
+pub(super) fn make_ready(content: &mut Vec<u8>, size: usize, byte: u8) {
+    content.resize(size, 0);
+    for at in [0, size.saturating_sub(1)] {
+        if let Some(place) = content.get_mut(at) {
+            *place = byte;
+        }
+    }
+}

@@ -1,0 +1,248 @@
+//! Latency over size, both logarithmic, as an SVG picture.
+
+use std::collections::BTreeMap;
+
+use plotters::coord::ranged1d::{KeyPointHint, Ranged};
+use plotters::prelude::*;
+
+use super::measure::Row;
+use super::part::{Fill, Socket, Wait};
+use super::way::Sort;
+use fipa::Kind;
+
+const WIDTH: u32 = 960;
+const HEIGHT: u32 = 560;
+/// Room for the names at the right.
+const NAMES: u32 = 250;
+const INK: RGBColor = RGBColor(0x33, 0x3a, 0x44);
+const FAINT: RGBColor = RGBColor(0xdd, 0xe1, 0xe6);
+
+/// One line of the picture.
+struct Line {
+    name: String,
+    colour: RGBColor,
+    /// What is compared with is drawn thin.
+    is_limit: bool,
+    points: Vec<(f64, f64)>,
+}
+
+/// Draws what was measured. The picture is SVG text.
+pub(super) fn svg(rows: &[Row], subtitle: &str) -> Result<String, String> {
+    let lines = lines(rows);
+    if lines.is_empty() {
+        return Err("nothing was measured".to_owned());
+    }
+    let mut text = String::new();
+    draw(&lines, subtitle, &mut text).map_err(|error| error.to_string())?;
+    Ok(text)
+}
+
+/// What is worth a line: of shared memory what is loaned and what is filled, of the network what
+/// lies in the application's memory; spinning where that was measured.
+fn lines(rows: &[Row]) -> Vec<Line> {
+    let spinning = |sort: Sort| {
+        rows.iter()
+            .any(|row| row.sort == sort && row.wait == Wait::Spin)
+    };
+    let mut lines: BTreeMap<(usize, Fill), Line> = BTreeMap::new();
+    for row in rows {
+        let wanted = if row.sort.loans() {
+            row.fill != Fill::Copied && (row.wait == Wait::Spin || !spinning(row.sort))
+        } else {
+            row.fill == Fill::Filled
+        };
+        if !wanted {
+            continue;
+        }
+        let (order, colour) = look(row.sort, row.fill);
+        let name = match (row.sort.loans(), row.fill) {
+            (true, Fill::Loaned) => format!("{}, loaned", row.path),
+            (true, _) => format!("{}, filled", row.path),
+            (false, _) => row.path.clone(),
+        };
+        let line = lines.entry((order, row.fill)).or_insert_with(|| Line {
+            name,
+            colour,
+            is_limit: row.sort.limit().is_none(),
+            points: Vec::new(),
+        });
+        line.points.push((row.size as f64, row.one_way_us.p50));
+    }
+    let mut lines: Vec<Line> = lines.into_values().collect();
+    for line in &mut lines {
+        line.points.sort_by(|a, b| a.0.total_cmp(&b.0));
+    }
+    lines
+}
+
+/// The place among the lines, and the colour, which a way and what it is compared with share.
+fn look(sort: Sort, fill: Fill) -> (usize, RGBColor) {
+    let shm = match fill {
+        Fill::Loaned => RGBColor(0x0b, 0x7a, 0x75),
+        _ => RGBColor(0x1f, 0x6f, 0xd1),
+    };
+    match sort {
+        Sort::Agents(Kind::Shm) => (0, shm),
+        Sort::Iceoryx => (1, shm),
+        Sort::Agents(Kind::Tcp) => (2, RGBColor(0xc9, 0x5d, 0x12)),
+        Sort::Socket(Socket::Tcp) => (3, RGBColor(0xc9, 0x5d, 0x12)),
+        Sort::Agents(_) => (4, RGBColor(0x8a, 0x6d, 0x00)),
+        Sort::Socket(Socket::Udp) => (5, RGBColor(0x8a, 0x6d, 0x00)),
+        Sort::Socket(Socket::Unix) => (6, RGBColor(0x7a, 0x83, 0x8f)),
+        Sort::Gateways(Kind::Udp) => (7, RGBColor(0xb0, 0x3a, 0x7a)),
+        Sort::Gateways(_) => (8, RGBColor(0x7b, 0x3f, 0xb5)),
+        Sort::Relay => (9, RGBColor(0x7b, 0x3f, 0xb5)),
+    }
+}
+
+fn draw(
+    lines: &[Line],
+    subtitle: &str,
+    text: &mut String,
+) -> Result<(), Box<dyn std::error::Error>> {
+    let area = SVGBackend::with_string(text, (WIDTH, HEIGHT)).into_drawing_area();
+    area.fill(&WHITE)?;
+    let style = |size: u32, colour: &RGBColor| ("sans-serif", size).into_font().color(colour);
+    area.draw_text(
+        "One way, from sending to the decoded message (median)",
+        &style(20, &INK),
+        (24, 18),
+    )?;
+    area.draw_text(subtitle, &style(13, &INK), (24, 46))?;
+    let (_, plot) = area.split_vertically(64);
+    let (sizes, times) = (span(lines, |point| point.0), span(lines, |point| point.1));
+    let mut chart = ChartBuilder::on(&plot)
+        .margin_top(12)
+        .margin_right(NAMES)
+        .x_label_area_size(44)
+        .y_label_area_size(72)
+        .build_cartesian_2d(Decades::sizes(sizes), Decades::times(times))?;
+    chart
+        .configure_mesh()
+        .light_line_style(TRANSPARENT)
+        .bold_line_style(FAINT)
+        .axis_style(INK)
+        .label_style(style(13, &INK))
+        .x_desc("content")
+        .x_label_formatter(&|size| super::report::size(size.round() as usize))
+        .y_label_formatter(&|time| duration(*time))
+        .draw()?;
+    for line in lines {
+        let width = if line.is_limit { 1 } else { 3 };
+        let points = line.points.iter().copied();
+        chart.draw_series(LineSeries::new(points, line.colour.stroke_width(width)))?;
+        let dots = line.points.iter();
+        let size = if line.is_limit { 2 } else { 4 };
+        chart.draw_series(dots.map(|point| Circle::new(*point, size, line.colour.filled())))?;
+    }
+    for (line, height) in lines.iter().zip(heights(&chart, lines)) {
+        let Some(end) = line.points.last() else {
+            continue;
+        };
+        let (right, _) = chart.backend_coord(end);
+        let weight = if line.is_limit { 12 } else { 14 };
+        area.draw_text(
+            &line.name,
+            &style(weight, &line.colour),
+            (right + 12, height - 7),
+        )?;
+    }
+    drop(chart);
+    area.present()?;
+    Ok(())
+}
+
+/// Where the names go: beside the ends of the lines, one below the other.
+fn heights<DB: DrawingBackend>(
+    chart: &ChartContext<'_, DB, Cartesian2d<Decades, Decades>>,
+    lines: &[Line],
+) -> Vec<i32> {
+    const APART: i32 = 17;
+    let ends = lines.iter().map(|line| {
+        let end = line.points.last().copied().unwrap_or((1.0, 1.0));
+        chart.backend_coord(&end).1
+    });
+    let mut ends: Vec<(usize, i32)> = ends.enumerate().collect();
+    ends.sort_by_key(|(_, height)| *height);
+    let mut heights = vec![0; lines.len()];
+    let mut free = i32::MIN;
+    for (index, height) in ends {
+        let height = height.max(free);
+        if let Some(place) = heights.get_mut(index) {
+            *place = height;
+        }
+        free = height + APART;
+    }
+    heights
+}
+
+/// The smallest and the largest.
+fn span(lines: &[Line], of: impl Fn(&(f64, f64)) -> f64) -> (f64, f64) {
+    let values = lines.iter().flat_map(|line| line.points.iter().map(&of));
+    values.fold((f64::INFINITY, 0.0), |(least, most), value| {
+        (least.min(value), most.max(value))
+    })
+}
+
+fn duration(micros: f64) -> String {
+    match micros {
+        micros if micros >= 1e6 => format!("{} s", micros / 1e6),
+        micros if micros >= 1e3 => format!("{} ms", micros / 1e3),
+        micros => format!("{micros} µs"),
+    }
+}
+
+/// A logarithmic axis that is labelled at the sizes that were measured, or at powers of ten.
+struct Decades {
+    from: f64,
+    until: f64,
+    marks: Vec<f64>,
+}
+
+impl Decades {
+    fn sizes((least, most): (f64, f64)) -> Self {
+        let common = [100.0, 1024.0, 65_536.0, 1_048_576.0, 4_194_304.0];
+        let marks = common
+            .into_iter()
+            .filter(|mark| (least..=most).contains(mark));
+        Self {
+            from: least / 1.3,
+            until: most * 1.1,
+            marks: marks.collect(),
+        }
+    }
+
+    fn times((least, most): (f64, f64)) -> Self {
+        let from = least.log10().floor() as i32;
+        let until = most.log10().ceil() as i32;
+        Self {
+            from: 10f64.powi(from),
+            until: 10f64.powi(until.max(from + 1)),
+            marks: (from..=until).map(|power| 10f64.powi(power)).collect(),
+        }
+    }
+}
+
+impl Ranged for Decades {
+    type FormatOption = plotters::coord::ranged1d::NoDefaultFormatting;
+    type ValueType = f64;
+
+    fn map(&self, value: &f64, (low, high): (i32, i32)) -> i32 {
+        let share = (value.ln() - self.from.ln()) / (self.until.ln() - self.from.ln());
+        low + (f64::from(high - low) * share).round() as i32
+    }
+
+    fn key_points<Hint: KeyPointHint>(&self, _hint: Hint) -> Vec<f64> {
+        self.marks.clone()
+    }
+
+    fn range(&self) -> std::ops::Range<f64> {
+        self.from..self.until
+    }
+}
+
+impl plotters::coord::ranged1d::ValueFormatter<f64> for Decades {
+    fn format(value: &f64) -> String {
+        value.to_string()
+    }
+}

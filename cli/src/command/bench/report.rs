@@ -1,0 +1,148 @@
+//! What was measured, as a table and as JSON.
+
+use comfy_table::{CellAlignment, Table, presets};
+use serde_json::{Value, json};
+
+use super::machine::Machine;
+use super::measure::{Effort, Measured, Row, name_of};
+use super::part::Wait;
+
+/// The whole as JSON.
+pub(super) fn json(machine: &Machine, effort: &Effort, measured: &Measured) -> Value {
+    json!({
+        "machine": machine,
+        "method": {
+            "rounds": effort.rounds,
+            "letters_in_flight_for_rate": { "copied": 16, "loaned": 8, "filled": 8 },
+        },
+        "rows": measured.rows,
+        "notes": measured.notes,
+    })
+}
+
+/// The whole for people.
+pub(super) fn text(machine: &Machine, effort: &Effort, measured: &Measured) -> String {
+    let mut text = format!(
+        "{}, {} cores, {:.0} GiB, {}, fipa {}{}; others used {:.0} % of the processors before\n",
+        machine.processor,
+        machine.cores,
+        machine.memory_bytes as f64 / f64::from(1 << 30),
+        machine.system,
+        machine.fipa,
+        if machine.optimised {
+            ""
+        } else {
+            " without optimisation"
+        },
+        machine.busy * 100.0,
+    );
+    text.push_str(&format!(
+        "{} rounds, all ways in turns within each; sender and receiver on processors of their own \
+         where there are two; times in microseconds\n\n",
+        effort.rounds
+    ));
+    text.push_str(&table(&measured.rows).to_string());
+    text.push_str(LEGEND);
+    for note in &measured.notes {
+        text.push_str(&format!("note: {note}\n"));
+    }
+    text
+}
+
+const LEGEND: &str = "
+wait     spin: who waits looks again and again; block: it sleeps until it is woken
+content  loaned: memory loaned and not written; filled: loaned and written by the application, which
+         counts; copied: in the application's own memory
+one way  from before sending until the receiver has the decoded message; round trip: until the
+         sender knows that it has arrived; rate: with 16 letters under way (8 when loaned)
+cpu      of all processes of the way together, one letter at a time
+x limit  the one way, in units of the same bytes through the bare mechanism in the same rounds (the
+         middle half of the rounds), and the same of round trip, rate and cpu
+";
+
+fn table(rows: &[Row]) -> Table {
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING);
+    let head = [
+        "content",
+        "way",
+        "wait",
+        "n",
+        "p50",
+        "p99",
+        "p99.9",
+        "round trip",
+        "rate/s",
+        "cpu",
+        "x limit",
+        "(spread)",
+        "trip",
+        "rate",
+        "cpu",
+    ];
+    table.set_header(head);
+    for column in table.column_iter_mut().skip(3) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+    let mut last = String::new();
+    for row in rows {
+        let content = format!("{} {}", size(row.size), name_of(row.fill));
+        let shown = if content == last {
+            String::new()
+        } else {
+            content.clone()
+        };
+        last = content;
+        let times = |ratio: Option<f64>| ratio.map(|ratio| format!("{ratio:.2}"));
+        let spread = row
+            .ratio_spread
+            .map(|[low, high]| format!("{low:.2}-{high:.2}"));
+        let cells = [
+            shown,
+            row.path.clone(),
+            wait(row.wait).to_owned(),
+            row.samples.to_string(),
+            micro(row.one_way_us.p50),
+            micro(row.one_way_us.p99),
+            micro(row.one_way_us.p999),
+            micro(row.round_trip_us.p50),
+            row.rate_per_s
+                .map(|rate| format!("{rate:.0}"))
+                .unwrap_or_default(),
+            micro(row.cpu_us_per_letter),
+            times(row.ratio).unwrap_or_default(),
+            spread.unwrap_or_default(),
+            times(row.round_trip_ratio).unwrap_or_default(),
+            times(row.rate_ratio).unwrap_or_default(),
+            times(row.cpu_ratio).unwrap_or_default(),
+        ];
+        table.add_row(cells);
+    }
+    table
+}
+
+fn micro(time: f64) -> String {
+    match time {
+        time if time < 10.0 => format!("{time:.2}"),
+        time if time < 100.0 => format!("{time:.1}"),
+        time => format!("{time:.0}"),
+    }
+}
+
+pub(super) fn wait(wait: Wait) -> &'static str {
+    match wait {
+        Wait::Spin => "spin",
+        Wait::Block => "block",
+    }
+}
+
+/// A size as it is said.
+pub(super) fn size(bytes: usize) -> String {
+    const KIB: usize = 1 << 10;
+    const MIB: usize = 1 << 20;
+    match bytes {
+        bytes if bytes >= MIB && bytes.is_multiple_of(MIB) => format!("{} MB", bytes / MIB),
+        bytes if bytes >= KIB && bytes.is_multiple_of(KIB) => format!("{} KB", bytes / KIB),
+        bytes => format!("{bytes} B"),
+    }
+}

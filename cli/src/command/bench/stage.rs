@@ -1,0 +1,192 @@
+//! The processes of a measurement: started, spoken with, ended, and nothing of them left behind.
+
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::{Duration, Instant};
+
+use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, Lines};
+use tokio::process::{Child, ChildStdin, ChildStdout, Command};
+
+use super::part::{End, Event, Order, Part};
+
+/// How long something may take that usually takes less than a second.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// How long a process may take to end when it was told to.
+const ENDING: Duration = Duration::from_secs(5);
+
+/// All processes of a measurement, and the place where they meet, away from this user's domains.
+///
+/// When it is dropped, everybody is ended and all traces are removed: also when the measurement
+/// was interrupted.
+pub(super) struct Stage {
+    program: PathBuf,
+    place: PathBuf,
+    processes: Vec<Process>,
+    /// The processors that this process may use.
+    cores: Vec<usize>,
+}
+
+/// A process on stage.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Who(usize);
+
+struct Process {
+    name: String,
+    child: Child,
+    orders: Option<ChildStdin>,
+    events: Lines<BufReader<ChildStdout>>,
+}
+
+impl Stage {
+    pub(super) fn new() -> Result<Self, String> {
+        let program = std::env::current_exe().map_err(|error| error.to_string())?;
+        let place = std::env::temp_dir().join(format!("fipa-bench-{}", std::process::id()));
+        let mut private = std::fs::DirBuilder::new();
+        std::os::unix::fs::DirBuilderExt::mode(&mut private, 0o700);
+        let made = private.create(&place);
+        made.map_err(|error| format!("cannot make {}: {error}", place.display()))?;
+        Ok(Self {
+            program,
+            place,
+            processes: Vec::new(),
+            cores: super::machine::cores(),
+        })
+    }
+
+    /// The name of one of the measurement's domains.
+    pub(super) fn domain(which: &str) -> String {
+        format!("bench-{}-{which}", std::process::id())
+    }
+
+    /// Starts a process and waits until it is there. Returns its address too.
+    pub(super) async fn start(
+        &mut self,
+        part: &Part,
+        domain: &str,
+        settings: &[String],
+    ) -> Result<(Who, String), String> {
+        let core = part.end().and_then(|end| self.core_of(end));
+        let described = serde_json::to_string(part).map_err(|error| error.to_string())?;
+        let mut command = Command::new(&self.program);
+        command
+            .args(["bench", "--part", &described])
+            .args(["--set", &format!("domain={}", Self::domain(domain))])
+            // Nothing leaves this machine.
+            .args(["--set", "discovery.interfaces=lo"])
+            .args(["--set", "transport.tcp.listen=127.0.0.1:0"])
+            .args(["--set", "transport.udp.listen=127.0.0.1:0"]);
+        if let Some(core) = core {
+            command.args(["--core", &core.to_string()]);
+        }
+        for setting in settings {
+            command.args(["--set", setting]);
+        }
+        let mut child = command
+            .env("FIPA_RUNTIME_DIR", &self.place)
+            .env_remove("FIPA_CONFIG")
+            .env_remove("HOME")
+            .current_dir("/")
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            // A Ctrl-C is for the measurement, which ends its parts in order.
+            .process_group(0)
+            .kill_on_drop(true)
+            .spawn()
+            .map_err(|error| format!("cannot start {}: {error}", self.program.display()))?;
+        let orders = child.stdin.take();
+        let stdout = child.stdout.take();
+        let stdout = stdout.ok_or("a process without standard output")?;
+        let who = Who(self.processes.len());
+        self.processes.push(Process {
+            name: format!("{part:?} in {domain}"),
+            child,
+            orders,
+            events: BufReader::new(stdout).lines(),
+        });
+        match self.event(who).await? {
+            Event::Ready { address } => Ok((who, address)),
+            other => Err(format!("a process began with {other:?}")),
+        }
+    }
+
+    /// The processor of an end, where there are enough.
+    fn core_of(&self, end: End) -> Option<usize> {
+        match (self.cores.as_slice(), end) {
+            ([sender, _, ..], End::Sender) => Some(*sender),
+            ([_, receiver, ..], End::Receiver) => Some(*receiver),
+            _ => None,
+        }
+    }
+
+    /// Tells a process to do something. What comes of it is the next event.
+    pub(super) async fn tell(&mut self, who: Who, order: &Order) -> Result<(), String> {
+        let process = self.process(who)?;
+        let mut line = serde_json::to_string(order).map_err(|error| error.to_string())?;
+        line.push('\n');
+        let orders = process.orders.as_mut().ok_or("it was told to end")?;
+        let written = orders.write_all(line.as_bytes()).await;
+        written.map_err(|error| format!("{}: {error}", process.name))
+    }
+
+    /// What a process says next.
+    pub(super) async fn event(&mut self, who: Who) -> Result<Event, String> {
+        let process = self.process(who)?;
+        let name = &process.name;
+        let line = tokio::time::timeout(PATIENCE, process.events.next_line()).await;
+        let line = line.map_err(|_| format!("{name} said nothing for {PATIENCE:?}"))?;
+        let line = line.map_err(|error| format!("{name}: {error}"))?;
+        let line = line.ok_or_else(|| format!("{name} ended unexpectedly"))?;
+        match serde_json::from_str(&line) {
+            Ok(Event::Failed { what }) => Err(what),
+            Ok(event) => Ok(event),
+            Err(error) => Err(format!("{name} said {line:?}: {error}")),
+        }
+    }
+
+    fn process(&mut self, who: Who) -> Result<&mut Process, String> {
+        let process = self.processes.get_mut(who.0);
+        process.ok_or_else(|| "nobody of this number is on stage".to_owned())
+    }
+
+    /// The measurement's shared memory.
+    fn shared_memory() -> impl Iterator<Item = PathBuf> {
+        let mark = format!("fipa_bench-{}-", std::process::id());
+        let files = std::fs::read_dir("/dev/shm");
+        let files = files.into_iter().flatten().flatten();
+        let ours = files.filter(move |file| file.file_name().to_string_lossy().starts_with(&mark));
+        ours.map(|file| file.path())
+    }
+}
+
+impl Drop for Stage {
+    fn drop(&mut self) {
+        for process in &mut self.processes {
+            process.orders = None;
+        }
+        let until = Instant::now() + ENDING;
+        for process in &mut self.processes {
+            while matches!(process.child.try_wait(), Ok(None)) && Instant::now() < until {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        }
+        for process in &mut self.processes {
+            let _ended_already = process.child.start_kill();
+        }
+        for process in &mut self.processes {
+            while matches!(process.child.try_wait(), Ok(None)) {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        }
+        for file in Self::shared_memory() {
+            let _ = std::fs::remove_file(file);
+        }
+        remove(&self.place);
+    }
+}
+
+fn remove(place: &Path) {
+    if let Err(error) = std::fs::remove_dir_all(place) {
+        tracing::warn!(%error, place = %place.display(), "left behind");
+    }
+}

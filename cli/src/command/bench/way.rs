@@ -1,0 +1,276 @@
+//! The ways that are measured, and what each of them is compared with.
+
+use fipa::Kind;
+
+use super::part::{End, Event, Fill, Letters, Order, Part, Socket, Wait};
+use super::stage::{Stage, Who};
+
+/// What letters go through.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Sort {
+    /// Two agents on one host.
+    Agents(Kind),
+    /// Two agents on two hosts, and a gateway on each.
+    Gateways(Kind),
+    /// Bare iceoryx2.
+    Iceoryx,
+    /// A bare socket.
+    Socket(Socket),
+    /// Bare iceoryx2, then bare TCP, then bare iceoryx2.
+    Relay,
+}
+
+impl Sort {
+    /// What this is compared with: the least that moving the bytes so can cost.
+    pub(super) fn limit(self) -> Option<Self> {
+        match self {
+            Self::Agents(Kind::Shm) => Some(Self::Iceoryx),
+            Self::Agents(Kind::Udp) => Some(Self::Socket(Socket::Udp)),
+            Self::Agents(_) => Some(Self::Socket(Socket::Tcp)),
+            Self::Gateways(_) => Some(Self::Relay),
+            Self::Iceoryx | Self::Socket(_) | Self::Relay => None,
+        }
+    }
+
+    pub(super) fn name(self) -> String {
+        match self {
+            Self::Agents(kind) => kind.to_string(),
+            Self::Gateways(kind) => format!("gateways {kind}"),
+            Self::Iceoryx => "raw iceoryx2".to_owned(),
+            Self::Socket(Socket::Tcp) => "raw tcp".to_owned(),
+            Self::Socket(Socket::Unix) => "raw unix socket".to_owned(),
+            Self::Socket(Socket::Udp) => "raw udp".to_owned(),
+            Self::Relay => "raw relay".to_owned(),
+        }
+    }
+
+    /// Whether there is memory to loan, which makes a difference between filling it and not.
+    pub(super) fn loans(self) -> bool {
+        matches!(self, Self::Agents(Kind::Shm) | Self::Iceoryx)
+    }
+
+    /// What may be too large is tried before.
+    fn is_ours(self) -> bool {
+        matches!(self, Self::Agents(_) | Self::Gateways(_))
+    }
+
+    /// The largest content, where that is known.
+    fn most(self) -> usize {
+        match self {
+            // A datagram, less headers and number.
+            Self::Socket(Socket::Udp) => 65_507 - 8,
+            _ => usize::MAX,
+        }
+    }
+
+    /// How many letters are under way when throughput is measured; none where that needs a
+    /// protocol.
+    pub(super) fn window(self, fill: Fill) -> Option<usize> {
+        match self {
+            Self::Socket(Socket::Udp) => None,
+            // As many loans as a process may have.
+            _ if fill != Fill::Copied => Some(8),
+            _ => Some(16),
+        }
+    }
+}
+
+/// One way, ready to be used.
+#[derive(Debug)]
+pub(super) struct Way {
+    pub(super) sort: Sort,
+    pub(super) wait: Wait,
+    sender: Who,
+    receiver: Who,
+    between: Vec<Who>,
+}
+
+/// One turn of a way.
+#[derive(Debug)]
+pub(super) struct Turn {
+    /// When each letter was begun, was there, and was known to be there.
+    pub(super) began: Vec<u64>,
+    pub(super) arrived: Vec<u64>,
+    pub(super) ended: Vec<u64>,
+    /// Of all processes together.
+    pub(super) cpu_ns: u64,
+}
+
+impl Way {
+    /// Starts the processes of a way.
+    pub(super) async fn open(stage: &mut Stage, sort: Sort, wait: Wait) -> Result<Self, String> {
+        let ends = [End::Sender, End::Receiver];
+        let own = |part: &str| format!("{}{part}", short(sort, wait));
+        let spin = match wait {
+            Wait::Spin => "transport.shm.spin=1s",
+            Wait::Block => "transport.shm.spin=0s",
+        };
+        let settings = |transports: &str| {
+            vec![
+                spin.to_owned(),
+                format!("mts.transports={transports}"),
+                "transport.shm.capacity=1GiB".to_owned(),
+            ]
+        };
+        let agents = |[from, to]: [String; 2]| {
+            let agent = |end, name| Part::Agent { end, name };
+            (agent(End::Sender, from), agent(End::Receiver, to))
+        };
+        let mut between = Vec::new();
+        let (sender, receiver, address) = match sort {
+            Sort::Agents(kind) => {
+                let settings = settings(kind.name());
+                let (from, to) = agents(["a", "b"].map(str::to_owned));
+                let (receiver, name) = stage.start(&to, &own(""), &settings).await?;
+                let (sender, _) = stage.start(&from, &own(""), &settings).await?;
+                (sender, receiver, Some(name))
+            }
+            Sort::Gateways(kind) => {
+                let settings = settings(&format!("shm,{kind}"));
+                for host in ["1", "2"] {
+                    let mut settings = settings.clone();
+                    settings.push(format!("mts.name={}", Stage::domain(&own(host))));
+                    let domain = own(host);
+                    let (who, _) = stage.start(&Part::Gateway, &domain, &settings).await?;
+                    between.push(who);
+                }
+                // Other measurements on this machine can be heard of.
+                let (from, to) = agents(["-a", "-b"].map(|end| Stage::domain(&own(end))));
+                let (receiver, name) = stage.start(&to, &own("2"), &settings).await?;
+                let (sender, _) = stage.start(&from, &own("1"), &settings).await?;
+                (sender, receiver, Some(name))
+            }
+            Sort::Iceoryx => {
+                let settings = settings("shm");
+                let [from, to] = ends.map(|end| Part::Iceoryx { end, wait });
+                let (receiver, _) = stage.start(&to, &own(""), &settings).await?;
+                let (sender, _) = stage.start(&from, &own(""), &settings).await?;
+                (sender, receiver, None)
+            }
+            Sort::Socket(kind) => {
+                let [from, to] = ends.map(|end| Part::Socket { end, kind });
+                let (receiver, address) = stage.start(&to, "raw", &[]).await?;
+                let (sender, _) = stage.start(&from, "raw", &[]).await?;
+                (sender, receiver, Some(address))
+            }
+            Sort::Relay => {
+                let settings = settings("shm");
+                let [from, to] = ends.map(|end| Part::Iceoryx { end, wait });
+                let [near, far] = ends.map(|end| Part::Relay { end });
+                let (receiver, _) = stage.start(&to, &own("2"), &settings).await?;
+                let (far, address) = stage.start(&far, &own("2"), &settings).await?;
+                let (near, _) = stage.start(&near, &own("1"), &settings).await?;
+                let (sender, _) = stage.start(&from, &own("1"), &settings).await?;
+                find(stage, near, address).await?;
+                between.extend([near, far]);
+                (sender, receiver, None)
+            }
+        };
+        if let Some(address) = address {
+            find(stage, sender, address).await?;
+        }
+        Ok(Self {
+            sort,
+            wait,
+            sender,
+            receiver,
+            between,
+        })
+    }
+
+    /// Whether letters of this size go this way; if not, why.
+    pub(super) async fn takes(&self, stage: &mut Stage, size: usize) -> Result<(), String> {
+        if size > self.sort.most() {
+            return Err("too large".to_owned());
+        }
+        if !self.sort.is_ours() {
+            return Ok(());
+        }
+        // An agent's queue takes the letter whether it is being received or not.
+        let one = Letters {
+            count: 1,
+            size,
+            fill: Fill::Copied,
+            window: 1,
+        };
+        stage.tell(self.sender, &Order::Send(one)).await?;
+        stage.event(self.sender).await?;
+        stage.tell(self.receiver, &Order::Receive(one)).await?;
+        stage.event(self.receiver).await?;
+        stage.event(self.receiver).await?;
+        Ok(())
+    }
+
+    /// Sends letters this way.
+    pub(super) async fn turn(&self, stage: &mut Stage, letters: Letters) -> Result<Turn, String> {
+        let before = self.cpu(stage).await?;
+        stage.tell(self.receiver, &Order::Receive(letters)).await?;
+        let Event::Receiving = stage.event(self.receiver).await? else {
+            return Err("the receiver does something else".to_owned());
+        };
+        stage.tell(self.sender, &Order::Send(letters)).await?;
+        let sent = stage.event(self.sender).await?;
+        let received = stage.event(self.receiver).await?;
+        let between = self.cpu(stage).await? - before;
+        let (
+            Event::Sent {
+                began,
+                ended,
+                cpu_ns: sending,
+            },
+            Event::Received {
+                at: arrived,
+                cpu_ns: receiving,
+            },
+        ) = (sent, received)
+        else {
+            return Err("the two ends did something else".to_owned());
+        };
+        let all = [began.len(), ended.len(), arrived.len()];
+        if all != [letters.count; 3] {
+            return Err(format!("of {} letters there were {all:?}", letters.count));
+        }
+        Ok(Turn {
+            began,
+            arrived,
+            ended,
+            cpu_ns: sending + receiving + between,
+        })
+    }
+
+    /// What the processes in between have used so far.
+    async fn cpu(&self, stage: &mut Stage) -> Result<u64, String> {
+        let mut all = 0;
+        for who in &self.between {
+            stage.tell(*who, &Order::Cpu).await?;
+            match stage.event(*who).await? {
+                Event::Cpu { ns } => all += ns,
+                other => return Err(format!("instead of a time there was {other:?}")),
+            }
+        }
+        Ok(all)
+    }
+}
+
+async fn find(stage: &mut Stage, who: Who, to: String) -> Result<(), String> {
+    stage.tell(who, &Order::Find { to }).await?;
+    match stage.event(who).await? {
+        Event::Found => Ok(()),
+        other => Err(format!("instead of an end there was {other:?}")),
+    }
+}
+
+/// A few letters that tell ways apart, for names of domains.
+fn short(sort: Sort, wait: Wait) -> String {
+    let wait = match wait {
+        Wait::Spin => 's',
+        Wait::Block => 'b',
+    };
+    match sort {
+        Sort::Agents(kind) => format!("{kind}{wait}"),
+        Sort::Gateways(kind) => format!("g{kind}{wait}"),
+        Sort::Iceoryx => format!("ice{wait}"),
+        Sort::Socket(_) => "raw".to_owned(),
+        Sort::Relay => format!("rel{wait}"),
+    }
+}

@@ -1,0 +1,138 @@
+//! The measurement, as a stranger runs it, and interrupted. Nothing here is about times.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use serde_json::Value;
+
+fn bench(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_fipa"));
+    command
+        .arg("bench")
+        .args(arguments)
+        .stdin(Stdio::null())
+        .env_remove("FIPA_CONFIG")
+        .current_dir("/");
+    command
+}
+
+/// What a measurement has in the file system, by the number of its process.
+fn traces(pid: u32) -> Vec<String> {
+    let places = ["/dev/shm".into(), std::env::temp_dir()];
+    let names = places.iter().flat_map(|place| {
+        let files = std::fs::read_dir(place).unwrap();
+        files.map(|file| file.unwrap().file_name().to_string_lossy().into_owned())
+    });
+    names
+        .filter(|name| name.contains(&format!("bench-{pid}")))
+        .collect()
+}
+
+/// The processes that a measurement has started.
+fn parts(pid: u32) -> usize {
+    let mark = format!("domain=bench-{pid}-");
+    let processes = std::fs::read_dir("/proc").unwrap().flatten();
+    let lines = processes.map(|process| std::fs::read(process.path().join("cmdline")));
+    let lines = lines.flatten();
+    lines
+        .filter(|line| String::from_utf8_lossy(line).contains(&mark))
+        .count()
+}
+
+fn number(value: &Value) -> f64 {
+    value
+        .as_f64()
+        .unwrap_or_else(|| panic!("{value} is no number"))
+}
+
+#[test]
+fn every_way_is_measured_beside_its_limit() {
+    let picture = tempfile::tempdir().unwrap();
+    let picture = picture.path().join("latency.svg");
+    let child = bench(&["--quick", "--json", "--sizes", "100B,20KiB", "--svg"])
+        .arg(&picture)
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let pid = child.id();
+    let output = child.wait_with_output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert!(number(&report["machine"]["cores"]) >= 1.0);
+    let rows = report["rows"].as_array().unwrap();
+    for row in rows {
+        let time = |key: &str, at: &str| number(&row[key][at]);
+        for key in ["one_way_us", "round_trip_us"] {
+            let [p50, p99, p999] = ["p50", "p99", "p999"].map(|at| time(key, at));
+            assert!(0.0 < p50 && p50 <= p99 && p99 <= p999, "{row:#}");
+        }
+        assert!(number(&row["samples"]) >= 8.0, "{row:#}");
+        assert!(number(&row["cpu_us_per_letter"]) > 0.0, "{row:#}");
+        let is_limit = row["path"].as_str().unwrap().starts_with("raw ");
+        assert_eq!(is_limit, row["limit"].is_null(), "{row:#}");
+        if !is_limit {
+            assert!(number(&row["ratio"]) > 0.0, "{row:#}");
+            assert!(number(&row["limit"]["p50_us"]) > 0.0, "{row:#}");
+            assert!(number(&row["rate_per_s"]) > 0.0, "{row:#}");
+        }
+    }
+    let measured = |path: &str, wait: &str, size: u64, fill: &str| {
+        rows.iter().any(|row| {
+            row["path"] == path && row["wait"] == wait && row["size"] == size && row["fill"] == fill
+        })
+    };
+    for size in [100, 20 << 10] {
+        for fill in ["loaned", "filled", "copied"] {
+            assert!(measured("shm", "spin", size, fill), "{report:#}");
+            assert!(measured("shm", "block", size, fill), "{report:#}");
+        }
+        assert!(measured("tcp", "block", size, "copied"), "{report:#}");
+        assert!(
+            measured("gateways tcp", "block", size, "copied"),
+            "{report:#}"
+        );
+        assert!(
+            measured("raw unix socket", "block", size, "copied"),
+            "{report:#}"
+        );
+    }
+    let drawn = std::fs::read_to_string(&picture).unwrap();
+    assert!(drawn.starts_with("<svg") && drawn.contains("raw iceoryx2"));
+    assert_eq!(traces(pid), Vec::<String>::new());
+    assert_eq!(parts(pid), 0);
+}
+
+#[test]
+fn an_interrupted_measurement_leaves_nothing_behind() {
+    let mut child = bench(&["shm"])
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let pid = child.id();
+    // Bare iceoryx2 is among the last that are started.
+    while parts(pid) < 6 {
+        assert!(child.try_wait().unwrap().is_none(), "it ended early");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let interrupted = Command::new("kill")
+        .args(["-INT", &pid.to_string()])
+        .status()
+        .unwrap();
+    assert!(interrupted.success());
+    assert_eq!(child.wait().unwrap().code(), Some(1));
+    assert_eq!(traces(pid), Vec::<String>::new());
+    assert_eq!(parts(pid), 0);
+}
+
+#[test]
+fn what_cannot_be_measured_is_wrong_usage() {
+    let output = bench(&["shm", "--sizes", "1GiB"]).output().unwrap();
+    assert_eq!(output.status.code(), Some(2));
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains("--sizes"), "{said}");
+}
