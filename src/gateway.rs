@@ -3,25 +3,27 @@
 //! host is announced to the network, what is announced there is told to the processes here.
 
 mod clerk;
+mod exchange;
 mod neighbours;
+mod publisher;
 
-use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
 
 use fipa_mts::Contacts;
 use fipa_mts::core::Peer;
 use fipa_sds::{
-    ContactDirectory, Directory, Entry, HostDirectory, MergedDirectory, Reach, RegisterError,
-    Registration, Role as EntryRole,
+    ContactDirectory, Directory, MergedDirectory, RegisterError, Registration, Role as EntryRole,
 };
-use fipa_transport::{Incarnation, Introduction, Kind, Location};
+use fipa_transport::{Incarnation, Introduction, Location};
 use parking_lot::Mutex;
 use tokio::task::JoinHandle;
 
 use self::clerk::Clerk;
+use self::exchange::{Exchanging, Means};
 pub use self::neighbours::Neighbour;
 use self::neighbours::{Neighbours, View};
+use self::publisher::{Keeper, Publisher};
 use crate::domain::OpenError;
 use crate::service::{Role, Service};
 use crate::{AgentId, Config};
@@ -32,6 +34,7 @@ pub struct Gateway {
     network: Option<Arc<dyn Network>>,
     view: Arc<dyn Directory>,
     neighbours: Arc<Neighbours>,
+    exchange: Arc<Exchanging>,
     tasks: Vec<JoinHandle<()>>,
 }
 
@@ -44,6 +47,7 @@ impl Gateway {
     /// the domain has a gateway already.
     pub async fn open(config: &Config) -> Result<Self, OpenError> {
         let contacts = Arc::new(Acquaintances::default());
+        let exchange = Arc::new(Exchanging::new(Incarnation::random().as_u64()));
         let made = Mutex::new(None);
         let service = Service::start(
             config,
@@ -54,20 +58,22 @@ impl Gateway {
                 contacts: Some(Arc::clone(&contacts) as Arc<dyn Contacts>),
                 view: &|host, mts| {
                     let network = network(config, mts)?;
+                    let told = exchange.directory() as Arc<dyn Directory>;
                     let there = network.clone().map(Network::directory);
+                    let known = there.into_iter().chain([told]).collect();
+                    let known = Arc::new(MergedDirectory::new(known));
                     let heard = Arc::clone(&contacts.directory) as Arc<dyn Directory>;
-                    let all = [Some(host as Arc<dyn Directory>), there, Some(heard)];
-                    let all = all.into_iter().flatten().collect();
+                    let beyond = Arc::clone(&known) as Arc<dyn Directory>;
                     let view: Arc<dyn Directory> = Arc::new(View {
-                        all: MergedDirectory::new(all),
+                        all: MergedDirectory::new(vec![host, beyond, heard]),
                         neighbours: Arc::clone(&contacts.neighbours),
                     });
-                    *made.lock() = Some((network, Arc::clone(&view)));
+                    *made.lock() = Some((network, known, Arc::clone(&view)));
                     Ok(view)
                 },
             },
         )?;
-        let Some((network, view)) = made.into_inner() else {
+        let Some((network, known, view)) = made.into_inner() else {
             return Err(OpenError::NoRuntime);
         };
         let mut gateway = Self {
@@ -75,6 +81,7 @@ impl Gateway {
             network,
             view,
             neighbours: Arc::clone(&contacts.neighbours),
+            exchange,
             tasks: Vec::new(),
         };
         // The queue first: once the name is known, letters come.
@@ -88,36 +95,46 @@ impl Gateway {
         let publisher = Arc::new(Publisher {
             host: Arc::clone(&gateway.service.host),
             network: gateway.network.clone().map(Network::directory),
+            known,
             contacts: Arc::clone(&contacts.directory),
             locations: gateway.service.locations.clone(),
         });
         // From now on, who writes becomes known on this host before its letter arrives there.
         *contacts.publisher.lock() = Some(Arc::clone(&publisher));
-        let exchange = Exchange {
-            publisher,
-            announced: HashMap::new(),
-        };
-        gateway.tasks.push(tokio::spawn(exchange.run()));
+        let keeper = Keeper::new(publisher);
+        gateway.tasks.push(tokio::spawn(keeper.run()));
         gateway.open_for_letters(config)?;
         Ok(gateway)
     }
 
-    /// From now on the gateway answers letters, and keeps in touch with its static peers.
+    /// From now on the gateway answers letters, exchanges its directory with neighbours and keeps
+    /// in touch with its static peers.
     fn open_for_letters(&mut self, config: &Config) -> Result<(), OpenError> {
-        let own = &self.service.own;
-        let id = AgentId::new(&*own.name)
-            .map_err(|error| OpenError::Name(RegisterError::Failed(Arc::new(error))))?;
+        let means = self.means()?;
         let clerk = Clerk {
             service: Arc::clone(&self.service),
-            id,
+            id: means.id.clone(),
             neighbours: Arc::clone(&self.neighbours),
             view: Arc::clone(&self.view),
+            exchange: Arc::clone(&self.exchange),
         };
         self.tasks.push(tokio::spawn(clerk.run()));
+        let exchange = Arc::clone(&self.exchange);
+        self.tasks.push(tokio::spawn(exchange.run(means)));
         let peers = peers(config);
         self.neighbours.name_peers(peers.clone());
         self.service.mts.keep_in_touch(peers);
         Ok(())
+    }
+
+    fn means(&self) -> Result<Means, OpenError> {
+        let id = AgentId::new(&*self.service.own.name)
+            .map_err(|error| OpenError::Name(RegisterError::Failed(Arc::new(error))))?;
+        Ok(Means {
+            service: Arc::clone(&self.service),
+            id,
+            neighbours: Arc::clone(&self.neighbours),
+        })
     }
 
     /// Registers the gateway itself, so that the processes of this host find it.
@@ -193,6 +210,9 @@ impl Gateway {
     pub async fn close(mut self) {
         for task in self.tasks.drain(..) {
             task.abort();
+        }
+        if let Ok(means) = self.means() {
+            self.exchange.goodbye(&means).await;
         }
         if let Some(network) = self.network.take() {
             // Blocks for as long as it takes to say goodbye.
@@ -307,113 +327,5 @@ impl Contacts for Acquaintances {
 
     fn parted(&self, peer: &Introduction) {
         self.neighbours.parted(peer);
-    }
-}
-
-/// Tells the processes of this host who is on others, as reachable through this gateway.
-struct Publisher {
-    host: Arc<HostDirectory>,
-    network: Option<Arc<dyn Directory>>,
-    contacts: Arc<ContactDirectory>,
-    /// Where this gateway takes letters: the locations of all that it stands for.
-    locations: Vec<Location>,
-}
-
-impl Publisher {
-    fn publish(&self) {
-        let announced = self.network.as_ref().map(|network| network.entries());
-        let heard = self.contacts.entries();
-        let known = announced.iter().flat_map(|entries| entries.iter());
-        // The later of one name counts: what is announced, before what was heard.
-        let all = heard
-            .iter()
-            .chain(known)
-            .filter(|entry| entry.role == EntryRole::Agent);
-        let through_here = all.map(|entry| Entry {
-            locations: self.locations.clone(),
-            ..Entry::clone(entry)
-        });
-        if let Err(error) = self.host.publish_remote(through_here.collect()) {
-            tracing::warn!(%error, "the processes of this host are not told of all other hosts");
-        }
-    }
-}
-
-/// Keeps the two directories in step.
-struct Exchange {
-    publisher: Arc<Publisher>,
-    announced: HashMap<Arc<str>, Arc<Entry>>,
-}
-
-impl Exchange {
-    async fn run(mut self) {
-        let publisher = Arc::clone(&self.publisher);
-        let network: Arc<dyn Directory> = match &publisher.network {
-            Some(network) => Arc::clone(network),
-            // Nobody is there, and nobody comes.
-            None => Arc::new(ContactDirectory::new()),
-        };
-        let (mut here, mut there) = (publisher.host.watch(), network.watch());
-        let mut forgetting = tokio::time::interval(ContactDirectory::MEMORY / 4);
-        loop {
-            if let Some(network) = &publisher.network {
-                self.announce(&**network);
-            }
-            publisher
-                .contacts
-                .forget(Instant::now(), |entry| network.known(&entry.name).is_some());
-            publisher.publish();
-            let goes_on = tokio::select! {
-                change = here.next() => change.is_some(),
-                change = there.next() => change.is_some(),
-                _ = forgetting.tick() => true,
-            };
-            if !goes_on {
-                return;
-            }
-            // Many changes that came together are one.
-            while here.try_next().is_some() || there.try_next().is_some() {}
-        }
-    }
-
-    /// Announces what has joined on this host, and takes back what has left.
-    fn announce(&mut self, network: &dyn Directory) {
-        let entries = self.publisher.host.entries();
-        let mine: HashMap<Arc<str>, &Arc<Entry>> = entries
-            .iter()
-            .filter(|entry| entry.reach == Reach::Local && entry.role == EntryRole::Agent)
-            .map(|entry| (Arc::clone(&entry.name), entry))
-            .collect();
-        self.announced.retain(|name, entry| {
-            let stays = mine.get(name).is_some_and(|now| ***now == **entry);
-            if !stays && let Err(error) = network.deregister(name, entry.incarnation) {
-                tracing::debug!(%name, %error, "was not announced any more");
-            }
-            stays
-        });
-        let locations = self.publisher.locations.iter();
-        let locations: Vec<Location> = locations
-            .filter(|location| location.kind() != Kind::Shm)
-            .cloned()
-            .collect();
-        for (name, entry) in mine {
-            if self.announced.contains_key(&name) {
-                continue;
-            }
-            let registration = Registration {
-                agent_type: entry.agent_type.clone(),
-                description: entry.description.clone(),
-                registered: entry.registered,
-                ..Registration::new(Arc::clone(&name), entry.incarnation, locations.clone())
-            };
-            match network.register(registration) {
-                Ok(_) => {
-                    self.announced.insert(name, Arc::clone(entry));
-                }
-                Err(error) => {
-                    tracing::warn!(%name, %error, "an agent is not announced to other hosts");
-                }
-            }
-        }
     }
 }

@@ -53,7 +53,7 @@ pub use fipa_acl::{
 };
 pub use fipa_sds::{
     Change, Directory, Entry, Matcher, Pattern, PatternError, Query, Reach, RegisterError, Role,
-    Watch, is_pattern,
+    Source, Watch, is_pattern,
 };
 pub use fipa_transport::{
     Attempt, FailureReason, Incarnation, Kind, ListenError, Location, Outcome,

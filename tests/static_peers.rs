@@ -102,3 +102,51 @@ async fn the_gateway_says_what_it_does_not_understand() {
     assert_eq!(answer.in_reply_to(), Some("1"));
     assert_eq!(answer.sender().unwrap().name(), gateway.name());
 }
+
+/// The agents of the other host that a process of this one sees.
+fn seen(domain: &Domain, name: &str) -> Option<std::sync::Arc<fipa::Entry>> {
+    let found = domain.directory().known(name)?;
+    matches!(found.reach, fipa::Reach::Remote { .. }).then_some(found)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn one_static_peer_is_enough_to_learn_each_others_agents() {
+    let far_config = config(&[]);
+    let far = Gateway::open(&far_config).await.unwrap();
+    let far_host = Domain::open(&far_config).await.unwrap();
+    let arm = far_host.register("arm").unwrap();
+    // Only one of them knows the other's address.
+    let near_config = config(&[knowing("far", &[&address(&far)])]);
+    let near = Gateway::open(&near_config).await.unwrap();
+    let near_host = Domain::open(&near_config).await.unwrap();
+    let rover = near_host.register("rover").unwrap();
+
+    until("the arm is known", || seen(&near_host, "arm").is_some()).await;
+    until("the rover is known", || seen(&far_host, "rover").is_some()).await;
+    let entry = near.directory().known("arm").unwrap();
+    assert_eq!(entry.source, fipa::Source::Exchange);
+    assert_eq!(entry.mts.incarnation, far.incarnation());
+    // Both can write first.
+    for (from, to) in [(&rover, &arm), (&arm, &rover)] {
+        let message = from
+            .message(Performative::Inform)
+            .receiver(AgentId::new(to.name()).unwrap())
+            .content("hello")
+            .build()
+            .unwrap();
+        assert!(from.send(message).await.unwrap().all_succeeded());
+        let received = to.receive().await.unwrap().message;
+        assert_eq!(received.content().unwrap().as_ref(), b"hello");
+    }
+
+    // What changes is told.
+    let leg = far_host.register("leg").unwrap();
+    until("the leg is known", || seen(&near_host, "leg").is_some()).await;
+    drop(leg);
+    until("the leg is gone", || seen(&near_host, "leg").is_none()).await;
+    // They leave with their gateway.
+    far.close().await;
+    until("the arm is gone", || seen(&near_host, "arm").is_none()).await;
+    assert!(seen(&near_host, "rover").is_none());
+    near.close().await;
+}

@@ -121,6 +121,8 @@ pub enum Source {
     Host,
     /// Announced on the network.
     Mdns,
+    /// Told by the gateway of another host, in a letter.
+    Exchange,
     /// It has written.
     Contact,
 }

@@ -3,8 +3,10 @@
 //!
 //! * [`Entry`] is what is known about one registration; [`Registration`] is what its owner says.
 //! * [`Directory`] is the one view everybody reads; [`Watch`] tells what changes in it.
-//! * [`MemoryDirectory`], [`StaticDirectory`], [`ContactDirectory`], [`HostDirectory`] and (feature
-//!   `mdns`) `MdnsDirectory` are its back ends; [`MergedDirectory`] makes one view of several.
+//! * [`MemoryDirectory`], [`StaticDirectory`], [`ContactDirectory`], [`HostDirectory`],
+//!   [`ExchangeDirectory`] and (feature `mdns`) `MdnsDirectory` are its back ends;
+//!   [`MergedDirectory`] makes one view of several.
+//! * [`Exchange`] decides what gateways tell each other of their agents.
 //! * [`Query`] and [`Pattern`] search; [`resolve`] turns the name of a receiver into entries.
 //!
 //! The crate depends on `fipa-transport`, sideways, for two words only: an entry lists
@@ -17,6 +19,7 @@
 mod contacts;
 mod directory;
 mod entry;
+mod exchange;
 mod host;
 #[cfg(feature = "mdns")]
 mod mdns;
@@ -31,6 +34,7 @@ mod watch;
 pub use contacts::ContactDirectory;
 pub use directory::{DeregisterError, Directory, RegisterError};
 pub use entry::{Entry, EntryError, Mts, Reach, Registration, Role, Source};
+pub use exchange::{EXCHANGE_ONTOLOGY, Exchange, ExchangeDirectory, ExchangeError};
 pub use host::{HostConfig, HostDirectory, HostError};
 #[cfg(feature = "mdns")]
 pub use mdns::{MdnsConfig, MdnsDirectory, MdnsError, MdnsStatus, Withdrawal};

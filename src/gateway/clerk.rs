@@ -11,9 +11,10 @@ use std::time::{Duration, SystemTime};
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_mts::core::{Received, Submission};
 use fipa_mts::letter_for;
-use fipa_sds::{Directory, Entry, Matcher, Query};
+use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Entry, Matcher, Query};
 use fipa_transport::Incarnation;
 
+use super::exchange::Exchanging;
 use super::neighbours::Neighbours;
 use crate::routes;
 use crate::service::Service;
@@ -27,6 +28,7 @@ pub(crate) struct Clerk {
     pub(crate) id: AgentId,
     pub(crate) neighbours: Arc<Neighbours>,
     pub(crate) view: Arc<dyn Directory>,
+    pub(super) exchange: Arc<Exchanging>,
 }
 
 impl Clerk {
@@ -43,6 +45,12 @@ impl Clerk {
     }
 
     fn handle(&self, message: &Message, sender: Incarnation) {
+        if message.ontology() == Some(EXCHANGE_ONTOLOGY)
+            && *message.performative() == Performative::Inform
+        {
+            let content = message.content().map(|content| &content[..]);
+            return self.exchange.received(sender, content.unwrap_or_default());
+        }
         let asked = matches!(
             message.performative(),
             Performative::Request

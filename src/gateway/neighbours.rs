@@ -16,6 +16,7 @@ use fipa_sds::{
 };
 use fipa_transport::{Incarnation, Introduction, Location};
 use parking_lot::Mutex;
+use tokio::sync::Notify;
 
 use crate::routes::Connected;
 
@@ -23,6 +24,7 @@ use crate::routes::Connected;
 #[derive(Debug, Default)]
 pub(crate) struct Neighbours {
     state: Mutex<State>,
+    changed: Notify,
 }
 
 #[derive(Debug, Default)]
@@ -70,6 +72,11 @@ impl Neighbours {
         self.state.lock().present.values().cloned().collect()
     }
 
+    /// Returns when there are others than before. For one task only.
+    pub(super) async fn changed(&self) {
+        self.changed.notified().await;
+    }
+
     pub(super) fn introduced(&self, peer: &Introduction) {
         let incarnation = peer.hop.location.incarnation();
         // Other processes of this host open connections, too.
@@ -94,6 +101,7 @@ impl Neighbours {
         }
         tracing::info!(name = %peer.name, at = %peer.hop.location, "connected with a gateway");
         state.present.insert(incarnation, neighbour);
+        self.changed.notify_one();
     }
 
     pub(super) fn parted(&self, peer: &Introduction) {
@@ -107,6 +115,7 @@ impl Neighbours {
             return;
         }
         state.present.remove(&incarnation);
+        self.changed.notify_one();
         tracing::info!(name = %peer.name, at = %peer.hop.location, "no longer connected");
     }
 }

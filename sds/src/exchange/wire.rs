@@ -1,0 +1,102 @@
+//! What the letters say, in JSON.
+//!
+//! ```json
+//! { "version": 1, "tell": "again" }
+//! { "version": 1, "tell": "goodbye" }
+//! { "version": 1, "tell": { "full": { "version": 7, "first": true, "last": false, "agents": [agent] } } }
+//! { "version": 1, "tell": { "changes": { "from": 7, "to": 9, "agents": [agent], "left": [name] } } }
+//! agent = { "name", "type", "id", "description", "registered": milliseconds since 1970, UTC }
+//! ```
+//!
+//! Where the agents are is not said: with the gateway whose letter it is. Unknown keys are passed
+//! over, so that a later version may add some.
+
+use std::sync::Arc;
+
+use fipa_transport::Incarnation;
+use serde::de::Error as _;
+use serde::{Deserialize, Serialize};
+
+use crate::Entry;
+use crate::entry::millis_of_time;
+
+const VERSION: u32 = 1;
+
+#[derive(Debug, Serialize, Deserialize)]
+struct Envelope<T> {
+    version: u32,
+    tell: T,
+}
+
+/// One letter.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum Told {
+    /// Tell me everything, again.
+    Again,
+    /// I am ending.
+    Goodbye,
+    Full(Full),
+    Changes(Changes),
+}
+
+/// A part of everything, in the state with this number.
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) struct Full {
+    pub(super) version: u64,
+    pub(super) first: bool,
+    pub(super) last: bool,
+    pub(super) agents: Vec<Agent>,
+}
+
+/// What leads from one state to a later one.
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) struct Changes {
+    pub(super) from: u64,
+    pub(super) to: u64,
+    /// New ones, and those that are different now.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(super) agents: Vec<Agent>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(super) left: Vec<String>,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) struct Agent {
+    pub(super) name: String,
+    #[serde(rename = "id")]
+    pub(super) incarnation: Incarnation,
+    #[serde(rename = "type", default, skip_serializing_if = "String::is_empty")]
+    pub(super) agent_type: String,
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub(super) description: String,
+    pub(super) registered: u64,
+}
+
+impl Agent {
+    pub(super) fn of(entry: &Arc<Entry>) -> Self {
+        Self {
+            name: entry.name.to_string(),
+            incarnation: entry.incarnation,
+            agent_type: entry.agent_type.clone(),
+            description: entry.description.clone(),
+            registered: millis_of_time(entry.registered),
+        }
+    }
+}
+
+pub(super) fn encode(tell: &Told) -> Vec<u8> {
+    let version = VERSION;
+    // Texts, numbers and lists of them: there is nothing in it that has no JSON.
+    serde_json::to_vec(&Envelope { version, tell }).unwrap_or_default()
+}
+
+pub(super) fn decode(content: &[u8]) -> Result<Told, serde_json::Error> {
+    let envelope: Envelope<Told> = serde_json::from_slice(content)?;
+    match envelope.version {
+        VERSION => Ok(envelope.tell),
+        other => Err(serde_json::Error::custom(format!(
+            "version {other} is not understood"
+        ))),
+    }
+}

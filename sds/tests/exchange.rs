@@ -1,0 +1,520 @@
+//! The exchange of directories: gateways on virtual time, letters that arrive late or not at all,
+//! drawn from a seed.
+
+// The exception that clippy.toml makes for tests does not reach what they call.
+#![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)]
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+use std::time::{Duration, Instant, UNIX_EPOCH};
+
+use fipa_sds::{Change, Directory, Entry, Exchange, ExchangeError, Mts, Reach, Role, Source};
+use fipa_transport::{Incarnation, Location};
+
+/// How long the simulated service tries to deliver a letter.
+const DEADLINE: Duration = Duration::from_secs(5);
+
+struct Gateway {
+    mts: Mts,
+    exchange: Exchange,
+    agents: BTreeMap<String, Arc<Entry>>,
+}
+
+/// A letter under way: it arrives when the link is there, or is given up.
+struct Letter {
+    from: usize,
+    to: usize,
+    content: Vec<u8>,
+    since: Instant,
+    due: Instant,
+}
+
+struct World {
+    now: Instant,
+    gateways: Vec<Gateway>,
+    letters: VecDeque<Letter>,
+    /// Links that are cut.
+    cut: Vec<(usize, usize)>,
+    random: fastrand::Rng,
+    sent: usize,
+    next: u64,
+}
+
+fn location(index: usize) -> Location {
+    let text = format!("tcp://10.0.0.{}:7788#{:016x}", index + 1, index + 1);
+    text.parse().unwrap()
+}
+
+impl World {
+    fn new(count: usize, seed: u64) -> Self {
+        let gateways = (0..count).map(|index| Gateway {
+            mts: Mts::new("same-name-mts", Incarnation::from_u64(index as u64 + 1)),
+            exchange: Exchange::new(seed ^ index as u64),
+            agents: BTreeMap::new(),
+        });
+        Self {
+            now: Instant::now(),
+            gateways: gateways.collect(),
+            letters: VecDeque::new(),
+            cut: Vec::new(),
+            random: fastrand::Rng::with_seed(seed),
+            sent: 0,
+            next: 1000,
+        }
+    }
+
+    fn connected(&self, one: usize, other: usize) -> bool {
+        one != other && !self.cut.contains(&(one.min(other), one.max(other)))
+    }
+
+    /// Everybody learns who can be written to.
+    fn connect(&mut self) {
+        for index in 0..self.gateways.len() {
+            let others = (0..self.gateways.len()).filter(|other| self.connected(index, *other));
+            let present: Vec<_> = others
+                .map(|other| (self.gateways[other].mts.clone(), vec![location(other)]))
+                .collect();
+            let now = self.now;
+            self.gateways[index]
+                .exchange
+                .handle_neighbours(now, &present);
+        }
+    }
+
+    fn join(&mut self, index: usize, name: &str) {
+        self.appear(index, name);
+        let gateway = &mut self.gateways[index];
+        gateway
+            .exchange
+            .handle_own(self.now, gateway.agents.values());
+    }
+
+    /// Joins, and nobody is told before something else happens.
+    fn appear(&mut self, index: usize, name: &str) {
+        self.next += 1;
+        let mts = self.gateways[index].mts.clone();
+        let entry = Entry {
+            name: name.into(),
+            agent_type: "arm".to_owned(),
+            incarnation: Incarnation::from_u64(self.next),
+            locations: vec!["shm://here".parse().unwrap()],
+            mts,
+            description: "né à \"côté\"".to_owned(),
+            registered: UNIX_EPOCH + Duration::from_millis(self.next),
+            source: Source::Host,
+            reach: Reach::Local,
+            role: Role::Agent,
+        };
+        let gateway = &mut self.gateways[index];
+        gateway.agents.insert(name.to_owned(), Arc::new(entry));
+        gateway
+            .exchange
+            .handle_own(self.now, gateway.agents.values());
+    }
+
+    fn leave(&mut self, index: usize, name: &str) {
+        let gateway = &mut self.gateways[index];
+        gateway.agents.remove(name);
+        gateway
+            .exchange
+            .handle_own(self.now, gateway.agents.values());
+    }
+
+    /// Lets so much time pass.
+    fn run(&mut self, time: Duration) {
+        self.step();
+        let end = self.now + time;
+        while self.now < end {
+            let soon = self.now + Duration::from_millis(1);
+            let gateways = self.gateways.iter();
+            let timeouts = gateways.filter_map(|gateway| gateway.exchange.poll_timeout());
+            let expiries = self.letters.iter().map(|letter| letter.since + DEADLINE);
+            // What could not arrive waits for its link, or to expire.
+            let arrivals = self.letters.iter().map(|letter| letter.due);
+            let arrivals = arrivals.filter(|due| *due > self.now);
+            let next = timeouts.chain(expiries).chain(arrivals).min();
+            self.now = next.unwrap_or(end).max(soon).min(end);
+            self.step();
+        }
+    }
+
+    fn step(&mut self) {
+        let now = self.now;
+        for from in 0..self.gateways.len() {
+            let exchange = &mut self.gateways[from].exchange;
+            exchange.handle_timeout(now);
+            while let Some((to, content)) = exchange.poll_letter(now) {
+                assert!(content.len() < Exchange::MAX_CONTENT);
+                self.sent += 1;
+                let delay = Duration::from_millis(self.random.u64(1..40));
+                self.letters.push_back(Letter {
+                    from,
+                    to: usize::try_from(to.as_u64() - 1).unwrap(),
+                    content,
+                    since: now,
+                    due: now + delay,
+                });
+            }
+            let due = exchange.poll_timeout();
+            assert!(due.is_none_or(|due| due > now), "what is due has been done");
+        }
+        // In order for each pair: a letter that waits holds up those behind it.
+        let mut waiting = VecDeque::new();
+        let mut held: Vec<(usize, usize)> = Vec::new();
+        while let Some(letter) = self.letters.pop_front() {
+            let pair = (letter.from, letter.to);
+            let expired = now >= letter.since + DEADLINE;
+            let goes = self.connected(letter.from, letter.to) && now >= letter.due;
+            if held.contains(&pair) || !(goes || expired) {
+                held.push(pair);
+                waiting.push_back(letter);
+                continue;
+            }
+            if goes && !expired {
+                let from = self.gateways[letter.from].mts.incarnation;
+                let receiver = &mut self.gateways[letter.to].exchange;
+                match receiver.handle_letter(now, from, &letter.content) {
+                    Ok(()) | Err(ExchangeError::Stranger) => {}
+                    Err(error) => panic!("{error}"),
+                }
+            }
+            let to = self.gateways[letter.to].mts.incarnation;
+            let sender = &mut self.gateways[letter.from].exchange;
+            sender.handle_sent(now, to, goes && !expired);
+        }
+        self.letters = waiting;
+    }
+
+    /// Whether everybody knows the agents of those it is connected with, and of nobody else.
+    fn agrees(&self) -> bool {
+        (0..self.gateways.len()).all(|index| {
+            let expected = (0..self.gateways.len())
+                .filter(|other| self.connected(index, *other))
+                .flat_map(|other| self.gateways[other].agents.values())
+                .fold(BTreeMap::<&str, &Arc<Entry>>::new(), |mut all, entry| {
+                    let holder = all.entry(&entry.name).or_insert(entry);
+                    if entry.precedes(holder) {
+                        *holder = entry;
+                    }
+                    all
+                });
+            let known = self.gateways[index].exchange.directory().entries();
+            known.len() == expected.len()
+                && known.iter().zip(expected.values()).all(|(known, entry)| {
+                    let owner = usize::try_from(entry.mts.incarnation.as_u64() - 1).unwrap();
+                    **known
+                        == Entry {
+                            locations: vec![location(owner)],
+                            source: Source::Exchange,
+                            reach: Reach::Remote {
+                                gateway: entry.mts.incarnation,
+                            },
+                            ..Entry::clone(entry)
+                        }
+                })
+        })
+    }
+}
+
+#[test]
+fn neighbours_learn_of_each_others_agents() {
+    let mut world = World::new(3, 1);
+    for number in 0..10 {
+        world.join(0, &format!("arm_{number}"));
+    }
+    world.join(1, "camera");
+    world.connect();
+    let directory = world.gateways[1].exchange.directory();
+    let mut watch = directory.watch();
+    world.run(Duration::from_millis(300));
+    assert!(world.agrees());
+    let mut joined = 0;
+    while let Some(Change::Joined(entry)) = watch.try_next() {
+        assert_eq!(entry.source, Source::Exchange);
+        joined += 1;
+    }
+    assert_eq!(joined, 10);
+    world.leave(0, "arm_3");
+    world.join(0, "arm_4");
+    world.run(Duration::from_millis(300));
+    assert!(world.agrees());
+    assert!(matches!(
+        watch.try_next(),
+        Some(Change::Left(_) | Change::Changed { .. })
+    ));
+}
+
+#[test]
+fn hundreds_that_start_at_once_make_few_letters() {
+    let mut world = World::new(2, 2);
+    world.connect();
+    world.run(Duration::from_millis(500));
+    let before = world.sent;
+    for number in 0..500 {
+        world.join(0, &format!("zero_{number}"));
+        world.join(1, &format!("one_{number}"));
+        world.step();
+    }
+    world.run(Duration::from_secs(2));
+    assert!(world.agrees());
+    let letters = world.sent - before;
+    assert!(letters <= 12, "{letters} letters");
+    // Nothing happens: nearly nothing is said.
+    let before = world.sent;
+    world.run(Duration::from_secs(60));
+    let letters = world.sent - before;
+    assert!((2..=10).contains(&letters), "{letters} letters");
+}
+
+#[test]
+fn many_agents_take_several_letters_and_may_change_meanwhile() {
+    let mut world = World::new(2, 3);
+    for number in 0..600 {
+        world.appear(0, &format!("agent_{number:04}"));
+    }
+    world.join(0, "last");
+    world.connect();
+    for number in 0..60 {
+        world.run(Duration::from_millis(5));
+        world.leave(0, &format!("agent_{:04}", number * 7));
+        world.join(0, &format!("between_{number}"));
+    }
+    world.run(Duration::from_secs(2));
+    assert!(world.agrees());
+    // More than is remembered changes while nothing arrives.
+    world.cut.push((0, 1));
+    for _ in 0..8 {
+        for number in 0..600 {
+            world.appear(0, &format!("agent_{number:04}"));
+        }
+        world.join(0, "last");
+    }
+    world.cut.clear();
+    world.run(Duration::from_secs(12));
+    assert!(world.agrees());
+}
+
+#[test]
+fn entries_leave_with_their_gateway() {
+    let mut world = World::new(2, 4);
+    world.join(0, "arm");
+    world.connect();
+    world.run(Duration::from_millis(300));
+    let directory = world.gateways[1].exchange.directory();
+    assert!(directory.lookup("arm").is_some());
+    // A connection that is made again at once is not noticed.
+    let now = world.now;
+    world.gateways[1].exchange.handle_neighbours(now, &[]);
+    world.run(Exchange::MEMORY / 2);
+    assert!(directory.lookup("arm").is_some());
+    world.connect();
+    world.run(Exchange::MEMORY * 2);
+    assert!(directory.lookup("arm").is_some());
+    let now = world.now;
+    world.gateways[1].exchange.handle_neighbours(now, &[]);
+    world.run(Exchange::MEMORY + Duration::from_millis(10));
+    assert!(directory.lookup("arm").is_none());
+    // It comes back, and has not noticed that it was away.
+    world.connect();
+    world.run(Duration::from_secs(20));
+    assert!(world.agrees());
+    // Who takes leave is gone at once.
+    let (to, content) = world.gateways[0].exchange.goodbye();
+    assert_eq!(to, [Incarnation::from_u64(2)]);
+    let now = world.now;
+    let receiver = &mut world.gateways[1].exchange;
+    receiver
+        .handle_letter(now, Incarnation::from_u64(1), &content)
+        .unwrap();
+    assert!(directory.lookup("arm").is_none());
+}
+
+/// A letter may be faster than the news that its sender can be written to.
+#[test]
+fn what_was_told_too_early_is_asked_for() {
+    let mut world = World::new(2, 6);
+    world.join(0, "arm");
+    let now = world.now;
+    let present = [(world.gateways[1].mts.clone(), vec![location(1)])];
+    world.gateways[0].exchange.handle_neighbours(now, &present);
+    world.run(Duration::from_millis(200));
+    assert!(!world.agrees());
+    world.connect();
+    world.run(Duration::from_millis(1500));
+    assert!(world.agrees());
+}
+
+#[test]
+fn a_gateway_that_is_elsewhere_takes_its_agents_along() {
+    let mut world = World::new(2, 5);
+    world.join(0, "arm");
+    world.connect();
+    world.run(Duration::from_millis(300));
+    let elsewhere: Location = "tcp://10.0.0.99:1#0000000000000001".parse().unwrap();
+    let (mts, now) = (world.gateways[0].mts.clone(), world.now);
+    let present = [(mts, vec![elsewhere.clone()])];
+    world.gateways[1].exchange.handle_neighbours(now, &present);
+    let entry = world.gateways[1]
+        .exchange
+        .directory()
+        .lookup("arm")
+        .unwrap();
+    assert_eq!(entry.locations, [elsewhere]);
+}
+
+/// Links are cut and healed in random order; connections are noticed to be broken, or not.
+#[test]
+fn after_every_healing_all_agree_within_ten_seconds() {
+    let seeds = std::env::var("FIPA_SIM_SEEDS")
+        .ok()
+        .and_then(|seeds| seeds.parse().ok());
+    for seed in 0..seeds.unwrap_or(40) {
+        let mut world = World::new(4, seed);
+        world.connect();
+        for round in 0..6 {
+            for _ in 0..world.random.usize(0..4) {
+                let (one, other) = (world.random.usize(0..4), world.random.usize(0..4));
+                if one != other {
+                    world.cut.push((one.min(other), one.max(other)));
+                }
+            }
+            let noticed = world.random.bool();
+            if noticed {
+                world.connect();
+            }
+            for _ in 0..world.random.usize(0..30) {
+                let index = world.random.usize(0..4);
+                // Names that several claim are among them.
+                let name = format!("agent_{}", world.random.usize(0..20));
+                if world.random.bool() {
+                    world.join(index, &name);
+                } else {
+                    world.leave(index, &name);
+                }
+                let pause = world.random.u64(0..400);
+                world.run(Duration::from_millis(pause));
+            }
+            world.cut.clear();
+            world.connect();
+            world.run(Duration::from_secs(10));
+            assert!(world.agrees(), "FIPA_SIM_SEEDS: seed {seed}, round {round}");
+        }
+    }
+}
+
+fn told(exchange: &mut Exchange, content: &str) -> Result<(), ExchangeError> {
+    let from = Incarnation::from_u64(7);
+    exchange.handle_letter(Instant::now(), from, content.as_bytes())
+}
+
+fn with_neighbour() -> Exchange {
+    let mut exchange = Exchange::new(0);
+    let mts = Mts::new("hostile", Incarnation::from_u64(7));
+    exchange.handle_neighbours(Instant::now(), &[(mts, vec![location(6)])]);
+    exchange
+}
+
+#[test]
+fn strangers_and_nonsense_are_refused() {
+    let mut exchange = with_neighbour();
+    let stranger = Incarnation::from_u64(8);
+    let again = br#"{"version":1,"tell":"again"}"#;
+    assert!(matches!(
+        exchange.handle_letter(Instant::now(), stranger, again),
+        Err(ExchangeError::Stranger)
+    ));
+    for nonsense in [
+        "",
+        "again",
+        r#"{"version":2,"tell":"again"}"#,
+        r#"{"version":1,"tell":"nothing"}"#,
+        r#"{"version":1,"tell":{"full":{"version":1}}}"#,
+        &format!("{}1{}", "[".repeat(100_000), "]".repeat(100_000)),
+    ] {
+        assert!(matches!(
+            told(&mut exchange, nonsense),
+            Err(ExchangeError::Malformed(_))
+        ));
+    }
+    let large = " ".repeat(Exchange::MAX_CONTENT + 1);
+    assert!(matches!(
+        told(&mut exchange, &large),
+        Err(ExchangeError::TooLarge(_))
+    ));
+    assert!(exchange.directory().entries().is_empty());
+}
+
+#[test]
+fn agents_that_cannot_be_are_left_out() {
+    let mut exchange = with_neighbour();
+    let agents = r#"[{"name":"","id":"0000000000000001","registered":1},
+        {"name":"a\nb","id":"0000000000000001","registered":1},
+        {"name":"nobody","id":"0000000000000000","registered":1},
+        {"name":"good","id":"0000000000000001","registered":99999999999999999,"more":[]}]"#;
+    let full = format!(
+        r#"{{"version":1,"tell":{{"full":{{"version":0,"first":true,"last":true,"agents":{agents}}}}}}}"#
+    );
+    told(&mut exchange, &full).unwrap();
+    let entries = exchange.directory().entries();
+    assert_eq!(entries.len(), 1);
+    assert_eq!(&*entries[0].name, "good");
+    assert_eq!(entries[0].locations, [location(6)]);
+}
+
+#[test]
+fn what_a_neighbour_can_tell_is_bounded() {
+    let mut exchange = with_neighbour();
+    let part = |part: usize, last: bool| {
+        let agents: Vec<String> = (0..5000)
+            .map(|number| {
+                format!(
+                    r#"{{"name":"agent {part} {number}","id":"{:016x}","registered":1}}"#,
+                    number + 1
+                )
+            })
+            .collect();
+        let (first, agents) = (part == 0, agents.join(","));
+        format!(
+            r#"{{"version":1,"tell":{{"full":{{"version":9,"first":{first},"last":{last},"agents":[{agents}]}}}}}}"#
+        )
+    };
+    told(&mut exchange, &part(0, false)).unwrap();
+    told(&mut exchange, &part(1, false)).unwrap();
+    assert!(matches!(
+        told(&mut exchange, &part(2, true)),
+        Err(ExchangeError::TooMany)
+    ));
+    assert!(exchange.directory().entries().is_empty());
+    // What it says next does not follow from anything, and is asked for.
+    told(&mut exchange, &part(3, true)).unwrap();
+    assert!(exchange.directory().entries().is_empty());
+    let now = Instant::now() + Duration::from_millis(1);
+    let (to, question) = exchange.poll_letter(now).unwrap();
+    assert_eq!(to, Incarnation::from_u64(7));
+    assert_eq!(question, br#"{"version":1,"tell":"again"}"#);
+    // Who asks all the time is told now and then.
+    exchange.handle_sent(now, to, true);
+    let mut answers = 0;
+    for millis in 0..3000 {
+        let now = now + Duration::from_millis(millis);
+        let again = br#"{"version":1,"tell":"again"}"#;
+        exchange.handle_letter(now, to, again).unwrap();
+        while exchange.poll_letter(now).is_some() {
+            answers += 1;
+            exchange.handle_sent(now, to, true);
+        }
+    }
+    assert!((2..=4).contains(&answers), "{answers}");
+    // So many neighbours and no more.
+    let crowd: Vec<_> = (0..2000)
+        .map(|number| {
+            (
+                Mts::new("x", Incarnation::from_u64(number + 1)),
+                vec![location(0)],
+            )
+        })
+        .collect();
+    exchange.handle_neighbours(now, &crowd);
+    let (known, _) = exchange.goodbye();
+    assert_eq!(known.len(), Exchange::MAX_NEIGHBOURS);
+}

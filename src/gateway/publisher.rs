@@ -1,0 +1,136 @@
+//! Keeps the directories of a gateway in step: what lives on this host is announced to the
+//! network, and what is known of other hosts is told to the processes here.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+use fipa_sds::{
+    ContactDirectory, Directory, Entry, HostDirectory, MergedDirectory, Reach, Registration, Role,
+};
+use fipa_transport::{Incarnation, Kind, Location};
+
+/// Tells the processes of this host who is on others, as reachable through this gateway.
+pub(super) struct Publisher {
+    pub(super) host: Arc<HostDirectory>,
+    /// Where the agents of this host are announced, if anywhere.
+    pub(super) network: Option<Arc<dyn Directory>>,
+    /// Who is known of other hosts without having written.
+    pub(super) known: Arc<MergedDirectory>,
+    pub(super) contacts: Arc<ContactDirectory>,
+    /// Where this gateway takes letters: the locations of all that it stands for.
+    pub(super) locations: Vec<Location>,
+}
+
+impl Publisher {
+    pub(super) fn publish(&self) {
+        let (heard, known) = (self.contacts.entries(), self.known.entries());
+        // The later of one name counts: what is known, before what was heard.
+        let all = heard.iter().chain(known.iter());
+        let through_here = all
+            .filter(|entry| entry.role == Role::Agent)
+            .map(|entry| Entry {
+                locations: self.locations.clone(),
+                ..Entry::clone(entry)
+            });
+        if let Err(error) = self.host.publish_remote(through_here.collect()) {
+            tracing::warn!(%error, "the processes of this host are not told of all other hosts");
+        }
+    }
+}
+
+/// The agents of this host as far as others are to know of them.
+pub(super) fn own_agents(host: &HostDirectory) -> Vec<Arc<Entry>> {
+    let entries = host.entries();
+    let own = entries
+        .iter()
+        .filter(|entry| entry.reach == Reach::Local && entry.role == Role::Agent);
+    own.cloned().collect()
+}
+
+/// The task that does it.
+pub(super) struct Keeper {
+    publisher: Arc<Publisher>,
+    announced: HashMap<Arc<str>, Arc<Entry>>,
+    /// Those that could not be announced, which was said once.
+    refused: HashMap<Arc<str>, Incarnation>,
+}
+
+impl Keeper {
+    pub(super) fn new(publisher: Arc<Publisher>) -> Self {
+        Self {
+            publisher,
+            announced: HashMap::new(),
+            refused: HashMap::new(),
+        }
+    }
+
+    pub(super) async fn run(mut self) {
+        let publisher = Arc::clone(&self.publisher);
+        let known = Arc::clone(&publisher.known);
+        let (mut here, mut there) = (publisher.host.watch(), known.watch());
+        let mut forgetting = tokio::time::interval(ContactDirectory::MEMORY / 4);
+        loop {
+            if let Some(network) = &publisher.network {
+                self.announce(&**network);
+            }
+            publisher
+                .contacts
+                .forget(Instant::now(), |entry| known.known(&entry.name).is_some());
+            publisher.publish();
+            let goes_on = tokio::select! {
+                change = here.next() => change.is_some(),
+                change = there.next() => change.is_some(),
+                _ = forgetting.tick() => true,
+            };
+            if !goes_on {
+                return;
+            }
+            // Many changes that came together are one.
+            while here.try_next().is_some() || there.try_next().is_some() {}
+        }
+    }
+
+    /// Announces what has joined on this host, and takes back what has left.
+    fn announce(&mut self, network: &dyn Directory) {
+        let agents = own_agents(&self.publisher.host);
+        let mine: HashMap<&Arc<str>, &Arc<Entry>> =
+            agents.iter().map(|entry| (&entry.name, entry)).collect();
+        self.announced.retain(|name, entry| {
+            let stays = mine.get(name).is_some_and(|now| ***now == **entry);
+            if !stays && let Err(error) = network.deregister(name, entry.incarnation) {
+                tracing::debug!(%name, %error, "was not announced any more");
+            }
+            stays
+        });
+        self.refused.retain(|name, _| mine.contains_key(name));
+        let locations = self.publisher.locations.iter();
+        let locations: Vec<Location> = locations
+            .filter(|location| location.kind() != Kind::Shm)
+            .cloned()
+            .collect();
+        for (name, entry) in mine {
+            if self.announced.contains_key(name) {
+                continue;
+            }
+            let registration = Registration {
+                agent_type: entry.agent_type.clone(),
+                description: entry.description.clone(),
+                registered: entry.registered,
+                ..Registration::new(Arc::clone(name), entry.incarnation, locations.clone())
+            };
+            match network.register(registration) {
+                Ok(_) => {
+                    self.announced.insert(Arc::clone(name), Arc::clone(entry));
+                    self.refused.remove(name);
+                }
+                Err(error) => {
+                    let before = self.refused.insert(Arc::clone(name), entry.incarnation);
+                    if before != Some(entry.incarnation) {
+                        tracing::warn!(%name, %error, "an agent is not announced to other hosts");
+                    }
+                }
+            }
+        }
+    }
+}
