@@ -15,6 +15,12 @@ use crate::domain::OpenError;
 use crate::place::{Place, RETRIES};
 use crate::routes::Report;
 
+/// How often the other end of a quiet connection is asked for a sign of life. One that leads
+/// nowhere any more, because an address has changed, is found out after twice this long, which
+/// has to be less than the usual deadline of a letter.
+#[cfg(feature = "net")]
+const KEEP_ALIVE: Duration = Duration::from_secs(2);
+
 /// How long a service that ends waits for what is under way.
 pub(crate) const CLOSING_PATIENCE: Duration = Duration::from_secs(1);
 
@@ -260,6 +266,7 @@ fn tcp(
     let max_letter = usize::try_from(config.transport.shm.max_letter).unwrap_or(usize::MAX);
     let limits = Limits {
         max_letter,
+        keep_alive: KEEP_ALIVE,
         ..Limits::default()
     };
     let config = TcpConfig {

@@ -1,0 +1,111 @@
+//! Gateways on real networks that misbehave: links go down and up, addresses change, gateways are
+//! killed, packets are lost, hosts are cut off. Every letter has one outcome, none is taken twice,
+//! the order is kept, and traffic goes on by itself when the network does.
+//!
+//! The hosts are network namespaces of the test's own; see `fipa-testbed`.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+
+mod fleet;
+
+use std::time::Duration;
+
+use fipa_testbed::{enter, isolated};
+use fleet::{Fleet, Plan};
+
+const TOOLS: &[&str] = &["nft"];
+
+fn pause(milliseconds: u64) {
+    std::thread::sleep(Duration::from_millis(milliseconds));
+}
+
+/// A test that the harness sees, and the one that it runs in namespaces of its own.
+macro_rules! on_a_network {
+    ($(#[$doc:meta])* $name:ident, $inside:ident, $work:expr) => {
+        $(#[$doc])*
+        #[test]
+        fn $name() {
+            isolated(stringify!($inside), TOOLS);
+        }
+
+        #[test]
+        #[ignore = "is run by the other test in namespaces of its own"]
+        fn $inside() {
+            enter();
+            let work: fn() = $work;
+            work();
+        }
+    };
+}
+
+on_a_network!(links_go_down_and_up, inside_links_go_down_and_up, || {
+    let fleet = Fleet::new(&Plan::default());
+    fleet.through(10_000, |fleet| {
+        for at in [0, 1, 2, 0] {
+            let host = fleet.network.host(at);
+            fleet.until_delivered(&[0, 1, 2]);
+            // The kernel tells of this,
+            host.ip("link set eth0 down");
+            pause(300);
+            host.ip("link set eth0 up");
+            fleet.until_delivered(&[0, 1, 2]);
+            // and nobody of this.
+            host.unplug();
+            pause(700);
+            host.plug();
+        }
+    });
+});
+
+on_a_network!(gateways_are_killed, inside_gateways_are_killed, || {
+    let fleet = Fleet::new(&Plan::default());
+    fleet.through(10_000, |fleet| {
+        for at in [0, 1, 2, 1] {
+            fleet.until_delivered(&[0, 1, 2]);
+            fleet.kill_gateway(at);
+            pause(200);
+            fleet.start_gateway(at);
+        }
+    });
+});
+
+on_a_network!(addresses_change, inside_addresses_change, || {
+    let fleet = Fleet::new(&Plan::default());
+    fleet.through(10_000, |fleet| {
+        let host = fleet.network.host(1);
+        for (from, to) in [("10.99.0.2", "10.99.0.52"), ("10.99.0.52", "10.99.0.2")] {
+            fleet.until_delivered(&[0, 1, 2]);
+            host.ip(&format!("addr del {from}/24 dev eth0"));
+            host.ip(&format!("addr add {to}/24 dev eth0"));
+            fleet.until_delivered(&[0, 1, 2]);
+        }
+    });
+});
+
+on_a_network!(tcp_loses_packets, inside_tcp_loses_packets, || {
+    let fleet = Fleet::new(&Plan::default());
+    for of_a_hundred in [1, 10, 30] {
+        fleet.through(3_500, |fleet| {
+            fleet.lose("tcp", of_a_hundred);
+            pause(4000);
+            fleet.lose_nothing();
+        });
+    }
+});
+
+on_a_network!(a_host_is_cut_off, inside_a_host_is_cut_off, || {
+    let fleet = Fleet::new(&Plan::default());
+    fleet.through(10_000, |fleet| {
+        fleet.until_delivered(&[0, 1, 2]);
+        fleet.network.host(2).unplug();
+        // Each has its outcome within its deadline: those that wait for one go on, then.
+        for (from, to) in [(0, 2), (1, 2), (2, 0), (2, 1)] {
+            fleet.until_failing(from, to);
+        }
+        fleet.until_delivered(&[0, 1]);
+        for (from, to) in [(0, 1), (1, 0)] {
+            assert_eq!(fleet.failed(from, to), 0, "{from} to {to}: others noticed");
+        }
+        fleet.network.host(2).plug();
+    });
+});
