@@ -88,11 +88,12 @@ impl Change<'_> {
 
     fn move_party(&mut self, party: &mut Party, made: Move) {
         let Move { side, lead, .. } = made;
-        self.late |= party.deadline != 0 && party.deadline < self.now && party.last != side;
+        let answers = party.last != side && !made.told;
+        self.late |= party.deadline != 0 && party.deadline < self.now && answers;
         let cancels = lead.state == CANCELLING && party.state != CANCELLING;
-        if lead.state == FAILED {
-            // Nothing was said; what failed may be said again, from the state before it.
-            (party.state, party.resume) = (lead.state, lead.resume);
+        if made.told || lead.state == FAILED {
+            // What failed may be said again, from the state before it.
+            (party.state, party.resume, party.echo) = (lead.state, lead.resume, lead.echo);
             self.state = self.state.or(Some(party.state));
             return;
         }

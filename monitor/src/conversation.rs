@@ -238,14 +238,18 @@ fn while_cancelling(machine: &Machine, party: &Party, said: &Said<'_>) -> Result
             _ => Lead::to(AFTER_NOT_UNDERSTOOD),
         });
     }
-    crossing.map(|lead| match lead.state {
-        AFTER_NOT_UNDERSTOOD => lead,
-        state => Lead {
+    crossing.map(|lead| {
+        let resume = match lead.state {
+            AFTER_NOT_UNDERSTOOD => return lead,
+            CANCELLING | FAILED => party.resume,
+            state => state,
+        };
+        Lead {
             state: CANCELLING,
-            resume: state,
+            resume,
             crossed: true,
             ..lead
-        },
+        }
     })
 }
 

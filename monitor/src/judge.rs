@@ -4,7 +4,10 @@
 use std::borrow::Cow;
 
 use crate::act::{Act, FAILURE};
-use crate::conversation::{Conversation, FAILED, Lead, NONE, Party, Said, Side, lead};
+use crate::conversation::{
+    AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, Conversation, FAILED, Lead, NONE, Party, Said,
+    Side, lead, side_index,
+};
 use crate::machine::{Machine, Scope};
 use crate::names::{Name, Names};
 use crate::verdict::ViolationKind as Kind;
@@ -26,6 +29,8 @@ pub(crate) struct Move {
     pub(crate) who: Who,
     pub(crate) side: Side,
     pub(crate) lead: Lead,
+    /// Whether this was told from outside, so that nobody who takes part has said anything.
+    pub(crate) told: bool,
 }
 
 /// Whose state changes.
@@ -136,7 +141,13 @@ impl Judge<'_> {
                 who => moves.iter().any(|made| made.who == who),
             };
             if !again {
-                moves.push(Move { who, side, lead });
+                let told = false;
+                moves.push(Move {
+                    who,
+                    side,
+                    lead,
+                    told,
+                });
             }
         }
         Ok(())
@@ -161,6 +172,7 @@ impl Judge<'_> {
             who,
             side: Side::Other,
             lead,
+            told: false,
         });
         Ok(())
     }
@@ -179,7 +191,7 @@ impl Judge<'_> {
                 } else {
                     return false;
                 };
-                let asked = party.asked[crate::conversation::side_index(side)];
+                let asked = party.asked[side_index(side)];
                 let answers =
                     self.heard.in_reply_to == 0 || asked == 0 || self.heard.in_reply_to == asked;
                 party.last == side && answers
@@ -255,6 +267,7 @@ impl Judge<'_> {
             who: Who::Party(0),
             side,
             lead,
+            told: false,
         });
         Ok(())
     }
@@ -318,16 +331,27 @@ pub(crate) fn unbound(machine: &Machine, conversation: &Conversation) -> u32 {
     all & !bound.fold(0, |mask, bound| mask | (1 << bound.role))
 }
 
+/// What the last message of a party, not having been delivered, leads to.
 fn failed(at: usize, party: &Party) -> Move {
+    let failed = |resume| Lead {
+        resume,
+        ..Lead::to(FAILED)
+    };
+    let lead = match party.state {
+        // What had ended has not begun again.
+        ended @ (AFTER_NOT_UNDERSTOOD | CANCELLED) => Lead {
+            echo: party.echo,
+            ..Lead::to(ended)
+        },
+        // The cancel was not heard.
+        CANCELLING => Lead::to(party.resume),
+        FAILED => failed(party.resume),
+        state => failed(state),
+    };
     Move {
         who: Who::Party(at),
         side: party.last,
-        lead: Lead {
-            resume: match party.state {
-                FAILED => party.resume,
-                state => state,
-            },
-            ..Lead::to(FAILED)
-        },
+        lead,
+        told: true,
     }
 }

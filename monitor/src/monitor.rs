@@ -206,12 +206,12 @@ impl Monitor {
             };
             return self.open(id, NONE, machine, header, &heard, now);
         };
-        let library = Arc::clone(&self.library);
-        let machine = self.machine_of(&library, main);
+        let machine = self.machine_of(&self.library, main);
         let follows = |name| machine.is_some_and(|machine: &Machine| machine.is_called(name));
         if header.protocol_name().is_none_or(follows) {
             return self.go_on(main, header, &heard, now);
         }
+        let library = Arc::clone(&self.library);
         self.embedded(&library, main, header, &heard, now)
     }
 

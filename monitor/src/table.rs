@@ -16,6 +16,10 @@ pub(crate) enum List {
     Ended = 1,
 }
 
+/// How exact the order of lists is, in milliseconds: moving a conversation touches two others, which
+/// would cost more than anything else, if it were done for every message.
+const PRECISION: u64 = 1_000;
+
 /// Conversations in slots that are used again, without allocating.
 #[derive(Debug)]
 pub(crate) struct Table {
@@ -40,6 +44,8 @@ pub(crate) struct Slot {
     pub(crate) parent: u32,
     used: bool,
     list: List,
+    /// When it came to its place in the list.
+    listed: u64,
     older: u32,
     newer: u32,
 }
@@ -147,6 +153,7 @@ impl Table {
             parent: NONE,
             used: false,
             list: List::Open,
+            listed: 0,
             older: NONE,
             newer: NONE,
         });
@@ -155,10 +162,11 @@ impl Table {
 
     /// Something happened in a main conversation.
     pub(crate) fn touch(&mut self, at: u32, list: List, now: u64) {
-        if let Some(slot) = self.slot_mut(at) {
-            slot.touched = now;
-        }
-        if self.ends[list as usize].newest == at {
+        let Some(slot) = self.slot_mut(at) else {
+            return;
+        };
+        slot.touched = now;
+        if slot.list == list && now < slot.listed.saturating_add(PRECISION) {
             return;
         }
         self.unlink(at);
@@ -222,6 +230,7 @@ impl Table {
         let newest = self.ends[list as usize].newest;
         if let Some(slot) = self.slot_mut(at) {
             (slot.list, slot.older, slot.newer) = (list, newest, NONE);
+            slot.listed = slot.touched;
         }
         match self.slot_mut(newest) {
             Some(slot) => slot.newer = at,
@@ -267,17 +276,21 @@ mod tests {
         let mut table = Table::new(RandomState::new());
         let [a, b, c] = ["a", "b", "c"].map(|id| table.insert(id, NONE, 0, 1));
         assert_eq!(order(&table, List::Open), ["a", "b", "c"]);
-        table.touch(a, List::Open, 2);
+        table.touch(a, List::Open, 2_000);
         assert_eq!(order(&table, List::Open), ["b", "c", "a"]);
-        table.touch(c, List::Ended, 3);
-        table.touch(a, List::Ended, 4);
+        table.touch(c, List::Ended, 3_000);
+        table.touch(a, List::Ended, 4_000);
         assert_eq!(order(&table, List::Open), ["b"]);
         assert_eq!(order(&table, List::Ended), ["c", "a"]);
-        table.touch(c, List::Open, 5);
+        table.touch(c, List::Open, 5_000);
         assert_eq!(order(&table, List::Open), ["b", "c"]);
+        table.touch(b, List::Open, 5_500);
+        assert_eq!(order(&table, List::Open), ["c", "b"]);
+        table.touch(c, List::Open, 5_999);
+        assert_eq!(order(&table, List::Open), ["c", "b"], "within a second");
         table.remove(b);
         assert_eq!((table.find("b"), table.find("c")), (None, Some(c)));
-        assert_eq!(table.insert("d", NONE, 0, 6), b);
+        assert_eq!(table.insert("d", NONE, 0, 6_000), b);
         assert_eq!(order(&table, List::Open), ["c", "d"]);
         assert_eq!(table.len(), 3);
     }

@@ -1,0 +1,182 @@
+//! What a verdict costs, and how much memory a conversation takes.
+//!
+//! `raw` is the least that any monitor of 10,000 conversations has to do: hash the conversation's id
+//! and find it in a table.
+
+#![expect(clippy::unwrap_used, reason = "a bench that cannot go on has failed")]
+#![expect(clippy::print_stdout, reason = "figures")]
+
+use std::collections::HashMap;
+use std::hint::black_box;
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
+use fipa_acl::{AgentId, Message, Performative};
+use fipa_monitor::{Header, Library, Limits, Monitor};
+
+const OPEN: usize = 10_000;
+
+fn now() -> SystemTime {
+    SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000)
+}
+
+fn id(number: usize) -> String {
+    format!("9f0a1c2e-5b7d-4e21-8c3f-{number:012}")
+}
+
+fn message(act: Performative, from: &str, to: &str, protocol: &str, id: String) -> Message {
+    Message::builder(act)
+        .sender(AgentId::new(from).unwrap())
+        .receiver(AgentId::new(to).unwrap())
+        .protocol(protocol)
+        .conversation_id(id)
+        .build()
+        .unwrap()
+}
+
+/// A monitor of subscriptions that go on.
+fn with_open(count: usize) -> (Monitor, Vec<Message>) {
+    let mut limits = Limits::default();
+    limits.conversations = 2_000_000;
+    let library = Arc::new(Library::standard());
+    let mut monitor = Monitor::observer(library).with_limits(limits);
+    let mut informs = Vec::new();
+    for number in 0..count {
+        let (ann, ben) = (
+            format!("rover_{}", number % 50),
+            format!("arm_{}", number % 70),
+        );
+        let protocol = "fipa-subscribe";
+        let ask = message(Performative::Subscribe, &ann, &ben, protocol, id(number));
+        let agree = message(Performative::Agree, &ben, &ann, protocol, id(number));
+        for said in [&ask, &agree] {
+            assert!(monitor.check(&Header::from(said), now()).is_accepted());
+        }
+        informs.push(message(
+            Performative::Inform,
+            &ben,
+            &ann,
+            protocol,
+            id(number),
+        ));
+    }
+    (monitor, informs)
+}
+
+/// Time for so many messages, which have just been received, of conversations far apart.
+fn on_letters(all: &[Message], count: u64, mut check: impl FnMut(&Message) -> bool) -> Duration {
+    const AT_ONCE: u64 = 64;
+    let mut spent = Duration::ZERO;
+    let mut next = 0;
+    let mut left = count;
+    while left > 0 {
+        let now = left.min(AT_ONCE);
+        let received: Vec<Message> = (0..now)
+            .map(|_| {
+                next = (next + 7_919) % OPEN;
+                all[next].clone()
+            })
+            .collect();
+        let began = Instant::now();
+        for message in &received {
+            assert!(check(black_box(message)));
+        }
+        spent += began.elapsed();
+        left -= now;
+    }
+    spent
+}
+
+fn verdicts(c: &mut Criterion) {
+    let mut group = c.benchmark_group("monitor");
+    let (mut monitor, informs) = with_open(OPEN);
+    let table: HashMap<String, usize> = (0..OPEN).map(|number| (id(number), number)).collect();
+    group.bench_function("raw", |b| {
+        b.iter_custom(|count| {
+            on_letters(&informs, count, |message| {
+                table.contains_key(message.conversation_id().unwrap())
+            })
+        });
+    });
+    group.bench_function("verdict", |b| {
+        b.iter_custom(|count| {
+            on_letters(&informs, count, |message| {
+                monitor.check(&Header::from(message), now()).is_accepted()
+            })
+        });
+    });
+    let wrong: Vec<Message> = (0..OPEN)
+        .map(|number| {
+            let (ann, ben) = (
+                format!("rover_{}", number % 50),
+                format!("arm_{}", number % 70),
+            );
+            message(
+                Performative::Propose,
+                &ben,
+                &ann,
+                "fipa-subscribe",
+                id(number),
+            )
+        })
+        .collect();
+    group.bench_function("violation", |b| {
+        b.iter_custom(|count| {
+            on_letters(&wrong, count, |message| {
+                let header = Header::from(message);
+                monitor.check(&header, now()).violation().is_some()
+            })
+        });
+    });
+    let mut number = OPEN;
+    group.bench_function("request, agree, inform", |b| {
+        b.iter_batched(
+            || {
+                number += 1;
+                let said = |act, from, to| message(act, from, to, "fipa-request", id(number));
+                [
+                    said(Performative::Request, "ann", "ben"),
+                    said(Performative::Agree, "ben", "ann"),
+                    said(Performative::Inform, "ben", "ann"),
+                ]
+            },
+            |messages| {
+                for message in &messages {
+                    assert!(monitor.check(&Header::from(message), now()).is_accepted());
+                }
+                messages
+            },
+            BatchSize::SmallInput,
+        );
+    });
+    group.finish();
+}
+
+fn memory(_: &mut Criterion) {
+    const MANY: usize = 1_000_000;
+    let mut limits = Limits::default();
+    limits.conversations = MANY;
+    let library = Arc::new(Library::standard());
+    let mut monitor = Monitor::observer(library).with_limits(limits);
+    let info = allocation_counter::measure(|| {
+        for number in 0..MANY {
+            let ann = format!("rover_{}", number % 1_000);
+            let header = Header::new(Performative::Request)
+                .sender(ann)
+                .receivers(["arm_1"])
+                .protocol("fipa-request")
+                .conversation_id(id(number));
+            assert!(monitor.check(&header, now()).is_accepted());
+        }
+    });
+    assert_eq!(monitor.len(), MANY);
+    println!(
+        "{MANY} conversations: {} MB held, {} MB at most",
+        info.bytes_current / 1_000_000,
+        info.bytes_max / 1_000_000
+    );
+}
+
+criterion_group!(benches, verdicts, memory);
+criterion_main!(benches);

@@ -1,0 +1,445 @@
+//! A second reading of the rules, written for being right and not for being fast: it shares no code
+//! with the monitor but the file's own transitions, keeps all that was said, and decides from that.
+
+use std::collections::HashMap;
+
+use fipa_monitor::{Library, Machine, Scope};
+
+mod talk;
+
+use talk::{Spot, Step, Talk, View, judge, state};
+pub(crate) use talk::{matches, options};
+
+/// A message, in plain words.
+#[derive(Debug, Clone)]
+pub(crate) struct Words {
+    pub(crate) act: &'static str,
+    pub(crate) from: &'static str,
+    pub(crate) to: Vec<&'static str>,
+    pub(crate) protocol: Option<String>,
+    pub(crate) id: String,
+    pub(crate) reply_with: Option<String>,
+    pub(crate) in_reply_to: Option<String>,
+    pub(crate) reply_to: Vec<&'static str>,
+    /// Milliseconds.
+    pub(crate) reply_by: Option<u64>,
+}
+
+/// What the reference says: the new state with opened, ended, complete, late; or the violation.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Says {
+    Right(String, [bool; 4]),
+    Wrong(&'static str),
+    Nothing,
+}
+
+/// A conversation's machine, its initiator, and the state of each participant.
+pub(crate) type Overview<'l> = (&'l Machine, &'static str, Vec<(&'static str, String)>);
+
+pub(crate) struct Reference<'l> {
+    library: &'l Library,
+    agent: Option<&'static str>,
+    talks: HashMap<String, Conversation<'l>>,
+}
+
+struct Conversation<'l> {
+    machine: &'l Machine,
+    initiator: &'static str,
+    /// One per participant, or a single one without a name.
+    talks: Vec<(&'static str, Talk)>,
+    /// With the members of a multicast.
+    multicast: Option<Talk>,
+    roles: Vec<(String, &'static str)>,
+    designated: Vec<&'static str>,
+    /// Conversations within, the latest first.
+    inner: Vec<Self>,
+}
+
+impl<'l> Reference<'l> {
+    pub(crate) fn new(library: &'l Library, agent: Option<&'static str>) -> Self {
+        Self {
+            library,
+            agent,
+            talks: HashMap::new(),
+        }
+    }
+
+    pub(crate) fn forget(&mut self, id: &str) {
+        self.talks.remove(id);
+    }
+
+    /// The states of a conversation, for whoever wants to say something fitting.
+    pub(crate) fn states(&self, id: &str) -> Option<Overview<'l>> {
+        let conversation = self.talks.get(id)?;
+        let talks = conversation.talks.iter();
+        let states = talks.map(|(peer, talk)| (*peer, talk.name()));
+        Some((
+            conversation.machine,
+            conversation.initiator,
+            states.collect(),
+        ))
+    }
+
+    pub(crate) fn hear(&mut self, words: &Words, now: u64) -> Says {
+        let own = self.agent == Some(words.from);
+        if let Some(conversation) = self.talks.get_mut(&words.id) {
+            let library = self.library;
+            return conversation
+                .hear_any(library, words, own, now)
+                .unwrap_or_else(Says::Wrong);
+        }
+        let named = words
+            .protocol
+            .as_ref()
+            .and_then(|name| self.library.find(name));
+        let Some(machine) = named else {
+            return Says::Nothing;
+        };
+        let mut conversation = Conversation::new(machine, words.from);
+        match conversation.hear(words, own, now) {
+            Ok(says) => {
+                self.talks.insert(words.id.clone(), conversation);
+                says
+            }
+            Err(_) => Says::Wrong("not-opened"),
+        }
+    }
+}
+
+impl<'l> Conversation<'l> {
+    fn new(machine: &'l Machine, initiator: &'static str) -> Self {
+        let mut talks = Vec::new();
+        if machine.scope() == Scope::Conversation {
+            talks.push(("", Talk::new(machine)));
+        }
+        Self {
+            machine,
+            initiator,
+            talks,
+            multicast: None,
+            roles: Vec::new(),
+            designated: Vec::new(),
+            inner: Vec::new(),
+        }
+    }
+
+    /// A message of this conversation, or of one within.
+    fn hear_any(
+        &mut self,
+        library: &'l Library,
+        words: &Words,
+        own: bool,
+        now: u64,
+    ) -> Result<Says, &'static str> {
+        let name = match &words.protocol {
+            Some(name) if !self.machine.is_called(name) => name,
+            _ => return self.hear(words, own, now),
+        };
+        let may_begin = self.may_begin(library, name, words.from)
+            || self
+                .inner
+                .iter()
+                .any(|inner| inner.may_begin(library, name, words.from));
+        let mut first_wrong = None;
+        for inner in &mut self.inner {
+            if inner.machine.is_called(name) {
+                match inner.hear(words, own, now) {
+                    Ok(says) => return Ok(says),
+                    Err(wrong) => first_wrong = first_wrong.or(Some(wrong)),
+                }
+            }
+        }
+        if !may_begin {
+            return Err(first_wrong.unwrap_or("wrong-protocol"));
+        }
+        let Some(machine) = library.find(name) else {
+            return Ok(Says::Nothing);
+        };
+        if self.inner.len() == 64 {
+            return Err("too-many");
+        }
+        let mut inner = Conversation::new(machine, words.from);
+        let says = inner
+            .hear(words, own, now)
+            .map_err(|_| first_wrong.unwrap_or("not-opened"))?;
+        self.inner.insert(0, inner);
+        Ok(says)
+    }
+
+    fn may_begin(&self, library: &Library, name: &str, from: &str) -> bool {
+        let machine = self.machine;
+        let roles: Vec<&str> = match machine.scope() {
+            Scope::Participant if from == self.initiator => vec![machine.initiator()],
+            Scope::Participant => {
+                let others = machine
+                    .roles()
+                    .iter()
+                    .filter(|role| *role != machine.initiator());
+                others.map(String::as_str).collect()
+            }
+            _ => {
+                let held = self.roles.iter().filter(|(_, agent)| *agent == from);
+                held.map(|(role, _)| role.as_str()).collect()
+            }
+        };
+        let names: Vec<&str> = match library.find(name) {
+            Some(inner) => {
+                let aliases = inner.aliases().iter().map(String::as_str);
+                aliases.chain([inner.name()]).collect()
+            }
+            None => vec![name],
+        };
+        self.talks.iter().any(|(peer, talk)| {
+            let Spot::At(id) = &talk.spot else {
+                return false;
+            };
+            let his = machine.scope() == Scope::Conversation || from == self.initiator;
+            (his || *peer == from)
+                && state(machine, id).subprotocols().iter().any(|sub| {
+                    roles.iter().any(|role| matches(sub.from(), role))
+                        && names.iter().any(|name| matches(sub.name(), name))
+                })
+        })
+    }
+}
+
+impl Conversation<'_> {
+    fn hear(&mut self, words: &Words, own: bool, now: u64) -> Result<Says, &'static str> {
+        for (_, talk) in &mut self.talks {
+            talk.expire(self.machine, now);
+        }
+        match self.machine.scope() {
+            Scope::Participant => self.hear_each(words, own, now),
+            _ => self.hear_all(words, own, now),
+        }
+    }
+
+    fn view<'w>(&self, words: &'w Words, by_initiator: bool, own: bool) -> View<'w> {
+        let begins = self.machine.initiator();
+        let (one, other): (Vec<String>, Vec<String>) = self
+            .machine
+            .roles()
+            .iter()
+            .cloned()
+            .partition(|role| role == begins);
+        let (from, to) = if by_initiator {
+            (one, other)
+        } else {
+            (other, one)
+        };
+        View {
+            words,
+            by_initiator,
+            from,
+            to,
+            known: true,
+            compares: true,
+            own,
+        }
+    }
+
+    fn hear_each(&mut self, words: &Words, own: bool, now: u64) -> Result<Says, &'static str> {
+        let place = |talks: &[(&'static str, Talk)], name: &str| {
+            talks.iter().position(|(peer, _)| *peer == name)
+        };
+        let machine = self.machine;
+        if words.from != self.initiator {
+            let known = place(&self.talks, words.from);
+            let fresh = known.is_none();
+            let talk = match (known, &self.multicast) {
+                (Some(at), _) => self.talks[at].1.clone(),
+                (None, Some(talk)) => talk.clone(),
+                (None, None) => return self.told_from_outside(words),
+            };
+            let addressed =
+                |name: &&&str| **name != self.initiator && !self.designated.contains(*name);
+            if words.to.iter().any(|name| addressed(&name)) {
+                return Err("wrong-receiver");
+            }
+            let step = judge(machine, &talk, &self.view(words, false, own))?;
+            let at = known.unwrap_or_else(|| {
+                self.talks.push((words.from, talk));
+                self.talks.len() - 1
+            });
+            let (opened, late) = self.talks[at].1.go(machine, words, false, step, now);
+            return Ok(self.says(Some(at), opened || fresh, late));
+        }
+        // To everybody or to nobody.
+        let mut steps: Vec<(&'static str, bool, Step)> = Vec::new();
+        for name in &words.to {
+            let talk = match place(&self.talks, name) {
+                Some(at) => self.talks[at].1.clone(),
+                None if name.contains('*') && self.multicast.is_some() => {
+                    self.multicast.clone().expect("there is one")
+                }
+                None => Talk::new(machine),
+            };
+            let mut side = true;
+            let mut step = judge(machine, &talk, &self.view(words, true, own));
+            if step.is_err()
+                && *name == words.from
+                && let Ok(other) = judge(machine, &talk, &self.view(words, false, own))
+            {
+                (side, step) = (false, Ok(other));
+            }
+            if !steps.iter().any(|(known, ..)| known == name) {
+                steps.push((*name, side, step?));
+            } else {
+                step?;
+            }
+        }
+        let (mut opened, mut late, mut first) = (false, false, None);
+        for (name, side, step) in steps {
+            let known = place(&self.talks, name);
+            if known.is_none() && name.contains('*') {
+                opened |= self.multicast.is_none();
+                let talk = self.multicast.get_or_insert_with(|| Talk::new(machine));
+                let (began, was_late) = talk.go(machine, words, side, step, now);
+                (opened, late) = (opened | began, late | was_late);
+                first = first.or(Some(talk.name()));
+                continue;
+            }
+            let at = known.unwrap_or_else(|| {
+                opened = true;
+                self.talks.push((name, Talk::new(machine)));
+                self.talks.len() - 1
+            });
+            let (began, was_late) = self.talks[at].1.go(machine, words, side, step, now);
+            (opened, late) = (opened | began, late | was_late);
+            first = first.or(Some(self.talks[at].1.name()));
+        }
+        self.designate(words);
+        Ok(self.says_state(first, opened, late))
+    }
+
+    fn designate(&mut self, words: &Words) {
+        for name in &words.reply_to {
+            if *name != self.initiator && !self.designated.contains(name) {
+                self.designated.push(name);
+            }
+        }
+    }
+
+    /// Somebody who takes no part: a message transport service that tells of a failure, or wrong.
+    fn told_from_outside(&mut self, words: &Words) -> Result<Says, &'static str> {
+        let takes_part =
+            |name: &str| name == self.initiator || self.talks.iter().any(|(peer, _)| *peer == name);
+        if words.act != "failure" || !words.to.iter().all(|name| takes_part(name)) {
+            return Err("stranger");
+        }
+        let (mut first, mut failed) = (None, Vec::new());
+        let before: Vec<(&str, Talk)> = self.talks.clone();
+        for name in &words.to {
+            let concerned: Vec<usize> = (0..before.len())
+                .filter(|at| {
+                    let (peer, talk) = &before[*at];
+                    let side = *name == self.initiator;
+                    if !side && peer != name {
+                        return false;
+                    }
+                    let asked = talk.last_of(side).and_then(|said| said.reply_with.clone());
+                    let answers = words.in_reply_to.is_none()
+                        || asked.is_none()
+                        || asked == words.in_reply_to;
+                    talk.last_by_initiator() == side && answers
+                })
+                .collect();
+            if let [only] = concerned[..] {
+                // Whoever is named twice is told once.
+                let talk = &mut self.talks[only].1;
+                if !failed.contains(&only) {
+                    talk.fail();
+                    failed.push(only);
+                }
+                first = first.or(Some(talk.name()));
+            }
+        }
+        Ok(self.says_state(first, false, false))
+    }
+
+    fn hear_all(&mut self, words: &Words, own: bool, now: u64) -> Result<Says, &'static str> {
+        let machine = self.machine;
+        let free: Vec<String> = machine
+            .roles()
+            .iter()
+            .filter(|role| !self.roles.iter().any(|(bound, _)| bound == *role))
+            .cloned()
+            .collect();
+        let held = |name: &str| {
+            let held = self.roles.iter().filter(|(_, agent)| *agent == name);
+            let mut held: Vec<String> = held.map(|(role, _)| role.clone()).collect();
+            if self.designated.contains(&name) {
+                held.push(machine.initiator().to_owned());
+            }
+            held
+        };
+        let may = |name: &str| [held(name), free.clone()].concat();
+        let mut to_roles = machine.roles().to_vec();
+        for name in &words.to {
+            to_roles.retain(|role| may(name).contains(role));
+        }
+        let knows = |name: &str| !held(name).is_empty();
+        let nobody = |name: &str| may(name).is_empty();
+        let view = View {
+            from: may(words.from),
+            to: to_roles,
+            known: knows(words.from) && words.to.iter().all(|name| knows(name)),
+            compares: self.roles.len() == 2,
+            ..self.view(words, words.from == self.initiator, own)
+        };
+        let strange = words.to.iter().any(|name| nobody(name));
+        let step = match judge(machine, &self.talks[0].1, &view) {
+            Ok(step) => step,
+            Err(_) if nobody(words.from) && words.act == "failure" && !strange => {
+                self.talks[0].1.fail();
+                return Ok(self.says(Some(0), false, false));
+            }
+            Err(_) if nobody(words.from) => return Err("stranger"),
+            Err("unexpected" | "out-of-order") if strange => return Err("wrong-receiver"),
+            Err(wrong) => return Err(wrong),
+        };
+        let mut give = Vec::new();
+        if let Some((from, to)) = &step.roles {
+            let single = |pattern: &str| {
+                let mut fit = machine.roles().iter().filter(|role| matches(pattern, role));
+                match (fit.next(), fit.next()) {
+                    (Some(role), None) if pattern != ".*" && free.contains(role) => {
+                        Some(role.clone())
+                    }
+                    _ => None,
+                }
+            };
+            give.extend(single(from).map(|role| (role, words.from)));
+            if let Some(role) = single(to) {
+                give.extend(words.to.iter().map(|name| (role.clone(), *name)));
+            }
+        }
+        self.roles.extend(give);
+        let by_initiator = view.by_initiator;
+        let (opened, late) = self.talks[0].1.go(machine, words, by_initiator, step, now);
+        if by_initiator {
+            self.designate(words);
+        }
+        Ok(self.says(Some(0), opened, late))
+    }
+
+    fn says(&self, at: Option<usize>, opened: bool, late: bool) -> Says {
+        self.says_state(at.map(|at| self.talks[at].1.name()), opened, late)
+    }
+
+    fn says_state(&self, name: Option<String>, opened: bool, late: bool) -> Says {
+        let machine = self.machine;
+        let first = || self.talks.first().map(|(_, talk)| talk.name());
+        let name = name
+            .or_else(first)
+            .unwrap_or_else(|| machine.initial().id().to_owned());
+        let ended = match name.as_str() {
+            "not-understood" | "cancelled" | "undelivered" => true,
+            "cancelling" => false,
+            own => state(machine, own).is_final(),
+        };
+        let complete =
+            self.multicast.is_none() && self.talks.iter().all(|(_, talk)| talk.has_ended(machine));
+        Says::Right(name, [opened, ended, complete, late])
+    }
+}

@@ -1,0 +1,378 @@
+//! One state machine as the reference runs it: what was said, and what a message means after that.
+
+use std::collections::HashMap;
+
+use fipa_monitor::{After, Cancel, Machine, Scope, State, Transition};
+use regex::Regex;
+
+use super::Words;
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Spot {
+    At(String),
+    NotUnderstood,
+    Cancelling(String),
+    Cancelled { one_more: bool },
+    Undelivered(Box<Spot>),
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct Talk {
+    pub(super) spot: Spot,
+    pub(super) previous: Spot,
+    pub(super) said: Vec<Said>,
+    pub(super) due: Option<u64>,
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct Said {
+    pub(super) by_initiator: bool,
+    pub(super) act: &'static str,
+    pub(super) reply_with: Option<String>,
+    /// A cancel that began cancelling.
+    pub(super) cancels: bool,
+    /// Sent before the other side's cancel was known.
+    pub(super) crossed: bool,
+}
+
+pub(super) struct Step {
+    pub(super) spot: Spot,
+    pub(super) roles: Option<(String, String)>,
+    pub(super) crossed: bool,
+}
+
+pub(super) fn to(spot: Spot) -> Step {
+    Step {
+        spot,
+        roles: None,
+        crossed: false,
+    }
+}
+
+pub(crate) fn matches(pattern: &str, text: &str) -> bool {
+    thread_local! {
+        static KNOWN: std::cell::RefCell<HashMap<String, Regex>> = HashMap::new().into();
+    }
+    KNOWN.with_borrow_mut(|known| {
+        let regex = known
+            .entry(pattern.to_owned())
+            .or_insert_with(|| Regex::new(&format!("^(?:{pattern})$")).expect("the file was read"));
+        regex.is_match(text)
+    })
+}
+
+pub(super) fn state<'m>(machine: &'m Machine, id: &str) -> &'m State {
+    let found = machine.states().iter().find(|state| state.id() == id);
+    found.expect("a state of the machine")
+}
+
+/// The state's transitions and those behind optional ones.
+pub(crate) fn options<'m>(machine: &'m Machine, id: &str) -> Vec<&'m Transition> {
+    let mut all = Vec::new();
+    for transition in state(machine, id).transitions() {
+        all.push(transition);
+        if transition.is_optional() {
+            all.extend(options(machine, machine.target(transition)));
+        }
+    }
+    all
+}
+
+pub(super) fn is_over(machine: &Machine, id: &str) -> bool {
+    let here = state(machine, id);
+    here.is_final() && here.transitions().is_empty() && here.subprotocols().is_empty()
+}
+
+impl Talk {
+    pub(super) fn new(machine: &Machine) -> Self {
+        let spot = Spot::At(machine.initial().id().to_owned());
+        Self {
+            previous: spot.clone(),
+            spot,
+            said: Vec::new(),
+            due: None,
+        }
+    }
+
+    /// Who said the last thing that counts; before anything is said, the other side.
+    pub(super) fn last_by_initiator(&self) -> bool {
+        let last = self.said.iter().rev().find(|said| !said.crossed);
+        last.is_some_and(|said| said.by_initiator)
+    }
+
+    pub(super) fn last_of(&self, initiator: bool) -> Option<&Said> {
+        let mut said = self.said.iter().rev();
+        said.find(|said| said.by_initiator == initiator && !said.cancels)
+    }
+
+    pub(super) fn cancel(&self) -> Option<&Said> {
+        self.said.iter().rev().find(|said| said.cancels)
+    }
+
+    pub(super) fn is_repeated(&self, words: &Words, initiator: bool) -> bool {
+        let last = self.last_of(initiator);
+        words.reply_with.is_some()
+            && last.is_some_and(|said| said.act == words.act && said.reply_with == words.reply_with)
+    }
+
+    pub(super) fn name(&self) -> String {
+        match &self.spot {
+            Spot::At(id) => id.clone(),
+            Spot::NotUnderstood => "not-understood".into(),
+            Spot::Cancelling(_) => "cancelling".into(),
+            Spot::Cancelled { .. } => "cancelled".into(),
+            Spot::Undelivered(_) => "undelivered".into(),
+        }
+    }
+
+    pub(super) fn has_ended(&self, machine: &Machine) -> bool {
+        match &self.spot {
+            Spot::At(id) => state(machine, id).is_final(),
+            Spot::Cancelling(_) => false,
+            _ => true,
+        }
+    }
+
+    pub(super) fn expire(&mut self, machine: &Machine, now: u64) {
+        let Spot::At(id) = &self.spot else { return };
+        let timeout = state(machine, id).timeout();
+        if let (Some(timeout), Some(due)) = (timeout, self.due)
+            && due < now
+        {
+            self.previous = self.spot.clone();
+            self.spot = Spot::At(machine.timeout_target(timeout).to_owned());
+        }
+    }
+}
+
+/// One message as one talk sees it: who may have which role, and who knows whom.
+pub(super) struct View<'a> {
+    pub(super) words: &'a Words,
+    pub(super) by_initiator: bool,
+    pub(super) from: Vec<String>,
+    pub(super) to: Vec<String>,
+    pub(super) known: bool,
+    pub(super) compares: bool,
+    pub(super) own: bool,
+}
+
+impl View<'_> {
+    pub(super) fn fits(&self, transition: &Transition) -> bool {
+        self.fits_ways(transition, &self.from, &self.to)
+    }
+
+    pub(super) fn fits_ways(
+        &self,
+        transition: &Transition,
+        from: &[String],
+        to: &[String],
+    ) -> bool {
+        let has = |pattern: &str, roles: &[String]| {
+            pattern == ".*" || roles.iter().any(|role| matches(pattern, role))
+        };
+        matches(transition.performative(), self.words.act)
+            && has(transition.from(), from)
+            && has(transition.to(), to)
+    }
+}
+
+pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<Step, &'static str> {
+    let act = view.words.act;
+    let answers_cancel = ["inform", "failure", "not-understood"].contains(&act);
+    let repeated = talk.is_repeated(view.words, view.by_initiator);
+    match &talk.spot {
+        Spot::At(id) => judge_at(machine, talk, id, view),
+        Spot::Undelivered(before) => {
+            let at = |spot: &Spot| match spot {
+                Spot::At(id) => judge_at(machine, talk, id, view),
+                // A protocol's own states only.
+                _ => Err("unexpected"),
+            };
+            at(before).or_else(|wrong| at(&talk.previous).map_err(|_| wrong))
+        }
+        Spot::NotUnderstood => Err(if repeated { "repeated" } else { "ended" }),
+        Spot::Cancelled { one_more } => {
+            let canceller = talk.cancel().is_some_and(|cancel| cancel.by_initiator);
+            if *one_more && view.by_initiator != canceller && answers_cancel {
+                return Ok(to(Spot::Cancelled { one_more: false }));
+            }
+            Err(if repeated { "repeated" } else { "ended" })
+        }
+        Spot::Cancelling(back) => {
+            let cancel = talk.cancel().expect("somebody cancelled");
+            if machine.scope() == Scope::Participant && view.by_initiator == cancel.by_initiator {
+                return match act {
+                    "not-understood" => Ok(to(Spot::NotUnderstood)),
+                    _ if repeated => Err("repeated"),
+                    _ => Err("unexpected"),
+                };
+            }
+            let both = cancel.reply_with.is_some() && view.words.in_reply_to.is_some();
+            let on_its_way = judge_at(machine, talk, back, view);
+            if answers_cancel && (!both || cancel.reply_with == view.words.in_reply_to) {
+                return Ok(to(match act {
+                    "inform" => Spot::Cancelled {
+                        one_more: !both && on_its_way.is_ok(),
+                    },
+                    "failure" => Spot::At(back.clone()),
+                    _ => Spot::NotUnderstood,
+                }));
+            }
+            on_its_way.map(|step| match step.spot {
+                Spot::At(id) | Spot::Cancelling(id) => Step {
+                    spot: Spot::Cancelling(id),
+                    crossed: true,
+                    roles: step.roles,
+                },
+                // While cancelling, a failure counts as under way, too.
+                Spot::Undelivered(_) => Step {
+                    crossed: true,
+                    ..to(talk.spot.clone())
+                },
+                other => to(other),
+            })
+        }
+    }
+}
+
+pub(super) fn judge_at(
+    machine: &Machine,
+    talk: &Talk,
+    id: &str,
+    view: &View<'_>,
+) -> Result<Step, &'static str> {
+    let words = view.words;
+    let here = state(machine, id);
+    let options = options(machine, id);
+    if let Some(taken) = options.iter().find(|option| view.fits(option)) {
+        let asked = talk
+            .last_of(!view.by_initiator)
+            .and_then(|said| said.reply_with.as_ref());
+        if let (true, Some(asked), Some(answer)) = (view.compares, asked, &words.in_reply_to)
+            && asked != answer
+        {
+            return Err("wrong-reply");
+        }
+        return Ok(Step {
+            roles: Some((taken.from().to_owned(), taken.to().to_owned())),
+            ..to(Spot::At(machine.target(taken).to_owned()))
+        });
+    }
+    for sub in here.subprotocols() {
+        let proxied = |role: &str| {
+            sub.proxied_to()
+                .is_some_and(|pattern| matches(pattern, role))
+        };
+        if view.from.iter().any(|role| matches(sub.from(), role))
+            && view.to.iter().any(|role| proxied(role))
+        {
+            return Ok(to(Spot::At(id.to_owned())));
+        }
+    }
+    let over = is_over(machine, id);
+    let hears_last = talk.last_by_initiator() != view.by_initiator;
+    if view.known && talk.said.iter().any(|said| !said.cancels) {
+        let may_cancel = match machine.cancel() {
+            Cancel::Initiator => view.by_initiator,
+            Cancel::Anyone => true,
+            _ => false,
+        };
+        match words.act {
+            "not-understood" if !here.is_final() || hears_last => {
+                return Ok(to(Spot::NotUnderstood));
+            }
+            "cancel" if may_cancel && (!over || (hears_last && !view.own)) => {
+                return Ok(to(Spot::Cancelling(id.to_owned())));
+            }
+            // In the form of fipa_acl, in which alone a conversation has one state here.
+            "failure" if machine.scope() == Scope::Conversation && !here.is_final() => {
+                return Ok(to(Spot::Undelivered(Box::new(Spot::At(id.to_owned())))));
+            }
+            _ => {}
+        }
+    }
+    Err(if talk.is_repeated(words, view.by_initiator) {
+        "repeated"
+    } else if over {
+        "ended"
+    } else if options
+        .iter()
+        .any(|option| view.fits_ways(option, &view.to, &view.from))
+    {
+        "wrong-sender"
+    } else if comes_later(machine, id, view, &mut Vec::new()) {
+        "out-of-order"
+    } else {
+        "unexpected"
+    })
+}
+
+pub(super) fn comes_later(
+    machine: &Machine,
+    id: &str,
+    view: &View<'_>,
+    seen: &mut Vec<String>,
+) -> bool {
+    if seen.iter().any(|other| other == id) {
+        return false;
+    }
+    seen.push(id.to_owned());
+    options(machine, id).iter().any(|option| view.fits(option))
+        || state(machine, id)
+            .transitions()
+            .iter()
+            .any(|step| comes_later(machine, machine.target(step), view, seen))
+}
+
+impl Talk {
+    pub(super) fn fail(&mut self) {
+        self.spot = match self.spot.clone() {
+            Spot::At(id) => Spot::Undelivered(Box::new(Spot::At(id))),
+            // The cancel was not heard.
+            Spot::Cancelling(back) => Spot::At(back),
+            // What has ended, or failed already.
+            other => other,
+        };
+    }
+
+    /// Goes there; whether the talk began so, and whether it was late.
+    pub(super) fn go(
+        &mut self,
+        machine: &Machine,
+        words: &Words,
+        by_initiator: bool,
+        step: Step,
+        now: u64,
+    ) -> (bool, bool) {
+        let opened = !self.said.iter().any(|said| !said.cancels);
+        if let Spot::Undelivered(_) = &step.spot {
+            self.spot = step.spot;
+            let late =
+                self.due.is_some_and(|due| due < now) && self.last_by_initiator() != by_initiator;
+            return (opened, late);
+        }
+        let late =
+            self.due.is_some_and(|due| due < now) && self.last_by_initiator() != by_initiator;
+        let cancels =
+            matches!(step.spot, Spot::Cancelling(_)) && !matches!(self.spot, Spot::Cancelling(_));
+        if !matches!(self.spot, Spot::Undelivered(_)) {
+            self.previous = self.spot.clone();
+        }
+        self.said.push(Said {
+            by_initiator,
+            act: words.act,
+            reply_with: words.reply_with.clone(),
+            cancels,
+            crossed: step.crossed,
+        });
+        self.spot = step.spot;
+        self.due = words.reply_by;
+        if let Spot::At(id) = &self.spot
+            && let Some(timeout) = state(machine, id).timeout()
+            && let After::Span(span) = timeout.after()
+        {
+            self.due = Some(now + u64::try_from(span.as_millis()).expect("a day at most"));
+        }
+        (opened, late)
+    }
+}
