@@ -25,7 +25,7 @@
 //! [transport.tcp]
 //! listen = ["127.0.0.1:0"]            # loopback unless the owner opens it
 //! [transport.udp]
-//! listen = ["127.0.0.1:0"]            # kept for later: this version has no udp
+//! listen = ["127.0.0.1:0"]            # as for tcp; letters that fit one datagram
 //! [discovery]
 //! mdns = true
 //! interfaces = []                     # empty: all that listen; names or addresses otherwise
@@ -110,7 +110,7 @@ pub struct Transports {
     pub shm: Shm,
     /// `[transport.tcp]`.
     pub tcp: Listen,
-    /// `[transport.udp]`. Understood so that a file may have it already; this version has no udp.
+    /// `[transport.udp]`.
     pub udp: Listen,
 }
 

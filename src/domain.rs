@@ -95,7 +95,6 @@ impl Domain {
                 name: name.into(),
                 gateway: false,
                 // Another way than shared memory between processes of this host; never further.
-                listen: vec!["127.0.0.1:0".to_owned()],
                 contacts: None,
                 view: &|host, _| Ok(host),
             },

@@ -54,7 +54,6 @@ impl Gateway {
             Role {
                 name: config.mts.name.as_str().into(),
                 gateway: true,
-                listen: config.transport.tcp.listen.clone(),
                 contacts: Some(Arc::clone(&contacts) as Arc<dyn Contacts>),
                 view: &|host, mts| {
                     let network = network(config, mts)?;

@@ -56,7 +56,8 @@ pub use fipa_sds::{
     Source, Watch, is_pattern,
 };
 pub use fipa_transport::{
-    Attempt, FailureReason, Incarnation, Kind, ListenError, Location, Outcome,
+    Attempt, FailureReason, Incarnation, Kind, ListenError, Location, Outcome, Signature, WayError,
+    WayFault,
 };
 #[cfg(feature = "net")]
 pub use gateway::{Gateway, Neighbour};

@@ -40,9 +40,6 @@ pub(crate) struct Role<'a> {
     pub(crate) name: Arc<str>,
     /// Leave to forward.
     pub(crate) gateway: bool,
-    /// Where TCP listens.
-    #[cfg_attr(not(feature = "net"), expect(dead_code, reason = "nothing listens"))]
-    pub(crate) listen: Vec<String>,
     /// Who is told of agents of other hosts that have written.
     pub(crate) contacts: Option<Arc<dyn Contacts>>,
     /// Makes the view of the directory in which receivers are looked up.
@@ -213,6 +210,8 @@ fn transports(
             Kind::Shm => shm(config, place, incarnation, handle),
             #[cfg(feature = "net")]
             Kind::Tcp => tcp(config, role, place, incarnation, handle),
+            #[cfg(feature = "net")]
+            Kind::Udp => udp(config, role, place, incarnation, handle),
             // One configuration serves all processes of a robot, whatever they were built with.
             other => {
                 tracing::debug!(kind = %other, "this program was built without it");
@@ -253,16 +252,7 @@ fn tcp(
     incarnation: Incarnation,
     handle: &Handle,
 ) -> Result<Arc<dyn Transport>, String> {
-    use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport};
-    let host = place
-        .host_id()
-        .map_err(|error| format!("cannot tell this host: {error}"))?;
-    let identity = Identity {
-        name: role.name.to_string(),
-        incarnation,
-        domain: config.domain.clone(),
-        host,
-    };
+    use fipa_transport_net::{Limits, TcpConfig, TcpTransport};
     let max_letter = usize::try_from(config.transport.shm.max_letter).unwrap_or(usize::MAX);
     let limits = Limits {
         max_letter,
@@ -270,9 +260,53 @@ fn tcp(
         ..Limits::default()
     };
     let config = TcpConfig {
-        listen: role.listen.clone(),
-        identity,
+        listen: listen(&config.transport.tcp, role),
+        identity: identity(config, role, place, incarnation)?,
         limits,
     };
     Ok(Arc::new(TcpTransport::new(config, handle.clone())))
+}
+
+#[cfg(feature = "net")]
+fn udp(
+    config: &Config,
+    role: &Role<'_>,
+    place: &Place,
+    incarnation: Incarnation,
+    handle: &Handle,
+) -> Result<Arc<dyn Transport>, String> {
+    use fipa_transport_net::{UdpConfig, UdpLimits, UdpTransport};
+    let config = UdpConfig {
+        listen: listen(&config.transport.udp, role),
+        identity: identity(config, role, place, incarnation)?,
+        limits: UdpLimits::default(),
+    };
+    Ok(Arc::new(UdpTransport::new(config, handle.clone())))
+}
+
+/// A gateway listens where its owner wants it, other processes for their own host.
+#[cfg(feature = "net")]
+fn listen(settings: &crate::config::Listen, role: &Role<'_>) -> Vec<String> {
+    if role.gateway {
+        settings.listen.clone()
+    } else {
+        vec!["127.0.0.1:0".to_owned()]
+    }
+}
+
+#[cfg(feature = "net")]
+fn identity(
+    config: &Config,
+    role: &Role<'_>,
+    place: &Place,
+    incarnation: Incarnation,
+) -> Result<fipa_transport_net::Identity, String> {
+    Ok(fipa_transport_net::Identity {
+        name: role.name.to_string(),
+        incarnation,
+        domain: config.domain.clone(),
+        host: place
+            .host_id()
+            .map_err(|error| format!("cannot tell this host: {error}"))?,
+    })
 }

@@ -10,7 +10,7 @@ use fipa::config::Sources;
 use fipa::routes::{self, Standing};
 use fipa::{
     Agent, AgentId, Config, Deliveries, Domain, FailureReason, Gateway, Kind, Message, OpenError,
-    Outcome, Performative, Query,
+    Outcome, Performative, Query, WayFault,
 };
 
 /// A host that no other test has, and names that nobody else announces.
@@ -92,6 +92,38 @@ fn reason(deliveries: &Deliveries) -> FailureReason {
             other => panic!("{other}"),
         },
         other => panic!("{other:?}"),
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn small_letters_go_by_udp_and_what_is_too_large_by_tcp() {
+    let order = ["mts.transports=shm,udp,tcp"];
+    let (here, there) = (Host::new(&order), Host::new(&order));
+    let (_near, at_home) = here.occupied().await;
+    let (_far, abroad) = there.occupied().await;
+    let rover = at_home.register(&here.name("rover")).unwrap();
+    let arm = abroad.register(&there.name("arm")).unwrap();
+    known(&at_home, arm.name()).await;
+    for round in 0..10 {
+        for (len, expected) in [(100, Kind::Udp), (200_000, Kind::Tcp), (20_000, Kind::Udp)] {
+            let content = round.to_string().repeat(len);
+            let sent = rover
+                .send(inform(&rover, arm.name(), &content))
+                .await
+                .unwrap();
+            assert_eq!(via(&sent), Some(expected), "{len} bytes");
+            let attempts = sent.0[0].outcome.attempts();
+            match expected {
+                Kind::Tcp => {
+                    assert_eq!(attempts.len(), 1, "{sent}");
+                    assert_eq!(attempts[0].via, Kind::Udp);
+                    assert_eq!(attempts[0].error.fault, WayFault::TooLarge);
+                }
+                _ => assert!(attempts.is_empty(), "{sent}"),
+            }
+            let incoming = arm.receive().await.unwrap();
+            assert_eq!(incoming.message.content().unwrap(), &content);
+        }
     }
 }
 

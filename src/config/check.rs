@@ -38,7 +38,7 @@ const MAX_INTERFACES: usize = 64;
 const MAX_PEERS: usize = 1024;
 
 /// The transports this version of fipa has.
-const BUILT: [Kind; 2] = [Kind::Shm, Kind::Tcp];
+const BUILT: [Kind; 3] = [Kind::Shm, Kind::Tcp, Kind::Udp];
 
 /// A value that is not allowed.
 #[derive(Debug)]
@@ -365,7 +365,7 @@ fn repeated<T: Eq + Hash + Clone>(all: impl IntoIterator<Item = T>) -> Option<T>
 }
 
 fn built() -> String {
-    BUILT.map(Kind::name).join(" and ")
+    BUILT.map(Kind::name).join(", ")
 }
 
 /// Errors of `regex` draw a picture over several lines; the last line says what is wrong.

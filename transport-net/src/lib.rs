@@ -1,14 +1,25 @@
 //! Letters between hosts.
 //!
-//! [`TcpTransport`] carries parcels in frames over one persistent connection per peer, and takes
-//! the unframed letters of old peers on the same port. Each kind of transport has a module tree
-//! of its own; they share nothing but [`Identity`].
+//! * [`TcpTransport`] carries parcels in frames over one persistent connection per peer, and takes
+//!   the unframed letters of old peers on the same port.
+//! * [`UdpTransport`] carries parcels that fit one datagram, acknowledged.
+//!
+//! Each has a module tree of its own. Beside them stands what they share: who is there
+//! ([`Identity`]) and how they introduce themselves (`hello`), addresses as text (`address`), how
+//! answers are written (`answer`), and why a connection ends (`end`).
 //!
 //! What must not live here: routes, retries, order across transports, directories. A transport
 //! tries once and reports.
 
+mod address;
+mod answer;
+mod end;
+mod hello;
 mod identity;
+mod seldom;
 mod tcp;
+mod udp;
 
 pub use identity::Identity;
 pub use tcp::{Counters, Limits, TcpConfig, TcpTransport};
+pub use udp::{UdpConfig, UdpCounters, UdpLimits, UdpTransport};

@@ -1,4 +1,4 @@
-//! The rules of every transport, kept by TCP on loopback, over IPv4 and IPv6.
+//! The rules of every transport, kept by TCP and UDP on loopback, over IPv4 and IPv6.
 #![allow(
     clippy::unwrap_used,
     reason = "a test or bench that cannot go on may panic"
@@ -6,22 +6,23 @@
 
 mod common;
 
+use std::net::UdpSocket;
 use std::sync::Arc;
 
 use fipa_transport::conformance::Fixture;
-use fipa_transport::{Kind, Location, Transport};
-use fipa_transport_net::TcpTransport;
+use fipa_transport::{Faulty, Kind, Location, Transport};
+use fipa_transport_net::{TcpTransport, UdpTransport};
 use tokio::net::TcpSocket;
 use tokio::runtime::Runtime;
 
-struct Loopback {
+struct Tcp {
     runtime: Runtime,
     address: &'static str,
     /// Bound and never listening: connecting to it is refused, and nobody else gets the port.
     nowhere: TcpSocket,
 }
 
-impl Loopback {
+impl Tcp {
     fn new(address: &'static str) -> Self {
         let runtime = common::runtime();
         let socket = if address.starts_with('[') {
@@ -39,7 +40,7 @@ impl Loopback {
     }
 }
 
-impl Fixture for Loopback {
+impl Fixture for Tcp {
     fn endpoint(&self) -> Arc<dyn Transport> {
         let config = common::config(&[self.address]);
         let runtime = self.runtime.handle().clone();
@@ -52,12 +53,71 @@ impl Fixture for Loopback {
     }
 }
 
-mod ipv4 {
-    use super::Loopback;
-    fipa_transport::conformance_tests!(Loopback::new("127.0.0.1:0"));
+struct Udp {
+    runtime: Runtime,
+    address: &'static str,
+    /// Connected to itself: whatever others send is refused, and nobody else gets the port.
+    nowhere: UdpSocket,
+    decorated: bool,
 }
 
-mod ipv6 {
-    use super::Loopback;
-    fipa_transport::conformance_tests!(Loopback::new("[::1]:0"));
+impl Udp {
+    fn new(address: &'static str) -> Self {
+        let nowhere = UdpSocket::bind(address).unwrap();
+        nowhere.connect(nowhere.local_addr().unwrap()).unwrap();
+        Self {
+            runtime: common::runtime(),
+            address,
+            nowhere,
+            decorated: false,
+        }
+    }
+
+    fn decorated(address: &'static str) -> Self {
+        Self {
+            decorated: true,
+            ..Self::new(address)
+        }
+    }
+}
+
+impl Fixture for Udp {
+    fn endpoint(&self) -> Arc<dyn Transport> {
+        let config = common::udp_config(&[self.address]);
+        let transport = Arc::new(UdpTransport::new(config, self.runtime.handle().clone()));
+        if self.decorated {
+            return Arc::new(Faulty::new(transport, 1, &[]));
+        }
+        transport
+    }
+
+    fn nowhere(&self) -> Location {
+        let address = self.nowhere.local_addr().unwrap().to_string();
+        Location::new(Kind::Udp, &address).unwrap()
+    }
+}
+
+mod tcp_ipv4 {
+    use super::Tcp;
+    fipa_transport::conformance_tests!(Tcp::new("127.0.0.1:0"));
+}
+
+mod tcp_ipv6 {
+    use super::Tcp;
+    fipa_transport::conformance_tests!(Tcp::new("[::1]:0"));
+}
+
+mod udp_ipv4 {
+    use super::Udp;
+    fipa_transport::conformance_tests!(Udp::new("127.0.0.1:0"));
+}
+
+mod udp_ipv6 {
+    use super::Udp;
+    fipa_transport::conformance_tests!(Udp::new("[::1]:0"));
+}
+
+mod udp_decorated {
+    use super::Udp;
+    fipa_transport::conformance_tests!(Udp::decorated("127.0.0.1:0"));
 }

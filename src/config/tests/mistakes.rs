@@ -157,16 +157,16 @@ fn mistakes_are_named_with_line_and_key() {
         ),
         (
             "[mts]\ntransports = []\n",
-            "fipa.toml:2: `mts.transports` is empty; list at least one of shm and tcp",
+            "fipa.toml:2: `mts.transports` is empty; list at least one of shm, tcp, udp",
         ),
         (
             "[mts]\ntransports = [\"tcp\", \"shm\", \"tcp\"]\n",
             "fipa.toml:2: `mts.transports` lists tcp twice; list each transport once",
         ),
         (
-            "[mts]\ntransports = [\"shm\", \"udp\", \"tcp\"]\n",
-            "fipa.toml:2: `mts.transports` lists udp, which is not built yet; \
-             take it out; this version of fipa has shm and tcp",
+            "[mts]\ntransports = [\"shm\", \"quic\", \"tcp\"]\n",
+            "fipa.toml:2: `mts.transports` lists quic, which is not built yet; \
+             take it out; this version of fipa has shm, tcp, udp",
         ),
         (
             "[mts]\ndeadline = \"0s\"\n",
@@ -197,13 +197,13 @@ fn mistakes_are_named_with_line_and_key() {
         ),
         (
             "[routes]\na = []\n",
-            "fipa.toml:2: `routes.a` is empty; list at least one of shm and tcp",
+            "fipa.toml:2: `routes.a` is empty; list at least one of shm, tcp, udp",
         ),
         (
             "[routes]\na = [\"shm\", \"quic\", \"shm\"]\n",
             "fipa.toml:2: `routes.a` lists shm twice; list each transport once\n\
              fipa.toml:2: `routes.a` lists quic, which is not built yet; \
-             take it out; this version of fipa has shm and tcp",
+             take it out; this version of fipa has shm, tcp, udp",
         ),
         (
             "[routes]\na = [\"tcp\"]\n[mts]\ntransports = [\"shm\"]\n",
@@ -253,8 +253,8 @@ fn mistakes_are_named_with_line_and_key() {
              write for example tcp://10.0.0.2:7788",
         ),
         (
-            "[discovery.static]\ncrex = [\"udp://10.0.0.2:7788\"]\n",
-            "fipa.toml:2: `discovery.static.crex` lists udp://10.0.0.2:7788, but udp is not built \
+            "[discovery.static]\ncrex = [\"quic://10.0.0.2:7788\"]\n",
+            "fipa.toml:2: `discovery.static.crex` lists quic://10.0.0.2:7788, but quic is not built \
              yet; write for example tcp://10.0.0.2:7788",
         ),
         (
@@ -349,9 +349,9 @@ fn mistakes_in_set_name_it() {
          (known in [mts]: name, transports, deadline, queue)"
     );
     assert_eq!(
-        error("", &["mts.transports=shm,udp"]),
-        "--set mts.transports=shm,udp: `mts.transports` lists udp, which is not built yet; \
-         take it out; this version of fipa has shm and tcp"
+        error("", &["mts.transports=shm,quic"]),
+        "--set mts.transports=shm,quic: `mts.transports` lists quic, which is not built yet; \
+         take it out; this version of fipa has shm, tcp, udp"
     );
     assert_eq!(
         error("", &["mts=5"]),

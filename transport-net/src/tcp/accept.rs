@@ -13,12 +13,13 @@ use tokio::io::AsyncReadExt;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::{sleep, timeout};
 
-use super::address;
 use super::config::Limits;
 use super::endpoint::{Endpoint, Stranger};
 use super::frame::{FrameReader, MAGIC};
 use super::link::Running;
 use super::unframed;
+use crate::address;
+use crate::seldom::warn_seldom;
 
 /// Connections that the system holds until they are accepted.
 const BACKLOG: i32 = 256;
@@ -33,23 +34,7 @@ const REST: Duration = Duration::from_millis(100);
 pub(crate) fn bind(text: &str) -> Result<std::net::TcpListener, ListenError> {
     let address =
         address::numeric(text).map_err(|error| ListenError::Unavailable(error.to_string()))?;
-    open(address).map_err(|error| {
-        let advice = match error.kind() {
-            io::ErrorKind::AddrInUse => {
-                "; another process listens there: stop it, or choose another port \
-                 (port 0 lets the system choose)"
-            }
-            io::ErrorKind::AddrNotAvailable => {
-                "; this machine has no such address (`ip address` lists those it has)"
-            }
-            io::ErrorKind::PermissionDenied => "; choose a port above 1023",
-            _ => "",
-        };
-        ListenError::Bind {
-            address: text.to_owned(),
-            source: io::Error::new(error.kind(), format!("{error}{advice}")),
-        }
-    })
+    open(address).map_err(|error| address::cannot_bind(text, &error))
 }
 
 fn open(address: SocketAddr) -> io::Result<std::net::TcpListener> {
@@ -145,15 +130,4 @@ async fn receive(endpoint: Arc<Endpoint>, place: Stranger, stream: TcpStream, fr
     let counter = &endpoint.tally().refused_nonsense;
     let before = counter.fetch_add(1, Ordering::Relaxed);
     warn_seldom(before, format_args!("{from}: connection closed: {refused}"));
-}
-
-/// Warns the first time, the second, the fourth, the eighth …: what others do to us must not fill
-/// our log.
-pub(crate) fn warn_seldom(times_before: u64, what: std::fmt::Arguments<'_>) {
-    let times = times_before.saturating_add(1);
-    if times.is_power_of_two() {
-        tracing::warn!(times, "{what}");
-    } else {
-        tracing::debug!(times, "{what}");
-    }
 }

@@ -13,10 +13,10 @@ use fipa_transport::{
 };
 
 use super::config::Limits;
-use super::end::End;
 use super::frame::{self, Frame};
-use super::hello::Hello;
 use super::outbox::{About, Outbox, Progress};
+use crate::end::End;
+use crate::hello::Hello;
 
 /// Numbers of parcels stay below this, so that a ticket has room for the connection's number too.
 pub(crate) const MAX_ID: u64 = 1 << 40;

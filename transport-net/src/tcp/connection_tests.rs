@@ -6,8 +6,8 @@ use fipa_transport::Stream;
 use proptest::prelude::*;
 
 use super::super::frame::{FrameReader, HEADER_LEN};
-use super::super::hello::tests::sample;
 use super::*;
+use crate::hello::tests::sample;
 
 fn parcel(sequence: u64, len: usize) -> Parcel {
     Parcel {

@@ -11,11 +11,11 @@ use tokio::net::{TcpStream, lookup_host};
 use tokio::time::timeout;
 
 use super::accept::prepare;
-use super::address::{self, Target};
-use super::end::End;
 use super::endpoint::Endpoint;
 use super::frame::FrameReader;
 use super::link::{Link, Running};
+use crate::address::{self, Target};
+use crate::end::End;
 
 /// Opens the connection of a link that has been made up, and serves it.
 pub(crate) async fn dial(

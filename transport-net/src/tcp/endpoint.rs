@@ -18,13 +18,14 @@ use parking_lot::Mutex;
 use tokio::runtime::Handle;
 use tokio::task::AbortHandle;
 
-use super::address;
 use super::config::{Limits, TcpConfig};
 use super::connection::{Connection, Role};
 use super::counters::{Tally, count};
-use super::end::End;
-use super::hello::Hello;
 use super::link::{Link, MAX_LINKS, of_ticket};
+use crate::address;
+use crate::end::End;
+use crate::hello::Hello;
+use crate::seldom::warn_seldom;
 
 #[derive(Debug)]
 pub(crate) struct Endpoint {
@@ -299,7 +300,7 @@ impl Endpoint {
     pub(crate) fn left(&self, link: &Arc<Link>, end: &End) {
         if end.is_misbehaviour() {
             let before = self.tally.refused_nonsense.fetch_add(1, Ordering::Relaxed);
-            super::accept::warn_seldom(before, format_args!("connection closed: {}", end.after()));
+            warn_seldom(before, format_args!("connection closed: {}", end.after()));
         } else {
             tracing::debug!(link = link.number, "connection ended: {}", end.after());
         }

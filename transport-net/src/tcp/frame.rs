@@ -4,9 +4,9 @@
 //!
 //! | kind | id | body |
 //! |---|---|---|
-//! | 1 hello | 0 | see [`super::hello`] |
+//! | 1 hello | 0 | see [`crate::hello`] |
 //! | 2 parcel | the sender's number of the parcel, rising | [`ParcelHeader`], then its body |
-//! | 3 answer | the parcel it answers | see [`super::answer`] |
+//! | 3 answer | the parcel it answers | see [`crate::answer`] |
 //! | 4 ping, 5 pong | 0 | none |
 //! | 6 goodbye | the last parcel that was taken; later ones have not been and never will be | none |
 //!
@@ -22,8 +22,8 @@ use fipa_transport::{Answer, Parcel};
 use zerocopy::little_endian::{U16, U64};
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
 
-use super::answer::{self, MAX_ANSWER};
-use super::hello::{Hello, MAX_HELLO};
+use crate::answer::{self, MAX_ANSWER};
+use crate::hello::{Hello, MAX_HELLO};
 
 /// What every frame begins with. A later version of the protocol keeps these eight bytes' layout.
 #[derive(

@@ -155,7 +155,7 @@ fn any_frame() -> impl Strategy<Value = Vec<u8>> {
         any::<u64>().prop_map(|id| answer(id, &Answer::Busy).to_vec()),
         any::<u64>()
             .prop_map(|id| { answer(id, &Answer::failed(FailureReason::Loop, "again")).to_vec() }),
-        (1..u64::MAX).prop_map(|i| hello(&super::super::hello::tests::sample(i)).to_vec()),
+        (1..u64::MAX).prop_map(|i| hello(&crate::hello::tests::sample(i)).to_vec()),
         Just(ping().to_vec()),
         Just(pong().to_vec()),
         any::<u64>().prop_map(|last| goodbye(last).to_vec()),

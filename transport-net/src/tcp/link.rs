@@ -19,9 +19,9 @@ use tokio::time::{sleep_until, timeout};
 
 use super::connection::{Connection, Event, MAX_ID, SendError};
 use super::counters::count;
-use super::end::End;
 use super::endpoint::Endpoint;
 use super::frame::FrameReader;
+use crate::end::End;
 
 /// Pieces handed to the kernel in one call.
 const MAX_SLICES: usize = 64;

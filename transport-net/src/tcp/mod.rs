@@ -1,23 +1,18 @@
 //! Framed, acknowledged letters over TCP.
 //!
-//! * [`frame`], [`hello`] and [`answer`]: the bytes.
-//! * [`connection`] with its [`outbox`] and its [`end`]: the protocol of one connection, without
-//!   socket or clock.
+//! * [`frame`]: the bytes.
+//! * [`connection`] with its [`outbox`]: the protocol of one connection, without socket or clock.
 //! * [`link`]: a connection with its socket; [`dial`] and [`accept`] make them.
 //! * [`endpoint`]: what the connections share.
 //! * [`unframed`]: letters of old peers, on the same port.
 
 mod accept;
-mod address;
-mod answer;
 mod config;
 mod connection;
 mod counters;
 mod dial;
-mod end;
 mod endpoint;
 mod frame;
-mod hello;
 mod link;
 mod outbox;
 mod unframed;
@@ -36,6 +31,8 @@ use self::connection::{SendError, letter_len};
 pub use self::counters::Counters;
 use self::endpoint::{Endpoint, Way};
 use self::link::Link;
+use crate::address;
+use crate::end::End;
 
 /// Carries parcels over TCP.
 ///
@@ -171,7 +168,7 @@ impl Transport for TcpTransport {
                 self.start(link, sink, to)?;
                 return sent.map_err(|error| match error {
                     SendError::Way(error) => error,
-                    SendError::Ended => end::End::Closed.after(),
+                    SendError::Ended => End::Closed.after(),
                 });
             }
             match sent {

@@ -1,4 +1,4 @@
-//! What the tests of the TCP endpoint share: endpoints on loopback, a sink that records, and
+//! What the tests of the endpoints share: endpoints on loopback, a sink that records, and
 //! waiting for a condition.
 #![allow(dead_code, reason = "each test file uses a part of it")]
 
@@ -12,7 +12,7 @@ use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel, Sink,
     Stream, Ticket, Transport, Verdict, WayError,
 };
-use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport};
+use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport, UdpConfig, UdpLimits};
 use parking_lot::Mutex;
 use tokio::runtime::Runtime;
 
@@ -24,15 +24,32 @@ pub(crate) fn runtime() -> Runtime {
         .unwrap()
 }
 
+fn identity() -> Identity {
+    Identity {
+        name: "test-mts".into(),
+        incarnation: Incarnation::random(),
+        domain: "test".into(),
+        host: "here".into(),
+    }
+}
+
+pub(crate) fn udp_config(listen: &[&str]) -> UdpConfig {
+    UdpConfig {
+        listen: listen.iter().map(|text| (*text).into()).collect(),
+        identity: identity(),
+        limits: UdpLimits {
+            // Whoever waits this long in a test waits for ever.
+            connect_timeout: Duration::from_secs(30),
+            silence: Duration::from_secs(30),
+            ..UdpLimits::default()
+        },
+    }
+}
+
 pub(crate) fn config(listen: &[&str]) -> TcpConfig {
     TcpConfig {
         listen: listen.iter().map(|text| (*text).into()).collect(),
-        identity: Identity {
-            name: "test-mts".into(),
-            incarnation: Incarnation::random(),
-            domain: "test".into(),
-            host: "here".into(),
-        },
+        identity: identity(),
         limits: Limits {
             // Whoever waits this long in a test waits for ever.
             connect_timeout: Duration::from_secs(30),
@@ -52,6 +69,15 @@ pub(crate) struct Record {
 pub(crate) struct Recorder {
     pub(crate) record: Mutex<Record>,
     verdict: Verdict,
+}
+
+impl Default for Recorder {
+    fn default() -> Self {
+        Self {
+            record: Mutex::default(),
+            verdict: Verdict::Now(Answer::Accepted),
+        }
+    }
 }
 
 impl Sink for Recorder {

@@ -1,7 +1,9 @@
 //! Addresses as text: parsing with scopes, and which of this machine's addresses others can use.
 
+use std::io;
 use std::net::{IpAddr, Ipv6Addr, SocketAddr, SocketAddrV6};
 
+use fipa_transport::ListenError;
 use if_addrs::{IfOperStatus, Interface};
 
 /// Why a text is not an address.
@@ -64,6 +66,25 @@ pub(crate) fn numeric(text: &str) -> Result<SocketAddr, AddressError> {
         Err(_) => interface_index(zone)?,
     };
     Ok(SocketAddrV6::new(ip, port, 0, scope).into())
+}
+
+/// Why an address cannot be listened on, with what to do.
+pub(crate) fn cannot_bind(text: &str, error: &io::Error) -> ListenError {
+    let advice = match error.kind() {
+        io::ErrorKind::AddrInUse => {
+            "; another process listens there: stop it, or choose another port \
+             (port 0 lets the system choose)"
+        }
+        io::ErrorKind::AddrNotAvailable => {
+            "; this machine has no such address (`ip address` lists those it has)"
+        }
+        io::ErrorKind::PermissionDenied => "; choose a port above 1023",
+        _ => "",
+    };
+    ListenError::Bind {
+        address: text.to_owned(),
+        source: io::Error::new(error.kind(), format!("{error}{advice}")),
+    }
 }
 
 fn interfaces() -> Result<Vec<Interface>, AddressError> {

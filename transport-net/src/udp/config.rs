@@ -1,0 +1,68 @@
+//! What the owner of a UDP endpoint chooses.
+
+use std::time::Duration;
+
+use super::packet::{BASE, LARGEST};
+use crate::Identity;
+
+/// Configuration of a [`UdpTransport`](crate::UdpTransport).
+#[derive(Debug, Clone)]
+pub struct UdpConfig {
+    /// Numeric addresses to listen on, for example `127.0.0.1:0`, `[::1]:7788`, `0.0.0.0:7788` or
+    /// `[fe80::1%eth0]:7788`. Port 0 lets the system choose. `[::]` is IPv6 only: list `0.0.0.0`
+    /// beside it for both. May be empty: then letters can be sent, and peers can answer over the
+    /// connections made for that.
+    pub listen: Vec<String>,
+    /// How this endpoint introduces itself.
+    pub identity: Identity,
+    /// What it takes and how long it waits.
+    pub limits: UdpLimits,
+}
+
+/// Bounds of a UDP endpoint. Memory is at most about `max_connections` × `max_queued_bytes` in
+/// each direction.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct UdpLimits {
+    /// Largest datagram sent, in bytes without the headers of IP and UDP: [`UdpLimits::BASE`] to
+    /// [`UdpLimits::LARGEST`]. What the path to a peer carries counts as well; it begins as
+    /// `BASE` and is found out when a letter needs more. Default `LARGEST`.
+    pub max_datagram: usize,
+    /// Most connections. Default 256.
+    pub max_connections: usize,
+    /// Most connections that one address opens. Default 64.
+    pub max_per_address: usize,
+    /// Most parcels per connection and direction that are not answered yet. Default 1024.
+    pub max_in_flight: usize,
+    /// Most bytes per connection and direction that wait to be sent, or for an earlier parcel that
+    /// was lost; a single letter is always let in. Default 4 MiB.
+    pub max_queued_bytes: usize,
+    /// How long opening a connection may take. Default 2 s.
+    pub connect_timeout: Duration,
+    /// After this long without a packet from a peer that has something to acknowledge or to
+    /// answer, and several attempts to reach it, the connection is given up. Default 2 s.
+    pub silence: Duration,
+    /// After this long without a letter or an answer a connection is closed. Default 60 s.
+    pub idle_close: Duration,
+}
+
+impl UdpLimits {
+    /// What every path carries: 1,200 bytes.
+    pub const BASE: usize = BASE;
+    /// Largest datagram there is: 65,487 bytes.
+    pub const LARGEST: usize = LARGEST;
+}
+
+impl Default for UdpLimits {
+    fn default() -> Self {
+        Self {
+            max_datagram: LARGEST,
+            max_connections: 256,
+            max_per_address: 64,
+            max_in_flight: 1024,
+            max_queued_bytes: 4 << 20,
+            connect_timeout: Duration::from_secs(2),
+            silence: Duration::from_secs(2),
+            idle_close: Duration::from_secs(60),
+        }
+    }
+}

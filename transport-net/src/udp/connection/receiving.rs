@@ -1,0 +1,157 @@
+//! What a connection receives: packets, and the parcels and answers in them, in their order.
+
+use std::time::Instant;
+
+use bytes::Bytes;
+use fipa_transport::{Answer, Conclusion, Parcel};
+
+use super::super::counters::UdpCounters;
+use super::super::packet::{Frame, Frames, split_parcel};
+use super::{Connection, Event, MAX_ID};
+use crate::end::End;
+
+impl Connection {
+    /// Takes a data packet.
+    ///
+    /// # Errors
+    /// When the connection is over because of it.
+    pub(crate) fn handle_packet(
+        &mut self,
+        number: u64,
+        frames: &[u8],
+        now: Instant,
+        counters: &mut UdpCounters,
+    ) -> Result<(), End> {
+        if self.dialling.is_some() {
+            // The welcome is late, or lost; all this comes again.
+            return Ok(());
+        }
+        self.heard = Some(now);
+        if !self.received.is_new(number) {
+            counters.duplicates += 1;
+            self.received.wants_ack(now, true);
+            return Ok(());
+        }
+        let (mut elicits, mut at_once, mut taken) = (false, false, true);
+        for frame in Frames(frames) {
+            let Ok(frame) = frame else {
+                return Err(End::Nonsense("a packet that cannot be read".into()));
+            };
+            match frame {
+                Frame::Ack(ack) => {
+                    let Some(told) = self.recovery.acknowledged(&ack, now) else {
+                        let what = "an acknowledgement of what was never sent";
+                        return Err(End::Nonsense(what.into()));
+                    };
+                    told.arrived.into_iter().for_each(|kept| self.arrived(kept));
+                    told.lost.into_iter().for_each(|kept| self.lost(kept));
+                }
+                Frame::Ping => (elicits, at_once) = (true, true),
+                Frame::Answer { id, answer } => {
+                    elicits = true;
+                    self.conclude(id, answer, now)?;
+                }
+                Frame::Skipped { id } => {
+                    elicits = true;
+                    taken &= self.hold(id, None, 0)?;
+                }
+                Frame::Goodbye { last } => return Err(End::Goodbye { last }),
+                Frame::Parcel { id, bytes } => {
+                    (elicits, at_once) = (true, true);
+                    taken &= self.take_parcel(id, bytes, now, counters)?;
+                }
+            }
+        }
+        if taken {
+            self.received.note(number, now);
+            if elicits {
+                self.received.wants_ack(now, at_once);
+            }
+        }
+        Ok(())
+    }
+
+    pub(super) fn take_parcel(
+        &mut self,
+        id: u64,
+        bytes: &[u8],
+        now: Instant,
+        counters: &mut UdpCounters,
+    ) -> Result<bool, End> {
+        if id < self.next_arrival || self.held.contains_key(&id) {
+            counters.duplicates += 1;
+            return Ok(true);
+        }
+        let nonsense = |what: &dyn std::fmt::Display| Err(End::Nonsense(what.to_string()));
+        let Some((header, body)) = split_parcel(bytes) else {
+            return nonsense(&"a parcel without a header");
+        };
+        if self.answers.len() >= self.limits.max_in_flight.max(1).saturating_mul(2) {
+            // The peer does not acknowledge answers.
+            return Ok(false);
+        }
+        let parcel = match header.parcel(Bytes::copy_from_slice(body)) {
+            Ok(parcel) => parcel,
+            Err(error) => return nonsense(&error),
+        };
+        let held = self.hold(id, Some(Box::new(parcel)), bytes.len())?;
+        if held {
+            self.busy = now;
+            counters.parcels_in += 1;
+        }
+        Ok(held)
+    }
+
+    /// Notes what has this number (a parcel, or that there never is one), and hands on whatever
+    /// has its turn. Says whether there was room.
+    pub(super) fn hold(
+        &mut self,
+        id: u64,
+        parcel: Option<Box<Parcel>>,
+        len: usize,
+    ) -> Result<bool, End> {
+        if id < self.next_arrival || self.held.contains_key(&id) {
+            return Ok(true);
+        }
+        let max = self.limits.max_in_flight.max(1);
+        if id >= MAX_ID || self.arrivals.len() >= max {
+            return Err(End::Nonsense("more parcels than may be in flight".into()));
+        }
+        let crowded = self.held.len() >= max
+            || self.held_bytes.saturating_add(len) > self.limits.max_queued_bytes;
+        if id > self.next_arrival && crowded {
+            return Ok(false);
+        }
+        self.held_bytes += len;
+        self.held.insert(id, parcel);
+        while let Some(next) = self.held.remove(&self.next_arrival) {
+            let id = self.next_arrival;
+            self.next_arrival += 1;
+            if let Some(parcel) = next {
+                self.arrivals.insert(id);
+                self.events.push_back(Event::Arrived { id, parcel });
+            }
+        }
+        if self.held.is_empty() {
+            self.held_bytes = 0;
+        }
+        Ok(true)
+    }
+
+    pub(super) fn conclude(&mut self, id: u64, answer: Answer, now: Instant) -> Result<(), End> {
+        if id > self.last_sent {
+            return Err(End::Nonsense("an answer to what was never sent".into()));
+        }
+        // Otherwise it has been concluded before.
+        if let Some(sent) = self.sent.remove(&id) {
+            self.resend.remove(&id);
+            self.busy = now;
+            if let Some(attempt) = sent.attempt {
+                self.attempts.remove(&attempt);
+                let conclusion = Conclusion::Answered(answer);
+                self.events.push_back(Event::Concluded(attempt, conclusion));
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,177 @@
+//! How connections begin: strangers are given cookies, and those who bring one back a connection.
+
+use std::net::SocketAddr;
+use std::time::Instant;
+
+use fipa_transport::{Hop, Kind, Location};
+
+use super::super::connection::{Connection, Path};
+use super::super::packet::{self, NO_COOKIE};
+use super::{Core, Inbound, MAX_OUTBOX};
+use crate::address;
+use crate::end::End;
+use crate::hello::Hello;
+
+impl Core {
+    /// A stranger says hello.
+    pub(super) fn greet(
+        &mut self,
+        now: Instant,
+        path: Path,
+        initiator: u64,
+        cookie: &packet::Cookie,
+        hello: &[u8],
+    ) {
+        let from = path.remote;
+        if *cookie == NO_COOKIE || !self.cookies.check(now, from, initiator, cookie) {
+            let cookie = self.cookies.give(now, from, initiator);
+            self.reply(path, packet::cookie_for(initiator, &cookie));
+            return;
+        }
+        if let Some(number) = self.greeted.get(&(from, initiator)) {
+            // The welcome was lost.
+            if let Some(entry) = self.connections.get(number) {
+                let id = entry.connection.id();
+                let own = self.own_hello(0, String::new());
+                self.reply(path, packet::welcome(initiator, id, &own));
+            }
+            return;
+        }
+        let Some(peer) = Hello::decode(hello).filter(|peer| peer.max_in_flight > 0) else {
+            self.counters.ignored += 1;
+            return;
+        };
+        let inbound = Inbound {
+            incarnation: peer.identity.incarnation,
+            ip: from.ip(),
+            dialled: peer.dialled.clone(),
+        };
+        match self.inbound.get(&inbound).copied() {
+            Some((serial, _)) if serial > peer.serial => {
+                self.counters.ignored += 1;
+                return;
+            }
+            // What the peer sent on its connection before this one must not arrive after what it
+            // sends now.
+            Some((_, before)) => self.end(before, &End::Superseded),
+            None => {}
+        }
+        let same_address = self.greeted.keys().filter(|(a, _)| a.ip() == from.ip());
+        if self.connections.len() >= self.limits.max_connections
+            || same_address.count() >= self.limits.max_per_address
+        {
+            self.counters.refused_crowd += 1;
+            self.reply(path, packet::refused(initiator));
+            return;
+        }
+        let Some(hop) = self.hop(&peer, from) else {
+            self.counters.ignored += 1;
+            return;
+        };
+        let id = self.fresh_id();
+        let serial = peer.serial;
+        let name = peer.identity.name.as_str().into();
+        let limits = self.limits.clone();
+        let connection = Connection::accepted(limits, id, initiator, peer, path, now);
+        let number = self.insert(connection, None, Some((from, initiator)));
+        self.greeted.insert((from, initiator), number);
+        self.inbound.insert(inbound, (serial, number));
+        self.enter(number, name, hop);
+        self.counters.accepted += 1;
+        let own = self.own_hello(0, String::new());
+        self.reply(path, packet::welcome(initiator, id, &own));
+        self.touch(number);
+    }
+
+    /// A peer has answered the hello of a connection.
+    pub(super) fn welcome(
+        &mut self,
+        now: Instant,
+        path: Path,
+        to: u64,
+        acceptor: u64,
+        hello: &[u8],
+    ) {
+        let Some(peer) = Hello::decode(hello) else {
+            self.counters.ignored += 1;
+            return;
+        };
+        let hop = self.hop(&peer, path.remote);
+        let mut greeted = None;
+        self.of_dialling(to, path, |number, connection| {
+            let name = peer.identity.name.as_str().into();
+            connection.welcomed(path, acceptor, peer, now)?;
+            greeted = Some((number, name));
+            Ok(())
+        });
+        if let (Some((number, name)), Some(hop)) = (greeted, hop) {
+            self.counters.dialled += 1;
+            self.enter(number, name, hop);
+        }
+    }
+
+    /// Somebody knows nothing of a connection.
+    pub(super) fn is_unknown(&mut self, path: Path, peer_id: u64) {
+        let is_meant = |connection: &Connection| {
+            connection.peer().is_some()
+                && connection.peer_id() == peer_id
+                && connection.path().is_some_and(|p| p.remote == path.remote)
+        };
+        let meant = self.connections.iter();
+        let meant = meant
+            .filter(|(_, entry)| is_meant(&entry.connection))
+            .map(|(number, _)| *number)
+            .next();
+        match meant {
+            Some(number) => {
+                let what = "the peer has forgotten the connection; was it restarted?";
+                self.end(number, &End::Broken(what.into()));
+            }
+            None => self.counters.ignored += 1,
+        }
+    }
+
+    /// Lets a connection that is being opened have what came for it.
+    pub(super) fn of_dialling(
+        &mut self,
+        to: u64,
+        path: Path,
+        act: impl FnOnce(u32, &mut Connection) -> Result<(), End>,
+    ) {
+        let number = self.ids.get(&to).copied();
+        let entry = number.and_then(|number| self.connections.get_mut(&number));
+        let meant = entry
+            .and_then(|entry| entry.connection.dialling_mut())
+            .is_some_and(|dialling| dialling.uses(path));
+        match number.filter(|_| meant) {
+            Some(number) => self.with(number, |connection, _| act(number, connection)),
+            None => self.counters.ignored += 1,
+        }
+    }
+
+    pub(super) fn hop(&self, peer: &Hello, from: SocketAddr) -> Option<Hop> {
+        let back = address::way_back(&peer.listening, from).to_string();
+        let location = Location::new(Kind::Udp, &back).ok()?;
+        Some(Hop {
+            location: location.with_incarnation(peer.identity.incarnation),
+            remote: self.identity.is_remote(&peer.identity),
+        })
+    }
+
+    pub(super) fn own_hello(&self, serial: u64, dialled: String) -> Hello {
+        Hello {
+            identity: self.identity.clone(),
+            max_letter: self.limits.max_datagram as u64,
+            max_in_flight: u32::try_from(self.limits.max_in_flight.max(1)).unwrap_or(u32::MAX),
+            serial,
+            dialled,
+            listening: self.listening.clone(),
+        }
+    }
+
+    pub(super) fn reply(&mut self, path: Path, datagram: Vec<u8>) {
+        if self.outbox.len() < MAX_OUTBOX {
+            self.outbox.push_back((path, datagram));
+        }
+    }
+}

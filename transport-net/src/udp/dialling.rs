@@ -1,0 +1,141 @@
+//! Opening a connection: hello, cookie, hello with the cookie, welcome.
+//!
+//! A peer with several addresses is greeted at all of them, one after the other and without waiting
+//! for the first to fail (RFC 8305); the first that answers counts.
+
+use std::time::{Duration, Instant};
+
+use fipa_transport::{WayError, WayFault};
+
+use super::connection::Path;
+use super::packet::{self, Cookie, NO_COOKIE};
+use crate::end::End;
+use crate::hello::Hello;
+
+/// How long after one address the next is greeted (RFC 8305 section 5).
+const STAGGER: Duration = Duration::from_millis(250);
+
+/// How long the first answer is waited for, and at most.
+const PATIENCE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_millis(500));
+
+#[derive(Debug)]
+pub(crate) struct Dialling {
+    id: u64,
+    hello: Hello,
+    deadline: Instant,
+    candidates: Vec<Candidate>,
+}
+
+#[derive(Debug)]
+struct Candidate {
+    path: Path,
+    cookie: Cookie,
+    /// When the next hello leaves; none when this way is known not to work.
+    next: Option<Instant>,
+    tries: u32,
+    /// When the first hello with this cookie left.
+    greeted: Option<Instant>,
+}
+
+impl Dialling {
+    pub(crate) fn new(id: u64, hello: Hello, deadline: Instant) -> Self {
+        Self {
+            id,
+            hello,
+            deadline,
+            candidates: Vec::new(),
+        }
+    }
+
+    /// The ways to the peer are known.
+    pub(crate) fn begin(&mut self, paths: impl IntoIterator<Item = Path>, now: Instant) {
+        self.candidates = paths
+            .into_iter()
+            .zip(0_u32..)
+            .map(|(path, number)| Candidate {
+                path,
+                cookie: NO_COOKIE,
+                next: Some(now + STAGGER * number),
+                tries: 0,
+                greeted: None,
+            })
+            .collect();
+    }
+
+    pub(crate) fn uses(&self, path: Path) -> bool {
+        self.candidates.iter().any(|c| is_same(c.path, path))
+    }
+
+    pub(crate) fn handle_cookie(&mut self, path: Path, cookie: Cookie, now: Instant) {
+        if let Some(candidate) = self.candidate(path)
+            && candidate.cookie != cookie
+        {
+            candidate.cookie = cookie;
+            candidate.tries = 0;
+            candidate.greeted = None;
+            candidate.next = Some(now);
+        }
+    }
+
+    /// The operating system says that a way does not work.
+    ///
+    /// # Errors
+    /// When no other is left.
+    pub(crate) fn failed(&mut self, path: Path, what: &str, now: Instant) -> Result<(), End> {
+        if let Some(candidate) = self.candidate(path) {
+            candidate.next = None;
+        }
+        let mut left = self.candidates.iter_mut().filter_map(|c| c.next.as_mut());
+        match left.next() {
+            // There is no reason to wait any longer.
+            Some(next) => *next = now.min(*next),
+            None => {
+                let detail = format!("{}: {what}", path.remote);
+                let error = WayError::new(WayFault::Unreachable, detail);
+                return Err(End::NotOpened(error));
+            }
+        }
+        Ok(())
+    }
+
+    pub(crate) fn due(&self) -> Instant {
+        let hello = self.candidates.iter().filter_map(|c| c.next).min();
+        hello.map_or(self.deadline, |hello| hello.min(self.deadline))
+    }
+
+    pub(crate) fn handle_timeout(&mut self, now: Instant, patience: Duration) -> Result<(), End> {
+        if now < self.deadline {
+            return Ok(());
+        }
+        let detail = format!("no answer within {patience:?} (connect_timeout)");
+        Err(End::NotOpened(WayError::new(WayFault::Unreachable, detail)))
+    }
+
+    pub(crate) fn poll_transmit(&mut self, now: Instant) -> Option<(Path, Vec<u8>)> {
+        let candidate = self
+            .candidates
+            .iter_mut()
+            .find(|c| c.next.is_some_and(|next| next <= now))?;
+        let wait = PATIENCE.0.saturating_mul(1 << candidate.tries.min(8));
+        candidate.next = Some(now + wait.min(PATIENCE.1));
+        candidate.tries += 1;
+        // A round trip is measured only where it is certain which hello was answered.
+        candidate.greeted = (candidate.tries == 1).then_some(now);
+        let datagram = packet::hello(self.id, &candidate.cookie, &self.hello);
+        Some((candidate.path, datagram))
+    }
+
+    pub(crate) fn round_trip(&self, path: Path, now: Instant) -> Option<Duration> {
+        let candidate = self.candidates.iter().find(|c| is_same(c.path, path))?;
+        Some(now.saturating_duration_since(candidate.greeted?))
+    }
+
+    fn candidate(&mut self, path: Path) -> Option<&mut Candidate> {
+        self.candidates.iter_mut().find(|c| is_same(c.path, path))
+    }
+}
+
+/// The own address is not known before the first answer.
+fn is_same(one: Path, other: Path) -> bool {
+    one.socket == other.socket && one.remote == other.remote
+}

@@ -1,0 +1,407 @@
+//! The thin shell around [`Core`]: its sockets, its clock and its sink.
+//!
+//! Whoever has something to send hands it to the system at once, on its own thread. One task per
+//! socket reads, and one keeps time; each of them may call the sink, one at a time.
+
+use std::collections::HashMap;
+use std::io;
+use std::net::SocketAddr;
+use std::sync::{Arc, Weak};
+use std::time::{Duration, Instant};
+
+use fipa_transport::{
+    Answer, Arrival, AttemptId, ListenError, Location, Parcel, Sink, Ticket, Verdict, WayError,
+    WayFault,
+};
+use parking_lot::Mutex;
+use tokio::net::lookup_host;
+use tokio::runtime::Handle;
+use tokio::sync::Notify;
+use tokio::task::AbortHandle;
+use tokio::time::{sleep, sleep_until};
+
+use super::config::UdpConfig;
+use super::connection::Path;
+use super::core::{Core, Random, Told};
+use super::counters::UdpCounters;
+use super::socket::{Buffers, Sent, Socket};
+use crate::address::{self, Target};
+use crate::end::End;
+
+/// Most addresses of one name that are greeted.
+const MAX_TARGETS: usize = 8;
+
+/// How long reading rests after the system has reported an error on a socket that listens.
+const REST: Duration = Duration::from_millis(10);
+
+pub(crate) struct Endpoint {
+    pub(crate) config: UdpConfig,
+    runtime: Handle,
+    state: Mutex<State>,
+    /// Held while the sink is called.
+    delivering: Mutex<()>,
+    wake: Notify,
+    this: Weak<Self>,
+}
+
+#[derive(Default)]
+struct State {
+    phase: Phase,
+    core: Option<Core>,
+    sink: Option<Arc<dyn Sink>>,
+    sockets: HashMap<u32, (Arc<Socket>, AbortHandle)>,
+    last_socket: u32,
+    /// When the task that keeps time wakes.
+    armed: Option<Instant>,
+}
+
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+enum Phase {
+    #[default]
+    New,
+    Open,
+    Closed,
+}
+
+impl Endpoint {
+    pub(crate) fn new(config: UdpConfig, runtime: Handle) -> Arc<Self> {
+        Arc::new_cyclic(|this| Self {
+            config,
+            runtime,
+            state: Mutex::default(),
+            delivering: Mutex::default(),
+            wake: Notify::new(),
+            this: this.clone(),
+        })
+    }
+
+    pub(crate) fn counters(&self) -> UdpCounters {
+        let state = self.state.lock();
+        state.core.as_ref().map(Core::counters).unwrap_or_default()
+    }
+
+    /// Opens the sockets and begins to work. Returns the addresses others can use.
+    pub(crate) fn open(
+        &self,
+        sink: Arc<dyn Sink>,
+        random: Random,
+    ) -> Result<Vec<SocketAddr>, ListenError> {
+        let mut state = self.state.lock();
+        if state.phase != Phase::New {
+            return Err(ListenError::OpenedBefore);
+        }
+        let _inside = self.runtime.enter();
+        let unavailable =
+            |error: &dyn std::fmt::Display| ListenError::Unavailable(error.to_string());
+        let mut sockets = Vec::new();
+        let mut reachable = Vec::new();
+        for text in &self.config.listen {
+            let address = address::numeric(text).map_err(|error| unavailable(&error))?;
+            let number = state.last_socket + 1;
+            state.last_socket = number;
+            let cannot = |error| address::cannot_bind(text, &error);
+            let socket = Socket::listen(number, address).map_err(cannot)?;
+            let bound = socket.address().map_err(cannot)?;
+            reachable.extend(address::reachable(bound).map_err(|error| unavailable(&error))?);
+            sockets.push(socket);
+        }
+        let UdpConfig {
+            identity, limits, ..
+        } = &self.config;
+        let listening = reachable.iter().map(ToString::to_string).collect();
+        let now = Instant::now();
+        let core = Core::new(identity.clone(), limits.clone(), listening, random, now);
+        state.core = Some(core);
+        state.sink = Some(sink);
+        state.phase = Phase::Open;
+        for socket in sockets {
+            self.start(&mut state, socket);
+        }
+        if let Some(this) = self.this.upgrade() {
+            self.runtime.spawn(keep_time(Running(this)));
+        }
+        Ok(reachable)
+    }
+
+    pub(crate) fn dispatch(
+        &self,
+        attempt: AttemptId,
+        to: &Location,
+        parcel: &Parcel,
+    ) -> Result<(), WayError> {
+        let mut state = self.state.lock();
+        let now = Instant::now();
+        let core = match (state.phase, state.core.as_mut()) {
+            (Phase::Open, Some(core)) => core,
+            (Phase::New, _) => {
+                return Err(WayError::new(WayFault::Closed, "listen was not called yet"));
+            }
+            _ => return Err(End::Closed.after()),
+        };
+        if let Some(fresh) = core.dispatch(now, attempt, to, parcel)? {
+            self.dial(&mut state, fresh, to.address());
+        }
+        self.go_on(&mut state);
+        Ok(())
+    }
+
+    pub(crate) fn abandon(&self, attempt: AttemptId) {
+        if let Some(core) = self.state.lock().core.as_mut() {
+            core.abandon(attempt);
+        }
+    }
+
+    pub(crate) fn answer(&self, ticket: Ticket, answer: &Answer) {
+        let mut state = self.state.lock();
+        if let Some(core) = state.core.as_mut() {
+            core.answer(Instant::now(), ticket, answer);
+        }
+        self.go_on(&mut state);
+    }
+
+    /// Ends everything. The task that keeps time concludes what is outstanding.
+    pub(crate) fn close(&self) {
+        let mut state = self.state.lock();
+        state.phase = Phase::Closed;
+        if let Some(core) = state.core.as_mut() {
+            core.close();
+        }
+        self.flush(&mut state);
+        for (_, (_, task)) in state.sockets.drain() {
+            task.abort();
+        }
+        self.wake.notify_one();
+    }
+
+    /// Begins to read a socket.
+    fn start(&self, state: &mut State, socket: Socket) {
+        let Some(this) = self.this.upgrade() else {
+            return;
+        };
+        let socket = Arc::new(socket);
+        let task = self.runtime.spawn(read(this, socket.clone()));
+        state
+            .sockets
+            .insert(socket.number, (socket, task.abort_handle()));
+    }
+
+    /// Finds the ways to a peer.
+    fn dial(&self, state: &mut State, connection: u32, text: &str) {
+        let error = match address::target(text) {
+            Ok(Target::Numeric(address)) => return self.begin(state, connection, &[address]),
+            Ok(Target::Named(name, port)) => match self.this.upgrade() {
+                Some(this) => {
+                    self.runtime.spawn(look_up(this, connection, name, port));
+                    return;
+                }
+                None => End::Closed.after(),
+            },
+            Err(error) => WayError::new(WayFault::Unreachable, error),
+        };
+        if let Some(core) = state.core.as_mut() {
+            core.cannot_begin(connection, error);
+        }
+    }
+
+    fn begin(&self, state: &mut State, connection: u32, addresses: &[SocketAddr]) {
+        let _inside = self.runtime.enter();
+        let mut paths = Vec::new();
+        let mut fault = "the name has no address".to_owned();
+        for remote in addresses.iter().take(MAX_TARGETS) {
+            state.last_socket = state.last_socket.wrapping_add(1);
+            match Socket::connect(state.last_socket, connection, *remote) {
+                Ok(socket) => {
+                    paths.push(Path {
+                        socket: socket.number,
+                        remote: *remote,
+                        local: None,
+                    });
+                    self.start(state, socket);
+                }
+                Err(error) => fault = format!("{remote}: {error}"),
+            }
+        }
+        let Some(core) = state.core.as_mut() else {
+            return;
+        };
+        if paths.is_empty() {
+            core.cannot_begin(connection, WayError::new(WayFault::Unreachable, fault));
+        } else {
+            core.begin(Instant::now(), connection, paths);
+        }
+    }
+
+    /// Sends what there is to send, and sees to it that the rest is done by a task.
+    fn go_on(&self, state: &mut State) {
+        self.flush(state);
+        let Some(core) = &state.core else { return };
+        let due = core.poll_timeout();
+        let earlier = match (due, state.armed) {
+            (Some(due), Some(armed)) => due < armed,
+            (due, None) => due.is_some(),
+            (None, Some(_)) => false,
+        };
+        if earlier || core.has_events() {
+            self.wake.notify_one();
+        }
+    }
+
+    fn flush(&self, state: &mut State) {
+        let State { core, sockets, .. } = state;
+        let Some(core) = core else { return };
+        let now = Instant::now();
+        while let Some(transmit) = core.poll_transmit(now) {
+            let path = transmit.path;
+            let Some((socket, _)) = sockets.get(&path.socket) else {
+                continue;
+            };
+            match (socket.send(path, &transmit.contents), transmit.connection) {
+                (Sent::TooBig, Some(number)) => core.too_big(number, transmit.contents.len()),
+                (Sent::Broken(error), Some(number)) => {
+                    core.handle_error(now, number, path, &error.to_string());
+                }
+                _ => {}
+            }
+        }
+        while let Some(gone) = core.poll_gone() {
+            sockets.retain(|_, (socket, task)| {
+                let stays = socket.owner != Some(gone);
+                if !stays {
+                    task.abort();
+                }
+                stays
+            });
+        }
+    }
+
+    /// Tells the sink what happened. Not to be called with the state locked.
+    fn deliver(&self) {
+        let _one_at_a_time = self.delivering.lock();
+        loop {
+            let (told, sink) = {
+                let mut state = self.state.lock();
+                let told = state.core.as_mut().and_then(Core::poll_event);
+                match (told, state.sink.clone()) {
+                    (Some(told), Some(sink)) => (told, sink),
+                    _ => return,
+                }
+            };
+            match told {
+                Told::Concluded(attempt, conclusion) => sink.concluded(attempt, conclusion),
+                Told::Introduced(peer) => sink.introduced(&peer),
+                Told::Parted(peer) => sink.parted(&peer),
+                Told::Arrived {
+                    parcel,
+                    from,
+                    ticket,
+                } => {
+                    let verdict = sink.arrived(Arrival {
+                        parcel: *parcel,
+                        from,
+                        ticket,
+                    });
+                    if let (Verdict::Now(answer), Some(core)) =
+                        (verdict, self.state.lock().core.as_mut())
+                    {
+                        core.answer(Instant::now(), ticket, &answer);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Reads a socket until it is closed.
+async fn read(endpoint: Arc<Endpoint>, socket: Arc<Socket>) {
+    let mut buffers = Buffers::new();
+    while let Ok(readiness) = socket.readable().await {
+        let received = {
+            let mut state = endpoint.state.lock();
+            let Some(core) = state.core.as_mut() else {
+                return;
+            };
+            let now = Instant::now();
+            let listening = socket.owner.is_none();
+            let received = socket.receive(readiness, &mut buffers, |path, bytes| {
+                core.handle_datagram(now, path, listening, bytes);
+            });
+            if let (Err(error), Some(owner)) = (&received, socket.owner)
+                && let Ok(remote) = socket.peer()
+            {
+                let path = Path {
+                    socket: socket.number,
+                    remote,
+                    local: None,
+                };
+                core.handle_error(now, owner, path, &error.to_string());
+            }
+            received
+        };
+        if matches!(received, Ok(0)) {
+            continue;
+        }
+        endpoint.deliver();
+        endpoint.go_on(&mut endpoint.state.lock());
+        if received.is_err() {
+            sleep(REST).await;
+        }
+    }
+}
+
+async fn look_up(endpoint: Arc<Endpoint>, connection: u32, name: String, port: u16) {
+    let found: io::Result<Vec<SocketAddr>> = lookup_host((name.as_str(), port))
+        .await
+        .map(Iterator::collect);
+    let mut state = endpoint.state.lock();
+    match found {
+        Ok(addresses) => endpoint.begin(&mut state, connection, &addresses),
+        Err(error) => {
+            let error = WayError::new(WayFault::Unreachable, format!("{name}: {error}"));
+            if let Some(core) = state.core.as_mut() {
+                core.cannot_begin(connection, error);
+            }
+        }
+    }
+    endpoint.go_on(&mut state);
+}
+
+/// Does what is due, until the endpoint is closed.
+async fn keep_time(running: Running) {
+    let endpoint = &running.0;
+    loop {
+        {
+            let mut state = endpoint.state.lock();
+            if let Some(core) = state.core.as_mut() {
+                core.handle_timeout(Instant::now());
+            }
+            endpoint.flush(&mut state);
+        }
+        endpoint.deliver();
+        let due = {
+            let mut state = endpoint.state.lock();
+            endpoint.flush(&mut state);
+            if state.phase == Phase::Closed {
+                break;
+            }
+            state.armed = state.core.as_ref().and_then(Core::poll_timeout);
+            state.armed
+        };
+        match due {
+            Some(due) => tokio::select! {
+                () = sleep_until(due.into()) => {}
+                () = endpoint.wake.notified() => {}
+            },
+            None => endpoint.wake.notified().await,
+        }
+    }
+}
+
+/// An endpoint that works: whatever happens to the task, every attempt gets its conclusion.
+struct Running(Arc<Endpoint>);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        self.0.close();
+        self.0.deliver();
+    }
+}

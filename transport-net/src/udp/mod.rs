@@ -1,0 +1,143 @@
+//! Letters that fit one datagram, acknowledged.
+//!
+//! * [`packet`]: the bytes. [`cookie`]: what strangers must bring back.
+//! * [`core`]: everything but sockets and clock, with the [`connection`]s in it. A connection is
+//!   [`dialling`] at first; then it has [`received`], [`recovery`] and the [`mtu`] of its path.
+//! * [`endpoint`]: the tasks around it, with their [`socket`]s.
+
+mod config;
+mod connection;
+mod cookie;
+mod core;
+mod counters;
+mod dialling;
+mod endpoint;
+mod mtu;
+mod packet;
+mod received;
+mod recovery;
+#[cfg(test)]
+mod simulation;
+mod socket;
+
+use std::sync::Arc;
+
+use fipa_transport::{
+    Answer, AttemptId, Body, Incarnation, Kind, ListenError, Location, Parcel, Signature, Sink,
+    Ticket, Transport, WayError, WayFault,
+};
+use tokio::runtime::Handle;
+
+pub use self::config::{UdpConfig, UdpLimits};
+pub use self::counters::UdpCounters;
+use self::endpoint::Endpoint;
+use self::packet::{BASE, LARGEST, PARCEL_OVERHEAD};
+
+/// Room for the receiver's name in the largest datagram.
+const NAME: usize = 255;
+
+/// Carries parcels over UDP, each in one datagram.
+///
+/// The first parcel to a location opens a connection: a handshake shows both sides that the other
+/// receives what it is sent, before anything is remembered of it. What gets lost is sent again, in
+/// time with the measured round trip; parcels arrive once and in order. What does not fit a
+/// datagram that the path carries unfragmented is [too large](WayFault::TooLarge).
+///
+/// An address is a numeric `address:port`, with a scope where one is needed
+/// (`[fe80::1%eth0]:7788`), or `name:port`.
+///
+/// Dropping it closes it. After [`close`](Transport::close) the attempts are concluded by the
+/// runtime's threads, so the runtime must live on for a moment.
+pub struct UdpTransport {
+    endpoint: Arc<Endpoint>,
+}
+
+impl UdpTransport {
+    /// An endpoint that does its work on `runtime`, which must have input, output and time
+    /// enabled. Nothing is opened before `listen`.
+    #[must_use]
+    pub fn new(config: UdpConfig, runtime: Handle) -> Self {
+        Self {
+            endpoint: Endpoint::new(config, runtime),
+        }
+    }
+
+    /// What happened so far.
+    #[must_use]
+    pub fn counters(&self) -> UdpCounters {
+        self.endpoint.counters()
+    }
+
+    fn check(&self, to: &Location, parcel: &Parcel) -> Result<(), WayError> {
+        if to.kind() != Kind::Udp || to.signature() != Signature::Frames {
+            let detail = format!("{to} is no UDP location");
+            return Err(WayError::new(WayFault::Unreachable, detail));
+        }
+        if let Body::Letter(letter) = &parcel.body
+            && letter.len() > self.max_letter()
+        {
+            let (len, max) = (letter.len(), self.max_letter());
+            let detail = format!("{len} bytes; at most {max} fit a datagram");
+            return Err(WayError::new(WayFault::TooLarge, detail));
+        }
+        Ok(())
+    }
+}
+
+impl Transport for UdpTransport {
+    fn kind(&self) -> Kind {
+        Kind::Udp
+    }
+
+    /// What fits the largest datagram. Paths between hosts carry less; see
+    /// [`UdpLimits::max_datagram`].
+    fn max_letter(&self) -> usize {
+        let datagram = self.endpoint.config.limits.max_datagram;
+        datagram.clamp(BASE, LARGEST) - PARCEL_OVERHEAD - NAME
+    }
+
+    fn answers_at_once(&self) -> bool {
+        false
+    }
+
+    fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
+        let identity = &self.endpoint.config.identity;
+        if let Some(fault) = identity.fault() {
+            return Err(ListenError::Unavailable(fault));
+        }
+        let unavailable =
+            |error: &dyn std::fmt::Display| ListenError::Unavailable(error.to_string());
+        // As unpredictable as an incarnation.
+        let random = Box::new(|| Incarnation::random().as_u64());
+        let reachable = self.endpoint.open(sink, random)?;
+        reachable
+            .iter()
+            .map(|address| Location::new(Kind::Udp, &address.to_string()))
+            .map(|location| location.map(|it| it.with_incarnation(identity.incarnation)))
+            .collect::<Result<_, _>>()
+            .map_err(|error| unavailable(&error))
+    }
+
+    fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
+        self.check(to, &parcel)?;
+        self.endpoint.dispatch(attempt, to, &parcel)
+    }
+
+    fn abandon(&self, attempt: AttemptId) {
+        self.endpoint.abandon(attempt);
+    }
+
+    fn answer(&self, ticket: Ticket, answer: Answer) {
+        self.endpoint.answer(ticket, &answer);
+    }
+
+    fn close(&self) {
+        self.endpoint.close();
+    }
+}
+
+impl Drop for UdpTransport {
+    fn drop(&mut self) {
+        self.close();
+    }
+}

@@ -1,0 +1,186 @@
+//! Sockets: opening them, and the thin layer over the system calls. Datagrams are never fragmented.
+
+use std::io::{self, IoSliceMut};
+use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
+
+use quinn_udp::{RecvMeta, Transmit, UdpSocketState};
+use socket2::{Domain, Protocol, Type};
+use tokio::io::Interest;
+use tokio::net::UdpSocket;
+
+use super::connection::Path;
+
+/// Room for what arrives while nobody reads; the system may allow less.
+const BUFFER: usize = 4 << 20;
+
+/// Datagrams, or runs of them, fetched in one call.
+const BATCH: usize = 8;
+
+/// Bytes of one of them.
+const LARGEST: usize = 1 << 16;
+
+pub(crate) struct Socket {
+    pub(crate) number: u32,
+    /// The connection it has been opened for; without one, strangers are heard.
+    pub(crate) owner: Option<u32>,
+    io: UdpSocket,
+    state: UdpSocketState,
+}
+
+/// What sending a datagram came to.
+pub(crate) enum Sent {
+    /// It left, or might as well have been lost on the way.
+    Perhaps,
+    TooBig,
+    Broken(io::Error),
+}
+
+impl Socket {
+    /// A socket that listens. To be called in the context of the runtime.
+    pub(crate) fn listen(number: u32, address: SocketAddr) -> io::Result<Self> {
+        Self::open(number, None, address, |socket| socket.bind(&address.into()))
+    }
+
+    /// A socket for the connection to one peer: of this one alone the operating system then says
+    /// that nobody is there. To be called in the context of the runtime.
+    pub(crate) fn connect(number: u32, owner: u32, remote: SocketAddr) -> io::Result<Self> {
+        let any: SocketAddr = if remote.is_ipv4() {
+            (Ipv4Addr::UNSPECIFIED, 0).into()
+        } else {
+            (Ipv6Addr::UNSPECIFIED, 0).into()
+        };
+        Self::open(number, Some(owner), remote, |socket| {
+            socket.bind(&any.into())?;
+            socket.connect(&remote.into())
+        })
+    }
+
+    fn open(
+        number: u32,
+        owner: Option<u32>,
+        address: SocketAddr,
+        prepare: impl FnOnce(&socket2::Socket) -> io::Result<()>,
+    ) -> io::Result<Self> {
+        let socket = socket2::Socket::new(
+            Domain::for_address(address),
+            Type::DGRAM.nonblocking(),
+            Some(Protocol::UDP),
+        )?;
+        if address.is_ipv6() {
+            socket.set_only_v6(true)?;
+        }
+        socket.set_recv_buffer_size(BUFFER)?;
+        prepare(&socket)?;
+        let socket: std::net::UdpSocket = socket.into();
+        let state = UdpSocketState::new((&socket).into())?;
+        Ok(Self {
+            number,
+            owner,
+            io: UdpSocket::from_std(socket)?,
+            state,
+        })
+    }
+
+    pub(crate) fn address(&self) -> io::Result<SocketAddr> {
+        self.io.local_addr()
+    }
+
+    /// Whom it is connected to.
+    pub(crate) fn peer(&self) -> io::Result<SocketAddr> {
+        self.io.peer_addr()
+    }
+
+    pub(crate) fn send(&self, path: Path, contents: &[u8]) -> Sent {
+        let transmit = Transmit {
+            destination: path.remote,
+            ecn: None,
+            contents,
+            segment_size: None,
+            src_ip: path.local,
+        };
+        // Past the runtime, which knows a new socket as writable only after a while.
+        let Err(error) = self.state.try_send((&self.io).into(), &transmit) else {
+            return Sent::Perhaps;
+        };
+        if quinn_udp::is_msg_size_err(&error) {
+            return Sent::TooBig;
+        }
+        match error.kind() {
+            // The system's buffers are full, or a filter dropped it: that is what networks do.
+            io::ErrorKind::WouldBlock
+            | io::ErrorKind::PermissionDenied
+            | io::ErrorKind::OutOfMemory
+            | io::ErrorKind::Interrupted => Sent::Perhaps,
+            _ if error.raw_os_error() == Some(ENOBUFS) => Sent::Perhaps,
+            _ => Sent::Broken(error),
+        }
+    }
+
+    /// Waits for datagrams or errors.
+    pub(crate) async fn readable(&self) -> io::Result<Interest> {
+        let ready = self.io.ready(Interest::READABLE | Interest::ERROR).await?;
+        Ok(if ready.is_error() {
+            Interest::ERROR
+        } else {
+            Interest::READABLE
+        })
+    }
+
+    /// Fetches what has arrived, after it was [ready](Self::readable), and tells of each datagram and where it came from. Says how many
+    /// there were; none when there is nothing now.
+    pub(crate) fn receive(
+        &self,
+        readiness: Interest,
+        buffers: &mut Buffers,
+        mut tell: impl FnMut(Path, &[u8]),
+    ) -> io::Result<usize> {
+        let mut meta = [RecvMeta::default(); BATCH];
+        let received = self.io.try_io(readiness, || {
+            let mut slices = buffers.slices();
+            self.state.recv((&self.io).into(), &mut slices, &mut meta)
+        });
+        let count = match received {
+            Ok(count) => count,
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => return Ok(0),
+            Err(error) => return Err(error),
+        };
+        let mut datagrams = 0;
+        for (meta, buffer) in meta.iter().take(count).zip(&buffers.0) {
+            let path = Path {
+                socket: self.number,
+                remote: meta.addr,
+                local: meta.dst_ip,
+            };
+            let run = buffer.get(..meta.len).unwrap_or_default();
+            if run.is_empty() {
+                tell(path, run);
+                datagrams += 1;
+            }
+            for datagram in run.chunks(meta.stride.max(1)) {
+                tell(path, datagram);
+                datagrams += 1;
+            }
+        }
+        Ok(datagrams)
+    }
+}
+
+/// No buffer space available: `std` has no name for it.
+const ENOBUFS: i32 = 105;
+
+/// What datagrams are received into.
+pub(crate) struct Buffers(Vec<Vec<u8>>);
+
+impl Buffers {
+    pub(crate) fn new() -> Self {
+        Self(vec![vec![0; LARGEST]; BATCH])
+    }
+
+    fn slices(&mut self) -> [IoSliceMut<'_>; BATCH] {
+        let mut rest = self.0.iter_mut();
+        std::array::from_fn(|_| match rest.next() {
+            Some(buffer) => IoSliceMut::new(buffer),
+            None => IoSliceMut::new(&mut []),
+        })
+    }
+}

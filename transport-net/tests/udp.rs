@@ -1,0 +1,178 @@
+//! The UDP endpoint on loopback: names, and strangers who mean no good.
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test or bench that cannot go on may panic"
+)]
+
+mod common;
+
+use std::net::UdpSocket;
+use std::sync::Arc;
+use std::time::Duration;
+
+use common::{Recorder, accepted, parcel, runtime, udp_config, until};
+use fipa_transport::{AttemptId, Conclusion, Kind, Location, Sink, Transport, WayFault};
+use fipa_transport_net::{UdpConfig, UdpTransport};
+use tokio::runtime::Runtime;
+
+struct Party {
+    transport: UdpTransport,
+    sink: Arc<Recorder>,
+    location: Location,
+    _runtime: Runtime,
+}
+
+impl Party {
+    fn new() -> Self {
+        Self::with(udp_config(&["127.0.0.1:0"]))
+    }
+
+    fn with(config: UdpConfig) -> Self {
+        let runtime = runtime();
+        let transport = UdpTransport::new(config, runtime.handle().clone());
+        let sink = Arc::new(Recorder::default());
+        let locations = transport
+            .listen(Arc::clone(&sink) as Arc<dyn Sink>)
+            .unwrap();
+        Self {
+            transport,
+            sink,
+            location: locations[0].clone(),
+            _runtime: runtime,
+        }
+    }
+
+    fn conclusion(&self, attempt: u64) -> Conclusion {
+        until("a conclusion", || {
+            let record = self.sink.record.lock();
+            record.concluded.get(&AttemptId(attempt))?.first().cloned()
+        })
+    }
+
+    fn assert_reaches(&self, attempt: u64, to: &Location) {
+        self.transport
+            .dispatch(AttemptId(attempt), to, parcel(attempt, "there?"))
+            .unwrap();
+        assert_eq!(self.conclusion(attempt), accepted());
+    }
+}
+
+/// A stranger's socket, connected to an endpoint.
+fn stranger(to: &Party) -> UdpSocket {
+    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+    socket.connect(to.location.address()).unwrap();
+    socket
+        .set_read_timeout(Some(Duration::from_secs(60)))
+        .unwrap();
+    socket
+}
+
+fn hello(number: u64, cookie: [u8; 16]) -> Vec<u8> {
+    let mut bytes = b"fipa\x01\x01\0\0".to_vec();
+    bytes.extend([0; 8]);
+    bytes.extend(number.to_le_bytes());
+    bytes.extend(cookie);
+    bytes.resize(1200, 0);
+    bytes
+}
+
+#[test]
+fn a_name_leads_to_whichever_of_its_addresses_answers() {
+    let (near, far) = (Party::new(), Party::new());
+    let port = far.location.address().rsplit_once(':').unwrap().1;
+    let named = Location::new(Kind::Udp, &format!("localhost:{port}")).unwrap();
+    near.assert_reaches(1, &named);
+    let nobody = Location::new(Kind::Udp, "nobody.invalid:7").unwrap();
+    near.transport
+        .dispatch(AttemptId(2), &nobody, parcel(1, "x"))
+        .unwrap();
+    match near.conclusion(2) {
+        Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Unreachable, "{error}"),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn a_flood_of_garbage_stops_nobody_and_leaves_nothing() {
+    let (near, far) = (Party::new(), Party::new());
+    near.assert_reaches(0, &far.location);
+    let socket = stranger(&far);
+    let mut random = fastrand::Rng::with_seed(1);
+    for round in 1..=50 {
+        for _ in 0..400 {
+            let mut bytes: Vec<u8> = (0..random.usize(0..200)).map(|_| random.u8(..)).collect();
+            if random.bool() && bytes.len() > 6 {
+                bytes[..5].copy_from_slice(b"fipa\x01");
+                bytes[5] %= 8;
+            }
+            // What the other side's buffer has no room for is lost.
+            let _ = socket.send(&bytes);
+        }
+        near.assert_reaches(round, &far.location);
+    }
+    let counters = far.transport.counters();
+    assert!(counters.ignored > 0);
+    assert_eq!((counters.accepted, counters.connections), (1, 1));
+}
+
+#[test]
+fn hellos_without_a_cookie_take_no_memory_and_get_little() {
+    let (near, far) = (Party::new(), Party::new());
+    let socket = stranger(&far);
+    let mut replies = 0;
+    let mut reply = [0; 2048];
+    for number in 1..=2000_u64 {
+        socket.send(&hello(number, [0; 16])).unwrap();
+        socket.send(&hello(number, [7; 16])).unwrap();
+        let len = socket.recv(&mut reply).unwrap();
+        assert!(len <= 64, "{len} bytes for a stranger");
+        replies += 1;
+    }
+    assert_eq!(replies, 2000);
+    let counters = far.transport.counters();
+    assert_eq!((counters.accepted, counters.connections), (0, 0));
+    near.assert_reaches(1, &far.location);
+}
+
+#[test]
+fn a_peer_that_stops_answering_is_given_up() {
+    let mut impatient = udp_config(&["127.0.0.1:0"]);
+    impatient.limits.connect_timeout = Duration::from_millis(300);
+    let near = Party::with(impatient);
+    // Somebody who receives and never says a word.
+    let mute = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let to = Location::new(Kind::Udp, &mute.local_addr().unwrap().to_string()).unwrap();
+    for attempt in 0..3 {
+        near.transport
+            .dispatch(AttemptId(attempt), &to, parcel(attempt, "x"))
+            .unwrap();
+    }
+    for attempt in 0..3 {
+        match near.conclusion(attempt) {
+            Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Unreachable, "{error}"),
+            other => panic!("{other:?}"),
+        }
+    }
+    assert_eq!(near.transport.counters().connections, 0);
+}
+
+#[test]
+fn a_peer_that_is_gone_is_noticed_when_the_system_says_so() {
+    let near = Party::new();
+    let far = Party::new();
+    near.assert_reaches(1, &far.location);
+    let gone = far.location.clone();
+    drop(far);
+    let port = gone.address().to_owned();
+    // Nobody is there now; nor does another socket take the port meanwhile.
+    let same = UdpSocket::bind(&port).unwrap();
+    same.connect(same.local_addr().unwrap()).unwrap();
+    let sent = near
+        .transport
+        .dispatch(AttemptId(2), &gone, parcel(2, "x"))
+        .map(|()| near.conclusion(2));
+    match sent {
+        Ok(Conclusion::NotSent(error)) => assert_eq!(error.fault, WayFault::Unreachable, "{error}"),
+        other => panic!("{other:?}"),
+    }
+}
