@@ -36,6 +36,7 @@
 //! process was built without (`tcp` without the feature `net`) is no mistake here, because one
 //! file serves all processes of a robot.
 
+mod changes;
 mod check;
 mod effective;
 mod error;

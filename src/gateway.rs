@@ -15,7 +15,7 @@ use fipa_mts::core::Peer;
 use fipa_sds::{
     ContactDirectory, Directory, MergedDirectory, RegisterError, Registration, Role as EntryRole,
 };
-use fipa_transport::{Incarnation, Introduction, Location};
+use fipa_transport::{Incarnation, Introduction, Kind, Location};
 use parking_lot::Mutex;
 use tokio::task::JoinHandle;
 
@@ -24,12 +24,14 @@ use self::exchange::{Exchanging, Means};
 pub use self::neighbours::Neighbour;
 use self::neighbours::{Neighbours, View};
 use self::publisher::{Keeper, Publisher};
+use crate::config::ConfigError;
 use crate::domain::OpenError;
 use crate::service::{Role, Service};
 use crate::{AgentId, Config};
 
 /// A running gateway. Ends when [`close`](Self::close) is called or it is dropped.
 pub struct Gateway {
+    config: Config,
     service: Arc<Service>,
     network: Option<Arc<dyn Network>>,
     view: Arc<dyn Directory>,
@@ -76,6 +78,7 @@ impl Gateway {
             return Err(OpenError::NoRuntime);
         };
         let mut gateway = Self {
+            config: config.clone(),
             service: Arc::new(service),
             network,
             view,
@@ -196,6 +199,44 @@ impl Gateway {
     #[must_use]
     pub fn neighbours(&self) -> Vec<Neighbour> {
         self.neighbours.all()
+    }
+
+    /// Uses another configuration from now on, without losing a letter: orders of transports,
+    /// exceptions, the deadline of old peers' letters, static peers. Returns the keys that differ
+    /// and are used only after the gateway was started again.
+    ///
+    /// # Errors
+    /// When the configuration has mistakes. Nothing has been changed then.
+    pub fn reload(&mut self, config: &Config) -> Result<Vec<String>, ConfigError> {
+        config.check()?;
+        let mut later = self.config.differences(config);
+        let open: Vec<Kind> = self.service.mts.kinds().collect();
+        later.retain(|key| match key.as_str() {
+            "mts.deadline" | "routes" | "discovery.static" => false,
+            "mts.transports" => config
+                .mts
+                .transports
+                .iter()
+                .any(|kind| !open.contains(kind)),
+            _ => true,
+        });
+        self.service.reorder(config);
+        let peers = peers(config);
+        self.neighbours.name_peers(peers.clone());
+        self.service.mts.keep_in_touch(peers);
+        self.config.mts.deadline = config.mts.deadline;
+        self.config.routes.clone_from(&config.routes);
+        self.config
+            .discovery
+            .peers
+            .clone_from(&config.discovery.peers);
+        if !later.iter().any(|key| key == "mts.transports") {
+            self.config
+                .mts
+                .transports
+                .clone_from(&config.mts.transports);
+        }
+        Ok(later)
     }
 
     /// What goes wrong with finding other hosts, if anything does.

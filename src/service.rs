@@ -115,6 +115,15 @@ impl Service {
         }
     }
 
+    /// Uses the orders and the deadline of this configuration from now on.
+    pub(crate) fn reorder(&self, config: &Config) {
+        let mut order = config.mts.transports.clone();
+        let open: Vec<Kind> = self.mts.kinds().collect();
+        order.retain(|kind| open.contains(kind));
+        let routes = routes(config, &order);
+        self.mts.reorder(order, routes, config.mts.deadline);
+    }
+
     /// Gives what is under way a moment to end, then ends.
     pub(crate) async fn close(&self) {
         self.mts.close(CLOSING_PATIENCE).await;
@@ -176,18 +185,23 @@ fn told(refused: &[(Kind, String)]) -> String {
 
 fn core_config(config: &Config, role: &Role<'_>, incarnation: Incarnation) -> CoreConfig {
     let order = config.mts.transports.clone();
+    CoreConfig {
+        forwards: role.gateway,
+        routes: routes(config, &order),
+        queue: config.mts.queue,
+        ..CoreConfig::new(Arc::clone(&role.name), incarnation, order)
+    }
+}
+
+/// The exceptions of the configuration, cut to the transports that are used.
+fn routes(config: &Config, order: &[Kind]) -> Vec<(Pattern, Vec<Kind>)> {
     let routes = config.routes.iter().filter_map(|route| {
         // Checked when the configuration was: what does not compile cannot be here.
         let pattern = Pattern::new(&route.receiver).ok()?;
         let used = route.transports.iter().filter(|kind| order.contains(kind));
         Some((pattern, used.copied().collect()))
     });
-    CoreConfig {
-        forwards: role.gateway,
-        routes: routes.collect(),
-        queue: config.mts.queue,
-        ..CoreConfig::new(Arc::clone(&role.name), incarnation, order.clone())
-    }
+    routes.collect()
 }
 
 /// The transports that are wanted, built in, and work here.

@@ -3,6 +3,7 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
@@ -16,6 +17,7 @@ use fipa::{
 /// A host that no other test has, and names that nobody else announces.
 struct Host {
     config: Config,
+    set: Vec<String>,
     mark: String,
 }
 
@@ -30,12 +32,23 @@ impl Host {
             "discovery.interfaces=lo".to_owned(),
         ];
         all.extend(set.iter().map(|setting| (*setting).to_owned()));
-        let config = Config::load(&Sources {
+        let mut host = Self {
+            config: Config::for_host("gateways"),
             set: all,
+            mark,
+        };
+        host.config = host.configured(&[]);
+        host
+    }
+
+    /// Its configuration, with something else set.
+    fn configured(&self, set: &[&str]) -> Config {
+        let set = set.iter().map(|setting| (*setting).to_owned());
+        Config::load(&Sources {
+            set: self.set.iter().cloned().chain(set).collect(),
             ..Sources::default()
         })
-        .unwrap();
-        Self { config, mark }
+        .unwrap()
     }
 
     /// The host's gateway, and a process on it.
@@ -354,4 +367,107 @@ async fn the_gateway_tells_which_way_letters_go_and_what_became_of_them() {
     assert!(counted.last_error.is_some(), "{counted:?}");
     let ended = counted.taken + counted.failed;
     assert!(ended <= counted.tried, "{counted:?}");
+}
+
+/// Numbered letters under way at a time, and one after another: what became of each.
+async fn numbered(from: Arc<Agent>, to: String, numbers: std::ops::Range<u32>) -> Vec<Deliveries> {
+    let sending = |number: u32| {
+        let message = inform(&from, &to, &number.to_string());
+        let from = Arc::clone(&from);
+        async move { from.send(message).await.unwrap() }
+    };
+    let mut outcomes = Vec::new();
+    for number in numbers.step_by(2) {
+        let (one, other) = tokio::join!(sending(number), sending(number + 1));
+        outcomes.extend([one, other]);
+    }
+    outcomes
+}
+
+async fn numbers(agent: &Agent, count: u32) -> Vec<u32> {
+    let mut all = Vec::new();
+    while all.len() < count as usize {
+        let message = agent.receive().await.unwrap().message;
+        if *message.performative() == Performative::Inform {
+            let content = message.content().unwrap().to_vec();
+            all.push(String::from_utf8(content).unwrap().parse().unwrap());
+        }
+    }
+    all
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn another_configuration_loses_no_letter() {
+    const LETTERS: u32 = 2000;
+    let (here, there) = (Host::new(&[]), Host::new(&[]));
+    let (mut near, at_home) = here.occupied().await;
+    let (_far, abroad) = there.occupied().await;
+    let rover = Arc::new(at_home.register(&here.name("rover")).unwrap());
+    let arm = abroad.register(&there.name("arm")).unwrap();
+    known(&at_home, arm.name()).await;
+    let sending = numbered(Arc::clone(&rover), arm.name().to_owned(), 0..LETTERS);
+    let sending = tokio::spawn(sending);
+    let reading = async {
+        let received = numbers(&arm, LETTERS).await;
+        assert_eq!(received, (0..LETTERS).collect::<Vec<_>>());
+    };
+    let changing = async {
+        let mut config = here.config.clone();
+        for round in 0_u16.. {
+            let order = ["shm,tcp", "tcp,shm"][usize::from(round % 2)];
+            config = here.configured(&[
+                &format!("mts.transports={order}"),
+                &format!("mts.deadline={}s", 5 + round % 3),
+                "routes={ \"arm.*\" = [\"tcp\"] }",
+                &format!(
+                    "discovery.static={{ x = [\"tcp://127.0.0.1:{}\"] }}",
+                    round % 9 + 1
+                ),
+            ]);
+            assert_eq!(near.reload(&config).unwrap(), Vec::<String>::new());
+            if sending.is_finished() {
+                break;
+            }
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
+        config.transport.tcp.listen = vec!["127.0.0.1:1".to_owned()];
+        config.mts.queue = 0;
+        assert!(
+            near.reload(&config).is_err(),
+            "a mistake is no configuration"
+        );
+        config.mts.queue = 7;
+        let later = near.reload(&config).unwrap();
+        assert_eq!(later, ["mts.queue", "transport.tcp.listen"]);
+    };
+    tokio::join!(reading, changing);
+    for deliveries in sending.await.unwrap() {
+        via(&deliveries);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_under_way_when_the_gateway_ends_has_an_outcome() {
+    const LETTERS: u32 = 600;
+    let (here, there) = (Host::new(&["mts.deadline=3s"]), Host::new(&[]));
+    let (near, at_home) = here.occupied().await;
+    let (_far, abroad) = there.occupied().await;
+    let rover = Arc::new(at_home.register(&here.name("rover")).unwrap());
+    let arm = Arc::new(abroad.register(&there.name("arm")).unwrap());
+    known(&at_home, arm.name()).await;
+    let sending = numbered(Arc::clone(&rover), arm.name().to_owned(), 0..LETTERS);
+    let sending = tokio::spawn(sending);
+    let reader = Arc::clone(&arm);
+    let first = numbers(&reader, 50).await;
+    near.close().await;
+    let mut delivered = 0;
+    for deliveries in sending.await.unwrap() {
+        assert_eq!(deliveries.0.len(), 1);
+        delivered += u32::from(deliveries.all_succeeded());
+    }
+    assert!(delivered < LETTERS, "the gateway has not ended");
+    // What was delivered is there, in order; what was not known to be may be.
+    let mut rest = numbers(&arm, delivered.saturating_sub(50)).await;
+    rest.splice(0..0, first);
+    assert!(rest.is_sorted_by(|a, b| a < b), "{rest:?}");
 }

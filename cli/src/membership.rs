@@ -1,7 +1,7 @@
 //! What the commands share that take part in a domain: they join it, say why they cannot, and end
 //! in order when they are told to.
 
-use std::io;
+use std::io::{self, IsTerminal};
 use std::pin::pin;
 
 use fipa::{Agent, Config, Domain, ListenError, OpenError, RegisterError, RegisterOptions};
@@ -15,6 +15,16 @@ pub(crate) struct Stop {
     interrupt: Signal,
     terminate: Signal,
     hang_up: Signal,
+    /// Whether it was started from a terminal.
+    from_terminal: bool,
+}
+
+/// What a signal wants of a service.
+pub(crate) enum Wish {
+    /// It is to end.
+    End,
+    /// It is to read its configuration again.
+    Reload,
 }
 
 impl Stop {
@@ -33,7 +43,24 @@ impl Stop {
             interrupt: listen(SignalKind::interrupt())?,
             terminate: listen(SignalKind::terminate())?,
             hang_up: listen(SignalKind::hangup())?,
+            from_terminal: io::stdin().is_terminal(),
         })
+    }
+
+    /// What a service is told: a hang-up means that its configuration has changed, unless the
+    /// terminal that it was started from has really been closed.
+    pub(crate) async fn wish(&mut self) -> Wish {
+        tokio::select! {
+            _ = self.interrupt.recv() => Wish::End,
+            _ = self.terminate.recv() => Wish::End,
+            _ = self.hang_up.recv() => {
+                if self.from_terminal && !io::stdin().is_terminal() {
+                    Wish::End
+                } else {
+                    Wish::Reload
+                }
+            }
+        }
     }
 
     /// Returns when one of them has come.

@@ -229,3 +229,36 @@ fn an_agent_of_another_host() {
     assert_eq!(echo.signal("-INT"), (Some(0), String::new()));
     gateway.tells(&["INFO", "left", &name]);
 }
+
+#[test]
+fn a_hang_up_reads_the_configuration_again() {
+    let host = Host::new();
+    let file = host.path("robot.toml");
+    let port = |number| format!("[transport.tcp]\nlisten = [\"127.0.0.1:{number}\"]\n");
+    std::fs::write(&file, port(0)).unwrap();
+    let mut gateway = host.start(&["up", "-v", "--json", "--config", "robot.toml"]);
+    let _arm = host.echo("arm");
+    let peers = || host.run(&["routes", "--json"]).done_json()["gateway"]["peers"].clone();
+    assert_eq!(peers(), json!([]));
+
+    let peer = "[discovery.static]\ncrex = [\"tcp://127.0.0.1:9\"]\n";
+    std::fs::write(&file, port(1) + peer).unwrap();
+    gateway.send_signal("-HUP");
+    let started = std::time::Instant::now();
+    while peers()[0]["name"] != "crex" {
+        assert!(started.elapsed().as_secs() < 60, "never: the new peer");
+    }
+    gateway.tells(&["warning", "transport.tcp.listen", "started again"]);
+    // A mistake changes nothing.
+    std::fs::write(&file, "[mts]\nqueue = 0\n").unwrap();
+    gateway.send_signal("-HUP");
+    gateway.tells(&["robot.toml:2"]);
+    assert_eq!(peers()[0]["name"], "crex");
+    std::fs::write(&file, port(0)).unwrap();
+    gateway.send_signal("-HUP");
+    while peers() != json!([]) {
+        assert!(started.elapsed().as_secs() < 60, "never: no peer");
+    }
+    let (code, log) = gateway.signal("-TERM");
+    assert_eq!(code, Some(0), "{log}");
+}

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use fipa_acl::Letter;
-use fipa_sds::{Directory, Entry};
+use fipa_sds::{Directory, Entry, Pattern};
 use fipa_transport::{
     Arrival, AttemptId, Conclusion, Incarnation, Introduction, Kind, ListenError, LoanedContent,
     Location, Outcome, Sink, Transport, Verdict,
@@ -36,7 +36,8 @@ pub struct RuntimeConfig {
     /// How long somebody who waits looks for something to do before going to sleep. Zero saves
     /// the battery.
     pub spin: Duration,
-    /// The deadline of letters that old peers throw at the gateway: theirs have none.
+    /// The deadline of letters that old peers throw at the gateway: theirs have none. Can be
+    /// [changed](Mts::reorder) later.
     pub unframed_deadline: Duration,
     /// Whom to tell of other hosts. Must not call the service back.
     pub contacts: Option<Arc<dyn Contacts>>,
@@ -78,6 +79,7 @@ struct Shared {
 
 struct State {
     core: Core,
+    unframed_deadline: Duration,
     /// Until when the timer sleeps.
     armed: Option<Instant>,
     sends: HashMap<SendId, Arc<Slot>>,
@@ -127,6 +129,7 @@ impl Mts {
     ) -> Started {
         let state = State {
             core: Core::new(core, Arc::clone(&directory)),
+            unframed_deadline: config.unframed_deadline,
             armed: None,
             sends: HashMap::new(),
             agents: HashMap::new(),
@@ -211,6 +214,25 @@ impl Mts {
     /// Sends a letter to this one life of an agent; see [`Core::send_to`].
     pub fn send_to(&self, submission: Submission, entry: &Entry) -> Sending {
         self.begin(|core| (core.send_to(Now::read(), submission, entry), 1))
+    }
+
+    /// Uses these orders of transports and this deadline of old peers' letters from now on; see
+    /// [`Core::reorder`]. No letter is lost by it.
+    pub fn reorder(
+        &self,
+        order: Vec<Kind>,
+        routes: Vec<(Pattern, Vec<Kind>)>,
+        unframed_deadline: Duration,
+    ) {
+        let mut state = self.shared.state.lock();
+        state.unframed_deadline = unframed_deadline;
+        state.core.reorder(Now::read(), order, routes);
+        self.shared.carry_out(state);
+    }
+
+    /// The transports that are open.
+    pub fn kinds(&self) -> impl Iterator<Item = Kind> {
+        self.shared.transports.iter().map(|it| it.kind())
     }
 
     /// Keeps in touch with these services, and no others, from now on; see
@@ -316,10 +338,11 @@ impl Mts {
         self.shared.drive()
     }
 
-    /// Ends the service: gives what is under way up to `patience` to end, then gives it up, and
-    /// closes the transports.
+    /// Ends the service: takes no more letters of others, gives what is under way up to `patience`
+    /// to end, then gives it up, and closes the transports.
     pub async fn close(&self, patience: Duration) {
         let until = Instant::now() + patience;
+        self.shared.state.lock().core.refuse_custody();
         while self.shared.state.lock().core.has_open_letters() && Instant::now() < until {
             if !self.shared.drive() {
                 tokio::time::sleep(Duration::from_millis(1)).await;
@@ -536,7 +559,7 @@ impl Sink for Receiving {
             return;
         };
         let mut state = shared.state.lock();
-        let deadline = shared.config.unframed_deadline;
+        let deadline = state.unframed_deadline;
         state
             .core
             .handle_unframed(Now::read(), deadline, letter, via);

@@ -6,16 +6,20 @@ use clap::Args;
 use fipa::{Change, Config, Entry, Gateway};
 use serde_json::{Value, json};
 
-use crate::membership::{self, Stop};
+use crate::membership::{self, Stop, Wish};
 use crate::options::{self, Global};
 use crate::output;
-use crate::report::Failure;
+use crate::report::{self, Failure};
 
 /// Run the gateway, which connects the agents of this host with those of other hosts
 ///
 /// Listens on the network (transport.tcp.listen), announces the agents of this host by mDNS and
 /// finds those of others, until Ctrl-C. Agents of one host reach each other without it. A domain
 /// has one gateway on a host.
+///
+/// A hang-up signal (`kill -HUP`) makes it read its configuration again, without losing a letter:
+/// mts.transports (their order), mts.deadline, [routes] and discovery.static; it says what has to
+/// wait until it is started again.
 ///
 /// Says on standard output what it is and where it listens. With -v, it logs to standard error
 /// who joins and who leaves.
@@ -42,13 +46,13 @@ const LOOK_FOR_PROBLEMS: Duration = Duration::from_secs(5);
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
-    options::runtime()?.block_on(serve(&config, arguments.json))
+    options::runtime()?.block_on(serve(&config, arguments.json, global))
 }
 
-async fn serve(config: &Config, json: bool) -> Result<(), Failure> {
+async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
     let opened = Gateway::open(config).await;
-    let gateway = opened.map_err(|error| membership::not_joined(error, config))?;
+    let mut gateway = opened.map_err(|error| membership::not_joined(error, config))?;
     let mut problem = gateway.discovery_problem();
     let mut changes = gateway.directory().watch();
     if json {
@@ -62,7 +66,10 @@ async fn serve(config: &Config, json: bool) -> Result<(), Failure> {
     let mut look = tokio::time::interval(LOOK_FOR_PROBLEMS);
     loop {
         tokio::select! {
-            () = stop.requested() => break,
+            wish = stop.wish() => match wish {
+                Wish::End => break,
+                Wish::Reload => reload(&mut gateway, global),
+            },
             Some(change) = changes.next() => log(&change),
             _ = look.tick() => {
                 let now = gateway.discovery_problem();
@@ -79,6 +86,27 @@ async fn serve(config: &Config, json: bool) -> Result<(), Failure> {
     tracing::info!("ending");
     gateway.close().await;
     Ok(())
+}
+
+/// Reads the configuration again. One with mistakes changes nothing.
+fn reload(gateway: &mut Gateway, global: &Global) {
+    let reloaded = global.config().and_then(|config| {
+        let later = gateway.reload(&config)?;
+        Ok(later)
+    });
+    match reloaded {
+        Ok(later) => {
+            tracing::info!("the configuration was read again");
+            if !later.is_empty() {
+                let later = later.join(", ");
+                report::warn(&format!(
+                    "what has changed in {later} is used when the gateway is started again"
+                ));
+            }
+        }
+        // It is told; the gateway goes on as it was.
+        Err(failure) => drop(failure.report()),
+    }
 }
 
 fn ready(config: &Config, gateway: &Gateway, problem: Option<&str>) -> String {

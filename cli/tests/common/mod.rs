@@ -232,10 +232,16 @@ impl Running {
     /// Sends a signal, waits for its end, and returns the exit code and standard error.
     #[track_caller]
     pub(crate) fn signal(mut self, signal: &str) -> (Option<i32>, String) {
+        self.send_signal(signal);
+        self.end()
+    }
+
+    /// Sends a signal.
+    #[track_caller]
+    pub(crate) fn send_signal(&self, signal: &str) {
         let pid = self.child.id().to_string();
         let sent = Command::new("kill").args([signal, &pid]).status().unwrap();
         assert!(sent.success());
-        self.end()
     }
 
     /// Waits for its end, and returns the exit code and all of standard error.

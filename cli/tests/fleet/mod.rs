@@ -86,6 +86,9 @@ struct Account {
 impl Fleet {
     /// Three hosts whose gateways know each other by address, and whose agents know each other.
     pub(crate) fn new(plan: &Plan) -> Self {
+        // What killed processes leave behind goes with the test.
+        fipa_testbed::run("mount -t tmpfs tmpfs /tmp");
+        fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
         let network = Network::new(3);
         let accounts = Arc::new(Accounts::default());
         let parties = (0..3).map(|at| Party::new(&network, at, plan)).collect();
@@ -357,6 +360,7 @@ impl Party {
         let transports = plan.transports.join(",");
         let mut settings = vec![
             format!("domain=host{at}"),
+            "discovery.mdns=false".to_owned(),
             format!("mts.name=gateway{at}"),
             format!("mts.transports={transports}"),
             format!("mts.deadline={}ms", plan.deadline.as_millis()),

@@ -39,7 +39,7 @@ impl Core {
         if from.remote {
             self.hear(parcel.stream.sender, &stamped, &from);
         }
-        let (bound, stream) = (self.desk.config.lane, parcel.stream);
+        let (bound, stream, ending) = (self.desk.config.lane, parcel.stream, self.ending);
         let bytes = self.desk.held.saturating_add(stamped.len());
         let too_many_bytes = self.desk.held > 0 && bytes > self.desk.config.custody_bytes;
         let new_lane = || Lane::new(now.instant, stream, Arc::clone(&entry.name));
@@ -53,6 +53,9 @@ impl Core {
         let Some(origin) = lane.adopt(parcel.sequence, origin, &mut self.desk) else {
             return taken;
         };
+        if ending {
+            return Verdict::Now(Answer::Busy);
+        }
         if too_many_bytes || lane.len() >= bound {
             lane.wait_for_credit(from.location);
             return Verdict::Now(Answer::Busy);

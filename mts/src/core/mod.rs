@@ -30,7 +30,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::Letter;
-use fipa_sds::{Directory, Entry, Resolution};
+use fipa_sds::{Directory, Entry, Pattern, Resolution};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind, Location,
     Outcome, Parcel, Report, Stream, Verdict,
@@ -96,6 +96,8 @@ pub struct Core {
     timers: BinaryHeap<Reverse<(Instant, Stream)>>,
     notes: BinaryHeap<Reverse<LateNote>>,
     peers: Peers,
+    /// No more letters of others are taken.
+    ending: bool,
     next_send: u64,
     /// Sequence of the letters that this service sends in its own name, where it is no agent.
     next_sequence: u64,
@@ -136,6 +138,7 @@ impl Core {
             timers: BinaryHeap::new(),
             notes: BinaryHeap::new(),
             peers: Peers::default(),
+            ending: false,
             next_send: 1,
             next_sequence: 1,
             next_forget: None,
@@ -501,6 +504,21 @@ impl Core {
         self.peers.handle_timeout(now.instant, &mut self.desk);
         self.tell_failures(now);
         self.forget_idle_lanes(now);
+    }
+
+    /// Uses these orders of transports from now on, for letters that wait as well. What is under
+    /// way stays so.
+    pub fn reorder(&mut self, now: Now, order: Vec<Kind>, routes: Vec<(Pattern, Vec<Kind>)>) {
+        self.desk.config.order = order;
+        self.desk.config.routes = routes;
+        self.peers.reorder(now.instant, &mut self.desk);
+        self.handle_directory_change(now);
+    }
+
+    /// Takes no more letters of others into custody: the service is about to end. Whoever has one
+    /// keeps it, and looks for another way or another gateway.
+    pub fn refuse_custody(&mut self) {
+        self.ending = true;
     }
 
     /// Keeps in touch with these services, and no others, from now on.

@@ -107,6 +107,14 @@ impl Peers {
         self.ask_who_is_due(now, desk);
     }
 
+    /// The order of transports has changed.
+    pub(super) fn reorder(&mut self, now: Instant, desk: &mut Desk) {
+        for watched in &mut self.all {
+            watched.order(desk);
+        }
+        self.ask_who_is_due(now, desk);
+    }
+
     /// A connection that had been opened for this location has ended.
     pub(super) fn parted(&mut self, now: Instant, location: &Location) {
         for watched in &mut self.all {
