@@ -157,6 +157,11 @@ fn who_is_there() {
         (&["arm"], json!([])),
         (&["--type", "eye"], json!(["camera"])),
         (&[".*", "--type", "arm|eye"], json!(["arm_1", "camera"])),
+        (&["--description", "left.*"], json!(["arm_1"])),
+        (&["--location", "shm://.*"], json!(["arm_1", "camera"])),
+        (&["--location", "udp://.*"], json!([])),
+        (&["--local", "--type", "eye"], json!(["camera"])),
+        (&["--remote"], json!([])),
     ] {
         let listed = host
             .run(&[&["agents", "--json"], search].concat())
@@ -167,6 +172,34 @@ fn who_is_there() {
     }
     let told = host.run(&["agents", "arm_["]).failed(2);
     assert!(told.contains("unclosed character class"), "{told}");
+}
+
+#[test]
+fn who_joins_and_leaves_is_watched() {
+    let host = Host::new();
+    let _arm = host.start(&["echo", "arm", "--type", "arm"]);
+    let mut watching = host.start(&["agents", "--watch", "--json", "arm.*"]);
+    let told = |line: &str| {
+        let line: Value = serde_json::from_str(line).unwrap();
+        assert!(line["time"].as_str().unwrap().ends_with('Z'), "{line}");
+        let name = line["agent"]["name"].as_str().unwrap();
+        format!("{} {name}", line["change"].as_str().unwrap())
+    };
+    assert_eq!(told(&watching.ready), "present arm");
+    let _other = host.echo("leg");
+    let newcomer = host.echo("arm_2");
+    assert_eq!(told(&watching.line()), "joined arm_2");
+    assert_eq!(newcomer.signal("-INT"), (Some(0), String::new()));
+    assert_eq!(told(&watching.line()), "left arm_2");
+    assert_eq!(watching.signal("-INT"), (Some(0), String::new()));
+
+    let watching = host.start(&["agents", "-w"]);
+    assert!(
+        watching
+            .ready
+            .contains("  present  arm (arm)  this host  shm://")
+    );
+    assert_eq!(watching.signal("-TERM"), (Some(0), String::new()));
 }
 
 #[test]

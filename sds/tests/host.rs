@@ -429,7 +429,7 @@ async fn a_gateway_publishes_what_it_has_learnt() {
     gateway.publish_remote(vec![entry.clone()]).unwrap();
     let found = here.lookup("camera").unwrap();
     let expected = Entry {
-        source: Source::Host,
+        source: Source::Mdns,
         reach: Reach::Remote {
             gateway: incarnation,
         },

@@ -1,10 +1,12 @@
 //! `fipa agents`: who is there, and where.
 
+mod watch;
+
 use std::time::Duration;
 
 use clap::Args;
 use comfy_table::{Table, presets};
-use fipa::{Directory, Entry, Matcher, Query, Reach, Role, Time};
+use fipa::{Directory, Entry, Matcher, Query, Reach, Role, Source, Time};
 use serde_json::{Value, json};
 
 use crate::membership;
@@ -17,19 +19,23 @@ use crate::report::Failure;
 /// Lists the agents of the domain on this host and, when a gateway is running (`fipa up`), those
 /// that it knows on other hosts; the gateway itself too. Needs no gateway.
 ///
-/// A pattern is a regular expression for the whole name, such as `arm_.*`. What has none of
-/// `* + ? [ ( { | ^ $ \` is a name.
+/// A pattern is a regular expression for the whole text, such as `arm_.*`. What has none of
+/// `* + ? [ ( { | ^ $ \` is compared as it is. Of several filters all have to match.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   fipa agents
   fipa agents 'arm_.*'
   fipa agents --type camera --json | jq -r '.agents[].name'
+  fipa agents --location 'tcp://10\\.0\\.0\\.2:.*' --remote
+  fipa agents --watch
 
 Columns:
   REACH      this host, or the gateway that letters go through
   LOCATIONS  where it takes letters, in order of preference
   MTS        the message transport service that delivers to it
+  LEARNT     how: host (a process of this host), mdns (announced on the network), exchange (told by
+             its gateway), static (the configuration), contact (it has written)
   AGE        since it was registered
 
 JSON:
@@ -37,7 +43,10 @@ JSON:
     \"agents\": [ { \"name\", \"type\", \"description\", \"role\": \"agent\" or \"gateway\",
                   \"reach\": \"local\" or \"remote\", \"gateway\": name, when it is remote,
                   \"locations\": [ text ], \"mts\": { \"name\", \"incarnation\" },
-                  \"incarnation\", \"registered\": time, \"source\": how it was learnt } ] }")]
+                  \"incarnation\", \"registered\": time, \"source\": how it was learnt } ] }
+
+With --watch, one object on each line, the first for those who are there already:
+  { \"time\", \"change\": \"present\", \"joined\", \"changed\" or \"left\", \"agent\": as above }")]
 pub(crate) struct Arguments {
     /// Only those with this name, or whose name matches this pattern
     #[arg(value_parser = Matcher::parse)]
@@ -47,27 +56,73 @@ pub(crate) struct Arguments {
     #[arg(long = "type", value_name = "TYPE", value_parser = Matcher::parse)]
     agent_type: Option<Matcher>,
 
+    /// Only those with such a location, written kind://address
+    #[arg(long, value_name = "LOCATION", value_parser = Matcher::parse)]
+    location: Option<Matcher>,
+
+    /// Only those with this description
+    #[arg(long, value_name = "TEXT", value_parser = Matcher::parse)]
+    description: Option<Matcher>,
+
+    /// Only those on this host
+    #[arg(long)]
+    local: bool,
+
+    /// Only those on other hosts
+    #[arg(long, conflicts_with = "local")]
+    remote: bool,
+
+    /// Go on, and tell who joins, changes and leaves until Ctrl-C
+    #[arg(long, short)]
+    watch: bool,
+
     /// Print JSON
     #[arg(long)]
     json: bool,
 }
 
+/// Whom to show.
+struct Filter {
+    query: Query,
+    local: bool,
+    remote: bool,
+}
+
+impl Filter {
+    fn matches(&self, entry: &Entry) -> bool {
+        let reach = match entry.reach {
+            Reach::Local => !self.remote,
+            Reach::Remote { .. } => !self.local,
+        };
+        reach && self.query.matches(entry)
+    }
+}
+
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
-    let query = Query {
-        name: arguments.pattern,
-        agent_type: arguments.agent_type,
-        ..Query::all()
+    let filter = Filter {
+        query: Query {
+            name: arguments.pattern,
+            agent_type: arguments.agent_type,
+            location: arguments.location,
+            description: arguments.description,
+        },
+        local: arguments.local,
+        remote: arguments.remote,
     };
+    if arguments.watch {
+        return watch::run(&filter, &config, arguments.json);
+    }
     let listed = membership::run(async {
         let domain = membership::join(&config).await?;
         let directory = domain.directory();
         directory.refresh();
+        let entries = directory.entries();
         let listed = Listed {
             gateway: gateway(directory).map(|entry| entry.name.to_string()),
-            entries: directory
-                .search(&query)
+            entries: entries
                 .iter()
+                .filter(|entry| filter.matches(entry))
                 .map(|entry| Row::of(entry, directory))
                 .collect(),
         };
@@ -100,11 +155,11 @@ struct Listed {
     entries: Vec<Row>,
 }
 
-const COLUMNS: [&str; 6] = ["NAME", "TYPE", "REACH", "LOCATIONS", "MTS", "AGE"];
+const COLUMNS: [&str; 7] = ["NAME", "TYPE", "REACH", "LOCATIONS", "MTS", "LEARNT", "AGE"];
 
 /// One agent, for people and for programs.
 struct Row {
-    cells: [String; 6],
+    cells: [String; 7],
     json: Value,
 }
 
@@ -145,6 +200,7 @@ impl Row {
             reach,
             locations.join("\n"),
             entry.mts.name.to_string(),
+            learnt(entry.source).to_owned(),
             age(entry),
         ];
         Self { cells, json }
@@ -157,6 +213,17 @@ fn gateway(directory: &dyn Directory) -> Option<std::sync::Arc<Entry>> {
         .iter()
         .filter(|entry| entry.role == Role::Gateway && entry.reach == Reach::Local);
     gateways.next().cloned()
+}
+
+fn learnt(source: Source) -> &'static str {
+    match source {
+        Source::Memory | Source::Host => "host",
+        Source::Static => "static",
+        Source::Mdns => "mdns",
+        Source::Exchange => "exchange",
+        Source::Contact => "contact",
+        _ => "?",
+    }
 }
 
 /// In whole seconds, by the clocks of two hosts; nothing when they disagree.

@@ -102,6 +102,9 @@ struct WrittenEntry {
     role: Role,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     remote: Option<Mts>,
+    /// How the gateway learnt of it, of entries of other hosts.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    source: Option<Source>,
 }
 
 impl WrittenEntry {
@@ -118,6 +121,7 @@ impl WrittenEntry {
             description: entry.description.clone(),
             registered: millis_of_time(entry.registered),
             role: entry.role,
+            source: remote.is_some().then_some(entry.source),
             remote,
         }
     }
@@ -141,7 +145,7 @@ impl WrittenEntry {
             mts: self.remote.unwrap_or_else(|| mts.clone()),
             description: self.description,
             registered: time_of_millis(self.registered),
-            source: Source::Host,
+            source: self.source.unwrap_or(Source::Host),
             reach,
             role: self.role,
         };
