@@ -10,6 +10,9 @@
 //! label of a record, on the other hand, means nothing between us: if it is taken by another
 //! name, another one is used.
 
+mod beacon;
+mod ear;
+mod held;
 mod record;
 mod task;
 mod whole;
@@ -23,6 +26,8 @@ use mdns_sd::{IfKind, ServiceDaemon, ServiceInfo, TxtProperty};
 use parking_lot::Mutex;
 use tokio::sync::{Notify, broadcast};
 
+use self::beacon::Digest;
+use self::held::Holdings;
 use crate::table::Table;
 use crate::{
     DeregisterError, Directory, Entry, Mts, RegisterError, Registration, Source, Subscriber,
@@ -116,6 +121,7 @@ impl MdnsDirectory {
             daemon,
             config,
             table: Table::new(),
+            held: Mutex::default(),
             own: Mutex::default(),
             withdrawals: broadcast::channel(64).0,
             status: Mutex::new(MdnsStatus {
@@ -150,18 +156,24 @@ impl MdnsDirectory {
     }
 
     /// Asks the network whether the record of this name is still there, because letters to it do
-    /// not arrive. If nobody answers, it leaves within a few seconds.
+    /// not arrive. If nobody answers, it leaves within a few seconds, and with it all others of
+    /// its gateway.
     pub fn verify(&self, name: &str) {
-        let Some((fullname, _)) = self.shared.table.holder(name) else {
+        let Some((fullname, entry)) = self.shared.table.holder(name) else {
             return;
         };
-        let patience = Duration::from_secs(2);
-        let asked = self
-            .shared
-            .ask(|daemon| daemon.verify(fullname.to_string(), patience));
-        if let Err(error) = asked {
-            self.shared
-                .failed(format!("cannot verify the record of {name:?}: {error}"));
+        match entry.mts.incarnation {
+            Incarnation::UNKNOWN => self.shared.verify(&fullname),
+            gateway => self.verify_gateway(gateway),
+        }
+    }
+
+    /// Asks the network whether this gateway is still there; see [`verify`](Self::verify). Asking
+    /// again within a few seconds does nothing.
+    pub fn verify_gateway(&self, gateway: Incarnation) {
+        let doubted = self.shared.held.lock().doubt(Instant::now(), gateway);
+        if doubted {
+            self.shared.postponed.notify_one();
         }
     }
 
@@ -239,6 +251,8 @@ struct Shared {
     /// The others' entries, by the full name of their record, spelt as they spell it: the daemon
     /// knows it by that only.
     table: Table<Arc<str>>,
+    /// The same records, by the gateways that announce them.
+    held: Mutex<Holdings>,
     own: Mutex<Own>,
     withdrawals: broadcast::Sender<Withdrawal>,
     status: Mutex<MdnsStatus>,
@@ -278,6 +292,7 @@ struct Announced {
     attempt: u32,
     /// When it is to be announced, if it is not yet.
     due: Option<Instant>,
+    digest: Digest,
 }
 
 /// How long a full name rests after a goodbye.
@@ -335,6 +350,7 @@ impl Shared {
         let before = before.filter(|announced| announced.fullname == fullname);
         let announced = Announced {
             entry: Arc::clone(entry),
+            digest: Digest::of(&record::encode(entry)),
             host: before.map_or_else(Incarnation::random, |announced| announced.host),
             due: own.resting.get(&fullname).copied(),
             fullname,
@@ -425,6 +441,32 @@ impl Shared {
                 done => return done.map(Some),
             }
         }
+    }
+
+    /// What the network says of a record now: this, or that it is gone.
+    fn put(&self, fullname: &Arc<str>, entry: Option<Arc<Entry>>) {
+        let now = Instant::now();
+        self.held.lock().put(now, fullname, entry.as_deref());
+        self.table.replace(fullname, entry);
+    }
+
+    /// Asks for a record, which leaves if nobody answers.
+    fn verify(&self, fullname: &Arc<str>) {
+        let patience = Duration::from_secs(2);
+        let asked = self.ask(|daemon| daemon.verify(fullname.to_string(), patience));
+        if let Err(error) = asked {
+            self.failed(format!("cannot verify the record {fullname}: {error}"));
+        }
+    }
+
+    /// What this gateway announces.
+    fn digest(&self) -> Digest {
+        let mut digest = Digest::default();
+        let own = self.own.lock();
+        for announced in own.agents.values().filter(|one| one.due.is_none()) {
+            digest.add(announced.digest);
+        }
+        digest
     }
 
     fn failed(&self, error: String) {

@@ -1,14 +1,14 @@
 //! The task that listens to the network.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use mdns_sd::{DaemonEvent, Receiver, ResolvedService, ServiceDaemon, ServiceEvent};
 use tokio::time::Instant;
 
+use super::ear::Ear;
 use super::record::Properties;
-use super::whole::{Reader, Sockets};
 use super::{MAX_SPOILT, MdnsDirectory, SERVICE_TYPE, Shared, Withdrawal, record};
 use crate::Entry;
 
@@ -18,10 +18,10 @@ pub(super) async fn run(shared: Arc<Shared>) {
         return;
     };
     let mut unconfirmed = HashSet::new();
-    let mut peers = Peers::default();
+    let mut ear = Ear::new();
     // The daemon drops a listener who has fallen behind; then all is asked for again.
     while let Some(found) = subscribe(&shared, |daemon| daemon.browse(SERVICE_TYPE)) {
-        listen(&shared, &found, &monitor, &mut unconfirmed, &mut peers).await;
+        listen(&shared, &found, &monitor, &mut unconfirmed, &mut ear).await;
         shared.failed("events were lost; asking the network again".to_owned());
         unconfirmed = shared.table.origins();
         tokio::time::sleep(Duration::from_secs(1)).await;
@@ -48,27 +48,27 @@ async fn listen(
     found: &Receiver<ServiceEvent>,
     monitor: &Receiver<DaemonEvent>,
     unconfirmed: &mut HashSet<Arc<str>>,
-    peers: &mut Peers,
+    ear: &mut Ear,
 ) {
     let give_up = Instant::now() + Duration::from_secs(5);
     loop {
-        let due = [shared.announce_due(), peers.ask(shared)];
+        let due = [shared.announce_due(), ear.speak(shared)];
         let due = due.into_iter().flatten().min();
         tokio::select! {
             () = shared.postponed.notified() => {}
             () = until(due), if due.is_some() => {}
-            whole = peers.answered() => {
+            whole = ear.listen(shared) => {
                 for (fullname, properties) in whole {
-                    peer_read(shared, peers, &fullname, properties);
+                    peer_read(shared, ear, &fullname, properties);
                 }
             }
             event = found.recv_async() => match event {
                 Ok(ServiceEvent::ServiceResolved(service)) => {
                     unconfirmed.remove(service.get_fullname());
-                    resolved(shared, peers, &service);
+                    resolved(shared, ear, &service);
                 }
                 Ok(ServiceEvent::ServiceRemoved(_, fullname)) => {
-                    peers.forget(&fullname);
+                    ear.forget(&fullname);
                     removed(shared, &fullname);
                 }
                 Ok(ServiceEvent::SearchStopped(_)) | Err(_) => return,
@@ -95,63 +95,7 @@ async fn until(due: Option<std::time::Instant>) {
     }
 }
 
-/// Old peers' records, which the daemon tells only a part of; see [`super::whole`].
-#[derive(Default)]
-struct Peers {
-    reader: Reader,
-    sockets: Option<Sockets>,
-    /// What the daemon has told of a record, and what the whole of it was then.
-    known: HashMap<Arc<str>, (Properties, Option<Properties>)>,
-}
-
-impl Peers {
-    /// What is known of the whole record of which the daemon tells this. It is asked for again
-    /// in any case: that part of it is the same says nothing about the rest.
-    fn whole(&mut self, fullname: &Arc<str>, told: &Properties) -> Option<Properties> {
-        let now = std::time::Instant::now();
-        let label = label_of(fullname);
-        self.reader.want(now, fullname, &label, fastrand::f64());
-        let (before, whole) = self.known.get(fullname)?;
-        whole.clone().filter(|_| before == told)
-    }
-
-    fn forget(&mut self, fullname: &str) {
-        self.reader.forget(&label_of(fullname));
-        self.known.remove(fullname);
-    }
-
-    /// Asks what is due, and says when there is more to be asked.
-    fn ask(&mut self, shared: &Shared) -> Option<std::time::Instant> {
-        if self.reader.is_idle() {
-            self.sockets = None;
-            return None;
-        }
-        let questions = self.reader.handle_timeout(std::time::Instant::now());
-        if !questions.is_empty() {
-            // Opened anew each time: interfaces come and go.
-            match Sockets::open(&shared.config) {
-                Ok(sockets) => self.sockets = Some(sockets),
-                Err(error) => shared.failed(format!("cannot ask for whole records: {error}")),
-            }
-        }
-        for question in questions {
-            if let Some(sockets) = &self.sockets {
-                sockets.send(&question);
-            }
-        }
-        self.reader.poll_timeout()
-    }
-
-    /// The next whole records that were asked for.
-    async fn answered(&mut self) -> Vec<(Arc<str>, Properties)> {
-        match &mut self.sockets {
-            Some(sockets) => self.reader.handle_packet(sockets.receive().await),
-            None => std::future::pending().await,
-        }
-    }
-}
-
-fn resolved(shared: &Shared, peers: &mut Peers, service: &ResolvedService) {
+fn resolved(shared: &Shared, ear: &mut Ear, service: &ResolvedService) {
     let fullname: Arc<str> = service.get_fullname().into();
     let properties = service.get_properties().iter();
     let told: Properties = properties
@@ -166,21 +110,20 @@ fn resolved(shared: &Shared, peers: &mut Peers, service: &ResolvedService) {
     if !shared.has_room(&fullname) {
         return;
     }
-    match peers.whole(&fullname, &told) {
+    match ear.whole(&fullname, &told) {
         Some(whole) => found(shared, &fullname, &whole, true),
         None => {
             found(shared, &fullname, &told, false);
             // Until the answer comes, that is all.
-            peers.known.insert(fullname, (told, None));
+            ear.told(fullname, told);
         }
     }
 }
 
 /// The whole of a peer's record has been read.
-fn peer_read(shared: &Shared, peers: &mut Peers, fullname: &Arc<str>, whole: Properties) {
-    if let Some((_, known)) = peers.known.get_mut(fullname) {
-        found(shared, fullname, &whole, true);
-        *known = Some(whole);
+fn peer_read(shared: &Shared, ear: &mut Ear, fullname: &Arc<str>, whole: Properties) {
+    if let Some(whole) = ear.read(fullname, whole) {
+        found(shared, fullname, whole, true);
     }
 }
 
@@ -204,7 +147,7 @@ fn found(shared: &Shared, fullname: &Arc<str>, properties: &Properties, whole: b
         return own_found(shared, fullname, &entry);
     }
     if shared.has_room(fullname) {
-        shared.table.replace(fullname, Some(Arc::clone(&entry)));
+        shared.put(fullname, Some(Arc::clone(&entry)));
         contested(shared, &entry);
     }
 }
@@ -223,7 +166,7 @@ impl Shared {
 }
 
 fn removed(shared: &Shared, fullname: &str) {
-    shared.table.replace(&fullname.into(), None);
+    shared.put(&fullname.into(), None);
 }
 
 /// One of our own records has come back, perhaps by another name than we have given it: then the
@@ -309,7 +252,7 @@ fn contested(shared: &Shared, theirs: &Arc<Entry>) {
 }
 
 /// The first label of a full name, as it was given.
-fn label_of(fullname: &str) -> String {
+pub(super) fn label_of(fullname: &str) -> String {
     let label = fullname
         .len()
         .checked_sub(SERVICE_TYPE.len() + 1)

@@ -7,7 +7,7 @@
 //!
 //! The questions are ordinary multicast ones, because Avahi cuts what it answers to one host alone
 //! at 512 bytes. The sockets are bound to the group's address: they take nothing away from others
-//! on this port, to whom somebody answers directly. They are open only while something is asked.
+//! on this port, to whom somebody answers directly.
 //!
 //! [`Reader`] decides what is asked when, and reads answers; [`Sockets`] is its shell.
 
@@ -32,7 +32,7 @@ const MAX_PACKET: usize = 9000;
 /// Most records asked for at one time.
 const MAX_WANTED: usize = 4096;
 /// Most questions in one packet: they fit the smallest packet every network carries.
-const QUESTIONS: usize = 8;
+pub(super) const QUESTIONS: usize = 8;
 /// When a record is asked for, after it was found. Who has just said it must not repeat it within
 /// a second (RFC 6762 clause 6).
 const PAUSES: [Duration; 4] = [
@@ -82,11 +82,6 @@ impl Reader {
     /// The record with this label is gone.
     pub(super) fn forget(&mut self, label: &str) {
         self.wanted.remove(&label.as_bytes().to_ascii_lowercase());
-    }
-
-    /// Whether anything is asked for.
-    pub(super) fn is_idle(&self) -> bool {
-        self.wanted.is_empty()
     }
 
     /// When there is something to be asked next.
@@ -160,7 +155,7 @@ fn service_labels() -> impl Iterator<Item = &'static str> {
 }
 
 /// One packet that asks for the TXT records of these labels. None when a label is none.
-fn question(labels: &[Vec<u8>]) -> Option<Vec<u8>> {
+pub(super) fn question(labels: &[Vec<u8>]) -> Option<Vec<u8>> {
     let mut packet = Packet::new_query(0);
     for label in labels {
         let mut name = vec![Label::new(label.as_slice()).ok()?];
@@ -177,7 +172,7 @@ fn question(labels: &[Vec<u8>]) -> Option<Vec<u8>> {
 
 /// Whether the packet is an answer, and large enough for as many records as it claims to have:
 /// the library takes memory for them before it looks.
-fn is_plausible(packet: &[u8]) -> bool {
+pub(super) fn is_plausible(packet: &[u8]) -> bool {
     let Some(header) = packet.first_chunk::<12>() else {
         return false;
     };
@@ -191,24 +186,41 @@ fn is_plausible(packet: &[u8]) -> bool {
 #[derive(Debug)]
 pub(super) struct Sockets {
     open: Vec<(UdpSocket, SocketAddr)>,
+    /// Those they are for.
+    interfaces: Vec<if_addrs::Interface>,
     buffer: Vec<u8>,
 }
 
 impl Sockets {
-    /// Opens what can be opened of the interfaces that the configuration names.
-    pub(super) fn open(config: &MdnsConfig) -> io::Result<Self> {
-        let mut open = Vec::new();
-        let mut indices = Vec::new();
-        let mut last_error = None;
-        for interface in if_addrs::get_if_addrs()? {
+    /// None yet.
+    pub(super) fn new() -> Self {
+        Self {
+            open: Vec::new(),
+            interfaces: Vec::new(),
+            buffer: vec![0; MAX_PACKET],
+        }
+    }
+
+    /// Opens what can be opened of the interfaces that the configuration names, if they are not
+    /// the same as before.
+    pub(super) fn refresh(&mut self, config: &MdnsConfig) -> io::Result<()> {
+        let mut interfaces = if_addrs::get_if_addrs()?;
+        interfaces.retain(|interface| {
             let chosen = |one: &String| match one.parse::<IpAddr>() {
                 Ok(address) => address == interface.ip(),
                 Err(_) => *one == interface.name,
             };
-            let wanted = config.interfaces.is_empty() || config.interfaces.iter().any(chosen);
-            if !wanted || !interface.is_oper_up() || open.len() >= MAX_INTERFACES {
-                continue;
-            }
+            let all = config.interfaces.is_empty();
+            interface.is_oper_up() && (all || config.interfaces.iter().any(chosen))
+        });
+        interfaces.truncate(MAX_INTERFACES);
+        if interfaces == self.interfaces {
+            return Ok(());
+        }
+        self.open.clear();
+        let mut indices = Vec::new();
+        let mut last_error = None;
+        for interface in &interfaces {
             let opened = match interface.ip() {
                 IpAddr::V4(address) => group_v4(address, config.port),
                 IpAddr::V6(_) => {
@@ -222,23 +234,24 @@ impl Sockets {
                 }
             };
             match opened {
-                Ok(socket) => open.push(socket),
+                Ok(socket) => self.open.push(socket),
                 Err(error) => last_error = Some(error),
             }
         }
         match last_error {
-            Some(error) if open.is_empty() => Err(error),
-            _ => Ok(Self {
-                open,
-                buffer: vec![0; MAX_PACKET],
-            }),
+            // An address that is not usable yet may be in a moment.
+            Some(error) if self.open.is_empty() => Err(error),
+            _ => {
+                self.interfaces = interfaces;
+                Ok(())
+            }
         }
     }
 
     /// Sends the packet on all interfaces. One that fails is no reason not to ask on the others.
     pub(super) fn send(&self, packet: &[u8]) {
         for (socket, group) in &self.open {
-            if let Err(error) = socket.try_send_to(packet, *group) {
+            if let Err(error) = SockRef::from(socket).send_to(packet, &(*group).into()) {
                 tracing::debug!(%error, %group, "an mDNS question was not sent");
             }
         }
@@ -246,7 +259,7 @@ impl Sockets {
 
     /// The next packet. Cancelling the future loses nothing.
     pub(super) async fn receive(&mut self) -> &[u8] {
-        let Self { open, buffer } = self;
+        let Self { open, buffer, .. } = self;
         let len = std::future::poll_fn(|context| {
             for (socket, _) in open.iter() {
                 let mut packet = ReadBuf::new(buffer);
@@ -270,6 +283,7 @@ fn group_v4(interface: Ipv4Addr, port: u16) -> io::Result<(UdpSocket, SocketAddr
     let socket = socket(Domain::IPV4, address)?;
     let of_socket = SockRef::from(&socket);
     of_socket.set_multicast_if_v4(&interface)?;
+    of_socket.set_multicast_all_v4(false)?;
     of_socket.set_multicast_ttl_v4(255)?;
     of_socket.join_multicast_v4(&group, &interface)?;
     Ok((socket, address))
@@ -281,6 +295,7 @@ fn group_v6(interface: u32, port: u16) -> io::Result<(UdpSocket, SocketAddr)> {
     let socket = socket(Domain::IPV6, address)?;
     let of_socket = SockRef::from(&socket);
     of_socket.set_multicast_if_v6(interface)?;
+    of_socket.set_multicast_all_v6(false)?;
     of_socket.set_multicast_hops_v6(255)?;
     of_socket.join_multicast_v6(&group, interface)?;
     Ok((socket, address))
@@ -354,7 +369,7 @@ mod tests {
         ];
         let expected = expected.map(|(key, value)| (key.to_owned(), value.to_vec()));
         assert_eq!(*properties, expected);
-        assert!(reader.is_idle());
+        assert_eq!(reader.poll_timeout(), None);
     }
 
     #[test]
@@ -381,7 +396,7 @@ mod tests {
             }
         }
         assert_eq!(packets, 2 * PAUSES.len());
-        assert!(reader.is_idle());
+        assert_eq!(reader.poll_timeout(), None);
     }
 
     #[test]
@@ -412,7 +427,7 @@ mod tests {
         let mut cyclic = vec![0, 0, 0x84, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0xc0, 12];
         cyclic.extend([0, 16, 0, 1, 0, 0, 0, 1, 0, 0]);
         assert!(reader.handle_packet(&cyclic).is_empty());
-        assert!(!reader.is_idle());
+        assert!(reader.poll_timeout().is_some());
     }
 
     proptest! {

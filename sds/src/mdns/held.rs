@@ -1,0 +1,214 @@
+//! What is held of each gateway, and what of it is in doubt.
+
+use std::collections::{HashMap, HashSet, VecDeque};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use fipa_transport::Incarnation;
+
+use super::beacon::{Digest, Held};
+use super::record;
+use crate::Entry;
+
+/// Most records that are verified at one time, and the pause after that: hundreds take seconds,
+/// rather than all at once what the network can carry.
+const BATCH: usize = 25;
+const PAUSE: Duration = Duration::from_millis(100);
+/// For how long the end of a record that was in doubt speaks for its gateway, too.
+const DOUBT: Duration = Duration::from_secs(6);
+
+/// The records of others by gateway, and those to be verified.
+#[derive(Debug, Default)]
+pub(super) struct Holdings {
+    records: HashMap<Arc<str>, (Incarnation, Digest)>,
+    gateways: HashMap<Incarnation, Gateway>,
+    queue: VecDeque<Arc<str>>,
+    next: Option<Instant>,
+}
+
+#[derive(Debug)]
+struct Gateway {
+    held: Held,
+    records: HashSet<Arc<str>>,
+    /// Since when it is doubted, by this record of it.
+    doubted: Option<(Instant, Arc<str>)>,
+}
+
+impl Holdings {
+    /// The record with this full name is that now, or gone.
+    pub(super) fn put(&mut self, now: Instant, fullname: &Arc<str>, entry: Option<&Entry>) {
+        if let Some((gateway, digest)) = self.records.remove(fullname)
+            && let Some(known) = self.gateways.get_mut(&gateway)
+        {
+            known.held.digest.remove(digest);
+            known.held.changed = now;
+            known.records.remove(fullname);
+            let end = known
+                .doubted
+                .take_if(|(_, doubted)| entry.is_none() && doubted == fullname);
+            if let Some((since, _)) = end
+                && now < since + DOUBT
+            {
+                // It did not answer for this one, so probably not for the others either.
+                self.queue.extend(known.records.iter().cloned());
+            }
+            if known.records.is_empty() {
+                self.gateways.remove(&gateway);
+            }
+        }
+        let Some(entry) = entry.filter(|entry| entry.mts.incarnation.is_known()) else {
+            return;
+        };
+        let digest = Digest::of(&record::encode(entry));
+        let gateway = entry.mts.incarnation;
+        let known = self.gateways.entry(gateway).or_insert_with(|| Gateway {
+            held: Held {
+                digest: Digest::default(),
+                changed: now,
+            },
+            records: HashSet::new(),
+            doubted: None,
+        });
+        known.held.digest.add(digest);
+        known.held.changed = now;
+        known.records.insert(Arc::clone(fullname));
+        self.records.insert(Arc::clone(fullname), (gateway, digest));
+    }
+
+    /// What is held of this gateway.
+    pub(super) fn of(&self, gateway: Incarnation) -> Option<Held> {
+        self.gateways.get(&gateway).map(|known| known.held)
+    }
+
+    /// Whether this gateway is there is doubted: one of its records is verified, and if that is
+    /// gone, so are all. Says whether anything is held of it that was not in doubt already.
+    pub(super) fn doubt(&mut self, now: Instant, gateway: Incarnation) -> bool {
+        let Some(known) = self.gateways.get_mut(&gateway) else {
+            return false;
+        };
+        let already = known.doubted.as_ref();
+        if already.is_some_and(|(since, _)| now < *since + DOUBT) {
+            return false;
+        }
+        let Some(fullname) = known.records.iter().next() else {
+            return false;
+        };
+        known.doubted = Some((now, Arc::clone(fullname)));
+        self.queue.push_front(Arc::clone(fullname));
+        true
+    }
+
+    /// All that is held of this gateway is verified.
+    pub(super) fn verify_all(&mut self, gateway: Incarnation) {
+        // What waits already need not wait twice.
+        if let Some(known) = self.gateways.get(&gateway)
+            && self.queue.len() <= self.records.len()
+        {
+            self.queue.extend(known.records.iter().cloned());
+        }
+    }
+
+    /// The full names of records to be verified now.
+    pub(super) fn due(&mut self, now: Instant) -> Vec<Arc<str>> {
+        if self.queue.is_empty() || self.next.is_some_and(|next| now < next) {
+            return Vec::new();
+        }
+        self.next = Some(now + PAUSE);
+        let batch = self.queue.len().min(BATCH);
+        let records = &self.records;
+        let batch = self.queue.drain(..batch);
+        batch.filter(|name| records.contains_key(name)).collect()
+    }
+
+    /// When more is to be verified.
+    pub(super) fn poll_timeout(&self, now: Instant) -> Option<Instant> {
+        (!self.queue.is_empty()).then(|| self.next.unwrap_or(now))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Mts, Reach, Role, Source};
+
+    fn entry(number: u64, gateway: u64) -> Entry {
+        let gateway = Incarnation::from_u64(gateway);
+        Entry {
+            name: format!("agent {number}").into(),
+            agent_type: String::new(),
+            incarnation: Incarnation::from_u64(number),
+            locations: Vec::new(),
+            mts: Mts::new("mts", gateway),
+            description: String::new(),
+            registered: std::time::UNIX_EPOCH,
+            source: Source::Mdns,
+            reach: Reach::Remote { gateway },
+            role: Role::Agent,
+        }
+    }
+
+    fn put(holdings: &mut Holdings, now: Instant, number: u64, gateway: u64, there: bool) {
+        let entry = entry(number, gateway);
+        let entry = there.then_some(&entry);
+        holdings.put(now, &number.to_string().into(), entry);
+    }
+
+    #[test]
+    fn what_is_held_is_what_was_put() {
+        let mut holdings = Holdings::default();
+        let now = Instant::now();
+        for number in 1..=3 {
+            put(&mut holdings, now, number, 7, true);
+        }
+        put(&mut holdings, now, 9, 8, true);
+        let mut expected = Digest::default();
+        for number in [1, 3] {
+            expected.add(Digest::of(&record::encode(&entry(number, 7))));
+        }
+        put(&mut holdings, now, 2, 7, false);
+        // Said again, it is the same.
+        put(&mut holdings, now, 3, 7, true);
+        let held = holdings.of(Incarnation::from_u64(7)).unwrap();
+        assert_eq!(held.digest, expected);
+        for number in [1, 3, 9] {
+            put(&mut holdings, now, number, 7, false);
+        }
+        assert!(holdings.of(Incarnation::from_u64(7)).is_none());
+        assert!(holdings.gateways.is_empty() && holdings.records.is_empty());
+        put(&mut holdings, now, 1, 0, true);
+        assert!(holdings.records.is_empty(), "old peers have no beacons");
+    }
+
+    #[test]
+    fn with_one_record_of_a_doubted_gateway_go_all() {
+        let mut holdings = Holdings::default();
+        let (now, gateway) = (Instant::now(), Incarnation::from_u64(7));
+        for number in 0..60 {
+            put(&mut holdings, now, number, 7, true);
+        }
+        assert!(holdings.doubt(now, gateway));
+        assert!(!holdings.doubt(now, gateway));
+        let [doubted] = &holdings.due(now)[..] else {
+            panic!("one is asked for");
+        };
+        let other = if &**doubted == "0" { 1 } else { 0 };
+        put(&mut holdings, now, other, 7, false);
+        assert_eq!(holdings.poll_timeout(now), None, "that one left by itself");
+        put(&mut holdings, now, doubted.parse().unwrap(), 7, false);
+        let mut asked = Vec::new();
+        let mut now = now;
+        while let Some(due) = holdings.poll_timeout(now) {
+            now = due;
+            let batch = holdings.due(now);
+            assert!(batch.len() <= BATCH);
+            asked.extend(batch);
+        }
+        assert_eq!(asked.len(), 58);
+        // Later, an end is an end and nothing more.
+        assert!(holdings.doubt(now, gateway));
+        let doubted = holdings.due(now + PAUSE);
+        now += DOUBT;
+        put(&mut holdings, now, doubted[0].parse().unwrap(), 7, false);
+        assert_eq!(holdings.poll_timeout(now), None);
+    }
+}
