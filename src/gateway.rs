@@ -97,21 +97,26 @@ impl Gateway {
         let publisher = Arc::new(Publisher {
             host: Arc::clone(&gateway.service.host),
             network: gateway.network.clone().map(Network::directory),
-            known,
+            known: Arc::clone(&known),
             contacts: Arc::clone(&contacts.directory),
             locations: gateway.service.locations.clone(),
         });
         // From now on, who writes becomes known on this host before its letter arrives there.
         *contacts.publisher.lock() = Some(Arc::clone(&publisher));
+        contacts.network.lock().clone_from(&gateway.network);
         let keeper = Keeper::new(publisher);
         gateway.tasks.push(tokio::spawn(keeper.run()));
-        gateway.open_for_letters(config)?;
+        gateway.open_for_letters(config, known)?;
         Ok(gateway)
     }
 
     /// From now on the gateway answers letters, exchanges its directory with neighbours and keeps
     /// in touch with its static peers.
-    fn open_for_letters(&mut self, config: &Config) -> Result<(), OpenError> {
+    fn open_for_letters(
+        &mut self,
+        config: &Config,
+        known: Arc<MergedDirectory>,
+    ) -> Result<(), OpenError> {
         let means = self.means()?;
         let clerk = Clerk {
             service: Arc::clone(&self.service),
@@ -122,7 +127,7 @@ impl Gateway {
         };
         self.tasks.push(tokio::spawn(clerk.run()));
         let exchange = Arc::clone(&self.exchange);
-        self.tasks.push(tokio::spawn(exchange.run(means)));
+        self.tasks.push(tokio::spawn(exchange.run(means, known)));
         let peers = peers(config);
         self.neighbours.name_peers(peers.clone());
         self.service.mts.keep_in_touch(peers);
@@ -296,6 +301,8 @@ fn peers(config: &Config) -> Vec<Peer> {
 trait Network: Send + Sync {
     fn directory(self: Arc<Self>) -> Arc<dyn Directory>;
     fn problem(&self) -> Option<String>;
+    /// Finds out whether this gateway is still there.
+    fn doubt(&self, gateway: Incarnation);
     fn close(&self);
 }
 
@@ -307,6 +314,10 @@ impl Network for fipa_sds::MdnsDirectory {
 
     fn problem(&self) -> Option<String> {
         self.status().last_error
+    }
+
+    fn doubt(&self, gateway: Incarnation) {
+        self.verify_gateway(gateway);
     }
 
     fn close(&self) {
@@ -346,6 +357,7 @@ struct Acquaintances {
     neighbours: Arc<Neighbours>,
     directory: Arc<ContactDirectory>,
     publisher: Mutex<Option<Arc<Publisher>>>,
+    network: Mutex<Option<Arc<dyn Network>>>,
 }
 
 impl Contacts for Acquaintances {
@@ -358,6 +370,12 @@ impl Contacts for Acquaintances {
             }
             Ok(false) => {}
             Err(error) => tracing::info!(%error, "who has written cannot be answered"),
+        }
+    }
+
+    fn doubtful(&self, mts: Incarnation) {
+        if let Some(network) = &*self.network.lock() {
+            network.doubt(mts);
         }
     }
 

@@ -150,3 +150,42 @@ async fn one_static_peer_is_enough_to_learn_each_others_agents() {
     assert!(seen(&near_host, "rover").is_none());
     near.close().await;
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_later_of_two_registrations_is_told_and_not_announced() {
+    let (far_config, third_config) = (config(&[]), config(&[]));
+    let far = Gateway::open(&far_config).await.unwrap();
+    let far_host = Domain::open(&far_config).await.unwrap();
+    let earlier = far_host.register("arm").unwrap();
+    let near_config = config(&[]);
+    let near_host = Domain::open(&near_config).await.unwrap();
+    // Registered while nobody knows of the other.
+    tokio::time::sleep(Duration::from_millis(5)).await;
+    let later = near_host.register("arm").unwrap();
+    let mut knows_both = near_config.clone();
+    knows_both.discovery = config(&[knowing("far", &[&address(&far)])]).discovery;
+    let near = Gateway::open(&knows_both).await.unwrap();
+
+    let told = later.receive().await.unwrap().message;
+    assert_eq!(*told.performative(), Performative::Failure);
+    assert_eq!(told.sender().unwrap().name(), near.name());
+    let content = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
+    assert!(content.contains("registered earlier"), "{content}");
+    // Who looks from elsewhere sees the earlier one only.
+    let mut watcher = third_config.clone();
+    watcher.discovery = config(&[knowing("near", &[&address(&near)])]).discovery;
+    let third = Gateway::open(&watcher).await.unwrap();
+    let here = near_host.register("only here").unwrap();
+    until("the third host is told", || {
+        third.directory().known("only here").is_some()
+    })
+    .await;
+    assert!(third.directory().known("arm").is_none());
+    // When the earlier one leaves, the name is free.
+    drop(earlier);
+    until("the later has the name", || {
+        third.directory().known("arm").is_some()
+    })
+    .await;
+    drop(here);
+}

@@ -49,6 +49,9 @@ pub trait Contacts: Send + Sync {
     /// An agent has written from behind this location; see [`Action::Heard`].
     fn heard(&self, name: &str, agent: Incarnation, location: Location);
 
+    /// A service may be gone; see [`Action::Doubtful`].
+    fn doubtful(&self, mts: Incarnation);
+
     /// A service has introduced itself on a connection; see [`Sink::introduced`].
     fn introduced(&self, peer: &Introduction);
 
@@ -428,6 +431,11 @@ impl Shared {
                     outcome,
                 } => {
                     state.outcome(send, receiver, outcome);
+                }
+                Action::Doubtful { mts } => {
+                    if let Some(contacts) = &self.config.contacts {
+                        contacts.doubtful(mts);
+                    }
                 }
                 Action::Heard {
                     name,

@@ -77,7 +77,7 @@ impl Gateway {
     /// The next thing to do, apart from hearing of the sender.
     fn next(&mut self) -> Option<Action> {
         match self.core.poll_action() {
-            Some(Action::Heard { .. }) => self.core.poll_action(),
+            Some(Action::Heard { .. } | Action::Doubtful { .. }) => self.core.poll_action(),
             other => other,
         }
     }

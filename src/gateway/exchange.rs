@@ -3,20 +3,23 @@
 //! Its letters are those of the gateway itself, to the neighbour itself, so they go by whatever
 //! transport leads there, in order and acknowledged. The clerk hands over what comes in.
 
+use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_mts::core::Submission;
 use fipa_mts::{Sending, letter_for};
-use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Entry, Exchange, ExchangeDirectory, Mts};
+use fipa_sds::{
+    Directory, EXCHANGE_ONTOLOGY, Entry, Exchange, ExchangeDirectory, MergedDirectory, Mts,
+};
 use fipa_transport::{Incarnation, Location};
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
 use super::neighbours::Neighbours;
-use super::publisher::own_agents;
+use super::publisher::{Contested, own_agents};
 use crate::service::Service;
 
 /// How long a letter of the exchange may be under way. A neighbour that a link was cut to for
@@ -24,6 +27,9 @@ use crate::service::Service;
 const DEADLINE: Duration = Duration::from_secs(5);
 /// How long goodbyes may take.
 const GOODBYE_DEADLINE: Duration = Duration::from_millis(500);
+
+/// The ontology of messages about registrations (FIPA00023).
+const MANAGEMENT_ONTOLOGY: &str = "fipa-agent-management";
 
 /// What neighbours have told, and what they are told.
 pub(super) struct Exchanging {
@@ -69,20 +75,30 @@ impl Exchanging {
     }
 
     /// Tells and is told, until the service ends.
-    pub(super) async fn run(self: Arc<Self>, means: Means) {
-        let mut host = means.service.host.watch();
+    pub(super) async fn run(self: Arc<Self>, means: Means, known: Arc<MergedDirectory>) {
+        let (mut host, mut there) = (means.service.host.watch(), known.watch());
+        let mut told = HashSet::new();
         let mut sent: JoinSet<(Incarnation, bool)> = JoinSet::new();
         let mut own_changed = true;
         loop {
-            let due = self.work(&means, own_changed, &mut sent);
-            own_changed = false;
+            if std::mem::take(&mut own_changed) {
+                let (own, contested) = own_agents(&means.service.host, &*known);
+                self.core.lock().handle_own(Instant::now(), &own);
+                tell_contested(&means, &contested, &mut told);
+            }
+            let due = self.work(&means, &mut sent);
             let until = due.map(tokio::time::Instant::from_std);
             tokio::select! {
                 change = host.next() => {
                     if change.is_none() {
                         return;
                     }
-                    while host.try_next().is_some() {}
+                    own_changed = true;
+                }
+                change = there.next() => {
+                    if change.is_none() {
+                        return;
+                    }
                     own_changed = true;
                 }
                 () = means.neighbours.changed() => {}
@@ -95,16 +111,15 @@ impl Exchanging {
                 () = tokio::time::sleep_until(until.unwrap_or_else(tokio::time::Instant::now)),
                     if until.is_some() => {}
             }
+            // Many changes that came together are one.
+            while host.try_next().is_some() || there.try_next().is_some() {
+                own_changed = true;
+            }
         }
     }
 
     /// Brings the core up to date, sends what is to be sent, and says when there is more.
-    fn work(
-        &self,
-        means: &Means,
-        own_changed: bool,
-        sent: &mut JoinSet<(Incarnation, bool)>,
-    ) -> Option<Instant> {
+    fn work(&self, means: &Means, sent: &mut JoinSet<(Incarnation, bool)>) -> Option<Instant> {
         let now = Instant::now();
         let neighbours = means.neighbours.all();
         let present: Vec<(Mts, Vec<Location>)> = neighbours
@@ -117,9 +132,6 @@ impl Exchanging {
             })
             .collect();
         let mut core = self.core.lock();
-        if own_changed {
-            core.handle_own(now, &own_agents(&means.service.host));
-        }
         core.handle_neighbours(now, &present);
         core.handle_timeout(now);
         while let Some((to, content)) = core.poll_letter(now) {
@@ -157,6 +169,36 @@ impl Exchanging {
     }
 }
 
+/// Tells agents of this host, once, that others reach somebody else by their name.
+fn tell_contested(means: &Means, contested: &[Contested], told: &mut HashSet<Incarnation>) {
+    told.retain(|agent| contested.iter().any(|one| one.entry.incarnation == *agent));
+    for Contested { entry, holder } in contested {
+        if !told.insert(entry.incarnation) {
+            continue;
+        }
+        let (name, mts) = (&entry.name, &holder.mts.name);
+        tracing::warn!(%name, holder = %mts, "an earlier registration on another host has the name");
+        let content = format!(
+            "the name {name:?} was registered earlier at {mts:?}: other hosts reach that agent, \
+             and this one on its own host only; deregister one of them"
+        );
+        if let Ok(receiver) = AgentId::new(&**name) {
+            let message = Message::builder(Performative::Failure)
+                .sender(means.id.clone())
+                .receiver(receiver)
+                .ontology(MANAGEMENT_ONTOLOGY)
+                .content(content)
+                .build();
+            // The letter is on its way, whether somebody waits for its outcome or not.
+            drop(
+                message
+                    .ok()
+                    .and_then(|message| means.post(&message, entry, DEADLINE)),
+            );
+        }
+    }
+}
+
 impl Means {
     /// Sends a letter of the exchange. None when there is no such letter.
     fn send(&self, to: &Entry, content: Vec<u8>, deadline: Duration) -> Option<Sending> {
@@ -167,10 +209,14 @@ impl Means {
             .ontology(EXCHANGE_ONTOLOGY)
             .content(content)
             .build();
-        let letter = message.ok().and_then(|message| {
-            let letter = letter_for(&message, SystemTime::now());
+        self.post(&message.ok()?, to, deadline)
+    }
+
+    fn post(&self, message: &Message, to: &Entry, deadline: Duration) -> Option<Sending> {
+        let letter = Some(message).and_then(|message| {
+            let letter = letter_for(message, SystemTime::now());
             letter
-                .inspect_err(|error| tracing::warn!(%error, "a neighbour could not be written to"))
+                .inspect_err(|error| tracing::warn!(%error, "could not be written to"))
                 .ok()
         })?;
         let submission = Submission {

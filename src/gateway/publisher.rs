@@ -39,13 +39,38 @@ impl Publisher {
     }
 }
 
-/// The agents of this host as far as others are to know of them.
-pub(super) fn own_agents(host: &HostDirectory) -> Vec<Arc<Entry>> {
+/// The agents of this host, as far as others are to know of them: first those that are, then those
+/// whose name somebody on another host has had for longer, each with that holder.
+pub(super) fn own_agents(
+    host: &HostDirectory,
+    known: &dyn Directory,
+) -> (Vec<Arc<Entry>>, Vec<Contested>) {
+    let (mut own, mut contested) = (Vec::new(), Vec::new());
     let entries = host.entries();
-    let own = entries
+    let agents = entries
         .iter()
         .filter(|entry| entry.reach == Reach::Local && entry.role == Role::Agent);
-    own.cloned().collect()
+    let age = |entry: &Entry| (entry.registered, entry.incarnation);
+    for entry in agents {
+        match known.known(&entry.name) {
+            Some(holder)
+                if holder.incarnation != entry.incarnation && age(&holder) < age(entry) =>
+            {
+                contested.push(Contested {
+                    entry: Arc::clone(entry),
+                    holder,
+                });
+            }
+            _ => own.push(Arc::clone(entry)),
+        }
+    }
+    (own, contested)
+}
+
+/// An agent of this host whose name belongs to somebody on another host.
+pub(super) struct Contested {
+    pub(super) entry: Arc<Entry>,
+    pub(super) holder: Arc<Entry>,
 }
 
 /// The task that does it.
@@ -93,7 +118,7 @@ impl Keeper {
 
     /// Announces what has joined on this host, and takes back what has left.
     fn announce(&mut self, network: &dyn Directory) {
-        let agents = own_agents(&self.publisher.host);
+        let (agents, _) = own_agents(&self.publisher.host, &*self.publisher.known);
         let mine: HashMap<&Arc<str>, &Arc<Entry>> =
             agents.iter().map(|entry| (&entry.name, entry)).collect();
         self.announced.retain(|name, entry| {

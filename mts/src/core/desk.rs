@@ -63,6 +63,12 @@ pub enum Action {
         /// Where its message transport service can be reached.
         location: Location,
     },
+    /// A way has failed that leads to this life of another service: it may be gone without having
+    /// said so. Told by gateways only.
+    Doubtful {
+        /// The service.
+        mts: Incarnation,
+    },
     /// Something was put into this agent's queue.
     Deliverable {
         /// The agent.
@@ -323,6 +329,10 @@ impl Desk {
     }
 
     pub(crate) fn way_failed(&mut self, now: Instant, location: &Location) {
+        let mts = location.incarnation();
+        if self.config.forwards && mts.is_known() {
+            self.actions.push_back(Action::Doubtful { mts });
+        }
         if self.health.len() >= MAX_HEALTH && !self.health.contains_key(location) {
             self.health.retain(|_, health| health.retry_at > now);
             if self.health.len() >= MAX_HEALTH {

@@ -454,7 +454,7 @@ impl World {
                     }
                 }
                 // Everybody knows everybody here.
-                Action::Heard { .. } => {}
+                Action::Heard { .. } | Action::Doubtful { .. } => {}
                 Action::Deliverable { agent } => {
                     if self.reading.insert(agent) {
                         self.after_ms(1 + self.weather.reading_pause_ms, Event::Read { at, agent });
