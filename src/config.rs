@@ -148,15 +148,16 @@ pub struct Discovery {
     pub mdns: bool,
     /// `interfaces`: where; empty: on all.
     pub interfaces: Vec<Interface>,
-    /// `static`: gateways known without being found.
+    /// `static`: gateways, and agents of old peers, known without being found.
     pub peers: Vec<Peer>,
 }
 
-/// One line of `discovery.static`: a gateway that is known without being found.
+/// One line of `discovery.static`: who is known without being found. A gateway, or an agent of an
+/// old peer when what is understood at its locations says so.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Peer {
-    /// The name of the gateway.
+    /// The name of the gateway, or of the agent.
     pub name: String,
     /// Where it listens, in order of preference; at least one.
     pub locations: Vec<Location>,

@@ -14,8 +14,9 @@ use fipa_mts::Contacts;
 use fipa_mts::core::Peer;
 use fipa_sds::{
     ContactDirectory, Directory, MergedDirectory, RegisterError, Registration, Role as EntryRole,
+    StaticDirectory,
 };
-use fipa_transport::{Incarnation, Introduction, Kind, Location};
+use fipa_transport::{Incarnation, Introduction, Kind, Location, Signature};
 use parking_lot::Mutex;
 use tokio::task::JoinHandle;
 
@@ -61,7 +62,8 @@ impl Gateway {
                     let network = network(config, mts)?;
                     let told = exchange.directory() as Arc<dyn Directory>;
                     let there = network.clone().map(Network::directory);
-                    let known = there.into_iter().chain([told]).collect();
+                    let old = Arc::new(old_peers(config)?) as Arc<dyn Directory>;
+                    let known = there.into_iter().chain([told, old]).collect();
                     let known = Arc::new(MergedDirectory::new(known));
                     let heard = Arc::clone(&contacts.directory) as Arc<dyn Directory>;
                     let beyond = Arc::clone(&known) as Arc<dyn Directory>;
@@ -216,8 +218,14 @@ impl Gateway {
         config.check()?;
         let mut later = self.config.differences(config);
         let open: Vec<Kind> = self.service.mts.kinds().collect();
+        let agents = |config: &Config| {
+            let peers = config.discovery.peers.iter();
+            peers.filter(|it| is_old(it)).cloned().collect::<Vec<_>>()
+        };
+        let same_agents = agents(&self.config) == agents(config);
         later.retain(|key| match key.as_str() {
-            "mts.deadline" | "routes" | "discovery.static" => false,
+            "mts.deadline" | "routes" => false,
+            "discovery.static" => !same_agents,
             "mts.transports" => config
                 .mts
                 .transports
@@ -231,10 +239,12 @@ impl Gateway {
         self.service.mts.keep_in_touch(peers);
         self.config.mts.deadline = config.mts.deadline;
         self.config.routes.clone_from(&config.routes);
-        self.config
-            .discovery
-            .peers
-            .clone_from(&config.discovery.peers);
+        if same_agents {
+            self.config
+                .discovery
+                .peers
+                .clone_from(&config.discovery.peers);
+        }
         if !later.iter().any(|key| key == "mts.transports") {
             self.config
                 .mts
@@ -286,9 +296,22 @@ impl Drop for Gateway {
     }
 }
 
-/// The static peers of the configuration.
+/// Whether a line of `discovery.static` names an agent of an old peer, not a gateway.
+fn is_old(peer: &crate::config::Peer) -> bool {
+    let mut locations = peer.locations.iter();
+    locations.all(|location| location.signature() != Signature::Frames)
+}
+
+/// The agents of old peers that the configuration names.
+fn old_peers(config: &Config) -> Result<StaticDirectory, OpenError> {
+    let peers = config.discovery.peers.iter().filter(|peer| is_old(peer));
+    let agents = peers.map(|peer| (peer.name.as_str(), peer.locations.clone()));
+    StaticDirectory::new(agents).map_err(|error| OpenError::Discovery(error.to_string()))
+}
+
+/// The gateways that the configuration names.
 fn peers(config: &Config) -> Vec<Peer> {
-    let peers = config.discovery.peers.iter();
+    let peers = config.discovery.peers.iter().filter(|peer| !is_old(peer));
     peers
         .map(|peer| Peer {
             name: peer.name.as_str().into(),

@@ -1,96 +1,151 @@
 //! Failure messages: how a sender is told in FIPA's own words that its letter was not delivered.
 //!
-//! The message is a `failure` with the ontology `fipa-agent-management` (FIPA00067), written like
-//! JADE's: language `fipa-sl`, content
-//! `((action (agent-identifier :name SENDER) (ACLMessage)) (MTS-error (agent-identifier :name
-//! RECEIVER) (internal-error "REASON: DETAIL")))`. It goes to the sender of the letter,
-//! `in-reply-to`, `conversation-id` and `protocol` taken from the message, and only when the
-//! message is not a failure itself.
+//! The message is a `failure` with the ontology `fipa-agent-management` (FIPA00067) from the message
+//! transport service to the sender of the letter; `in-reply-to`, `conversation-id` and `protocol`
+//! are taken from the message. There is none about a message that is a failure itself. Its content
+//! is what the sender understands:
+//!
+//! * our own agents and JADE's: language `fipa-sl`, content `((action (agent-identifier :name
+//!   SENDER) (ACLMessage)) (MTS-error (agent-identifier :name RECEIVER) (internal-error "REASON:
+//!   DETAIL")))`;
+//! * agents of fipa_services: an `inform` in the string encoding, from the sender to the intended
+//!   receiver, in the language `internal-error`, that tells the services which the letter passed.
 
+use std::error::Error;
 use std::time::SystemTime;
 
-use fipa_acl::{AgentId, Letter, Message, Performative};
+use fipa_acl::{AgentId, Dialect, EnvelopeView, Letter, Message, Performative, Representation};
 use fipa_transport::FailureReason;
 
 use crate::letter_for;
 
-/// A failure message, ready to be sent.
-pub(crate) struct FailureMessage {
-    /// The name of the agent that is told.
-    pub(crate) to: String,
-    pub(crate) letter: Letter,
+/// What there is to tell about a letter that was not delivered to one receiver.
+pub(crate) struct Failure<'a> {
+    /// Whom it is told.
+    pub(crate) sender: AgentId,
+    /// Whom the letter was for.
+    pub(crate) receiver: &'a str,
+    /// How its message was encoded, which the sender understands.
+    pub(crate) representation: Option<Representation>,
+    message: Message,
+    reason: FailureReason,
+    detail: &'a str,
+    /// The services that the letter passed, the first one first.
+    path: Vec<String>,
 }
 
-/// The failure message about a letter, unless there is nobody to tell, or the letter is a failure
-/// message itself. What cannot be decoded or encoded is logged: nobody else could be told.
-pub(crate) fn compose(
-    mts: &str,
-    letter: &Letter,
-    receiver: &str,
-    reason: FailureReason,
-    detail: &str,
-    utc: SystemTime,
-) -> Option<FailureMessage> {
-    let message = match Message::decode(letter.payload()) {
-        Ok(message) => message,
-        Err(error) => {
-            tracing::info!(%error, receiver, "no failure message about what cannot be decoded");
+impl<'a> Failure<'a> {
+    /// What there is to tell, unless there is nobody to tell, or the letter is a failure message
+    /// itself. What cannot be decoded is logged: nobody else could be told.
+    pub(crate) fn of(
+        letter: &Letter,
+        receiver: &'a str,
+        reason: FailureReason,
+        detail: &'a str,
+    ) -> Option<Self> {
+        let message = match Message::decode(letter.payload()) {
+            Ok(message) => message,
+            Err(error) => {
+                tracing::info!(%error, receiver, "no failure message about what cannot be decoded");
+                return None;
+            }
+        };
+        let sender = message.sender()?.clone();
+        if *message.performative() == Performative::Failure {
             return None;
         }
-    };
-    let sender = message.sender()?;
-    if *message.performative() == Performative::Failure {
-        return None;
+        Some(Self {
+            sender,
+            receiver,
+            representation: Representation::detect(&letter.payload().head),
+            message,
+            reason,
+            detail,
+            path: path(letter),
+        })
     }
-    match written(mts, &message, sender, receiver, reason, detail, utc) {
-        Ok(letter) => Some(FailureMessage {
-            to: sender.name().to_owned(),
-            letter,
-        }),
-        Err(error) => {
-            tracing::warn!(%error, receiver, "a failure message could not be written");
-            None
+
+    /// The failure message of this service, for a sender that understands this dialect.
+    pub(crate) fn written_for(
+        &self,
+        mts: &str,
+        dialect: Dialect,
+        utc: SystemTime,
+    ) -> Result<Letter, Box<dyn Error>> {
+        let mut failure = Message::builder(Performative::Failure)
+            .sender(AgentId::new(mts)?)
+            .receiver(self.sender.clone())
+            .ontology("fipa-agent-management");
+        failure = match dialect {
+            Dialect::FipaServices => match self.told_by_path(mts) {
+                Ok(content) => failure.content(content),
+                // Names that its string encoding has no way to say.
+                Err(error) => {
+                    tracing::debug!(%error, receiver = self.receiver, "told in the standard's words");
+                    failure.language("fipa-sl").content(self.told_in_sl())
+                }
+            },
+            _ => failure.language("fipa-sl").content(self.told_in_sl()),
+        };
+        if let Some(protocol) = self.message.protocol() {
+            failure = failure.protocol(protocol);
         }
+        if let Some(conversation) = self.message.conversation_id() {
+            failure = failure.conversation_id(conversation);
+        }
+        if let Some(reply_with) = self.message.reply_with() {
+            failure = failure.in_reply_to(reply_with);
+        }
+        Ok(letter_for(&failure.build()?, utc)?)
+    }
+
+    fn told_in_sl(&self) -> String {
+        let text = if self.detail.is_empty() {
+            self.reason.to_string()
+        } else {
+            format!("{}: {}", self.reason, self.detail)
+        };
+        format!(
+            "((action (agent-identifier :name {}) (ACLMessage)) \
+             (MTS-error (agent-identifier :name {}) (internal-error {})))",
+            sl_string(self.sender.name()),
+            sl_string(self.receiver),
+            sl_string(&text),
+        )
+    }
+
+    fn told_by_path(&self, mts: &str) -> Result<Vec<u8>, Box<dyn Error>> {
+        let mut path = self.path.clone();
+        path.push(mts.to_owned());
+        let told = Message::builder(Performative::Inform)
+            .sender(self.sender.clone())
+            .receiver(AgentId::new(self.receiver)?)
+            .language("internal-error")
+            .content(format!(
+                "description: message delivery failed: {}\ndelivery path: {}",
+                self.reason,
+                path.join(",")
+            ))
+            .build()?;
+        let told = told.encode(Representation::String, Dialect::FipaServices)?;
+        Ok(told.to_vec())
     }
 }
 
-fn written(
-    mts: &str,
-    message: &Message,
-    sender: &AgentId,
-    receiver: &str,
-    reason: FailureReason,
-    detail: &str,
-    utc: SystemTime,
-) -> Result<Letter, Box<dyn std::error::Error>> {
-    let text = if detail.is_empty() {
-        reason.to_string()
-    } else {
-        format!("{reason}: {detail}")
+fn path(letter: &Letter) -> Vec<String> {
+    let envelope = letter.envelope();
+    let mut path: Vec<String> = match EnvelopeView::parse(&envelope) {
+        Ok(view) => {
+            let stamps = view.stamps();
+            stamps
+                .map(|stamp| stamp.by().as_str().into_owned())
+                .collect()
+        }
+        Err(_) => Vec::new(),
     };
-    let content = format!(
-        "((action (agent-identifier :name {}) (ACLMessage)) \
-         (MTS-error (agent-identifier :name {}) (internal-error {})))",
-        sl_string(sender.name()),
-        sl_string(receiver),
-        sl_string(&text),
-    );
-    let mut failure = Message::builder(Performative::Failure)
-        .sender(AgentId::new(mts)?)
-        .receiver(sender.clone())
-        .ontology("fipa-agent-management")
-        .language("fipa-sl")
-        .content(content);
-    if let Some(protocol) = message.protocol() {
-        failure = failure.protocol(protocol);
-    }
-    if let Some(conversation) = message.conversation_id() {
-        failure = failure.conversation_id(conversation);
-    }
-    if let Some(reply_with) = message.reply_with() {
-        failure = failure.in_reply_to(reply_with);
-    }
-    Ok(letter_for(&failure.build()?, utc)?)
+    // The newest stamp stands in front.
+    path.reverse();
+    path
 }
 
 /// A string literal of FIPA SL (FIPA00008): `\"` is its only escape.

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use fipa_transport::{Incarnation, Location};
+use fipa_transport::{Incarnation, Location, Signature};
 
 use crate::entry::{millis_of_time, time_of_millis};
 use crate::table::Table;
@@ -68,9 +68,10 @@ impl Directory for MemoryDirectory {
     }
 }
 
-/// The gateways that the configuration names, for networks on which nobody can be discovered.
+/// Those that the configuration names, for networks on which nobody can be discovered: gateways,
+/// and agents of old peers, which their locations tell from each other.
 ///
-/// Their incarnations are unknown until somebody has talked to them; the agents behind them are
+/// A gateway's incarnation is unknown until somebody has talked to it; the agents behind it are
 /// learnt then, and elsewhere.
 #[derive(Debug)]
 pub struct StaticDirectory {
@@ -78,7 +79,7 @@ pub struct StaticDirectory {
 }
 
 impl StaticDirectory {
-    /// A directory of gateways by name, each with its locations in order of preference.
+    /// A directory of them by name, each with its locations in order of preference.
     ///
     /// # Errors
     /// When a name is not valid or has too many locations.
@@ -89,6 +90,12 @@ impl StaticDirectory {
         let registered = time_of_millis(millis_of_time(SystemTime::now()));
         for (name, locations) in gateways {
             let name = name.into();
+            let ours = |location: &Location| location.signature() == Signature::Frames;
+            let role = if locations.iter().any(ours) {
+                Role::Gateway
+            } else {
+                Role::Agent
+            };
             let entry = Entry {
                 name: name.clone(),
                 agent_type: String::new(),
@@ -101,7 +108,7 @@ impl StaticDirectory {
                 reach: Reach::Remote {
                     gateway: Incarnation::UNKNOWN,
                 },
-                role: Role::Gateway,
+                role,
             };
             entry.check()?;
             table.put((), Arc::new(entry));

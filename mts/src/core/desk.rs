@@ -265,6 +265,15 @@ impl Desk {
         }
     }
 
+    /// Who is meant by this stream and this name, if the directory still has such an agent.
+    pub(crate) fn receiver(&self, life: Incarnation, name: &str) -> Option<Arc<Entry>> {
+        self.directory.by_incarnation(life).or_else(|| {
+            let nameless = life == life_by_name(name);
+            let entry = nameless.then(|| self.directory.lookup(name)).flatten();
+            entry.filter(|entry| !entry.incarnation.is_known())
+        })
+    }
+
     /// The best way to this receiver that was not tried yet: the configured order, cut to what
     /// the receiver offers, ways that failed recently moved to the end.
     pub(crate) fn choose(
@@ -347,6 +356,23 @@ impl Desk {
         health.failures += 1;
         health.retry_at = now + penalty.min(LONGEST_PENALTY);
     }
+}
+
+/// The life that letters to this agent are for. An old peer's agent has no incarnation; all of its
+/// lives are one, which its name stands for.
+pub(crate) fn life_of(entry: &Entry) -> Incarnation {
+    if entry.incarnation.is_known() {
+        entry.incarnation
+    } else {
+        life_by_name(&entry.name)
+    }
+}
+
+/// The same in every process, so that reports find their letters: the 64-bit FNV-1a hash.
+fn life_by_name(name: &str) -> Incarnation {
+    let step = |hash: u64, byte: &u8| (hash ^ u64::from(*byte)).wrapping_mul(0x100_0000_01b3);
+    let hash = name.as_bytes().iter().fold(0xcbf2_9ce4_8422_2325, step);
+    Incarnation::from_u64(hash.max(1))
 }
 
 pub(super) fn note_parcel(stream: Stream, receiver: Arc<str>, sequence: u64, body: Body) -> Parcel {

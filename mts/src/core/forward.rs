@@ -1,18 +1,21 @@
 //! Letters for somebody else: the gateway's role, old peers' letters, and failure messages.
 
+use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
-use fipa_acl::Letter;
-use fipa_sds::{Entry, Reach, Resolution, Role};
+use fipa_acl::{Dialect, Letter, Representation};
+use fipa_sds::{Entry, Mts, Reach, Resolution, Role, Source};
 use fipa_transport::{
-    Answer, FailureReason, Hop, Incarnation, Kind, Parcel, Stream, Ticket, Verdict,
+    Answer, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Signature, Stream, Ticket,
+    Verdict,
 };
 
-use super::desk::{Action, Origin, Undelivered};
+use super::desk::{Action, Origin, Undelivered, life_of};
 use super::lane::{Delivery, Lane};
 use super::{Core, MAX_DEADLINE, Now};
-use crate::{failure, stamp};
+use crate::failure::Failure;
+use crate::stamp;
 
 /// How far from the network a letter may come before a gateway refuses to pass it on.
 const MAX_HOPS: u8 = 1;
@@ -84,7 +87,7 @@ impl Core {
         if !config.forwards {
             return Err(unknown("the agent is not in this process any more"));
         }
-        let entry = self.desk.directory.by_incarnation(parcel.stream.receiver);
+        let entry = self.desk.receiver(parcel.stream.receiver, &parcel.receiver);
         let entry = entry.ok_or_else(|| unknown("the agent is not known to the gateway"))?;
         if entry.role == Role::Gateway {
             return Err(refused(
@@ -205,36 +208,105 @@ impl Core {
                 reason,
                 detail,
             } = undelivered;
-            let name = &self.desk.config.name;
-            let Some(report) = failure::compose(name, &letter, &receiver, reason, &detail, now.utc)
-            else {
+            let name = Arc::clone(&self.desk.config.name);
+            let name = &*name;
+            let Some(report) = Failure::of(&letter, &receiver, reason, &detail) else {
                 continue;
             };
             if let Some((agent, inbox)) =
                 sender.and_then(|agent| Some((agent, self.agents.get_mut(&agent)?)))
             {
-                if inbox.push_failure(report.letter) {
+                let letter = match report.written_for(name, Dialect::Standard, now.utc) {
+                    Ok(letter) => letter,
+                    Err(error) => {
+                        tracing::warn!(%error, %receiver, "a failure message could not be written");
+                        continue;
+                    }
+                };
+                if inbox.push_failure(letter) {
                     self.desk.actions.push_back(Action::Deliverable { agent });
                 }
                 continue;
             }
-            // An old peer's letter: its sender may be known by name.
-            let Some(entry) = self.desk.directory.lookup(&report.to) else {
-                tracing::info!(to = %report.to, %reason, "nobody to send a failure message to");
+            // An old peer's letter: its sender is known by name, or has said where it is.
+            let known = self.desk.directory.lookup(report.sender.name());
+            let said = match known {
+                Some(_) => None,
+                None => said_of_itself(&report),
+            };
+            let Some(entry) = known.or_else(|| said.clone()) else {
+                tracing::info!(to = %report.sender, %reason, "nobody to send a failure message to");
                 continue;
             };
             if entry.role == Role::Gateway {
                 continue;
             }
+            let letter = match report.written_for(name, dialect_of(&entry), now.utc) {
+                Ok(letter) => letter,
+                Err(error) => {
+                    tracing::warn!(%error, receiver = %report.receiver, "a failure message could not be written");
+                    continue;
+                }
+            };
             let sequence = self.sequence_of(self.desk.config.incarnation);
             let deadline = now.instant + FAILURE_DEADLINE;
-            let mut delivery = Delivery::new(Origin::Nobody, report.letter, sequence, deadline);
+            let mut delivery = Delivery::new(Origin::Nobody, letter, sequence, deadline);
             delivery.hops = u8::from(entry.reach != Reach::Local);
             let stream = Stream {
                 sender: self.desk.config.incarnation,
-                receiver: entry.incarnation,
+                receiver: life_of(&entry),
             };
+            if said.is_some() {
+                let new = || Lane::new(now.instant, stream, Arc::clone(&entry.name));
+                self.lanes
+                    .entry(stream)
+                    .or_insert_with(new)
+                    .said(Arc::clone(&entry));
+            }
             self.put(now, stream, Arc::clone(&entry.name), delivery);
         }
+    }
+}
+
+/// An agent that the directory does not know, as it said itself where it can be reached: the
+/// numeric addresses of an old peer's agent.
+fn said_of_itself(report: &Failure<'_>) -> Option<Arc<Entry>> {
+    let agent = &report.sender;
+    let signature = match report.representation {
+        Some(Representation::String) => Signature::JadeProxy,
+        _ => Signature::FipaServices,
+    };
+    let locations = agent.addresses().iter().filter_map(|address| {
+        let location: Location = address.parse().ok()?;
+        location.address().parse::<SocketAddr>().ok()?;
+        location.with_signature(signature).ok()
+    });
+    let locations: Vec<Location> = locations.take(Entry::MAX_LOCATIONS).collect();
+    if locations.is_empty() {
+        return None;
+    }
+    let entry = Entry {
+        name: agent.name().into(),
+        agent_type: String::new(),
+        incarnation: Incarnation::UNKNOWN,
+        locations,
+        mts: Mts::new(agent.name(), Incarnation::UNKNOWN),
+        description: String::new(),
+        registered: SystemTime::UNIX_EPOCH,
+        source: Source::Contact,
+        reach: Reach::Remote {
+            gateway: Incarnation::UNKNOWN,
+        },
+        role: Role::Agent,
+    };
+    entry.check().is_ok().then(|| Arc::new(entry))
+}
+
+/// What an agent understands, by what is understood where it can be reached.
+fn dialect_of(entry: &Entry) -> Dialect {
+    match entry.locations.first().map(Location::signature) {
+        Some(Signature::FipaServices) => Dialect::FipaServices,
+        Some(Signature::JadeProxy) => Dialect::Jade,
+        _ => Dialect::Standard,
     }
 }

@@ -208,17 +208,11 @@ impl Core {
                 self.undeliverable(send, sender, receiver, letter.clone(), reason);
             }
             for entry in entries {
-                if !entry.incarnation.is_known() {
-                    // An old peer's agent: there is no way to it that this version can write.
-                    count += 1;
-                    let (name, reason) = (Arc::clone(&entry.name), FailureReason::Unreachable);
-                    self.undeliverable(send, sender, name, letter.clone(), reason);
+                let life = desk::life_of(&entry);
+                if reached.contains(&life) {
                     continue;
                 }
-                if reached.contains(&entry.incarnation) {
-                    continue;
-                }
-                reached.push(entry.incarnation);
+                reached.push(life);
                 count += 1;
                 self.send_one(now, (send, sender), &entry, letter.clone(), deadline);
             }
@@ -249,7 +243,7 @@ impl Core {
     ) {
         let stream = Stream {
             sender,
-            receiver: entry.incarnation,
+            receiver: desk::life_of(entry),
         };
         let name = Arc::clone(&entry.name);
         let waiting = self.lanes.get(&stream).map_or(0, Lane::len);
@@ -330,7 +324,7 @@ impl Core {
         for Moved { to, delivery } in moved {
             let stream = Stream {
                 sender: stream.sender,
-                receiver: to.incarnation,
+                receiver: desk::life_of(&to),
             };
             self.put(now, stream, Arc::clone(&to.name), delivery);
         }

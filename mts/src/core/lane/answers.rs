@@ -127,10 +127,7 @@ impl Lane {
                 detail,
             } => {
                 // The directory may know by now that the agent was registered anew.
-                let gone = desk
-                    .directory
-                    .by_incarnation(self.stream.receiver)
-                    .is_none();
+                let gone = self.entry(desk).is_none();
                 if gone {
                     self.recovering = true;
                     self.receiver_left(index, desk, moved);
@@ -233,6 +230,7 @@ impl Lane {
                 Some(kind)
             }
         };
+        let here = self.entry(desk).is_some();
         let delivery = &mut self.letters[index];
         delivery.progress.state = State::Waiting;
         // The sender is told the way between the hosts, which only this side may have seen.
@@ -253,8 +251,7 @@ impl Lane {
             }
             Outcome::Failed { reason, .. } => {
                 delivery.progress.attempts = attempts;
-                let here = desk.directory.by_incarnation(self.stream.receiver);
-                if reason == FailureReason::NoSuchAgent && here.is_none() {
+                if reason == FailureReason::NoSuchAgent && !here {
                     self.receiver_left(index, desk, moved);
                 } else if delivery.progress.unconfirmed {
                     self.fail(index, FailureReason::Unconfirmed, desk);
@@ -276,7 +273,7 @@ impl Lane {
         moved: &mut Vec<Moved>,
     ) {
         // When the receiver itself is gone, its custodian says so, or the deadline does.
-        if let Some(entry) = desk.directory.by_incarnation(self.stream.receiver) {
+        if let Some(entry) = self.entry(desk) {
             for index in 0..self.letters.len() {
                 self.check_custodian(now, index, &entry, desk);
             }

@@ -24,7 +24,7 @@ use fipa_transport::{
 
 pub(crate) use self::delivery::Delivery;
 use self::delivery::State;
-use super::desk::{Desk, Origin, Purpose, Undelivered};
+use super::desk::{Desk, Origin, Purpose, Undelivered, life_of};
 use super::routes::Tally;
 
 /// How many failed letters of a stream are remembered to mend the order of later ones.
@@ -48,6 +48,8 @@ const HOP_MARGIN: Duration = Duration::from_millis(100);
 pub(crate) struct Lane {
     stream: Stream,
     receiver: Arc<str>,
+    /// What the receiver said of itself, if the directory does not know it.
+    said: Option<Arc<Entry>>,
     letters: VecDeque<Delivery>,
     under_way: usize,
     /// The way that letters under way go.
@@ -84,6 +86,7 @@ impl Lane {
         Self {
             stream,
             receiver,
+            said: None,
             letters: VecDeque::new(),
             under_way: 0,
             way: None,
@@ -135,6 +138,18 @@ impl Lane {
         if self.due.is_none_or(|due| at < due) {
             self.due = Some(at);
         }
+    }
+
+    /// Where the receiver can be reached: as the directory has it, or as it said itself when the
+    /// directory does not know it.
+    fn entry(&self, desk: &Desk) -> Option<Arc<Entry>> {
+        let known = desk.receiver(self.stream.receiver, &self.receiver);
+        known.or_else(|| self.said.clone())
+    }
+
+    /// The receiver is not in the directory, but has said where it can be reached.
+    pub(crate) fn said(&mut self, entry: Arc<Entry>) {
+        self.said = Some(entry);
     }
 
     /// Puts a letter in, at its place in the order.
@@ -193,7 +208,7 @@ impl Lane {
                 index += 1;
                 continue;
             }
-            let Some(entry) = desk.directory.by_incarnation(self.stream.receiver) else {
+            let Some(entry) = self.entry(desk) else {
                 if self.receiver_left(index, desk, moved) {
                     continue;
                 }
@@ -329,7 +344,7 @@ impl Lane {
         let may_move =
             matches!(self.letters[index].origin, Origin::Local { .. }) && !progress.unconfirmed;
         let successor = desk.directory.lookup(&self.receiver);
-        let successor = successor.filter(|entry| entry.incarnation != self.stream.receiver);
+        let successor = successor.filter(|entry| life_of(entry) != self.stream.receiver);
         match successor.filter(|_| may_move) {
             // Those before it may have to go there too, and first.
             Some(_) if index > 0 => false,
