@@ -6,8 +6,8 @@ use std::time::Duration;
 use bytes::{Bytes, BytesMut};
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use fipa_acl::{
-    AgentId, Dialect, EnvelopeView, Message, MessageView, Payload, Performative, Representation,
-    bitefficient,
+    AgentId, Dialect, Envelope, EnvelopeView, Message, MessageView, Payload, Performative,
+    Representation, bitefficient,
 };
 
 const LETTER: &[u8] = include_bytes!("../tests/vectors/failure_letter.bin");
@@ -67,18 +67,31 @@ fn codec(criterion: &mut Criterion) {
             bench.iter(|| Message::decode(black_box(&whole)));
         });
     }
-    for (name, content_len) in [("1B", 1), ("1KB", 1 << 10), ("1MB", 1 << 20)] {
-        let message = message(content_len);
-        let mut group = criterion.benchmark_group("string");
-        for dialect in [Dialect::Standard, Dialect::FipaServices, Dialect::Jade] {
-            let encode = || black_box(&message).encode(Representation::String, dialect);
-            let payload = Payload::from(encode().expect("a string message"));
-            let id = |what: &str| BenchmarkId::new(format!("{what} {dialect}"), name);
-            group.bench_function(id("encode"), |bench| bench.iter(encode));
-            group.bench_function(id("decode"), |bench| {
-                bench.iter(|| Message::decode(black_box(&payload)));
-            });
+    for representation in [Representation::String, Representation::Xml] {
+        for (name, content_len) in [("1B", 1), ("1KB", 1 << 10), ("1MB", 1 << 20)] {
+            let message = message(content_len);
+            let mut group = criterion.benchmark_group(representation.to_string());
+            for dialect in [Dialect::Standard, Dialect::FipaServices] {
+                let encode = || black_box(&message).encode(representation, dialect);
+                let payload = Payload::from(encode().expect("a message"));
+                let id = |what: &str| BenchmarkId::new(format!("{what} {dialect}"), name);
+                group.bench_function(id("encode"), |bench| bench.iter(encode));
+                group.bench_function(id("decode"), |bench| {
+                    bench.iter(|| Message::decode(black_box(&payload)));
+                });
+            }
         }
+    }
+    let (envelope, _) = Envelope::decode(LETTER).expect("an envelope");
+    for representation in [Representation::BitEfficient, Representation::Xml] {
+        let encode = || black_box(&envelope).encode(representation, Dialect::FipaServices);
+        let bytes = encode().expect("an envelope");
+        let mut group = criterion.benchmark_group("envelope");
+        let id = |what: &str| BenchmarkId::new(what, representation);
+        group.bench_function(id("encode"), |bench| bench.iter(encode));
+        group.bench_function(id("decode"), |bench| {
+            bench.iter(|| Envelope::decode(black_box(&bytes)));
+        });
     }
     criterion.bench_function("envelope/view", |bench| {
         bench.iter(|| black_box(EnvelopeView::parse(black_box(LETTER))).is_ok());

@@ -4,38 +4,43 @@ use crate::Representation;
 
 /// Bytes that are not what they should be: where, what is wrong, and the clause that says so.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("at byte {offset}: {problem} ({clause})")]
-pub struct DecodeError {
+#[error("at byte {}: {} ({})", .0.offset, .0.problem, .0.clause)]
+pub struct DecodeError(Box<Place>);
+
+/// Apart from the error, so that what succeeds does not carry room for it around.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Place {
     offset: usize,
     clause: &'static str,
     problem: Problem,
 }
 
 impl DecodeError {
+    #[cold]
     pub(crate) fn new(offset: usize, clause: &'static str, problem: Problem) -> Self {
-        Self {
+        Self(Box::new(Place {
             offset,
             clause,
             problem,
-        }
+        }))
     }
 
     /// Where the offending bytes begin, counted from the start of what was decoded.
     #[must_use]
     pub fn offset(&self) -> usize {
-        self.offset
+        self.0.offset
     }
 
     /// The clause of the standard that is violated, for example `FIPA00069 2.1`.
     #[must_use]
     pub fn clause(&self) -> &'static str {
-        self.clause
+        self.0.clause
     }
 
     /// What is wrong.
     #[must_use]
     pub fn problem(&self) -> &Problem {
-        &self.problem
+        &self.0.problem
     }
 }
 
@@ -72,9 +77,13 @@ pub enum Problem {
     /// Nesting deeper than accepted.
     #[error("{0} nested too deep")]
     TooDeep(&'static str),
-    /// The message uses dynamic code tables, which both sides would have to agree on beforehand.
-    #[error("the message uses dynamic code tables, which are not supported")]
+    /// The message uses dynamic code tables, which both sides have to agree on beforehand, and was
+    /// read without one.
+    #[error("the message uses dynamic code tables, and was read without one")]
     CodeTable,
+    /// The message refers to an entry that is not in the code table.
+    #[error("there is no entry {0} in the code table")]
+    NoSuchCode(usize),
     /// Digits that are not a number or not one of the range expected.
     #[error("malformed number")]
     Number,

@@ -54,7 +54,7 @@ mod word;
 mod xml;
 
 pub use agent_id::{AgentId, AgentIdError};
-pub use bitefficient::{AgentIdView, AgentIds, MessageView, Text};
+pub use bitefficient::{AgentIdView, AgentIds, CodeTable, MessageView, Text};
 pub use builder::{BuildError, MessageBuilder};
 pub use dialect::Dialect;
 pub use envelope::{

@@ -29,6 +29,14 @@ macro_rules! performatives {
                 }
             }
 
+            /// The name of the standard act with this code, or nothing.
+            pub(crate) fn name_of_code(code: u8) -> &'static str {
+                match code {
+                    $($code => $name,)*
+                    _ => "",
+                }
+            }
+
             /// The code of a standard act (FIPA00069 clause 2.1, `MsgType`).
             pub(crate) fn code(&self) -> Option<u8> {
                 match self {
@@ -148,6 +156,7 @@ mod tests {
         for (place, act) in Performative::STANDARD.iter().enumerate() {
             assert_eq!(act.code().map(usize::from), Some(place + 1), "{act}");
             assert_eq!(Performative::of_code(place as u8 + 1).as_ref(), Some(act));
+            assert_eq!(Performative::name_of_code(place as u8 + 1), act.as_str());
         }
         assert_eq!(Performative::of_code(0), None);
         assert_eq!(Performative::of_code(23), None);

@@ -6,21 +6,77 @@
 /// parentheses, and not beginning with a digit, `#`, `-` or `@`. A quotation mark in front is
 /// excluded too, because a reader would take the text for a string literal.
 pub(crate) fn is_word(text: &str) -> bool {
-    let starts_well = match text.as_bytes().first() {
-        None | Some(b'0'..=b'9' | b'#' | b'-' | b'@' | b'"') => false,
-        Some(_) => true,
-    };
-    starts_well && is_token(text)
+    Shape::of(text) == Shape::Word
 }
 
 /// Whether the text is a `Word` but for its first character, which peers do not look at: JADE
 /// writes whatever has no blanks as a word.
 pub(crate) fn is_token(text: &str) -> bool {
-    !text.is_empty()
-        && text
-            .bytes()
-            .all(|byte| byte > 0x20 && byte != b'(' && byte != b')')
+    !text.is_empty() && classes(text.as_bytes()).0 == 0
 }
+
+/// How a text can be written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Shape {
+    Word,
+    /// In quotation marks, as it is.
+    Quotable,
+    /// Not without care.
+    Other,
+}
+
+impl Shape {
+    #[inline]
+    pub(crate) fn of(text: &str) -> Self {
+        let (no_token, care) = classes(text.as_bytes());
+        let starts_well = match text.as_bytes().first() {
+            None | Some(b'0'..=b'9' | b'#' | b'-' | b'@' | b'"') => false,
+            Some(_) => true,
+        };
+        if starts_well && no_token == 0 {
+            Self::Word
+        } else if care == 0 {
+            Self::Quotable
+        } else {
+            Self::Other
+        }
+    }
+}
+
+/// Two numbers, neither of which is zero if there are bytes that no token has (blanks, parentheses
+/// and control characters), or bytes that need care in quotation marks (those and backslashes).
+#[inline]
+fn classes(bytes: &[u8]) -> (u64, u64) {
+    let (mut no_token, mut care) = (0, 0);
+    let mut look = |eight: [u8; 8]| {
+        let word = u64::from_le_bytes(eight);
+        // Exact as to whether there is one.
+        let below = |bound: u64| word.wrapping_sub(ONES * bound) & !word;
+        let zero = |word: u64| word.wrapping_sub(ONES) & !word;
+        let parentheses = (word & (ONES * 0xfe)) ^ (ONES * 0x28);
+        no_token |= (below(0x21) | zero(parentheses)) & TOPS;
+        care |= (zero(word ^ (ONES * 0x22)) | zero(word ^ (ONES * 0x5c))) & TOPS;
+    };
+    match (bytes.as_chunks::<8>(), bytes.last_chunk()) {
+        // The last eight overlap those in front of them.
+        ((eights, _), Some(last)) => {
+            eights.iter().for_each(|eight| look(*eight));
+            look(*last);
+        }
+        ((_, rest), None) => {
+            // Letters, which are neither.
+            let mut eight = [b'a'; 8];
+            for (filled, byte) in eight.iter_mut().zip(rest) {
+                *filled = *byte;
+            }
+            look(eight);
+        }
+    }
+    (no_token, care)
+}
+
+const ONES: u64 = 0x0101_0101_0101_0101;
+const TOPS: u64 = ONES << 7;
 
 /// A piece of a string literal.
 pub(crate) enum Piece<'a> {
@@ -45,7 +101,8 @@ pub(crate) fn string_literal<'a>(text: &'a str, mut put: impl FnMut(Piece<'a>)) 
 /// backslash and no backslash at the end.
 pub(crate) fn is_quotable(text: &str) -> bool {
     let bytes = text.as_bytes();
-    bytes.last() != Some(&b'\\') && memchr::memmem::find(bytes, b"\\\"").is_none()
+    bytes.last() != Some(&b'\\')
+        && (memchr::memchr(b'"', bytes).is_none() || memchr::memmem::find(bytes, b"\\\"").is_none())
 }
 
 /// The pieces of a text in quotation marks, `"` written as `\"`.
@@ -87,6 +144,32 @@ mod tests {
             assert!(!is_word(other), "{other:?}");
         }
         assert!(is_token("1a") && is_token("@a") && !is_token("a b") && !is_token(""));
+    }
+
+    #[test]
+    fn every_byte_counts_wherever_it_stands() {
+        for len in 1..20 {
+            for place in 0..len {
+                for byte in 0..=0x7f_u8 {
+                    let mut text = vec![b'a'; len];
+                    text[place] = byte;
+                    let text = String::from_utf8(text).unwrap();
+                    let no_token = byte <= 0x20 || b"()".contains(&byte);
+                    assert_eq!(is_token(&text), !no_token, "{text:?}");
+                    let starts_badly = place == 0 && b"0123456789#-@\"".contains(&byte);
+                    let expected = if !no_token && !starts_badly {
+                        Shape::Word
+                    } else if b"\"\\".contains(&byte) {
+                        Shape::Other
+                    } else {
+                        Shape::Quotable
+                    };
+                    assert_eq!(Shape::of(&text), expected, "{text:?}");
+                }
+            }
+        }
+        assert_eq!(Shape::of("é é\""), Shape::Other);
+        assert_eq!(Shape::of("\u{a0}\u{fe}"), Shape::Word);
     }
 
     #[test]

@@ -57,6 +57,19 @@ fn jade_puts_a_tag_in_front_of_stamps() {
 }
 
 #[test]
+fn an_address_is_not_taken_for_the_end_of_its_list() {
+    let envelope = Envelope {
+        base: EnvelopeParams {
+            to: vec![agent("bob").with_address("\x01\x01").unwrap()],
+            ..base()
+        },
+        extensions: Vec::new(),
+    };
+    let bytes = envelope.encode_standard().unwrap();
+    assert_eq!(Envelope::decode(&bytes).unwrap().0, envelope);
+}
+
+#[test]
 fn jade_writes_user_defined_parameters_its_own_way() {
     let parameters = b"\x00X-k v w\0\x03\x02a\0\x04X-p\0q\0\x01\x00X-l\0m\0";
     let (envelope, _) = Envelope::decode(&encoded_base(parameters)).unwrap();

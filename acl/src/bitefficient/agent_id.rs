@@ -13,10 +13,7 @@ const CLAUSE: &str = "FIPA00069 2.1 AID";
 #[derive(Debug, Clone, Copy)]
 pub struct AgentIdView<'a> {
     name: &'a str,
-    /// Behind the code, up to and without the end of the list.
-    addresses: &'a [u8],
-    resolvers: &'a [u8],
-    /// What follows the name, up to and without the end of the identifier.
+    /// What follows the name, with the end of the identifier.
     parameters: &'a [u8],
 }
 
@@ -29,7 +26,12 @@ impl<'a> AgentIdView<'a> {
 
     /// Transport addresses, the preferred one first.
     pub fn addresses(&self) -> impl Iterator<Item = &'a str> + use<'a> {
-        let mut reader = Reader::new(self.addresses);
+        // Of several lists the last one counts.
+        let lists = self.parameters().filter_map(|parameter| match parameter {
+            Parameter::Addresses(bytes) => Some(bytes),
+            _ => None,
+        });
+        let mut reader = Reader::new(lists.last().unwrap_or_default());
         // Checked when the message was read: an error cannot occur, and would end the list.
         std::iter::from_fn(move || {
             (reader.peek()? == 0x10).then(|| reader.skip_peeked())?;
@@ -40,20 +42,25 @@ impl<'a> AgentIdView<'a> {
     /// Agents that can resolve the name.
     #[must_use]
     pub fn resolvers(&self) -> AgentIds<'a> {
-        AgentIds::new(self.resolvers)
+        let lists = self.parameters().filter_map(|parameter| match parameter {
+            Parameter::Resolvers(bytes) => Some(bytes),
+            _ => None,
+        });
+        AgentIds::new(lists.last().unwrap_or_default())
     }
 
     /// User-defined parameters, names without `X-`.
     pub fn user_defined(&self) -> impl Iterator<Item = (&'a str, Text<'a>)> + use<'a> {
-        let mut reader = Reader::new(self.parameters);
-        std::iter::from_fn(move || {
-            loop {
-                match parameter(&mut reader, AgentId::MAX_DEPTH).ok()?? {
-                    Parameter::UserDefined(name, value) => return Some((name, value)),
-                    Parameter::Addresses(_) | Parameter::Resolvers(_) => {}
-                }
-            }
+        self.parameters().filter_map(|parameter| match parameter {
+            Parameter::UserDefined(name, value) => Some((name, value)),
+            _ => None,
         })
+    }
+
+    fn parameters(&self) -> impl Iterator<Item = Parameter<'a>> + use<'a> {
+        let mut reader = Reader::new(self.parameters);
+        // Checked when the message was read: an error cannot occur, and would end this.
+        std::iter::from_fn(move || parameter(&mut reader, AgentId::MAX_DEPTH).ok()?)
     }
 
     /// The identifier as an owned value.
@@ -74,16 +81,12 @@ impl<'a> AgentIdView<'a> {
 
 /// The agent identifiers of a set or sequence in an encoded message.
 #[derive(Debug, Clone, Default)]
-pub struct AgentIds<'a> {
-    reader: Option<Reader<'a>>,
-}
+pub struct AgentIds<'a>(&'a [u8]);
 
 impl<'a> AgentIds<'a> {
     /// The identifiers in checked bytes.
     pub(crate) fn new(bytes: &'a [u8]) -> Self {
-        Self {
-            reader: Some(Reader::new(bytes)),
-        }
+        Self(bytes)
     }
 }
 
@@ -91,15 +94,33 @@ impl<'a> Iterator for AgentIds<'a> {
     type Item = AgentIdView<'a>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        let reader = self.reader.as_mut()?;
-        (reader.remaining() > 0).then_some(())?;
+        (!self.0.is_empty()).then_some(())?;
+        let mut reader = Reader::new(self.0);
         // Checked when the message was read: an error cannot occur, and would end the list.
-        agent_id(reader, AgentId::MAX_DEPTH).ok()
+        let agent = agent_id(&mut reader, AgentId::MAX_DEPTH).ok();
+        self.0 = agent.map_or(&[], |_| reader.rest());
+        agent
     }
 }
 
 /// Reads an agent identifier, whose resolvers may be nested `depth` deep.
+#[inline(always)]
 pub(crate) fn agent_id<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
+    depth: usize,
+) -> Result<AgentIdView<'a>, DecodeError> {
+    // Whoever wants every part explained has to go the long way.
+    if N::SILENT
+        && let Some(name) = reader.short_agent_name()
+    {
+        let parameters = &[0x01];
+        return Ok(AgentIdView { name, parameters });
+    }
+    other_agent_id(reader, depth)
+}
+
+#[inline(never)]
+fn other_agent_id<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     depth: usize,
 ) -> Result<AgentIdView<'a>, DecodeError> {
@@ -109,37 +130,21 @@ pub(crate) fn agent_id<'a, N: Notes>(
     }
     let offset = reader.offset();
     let name = word(reader, "agent name")?;
-    let wrong = |problem| Err(DecodeError::new(offset, CLAUSE, problem));
-    if name.is_empty() {
-        return wrong(Problem::Empty("agent name"));
+    if name.is_empty() || name.len() > AgentId::MAX_NAME {
+        let problem = match name {
+            "" => Problem::Empty("agent name"),
+            _ => Problem::TooLong("agent name"),
+        };
+        return Err(DecodeError::new(offset, CLAUSE, problem));
     }
-    if name.len() > AgentId::MAX_NAME {
-        return wrong(Problem::TooLong("agent name"));
-    }
-    let mut view = AgentIdView {
-        name,
-        addresses: &[],
-        resolvers: &[],
-        parameters: &[],
-    };
     reader.note(|| format!("agent identifier: name {}", notes::quoted(name)));
     reader.notes().deeper();
     let start = reader.position();
-    loop {
-        let before = reader.position();
-        match parameter(reader, depth)? {
-            Some(Parameter::Addresses(addresses)) => view.addresses = addresses,
-            Some(Parameter::Resolvers(resolvers)) => view.resolvers = resolvers,
-            Some(Parameter::UserDefined(..)) => {}
-            None => {
-                reader.notes().shallower();
-                reader.note(|| "end of agent identifier".to_owned());
-                let with_end = reader.since(start);
-                view.parameters = with_end.get(..before - start).unwrap_or_default();
-                return Ok(view);
-            }
-        }
-    }
+    while parameter(reader, depth)?.is_some() {}
+    reader.notes().shallower();
+    reader.note(|| "end of agent identifier".to_owned());
+    let parameters = reader.since(start);
+    Ok(AgentIdView { name, parameters })
 }
 
 /// Reads the agent identifiers of a set up to its end, and gives the bytes in front of that.
@@ -157,8 +162,7 @@ enum Parameter<'a> {
     UserDefined(&'a str, Text<'a>),
 }
 
-/// The next parameter of an identifier, or `None` at its end (or, in bytes cut out before, at
-/// theirs).
+/// The next parameter of an identifier, or `None` at its end.
 fn parameter<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     depth: usize,
@@ -201,8 +205,19 @@ fn addresses<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<&'a [u8], Decod
 }
 
 /// Reads a `BinWord`.
-#[inline]
+#[inline(always)]
 pub(crate) fn word<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
+    what: &'static str,
+) -> Result<&'a str, DecodeError> {
+    match reader.short_word() {
+        Some(word) => Ok(word),
+        None => other_word(reader, what),
+    }
+}
+
+#[inline(never)]
+fn other_word<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     what: &'static str,
 ) -> Result<&'a str, DecodeError> {

@@ -10,6 +10,9 @@ use crate::{Time, Zone};
 
 /// Listens to the remarks of a reader.
 pub(crate) trait Notes {
+    /// Nothing is listened to.
+    const SILENT: bool = false;
+
     /// Everything from the end of the last note up to the offset `end` means this. Nothing is to
     /// be noted where there are no bytes.
     fn note(&mut self, end: usize, meaning: impl FnOnce() -> String);
@@ -32,6 +35,8 @@ pub(crate) trait Notes {
 pub(crate) struct Silent;
 
 impl Notes for Silent {
+    const SILENT: bool = true;
+
     #[inline(always)]
     fn note(&mut self, _: usize, _: impl FnOnce() -> String) {}
 

@@ -1,5 +1,7 @@
 //! Reading what both bit-efficient formats consist of, with every bound checked.
 
+use ascii::AsciiStr;
+
 use crate::bitefficient::notes::{Notes, Silent};
 use crate::bitefficient::text::Text;
 use crate::error::{DecodeError, Problem};
@@ -226,22 +228,112 @@ impl<'a, N: Notes> Reader<'a, N> {
     /// UTF-8 text up to the next NUL, as it stands.
     #[inline]
     pub(crate) fn plain(&mut self, clause: &'static str, what: &'static str) -> Result<&'a str> {
-        let offset = self.offset();
         let bytes = self.until_nul(clause, what)?;
-        utf8(bytes, offset, clause, what)
+        self.utf8(bytes, 1, clause, what)
+    }
+
+    /// The next text, if it is of the kind that nearly all are: short, in ASCII, and a word
+    /// (`10 … 00`) or in quotation marks (`14 "…" 00`).
+    #[inline(always)]
+    pub(crate) fn short_text(&mut self) -> Option<Text<'a>> {
+        let (&code, rest) = self.bytes.get(self.position..)?.split_first()?;
+        let text = match (code, rest.get(..near_nul(rest)?)?) {
+            (0x10, word) => Text::plain(ascii(word)?),
+            (0x14, [b'"', inner @ .., b'"']) => Text::quoted(ascii(inner)?),
+            _ => return None,
+        };
+        // Code and NUL, and the quotation marks.
+        self.position += text.raw().len() + if code == 0x10 { 2 } else { 4 };
+        Some(text)
+    }
+
+    /// The next word, if it is short and in ASCII as nearly all are.
+    #[inline(always)]
+    pub(crate) fn short_word(&mut self) -> Option<&'a str> {
+        let [0x10, rest @ ..] = self.bytes.get(self.position..)? else {
+            return None;
+        };
+        let word = ascii(rest.get(..near_nul(rest)?)?)?;
+        self.position += word.len() + 2;
+        Some(word)
+    }
+
+    /// The next agent identifier, if it is of the kind that nearly all are: a short name in ASCII,
+    /// and nothing else (`02 10 … 00 01`).
+    #[inline(always)]
+    pub(crate) fn short_agent_name(&mut self) -> Option<&'a str> {
+        let [0x02, 0x10, rest @ ..] = self.bytes.get(self.position..)? else {
+            return None;
+        };
+        let len = near_nul(rest)?;
+        let name = ascii(rest.get(..len)?)?;
+        (len > 0 && rest.get(len + 1) == Some(&0x01)).then(|| {
+            self.position += len + 4;
+            name
+        })
+    }
+
+    /// UTF-8 text of this length.
+    pub(crate) fn counted(
+        &mut self,
+        len: usize,
+        clause: &'static str,
+        what: &'static str,
+    ) -> Result<&'a str> {
+        let offset = self.offset();
+        let bytes = self.bytes(len, clause, what)?;
+        if memchr::memchr(0, bytes).is_some() {
+            return Err(DecodeError::new(offset, clause, Problem::Nul(what)));
+        }
+        self.utf8(bytes, 0, clause, what)
     }
 
     /// Text up to the next NUL, by the rule for `String 00` that fits every peer: in quotation
     /// marks (standard, fipa_services), with its length in front (fipa_services), or bare (JADE).
     #[inline]
     pub(crate) fn string(&mut self, clause: &'static str, what: &'static str) -> Result<Text<'a>> {
-        let offset = self.offset();
-        let (form, bytes) = string_form(self.until_nul(clause, what)?);
-        let text = utf8(bytes, offset, clause, what)?;
+        let text = self.plain(clause, what)?;
+        let (form, inner) = string_form(text.as_bytes());
+        // What is taken off is ASCII, so this is always a text.
+        let from = match form {
+            Form::Bare => return Ok(Text::plain(text)),
+            Form::Quoted => 1,
+            Form::Counted => text.len() - inner.len(),
+        };
+        let inner = text.get(from..from + inner.len()).unwrap_or_default();
         Ok(match form {
-            Form::Quoted => Text::quoted(text),
-            Form::Counted => Text::counted(text),
-            Form::Bare => Text::plain(text),
+            Form::Quoted => Text::quoted(inner),
+            _ => Text::counted(inner),
+        })
+    }
+
+    /// Bytes as text, `behind` which bytes more were read. Nearly all text is ASCII, and that is
+    /// quickly found out.
+    #[inline(always)]
+    fn utf8(
+        &self,
+        bytes: &'a [u8],
+        behind: usize,
+        clause: &'static str,
+        what: &'static str,
+    ) -> Result<&'a str> {
+        match ascii(bytes) {
+            Some(text) => Ok(text),
+            None => self.other_utf8(bytes, behind, clause, what),
+        }
+    }
+
+    #[inline(never)]
+    fn other_utf8(
+        &self,
+        bytes: &'a [u8],
+        behind: usize,
+        clause: &'static str,
+        what: &'static str,
+    ) -> Result<&'a str> {
+        std::str::from_utf8(bytes).map_err(|error| {
+            let offset = self.offset() - behind - bytes.len() + error.valid_up_to();
+            DecodeError::new(offset, clause, Problem::NotUtf8(what))
         })
     }
 
@@ -257,6 +349,7 @@ impl<'a, N: Notes> Reader<'a, N> {
         let offset = self.offset();
         let wrong = || DecodeError::new(offset, clause, Problem::DateTime);
         let digits = self.bytes(9, clause, "a date")?;
+        let digits = <[u8; 9]>::try_from(digits).map_err(|_| wrong())?;
         let fields = bin_date(digits).ok_or_else(wrong)?;
         let zone = if code >= 0x24 {
             let letter = self.byte(clause, "a date")?;
@@ -319,28 +412,36 @@ fn counted(bytes: &[u8]) -> Option<&[u8]> {
     (!digits.is_empty() && len == text.len()).then_some(text)
 }
 
-/// Words and names are a few bytes long: looking at those first is quicker than starting a
+const ONES: u64 = 0x0101_0101_0101_0101;
+const TOPS: u64 = ONES << 7;
+
+/// Words and names are a few bytes long: looking at those eight by eight is quicker than starting a
 /// vectorised search.
 #[inline]
 fn find_nul(bytes: &[u8]) -> Option<usize> {
-    const NEAR: usize = 24;
-    let (near, far) = bytes.split_at_checked(NEAR).unwrap_or((bytes, &[]));
-    match near.iter().position(|&byte| byte == 0) {
-        Some(place) => Some(place),
-        None => memchr::memchr(0, far).map(|place| place + NEAR),
-    }
+    near_nul(bytes).or_else(|| memchr::memchr(0, bytes))
 }
 
-#[inline]
-pub(crate) fn utf8<'a>(
-    bytes: &'a [u8],
-    offset: usize,
-    clause: &'static str,
-    what: &'static str,
-) -> Result<&'a str> {
-    std::str::from_utf8(bytes).map_err(|error| {
-        DecodeError::new(offset + error.valid_up_to(), clause, Problem::NotUtf8(what))
-    })
+/// The first NUL, if it is near and not among the last bytes.
+#[inline(always)]
+fn near_nul(bytes: &[u8]) -> Option<usize> {
+    const NEAR: usize = 5;
+    let mut before = 0;
+    for eight in bytes.as_chunks::<8>().0.iter().take(NEAR) {
+        let word = u64::from_le_bytes(*eight);
+        // Of the first byte that is zero, and perhaps of later ones, the top bit is set.
+        let zeros = word.wrapping_sub(ONES) & !word & TOPS;
+        if zeros != 0 {
+            return Some(before + zeros.trailing_zeros() as usize / 8);
+        }
+        before += 8;
+    }
+    None
+}
+
+#[inline(always)]
+fn ascii(bytes: &[u8]) -> Option<&str> {
+    AsciiStr::from_ascii(bytes).ok().map(AsciiStr::as_str)
 }
 
 /// The characters of digits that were read; `None` stands for a nibble without a meaning.
@@ -363,29 +464,54 @@ pub(crate) fn digit_chars(digits: &[u8]) -> impl Iterator<Item = Option<char>> +
 
 /// The nine bytes of `BinDate` (FIPA00069 2.3). Milliseconds are three digits and padding, or four
 /// digits (fipa_services). The fields between year and milliseconds may be one digit and padding.
-fn bin_date(digits: &[u8]) -> Option<Fields> {
-    let &[y1, y2, month, day, hour, minute, second, m1, m2] = digits else {
-        return None;
-    };
-    let two = |byte: u8| Some(nibble(byte >> 4)? * 10 + nibble(byte & 0x0f)?);
-    let padded = |byte: u8| match (byte >> 4, byte & 0x0f) {
-        (digit, 0) | (0, digit) => nibble(digit),
-        _ => two(byte),
+fn bin_date(digits: [u8; 9]) -> Option<Fields> {
+    let [y1, y2, month, day, hour, minute, second, m1, m2] = digits;
+    let first = [y1, y2, month, day, hour, minute, second, m1];
+    let [century, year, month, day, hour, minute, second, tens] = match all_digits(first) {
+        Some(numbers) => numbers,
+        None => {
+            let padded = |byte: u8| match (byte >> 4, byte & 0x0f) {
+                (digit, 0) | (0, digit) => nibble(digit),
+                _ => two(byte),
+            };
+            let fields = [month, day, hour, minute, second].map(padded);
+            let [Some(a), Some(b), Some(c), Some(d), Some(e)] = fields else {
+                return None;
+            };
+            [two(y1)?, two(y2)?, a, b, c, d, e, two(m1)?]
+        }
     };
     let millisecond = if m2 & 0x0f == 0 {
-        u16::from(two(m1)?) * 10 + u16::from(nibble(m2 >> 4)?)
+        u16::from(tens) * 10 + u16::from(nibble(m2 >> 4)?)
     } else {
-        u16::from(two(m1)?) * 100 + u16::from(two(m2)?)
+        u16::from(tens) * 100 + u16::from(two(m2)?)
     };
     Some(Fields {
-        year: u16::from(two(y1)?) * 100 + u16::from(two(y2)?),
-        month: padded(month)?,
-        day: padded(day)?,
-        hour: padded(hour)?,
-        minute: padded(minute)?,
-        second: padded(second)?,
+        year: u16::from(century) * 100 + u16::from(year),
+        month,
+        day,
+        hour,
+        minute,
+        second,
         millisecond,
     })
+}
+
+/// The numbers that eight times two digits are, if all of them are digits.
+#[inline]
+fn all_digits(bytes: [u8; 8]) -> Option<[u8; 8]> {
+    let word = u64::from_le_bytes(bytes);
+    let (high, low) = (word >> 4 & (ONES * 0x0f), word & (ONES * 0x0f));
+    // In every byte: the top bit is set where there is a padding nibble or none of a digit.
+    let padding = |nibbles: u64| !(nibbles + ONES * 0x7f);
+    let beyond = |nibbles: u64| nibbles + ONES * (0x80 - 11);
+    let wrong = padding(high) | padding(low) | beyond(high) | beyond(low);
+    (wrong & TOPS == 0).then(|| (high * 10 + low - ONES * 11).to_le_bytes())
+}
+
+/// The number that two digits are.
+fn two(byte: u8) -> Option<u8> {
+    Some(nibble(byte >> 4)? * 10 + nibble(byte & 0x0f)?)
 }
 
 fn nibble(nibble: u8) -> Option<u8> {

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::fmt;
 
 use crate::bitefficient::notes::{self, Notes};
-use crate::bitefficient::reader::{Form, Reader, digit_chars, string_form, utf8};
+use crate::bitefficient::reader::{Form, Reader, digit_chars, string_form};
 use crate::error::{DecodeError, Problem};
 use crate::word::push_string_literal;
 
@@ -117,25 +117,18 @@ pub(crate) const MAX_EXPRESSION_DEPTH: usize = 64;
 const CLAUSE: &str = "FIPA00069 2.1 BinExpression";
 
 /// Reads a `BinExpression`: checked in one pass, nothing kept but where it is.
-#[inline]
+#[inline(always)]
 pub(crate) fn expression<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     what: &'static str,
 ) -> Result<Text<'a>, DecodeError> {
-    match reader.peek() {
-        // The two forms that nearly every text has.
-        Some(0x10) => {
-            reader.skip_peeked();
-            reader.plain(CLAUSE, what).map(Text::plain)
-        }
-        Some(0x14) => {
-            reader.skip_peeked();
-            reader.string(CLAUSE, what)
-        }
-        _ => other_expression(reader, what),
+    match reader.short_text() {
+        Some(text) => Ok(text),
+        None => other_expression(reader, what),
     }
 }
 
+#[inline(never)]
 fn other_expression<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     what: &'static str,
@@ -146,6 +139,8 @@ fn other_expression<'a, N: Notes>(
     }
     let code = reader.byte(CLAUSE, what)?;
     match code {
+        0x10 => reader.plain(CLAUSE, what).map(Text::plain),
+        0x14 => reader.string(CLAUSE, what),
         // An opaque expression, a leftover of former editions: the string that follows is it.
         0xff => {
             let code = reader.byte(CLAUSE, what)?;
@@ -185,12 +180,7 @@ fn string_after<'a, N: Notes>(
         0x19 => reader.u32_len(CLAUSE)?,
         other => return Err(reader.unexpected(CLAUSE, other, "a string")),
     };
-    let offset = reader.offset();
-    let bytes = reader.bytes(len, CLAUSE, what)?;
-    if memchr::memchr(0, bytes).is_some() {
-        return Err(DecodeError::new(offset, CLAUSE, Problem::Nul(what)));
-    }
-    utf8(bytes, offset, CLAUSE, what).map(Text::plain)
+    reader.counted(len, CLAUSE, what).map(Text::plain)
 }
 
 /// Walks over a parenthesised expression whose first byte was read, up to the parenthesis that

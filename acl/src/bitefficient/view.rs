@@ -40,9 +40,10 @@ pub struct MessageView<'a> {
     has_user_defined: bool,
 }
 
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Copy)]
 enum PerformativeView<'a> {
-    Standard(Performative),
+    /// The code of one of the standard.
+    Standard(u8),
     Other(&'a str),
 }
 
@@ -92,18 +93,19 @@ impl<'a> MessageView<'a> {
     /// What the message does; allocates for a user-defined act.
     #[must_use]
     pub fn performative(&self) -> Performative {
-        match &self.performative {
-            PerformativeView::Standard(act) => act.clone(),
-            // Checked to be a word when the message was read.
-            PerformativeView::Other(name) => name.parse().unwrap_or(Performative::NotUnderstood),
+        // Checked when the message was read: there is such an act, or the name is a word.
+        match self.performative {
+            PerformativeView::Standard(code) => Performative::of_code(code),
+            PerformativeView::Other(name) => name.parse().ok(),
         }
+        .unwrap_or(Performative::NotUnderstood)
     }
 
     /// The name of what the message does.
     #[must_use]
-    pub fn performative_name(&self) -> &str {
-        match &self.performative {
-            PerformativeView::Standard(act) => act.as_str(),
+    pub fn performative_name(&self) -> &'a str {
+        match self.performative {
+            PerformativeView::Standard(code) => Performative::name_of_code(code),
             PerformativeView::Other(name) => name,
         }
     }
@@ -199,8 +201,9 @@ impl<'a> MessageView<'a> {
             let mut reader = Reader::new(parameters);
             std::iter::from_fn(move || {
                 // Checked when the message was read: an error cannot occur, and would end this.
+                let mut passed = MessageView::empty(PerformativeView::Other(""));
                 while reader.remaining() > 0 {
-                    if let Parameter::UserDefined(name, value) = parameter(&mut reader).ok()? {
+                    if let Step::UserDefined(name, value) = passed.step(&mut reader).ok()? {
                         return Some((name, value));
                     }
                 }
@@ -216,53 +219,96 @@ impl<'a> MessageView<'a> {
 
 const CLAUSE: &str = "FIPA00069 2.1 Message";
 
-enum Parameter<'a> {
-    Sender(AgentIdView<'a>),
-    Receivers(&'a [u8]),
-    Content(ContentView<'a>),
-    ReplyWith(Text<'a>),
-    ReplyBy(Time),
-    InReplyTo(Text<'a>),
-    ReplyTo(&'a [u8]),
-    Language(Text<'a>),
-    Encoding(Text<'a>),
-    Ontology(Text<'a>),
-    Protocol(&'a str),
-    ConversationId(Text<'a>),
+/// What was read of a message.
+enum Step<'a> {
+    /// A parameter that is in the view now.
+    Parameter,
     UserDefined(&'a str, Text<'a>),
     End,
 }
 
-#[inline]
-fn parameter<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<Parameter<'a>, DecodeError> {
-    let code = reader.byte(CLAUSE, "a message")?;
-    Ok(match code {
-        0x00 => {
-            let (name, value) = user_defined(reader)?;
-            Parameter::UserDefined(name, value)
+impl<'a> MessageView<'a> {
+    fn empty(performative: PerformativeView<'a>) -> Self {
+        Self {
+            performative,
+            sender: None,
+            receivers: AgentIds::default(),
+            reply_to: AgentIds::default(),
+            content: None,
+            language: None,
+            encoding: None,
+            ontology: None,
+            protocol: None,
+            conversation_id: None,
+            reply_with: None,
+            in_reply_to: None,
+            reply_by: None,
+            parameters: [&[]; 2],
+            has_user_defined: false,
         }
-        0x01 => {
-            reader.note(|| "end of message".to_owned());
-            Parameter::End
+    }
+
+    /// Reads one parameter.
+    #[inline]
+    fn step<N: Notes>(&mut self, reader: &mut Reader<'a, N>) -> Result<Step<'a>, DecodeError> {
+        let code = reader.byte(CLAUSE, "a message")?;
+        let (text, what) = match code {
+            0x05 => (&mut self.reply_with, "reply-with"),
+            0x07 => (&mut self.in_reply_to, "in-reply-to"),
+            0x09 => (&mut self.language, "language"),
+            0x0a => (&mut self.encoding, "encoding"),
+            0x0b => (&mut self.ontology, "ontology"),
+            0x0d => (&mut self.conversation_id, "conversation-id"),
+            _ => return self.other_step(code, reader),
+        };
+        *text = Some(self::text(reader, what)?);
+        Ok(Step::Parameter)
+    }
+
+    #[inline]
+    fn other_step<N: Notes>(
+        &mut self,
+        code: u8,
+        reader: &mut Reader<'a, N>,
+    ) -> Result<Step<'a>, DecodeError> {
+        match code {
+            0x00 => {
+                let (name, value) = user_defined(reader)?;
+                return Ok(Step::UserDefined(name, value));
+            }
+            0x01 => {
+                reader.note(|| "end of message".to_owned());
+                return Ok(Step::End);
+            }
+            0x02 => {
+                let sender = sender(reader)?;
+                self.sender = (sender.name() != UNDEFINED_AGENT).then_some(sender);
+            }
+            0x03 => {
+                let ids = agent_ids(reader, AgentId::MAX_DEPTH, "receivers")?;
+                self.receivers = AgentIds::new(ids);
+            }
+            0x04 => {
+                if let Some(ContentView::Beside(_)) = self.content {
+                    let problem = Problem::Split("there is more content behind the content");
+                    return Err(reader.error(CLAUSE, problem));
+                }
+                self.content = Some(content(reader)?);
+            }
+            0x06 => {
+                let time = reader.date_time("FIPA00069 2.3 BinDateTime")?;
+                reader.note(|| notes::date("reply-by:", time));
+                self.reply_by = Some(time);
+            }
+            0x08 => {
+                let ids = agent_ids(reader, AgentId::MAX_DEPTH, "reply-to")?;
+                self.reply_to = AgentIds::new(ids);
+            }
+            0x0c => self.protocol = Some(protocol(reader)?),
+            other => return Err(reader.unexpected(CLAUSE, other, "a parameter of a message")),
         }
-        0x02 => Parameter::Sender(sender(reader)?),
-        0x03 => Parameter::Receivers(agent_ids(reader, AgentId::MAX_DEPTH, "receivers")?),
-        0x04 => Parameter::Content(content(reader)?),
-        0x05 => Parameter::ReplyWith(text(reader, "reply-with")?),
-        0x06 => {
-            let time = reader.date_time("FIPA00069 2.3 BinDateTime")?;
-            reader.note(|| notes::date("reply-by:", time));
-            Parameter::ReplyBy(time)
-        }
-        0x07 => Parameter::InReplyTo(text(reader, "in-reply-to")?),
-        0x08 => Parameter::ReplyTo(agent_ids(reader, AgentId::MAX_DEPTH, "reply-to")?),
-        0x09 => Parameter::Language(text(reader, "language")?),
-        0x0a => Parameter::Encoding(text(reader, "encoding")?),
-        0x0b => Parameter::Ontology(text(reader, "ontology")?),
-        0x0c => Parameter::Protocol(protocol(reader)?),
-        0x0d => Parameter::ConversationId(text(reader, "conversation-id")?),
-        other => return Err(reader.unexpected(CLAUSE, other, "a parameter of a message")),
-    })
+        Ok(Step::Parameter)
+    }
 }
 
 fn sender<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<AgentIdView<'a>, DecodeError> {
@@ -273,7 +319,7 @@ fn sender<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<AgentIdView<'a>, D
     Ok(sender)
 }
 
-#[inline]
+#[inline(always)]
 fn text<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     what: &'static str,
@@ -383,20 +429,17 @@ impl<'a, N: Notes> Parser<'a, N> {
             }
             PerformativeView::Other(name)
         } else {
-            let act = Performative::of_code(code);
-            PerformativeView::Standard(act.ok_or_else(|| {
+            if Performative::name_of_code(code).is_empty() {
+                let found = code;
                 let expected = "the code of a performative";
-                wrong(
-                    CLAUSE,
-                    Problem::Unexpected {
-                        found: code,
-                        expected,
-                    },
-                )
-            })?)
+                return Err(wrong(CLAUSE, Problem::Unexpected { found, expected }));
+            }
+            PerformativeView::Standard(code)
         };
-        reader.note(|| match &performative {
-            PerformativeView::Standard(act) => format!("performative: {act}"),
+        reader.note(|| match performative {
+            PerformativeView::Standard(code) => {
+                format!("performative: {}", Performative::name_of_code(code))
+            }
             PerformativeView::Other(name) => {
                 format!("performative: {}, user-defined", notes::plain(name))
             }
@@ -408,61 +451,26 @@ impl<'a, N: Notes> Parser<'a, N> {
         })
     }
 
+    #[inline]
     fn message(mut self) -> Result<MessageView<'a>, DecodeError> {
-        let mut view = MessageView {
-            performative: self.performative.clone(),
-            sender: None,
-            receivers: AgentIds::default(),
-            reply_to: AgentIds::default(),
-            content: None,
-            language: None,
-            encoding: None,
-            ontology: None,
-            protocol: None,
-            conversation_id: None,
-            reply_with: None,
-            in_reply_to: None,
-            reply_by: None,
-            parameters: [&[]; 2],
-            has_user_defined: false,
-        };
+        let mut view = MessageView::empty(self.performative);
         let mut start = self.reader.position();
         loop {
-            let in_front = self.reader.since(start);
-            if let Some(content) = self.content_beside()? {
-                view.parameters[0] = in_front;
-                view.content = Some(ContentView::Beside(content));
-                start = self.reader.position();
-                continue;
+            if self.split.is_some() {
+                let in_front = self.reader.since(start);
+                if let Some(content) = self.content_beside()? {
+                    view.parameters[0] = in_front;
+                    view.content = Some(ContentView::Beside(content));
+                    start = self.reader.position();
+                }
             }
-            match parameter(&mut self.reader)? {
-                Parameter::Sender(sender) => {
-                    view.sender = (sender.name() != UNDEFINED_AGENT).then_some(sender);
-                }
-                Parameter::Receivers(ids) => view.receivers = AgentIds::new(ids),
-                Parameter::Content(content) => {
-                    if let Some(ContentView::Beside(_)) = view.content {
-                        let problem = Problem::Split("there is more content behind the content");
-                        return Err(self.reader.error(CLAUSE, problem));
-                    }
-                    view.content = Some(content);
-                }
-                Parameter::ReplyWith(text) => view.reply_with = Some(text),
-                Parameter::ReplyBy(time) => view.reply_by = Some(time),
-                Parameter::InReplyTo(text) => view.in_reply_to = Some(text),
-                Parameter::ReplyTo(ids) => view.reply_to = AgentIds::new(ids),
-                Parameter::Language(text) => view.language = Some(text),
-                Parameter::Encoding(text) => view.encoding = Some(text),
-                Parameter::Ontology(text) => view.ontology = Some(text),
-                Parameter::Protocol(name) => view.protocol = Some(name),
-                Parameter::ConversationId(text) => view.conversation_id = Some(text),
-                Parameter::UserDefined(..) => view.has_user_defined = true,
-                Parameter::End => {
-                    view.parameters[1] = in_front;
-                    break;
-                }
+            match view.step(&mut self.reader)? {
+                Step::Parameter => {}
+                Step::UserDefined(..) => view.has_user_defined = true,
+                Step::End => break,
             }
         }
+        view.parameters[1] = self.reader.since(start);
         self.end()?;
         Ok(view)
     }

@@ -4,7 +4,7 @@ use bytes::{BufMut, Bytes, BytesMut};
 
 use crate::error::EncodeError;
 use crate::time::{Base, Fields, Time, Zone};
-use crate::word::{self, Piece, is_word};
+use crate::word::{self, Piece, Shape, is_word};
 use crate::{AgentId, Message, Payload};
 
 /// Length of the encoded message in bytes.
@@ -80,6 +80,19 @@ fn head(message: &Message, content_len: usize) -> Bytes {
 pub(crate) trait Out {
     fn byte(&mut self, byte: u8);
     fn slice(&mut self, bytes: &[u8]);
+
+    /// The same as three slices.
+    #[inline]
+    fn framed<const N: usize, const M: usize>(
+        &mut self,
+        before: [u8; N],
+        bytes: &[u8],
+        behind: [u8; M],
+    ) {
+        self.slice(&before);
+        self.slice(bytes);
+        self.slice(&behind);
+    }
 }
 
 struct Counter(usize);
@@ -141,6 +154,30 @@ impl<B: BufMut> Out for Sink<'_, B> {
             None => self.out.put_slice(bytes),
         }
     }
+
+    /// All at once, where there is room.
+    #[inline]
+    fn framed<const N: usize, const M: usize>(
+        &mut self,
+        before: [u8; N],
+        bytes: &[u8],
+        behind: [u8; M],
+    ) {
+        let room = self.collected.get_mut(self.len..).unwrap_or_default();
+        if let Some((first, room)) = room.split_first_chunk_mut::<N>()
+            && let Some((middle, room)) = room.split_at_mut_checked(bytes.len())
+            && let Some((last, _)) = room.split_first_chunk_mut::<M>()
+        {
+            *first = before;
+            middle.copy_from_slice(bytes);
+            *last = behind;
+            self.len += N + bytes.len() + M;
+        } else {
+            self.slice(&before);
+            self.slice(bytes);
+            self.slice(&behind);
+        }
+    }
 }
 
 impl Out for Vec<u8> {
@@ -194,9 +231,15 @@ fn write_head(message: &Message, content_len: Option<usize>, out: &mut impl Out)
 }
 
 fn write_text(code: u8, text: Option<&str>, out: &mut impl Out) {
-    if let Some(text) = text {
-        out.byte(code);
-        write_expression(text, out);
+    let Some(text) = text else { return };
+    let bytes = text.as_bytes();
+    match Shape::of(text) {
+        Shape::Word => out.framed([code, 0x10], bytes, [0x00]),
+        Shape::Quotable => out.framed([code, 0x14, b'"'], bytes, [b'"', 0x00]),
+        Shape::Other => {
+            out.byte(code);
+            write_expression(text, out);
+        }
     }
 }
 
@@ -215,8 +258,7 @@ fn write_agent_ids(agents: &[AgentId], out: &mut impl Out) {
 }
 
 fn write_agent_id(agent: &AgentId, out: &mut impl Out) {
-    out.byte(0x02);
-    write_word(agent.name(), out);
+    out.framed([0x02, 0x10], agent.name().as_bytes(), [0x00]);
     if !agent.addresses().is_empty() {
         out.byte(0x02);
         for address in agent.addresses() {
@@ -236,16 +278,12 @@ fn write_agent_id(agent: &AgentId, out: &mut impl Out) {
 }
 
 fn write_user_defined(name: &str, value: &str, out: &mut impl Out) {
-    out.slice(b"\x10X-");
-    out.slice(name.as_bytes());
-    out.byte(0x00);
+    out.framed(*b"\x10X-", name.as_bytes(), [0x00]);
     write_expression(value, out);
 }
 
 fn write_word(word: &str, out: &mut impl Out) {
-    out.byte(0x10);
-    out.slice(word.as_bytes());
-    out.byte(0x00);
+    out.framed([0x10], word.as_bytes(), [0x00]);
 }
 
 /// A word where it is one, else a string literal. Text is never taken apart into coded numbers and
@@ -311,7 +349,7 @@ pub(crate) fn write_local_date_time(time: Time, out: &mut impl Out) {
     out.byte(0x20);
     write_seconds(time, out);
     let millisecond = time.fields.millisecond;
-    out.slice(&[two_digits(millisecond / 100), two_digits(millisecond)]);
+    out.slice(&[two_digits(millisecond / 100), two_digits(millisecond % 100)]);
 }
 
 /// Year to seconds.
@@ -326,13 +364,15 @@ fn write_seconds(time: Time, out: &mut impl Out) {
         millisecond: _,
     } = time.fields;
     let [month, day, hour, minute, second] = [month, day, hour, minute, second].map(u16::from);
-    let fields = [year / 100, year, month, day, hour, minute, second];
+    let fields = [year / 100, year % 100, month, day, hour, minute, second];
     out.slice(&fields.map(two_digits));
 }
 
-/// The last two digits of a number.
+/// A number below 100.
+#[inline]
 fn two_digits(number: u16) -> u8 {
-    ((number / 10 % 10 + 1) << 4 | (number % 10 + 1)) as u8
+    let (tens, ones) = (number / 10, number % 10);
+    ((tens + 1) << 4 | (ones + 1)) as u8
 }
 
 /// Digits (FIPA00069 2.2) of a number.

@@ -6,7 +6,7 @@
 
 use crate::AgentId;
 use crate::bitefficient::notes::{self, Notes, Silent};
-use crate::bitefficient::reader::{Reader, digit_chars, utf8};
+use crate::bitefficient::reader::{Reader, digit_chars};
 use crate::bitefficient::{Text, without_x};
 use crate::envelope::agent_id::{AgentIdView, agent_id, agent_ids, user_defined_name};
 use crate::error::{DecodeError, Problem};
@@ -392,12 +392,7 @@ pub(super) fn any<'a, N: Notes>(
         0x19 => reader.u32_len(CLAUSE)?,
         other => return Err(reader.unexpected(CLAUSE, other, "a value")),
     };
-    let offset = reader.offset();
-    let bytes = reader.bytes(len, CLAUSE, what)?;
-    if memchr::memchr(0, bytes).is_some() {
-        return Err(DecodeError::new(offset, CLAUSE, Problem::Nul(what)));
-    }
-    utf8(bytes, offset, CLAUSE, what).map(Text::plain)
+    reader.counted(len, CLAUSE, what).map(Text::plain)
 }
 
 #[cold]

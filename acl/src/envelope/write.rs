@@ -158,7 +158,12 @@ impl Writer {
             match self.dialect {
                 // It reads a name here, not the code.
                 Dialect::Jade => {
-                    self.string("acl-representation", representation.as_str())?;
+                    let what = "acl-representation";
+                    if representation.as_str().starts_with(char::is_control) {
+                        let why = "others than JADE would take it for the code of one";
+                        return Err(EncodeError::Unrepresentable { what, why });
+                    }
+                    self.string(what, representation.as_str())?;
                 }
                 _ => self.acl_representation(representation)?,
             }
@@ -334,13 +339,15 @@ impl Writer {
         }
     }
 
-    /// In the standard, bare: only a text that would be taken for a text in another form, or for
-    /// the code (0a) that JADE puts in front of stamps, is put in quotation marks.
+    /// In the standard, bare: only a text that would be taken for a text in another form, for the
+    /// end of a list (01), or for the code (0a) that JADE puts in front of stamps, is put in
+    /// quotation marks.
     fn string(&mut self, what: &'static str, text: &str) -> Result<(), EncodeError> {
         if text.contains('\0') {
             return Err(EncodeError::Nul(what));
         }
-        let bare = string_form(text.as_bytes()).0 == Form::Bare && !text.starts_with('\n');
+        let bare =
+            string_form(text.as_bytes()).0 == Form::Bare && !text.starts_with(['\x01', '\n']);
         match self.dialect {
             Dialect::FipaServices => {
                 self.out.slice(format!("#{}\"", text.len()).as_bytes());

@@ -366,10 +366,23 @@ fn is_glued_keyword<T>(behind_colon: &[u8], keywords: &Keywords<T>) -> bool {
     })
 }
 
+#[inline(always)]
 fn starts_with(bytes: &[u8], name: &str) -> bool {
-    bytes
-        .get(..name.len())
-        .is_some_and(|start| start.eq_ignore_ascii_case(name.as_bytes()))
+    // Most names begin otherwise, which is quickly found out.
+    let (Some(one), Some(other)) = (bytes.first(), name.as_bytes().first()) else {
+        return false;
+    };
+    (one ^ other) & !0x20 == 0 && starts_with_all(bytes, name)
+}
+
+#[inline(never)]
+fn starts_with_all(bytes: &[u8], name: &str) -> bool {
+    let name = name.as_bytes();
+    // Nearly everybody writes small letters.
+    bytes.starts_with(name)
+        || bytes
+            .get(..name.len())
+            .is_some_and(|start| start.eq_ignore_ascii_case(name))
 }
 
 fn is_space(byte: u8) -> bool {

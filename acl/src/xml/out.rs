@@ -147,23 +147,37 @@ impl Out {
     }
 
     fn escaped(&mut self, what: &'static str, text: &str, layout: bool) -> Result<(), EncodeError> {
+        let looked_for = if self.guards_space {
+            MARK | SPACE
+        } else {
+            MARK
+        };
+        let bytes = text.as_bytes();
         let mut plain = 0;
-        // In front of the text there might as well be a space.
-        let mut after_space = true;
-        for (at, character) in text.char_indices() {
-            let condensed = self.guards_space && (after_space || at + 1 == text.len());
-            after_space = character == ' ';
-            let escape = match character {
-                ' ' if condensed => "&#x20;",
-                '<' => "&lt;",
-                '>' => "&gt;",
-                '&' => "&amp;",
-                '"' if layout => "&quot;",
-                '\r' => "&#x0D;",
-                '\n' if layout => "&#x0A;",
-                '\t' if layout => "&#x09;",
-                '\n' | '\t' => continue,
-                '\0'..='\x1f' | '\u{fffe}' | '\u{ffff}' => {
+        let mut from = 0;
+        while let Some(found) = bytes.get(from..).and_then(|rest| {
+            let class = |byte: u8| CLASS.get(usize::from(byte)).copied().unwrap_or_default();
+            rest.iter().position(|byte| class(*byte) & looked_for != 0)
+        }) {
+            let at = from + found;
+            from = at + 1;
+            // In front of the text there might as well be a space.
+            let condensed = || {
+                let before = at.checked_sub(1).and_then(|before| bytes.get(before));
+                before.is_none_or(|byte| *byte == b' ') || from == bytes.len()
+            };
+            let escape = match bytes.get(at..).unwrap_or_default() {
+                [b' ', ..] if condensed() => "&#x20;",
+                [b'<', ..] => "&lt;",
+                [b'>', ..] => "&gt;",
+                [b'&', ..] => "&amp;",
+                [b'"', ..] if layout => "&quot;",
+                [b'\r', ..] => "&#x0D;",
+                [b'\n', ..] if layout => "&#x0A;",
+                [b'\t', ..] if layout => "&#x09;",
+                [b' ' | b'"' | b'\n' | b'\t', ..] => continue,
+                // U+FFFE and U+FFFF.
+                [0..=0x1f, ..] | [0xef, 0xbf, 0xbe | 0xbf, ..] => {
                     return Err(EncodeError::Unrepresentable {
                         what,
                         why: "XML has no way to write its control characters",
@@ -173,9 +187,28 @@ impl Out {
             };
             self.text.push_str(text.get(plain..at).unwrap_or_default());
             self.text.push_str(escape);
-            plain = at + character.len_utf8();
+            plain = from;
         }
         self.text.push_str(text.get(plain..).unwrap_or_default());
         Ok(())
     }
 }
+
+/// Bytes that are escaped or refused, or might be.
+const MARK: u8 = 1;
+const SPACE: u8 = 2;
+
+/// A table, because content may be long.
+static CLASS: [u8; 256] = {
+    let mut class = [0; 256];
+    let mut byte = 0;
+    while byte < class.len() {
+        class[byte] = match byte {
+            0..=0x1f | 0x22 | 0x26 | 0x3c | 0x3e | 0xef => MARK,
+            0x20 => SPACE,
+            _ => 0,
+        };
+        byte += 1;
+    }
+    class
+};

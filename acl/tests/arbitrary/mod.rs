@@ -20,6 +20,7 @@ pub(crate) fn text() -> BoxedStrategy<String> {
         Just("\"quoted\"".to_owned()),
         Just("#3\"abc".to_owned()),
         Just("ends with \\".to_owned()),
+        "[\\x01-\\x20]{1,3}",
     ]
     .boxed()
 }

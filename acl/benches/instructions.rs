@@ -1,0 +1,150 @@
+//! The hot paths, one at a time, to count their instructions under valgrind: `.ci/instructions`.
+//!
+//! The name of a path is the argument; without one, all names are listed. What is to be counted
+//! happens inside of `measured`, once, after everything was made ready.
+
+use std::hint::black_box;
+
+use bytes::{Bytes, BytesMut};
+use fipa_acl::{
+    AclRepresentation, AgentId, Dialect, Envelope, EnvelopeParams, EnvelopeView, Message,
+    MessageView, Payload, Performative, Received, Representation, bitefficient,
+};
+
+const FIPA_SERVICES_LETTER: &[u8] = include_bytes!("../tests/vectors/tcp_letter.bin");
+
+type Path = (&'static str, fn());
+
+const PATHS: &[Path] = &[
+    ("message/view/1B", || view(1)),
+    ("message/view/1KB", || view(1 << 10)),
+    ("message/view/1MB", || view(1 << 20)),
+    ("message/decode/1KB", || {
+        decode(Representation::BitEfficient, 1 << 10);
+    }),
+    ("message/encoded_len", || {
+        let message = message(1);
+        measured(|| bitefficient::encoded_len(black_box(&message)));
+    }),
+    ("message/encode/1B", || encode(1)),
+    ("message/encode/1KB", || encode(1 << 10)),
+    ("message/to_payload", || {
+        let message = message(1 << 20);
+        measured(|| black_box(&message).to_payload());
+    }),
+    ("string/decode/1B", || decode(Representation::String, 1)),
+    ("string/decode/1KB", || {
+        decode(Representation::String, 1 << 10);
+    }),
+    ("xml/decode/1B", || decode(Representation::Xml, 1)),
+    ("xml/decode/1KB", || decode(Representation::Xml, 1 << 10)),
+    ("envelope/view", || {
+        let bytes = envelope().encode_standard().expect("an envelope");
+        measured(|| EnvelopeView::parse(black_box(&bytes)).is_ok());
+    }),
+    ("envelope/view/stamped", || {
+        let mut envelope = envelope();
+        envelope.extensions.push(stamp());
+        let bytes = envelope.encode_standard().expect("an envelope");
+        measured(|| EnvelopeView::parse(black_box(&bytes)).is_ok());
+    }),
+    ("envelope/view/fipa_services", || {
+        measured(|| EnvelopeView::parse(black_box(FIPA_SERVICES_LETTER)).is_ok());
+    }),
+    ("envelope/stamp", || {
+        let stamp = stamp();
+        measured(|| Envelope::encode_extension(black_box(&stamp)).is_ok());
+    }),
+    ("envelope/xml/decode", || {
+        let bytes = envelope().encode(Representation::Xml, Dialect::Standard);
+        let bytes = bytes.expect("an envelope");
+        measured(|| Envelope::decode(black_box(&bytes)).is_ok());
+    }),
+];
+
+#[allow(clippy::print_stdout, reason = "the names are what is asked for")]
+fn main() {
+    // Cargo's own arguments begin with a hyphen.
+    let asked = std::env::args().skip(1).find(|name| !name.starts_with('-'));
+    match asked {
+        None => PATHS.iter().for_each(|(name, _)| println!("{name}")),
+        Some(asked) => {
+            let path = PATHS.iter().find(|(name, _)| *name == asked);
+            let (_, run) = path.unwrap_or_else(|| panic!("there is no path {asked}"));
+            run();
+        }
+    }
+}
+
+/// The instructions of what is given are counted, without those of dropping its result.
+#[inline(never)]
+fn measured<T>(run: impl FnOnce() -> T) -> T {
+    black_box(run())
+}
+
+fn view(content_len: usize) {
+    let bytes = message(content_len).to_payload().to_bytes();
+    measured(|| MessageView::parse(black_box(&bytes)).is_ok());
+}
+
+fn encode(content_len: usize) {
+    let message = message(content_len);
+    let mut out = BytesMut::with_capacity(bitefficient::encoded_len(&message));
+    measured(|| bitefficient::encode(black_box(&message), &mut out));
+    black_box(&out);
+}
+
+fn decode(representation: Representation, content_len: usize) {
+    let bytes = message(content_len).encode(representation, Dialect::Standard);
+    let payload = Payload::from(bytes.expect("a message"));
+    let decoded = measured(|| Message::decode(black_box(&payload)));
+    decoded.expect("a message");
+}
+
+/// The message with all 13 parameters.
+fn message(content_len: usize) -> Message {
+    Message::builder(Performative::Request)
+        .sender(agent("proxy"))
+        .receiver(agent("crex_0"))
+        .reply_to(agent("proxy"))
+        .content(Bytes::from(vec![b'x'; content_len]))
+        .language("test language")
+        .encoding("test encoding")
+        .ontology("test ontology")
+        .protocol("RIMRES")
+        .conversation_id("test conversationID")
+        .reply_with("test reply_with")
+        .in_reply_to("test in_reply_to")
+        .reply_by("20101223T120037980".parse().expect("a time"))
+        .build()
+        .expect("a message")
+}
+
+fn agent(name: &str) -> AgentId {
+    AgentId::new(name).expect("a name")
+}
+
+fn envelope() -> Envelope {
+    let base = EnvelopeParams {
+        to: vec![agent("crex_0")],
+        from: Some(agent("proxy")),
+        acl_representation: Some(AclRepresentation::BitEfficient),
+        payload_length: Some(190),
+        date: Some("20261120T112644998Z".parse().expect("a time")),
+        intended_receivers: vec![agent("crex_0")],
+        ..EnvelopeParams::default()
+    };
+    let extensions = Vec::new();
+    Envelope { base, extensions }
+}
+
+fn stamp() -> EnvelopeParams {
+    let date = "20261120T112644998Z".parse().expect("a time");
+    EnvelopeParams {
+        received: Some(Received {
+            id: Some("4294967296".into()),
+            ..Received::new("sherpa-mts", date)
+        }),
+        ..EnvelopeParams::default()
+    }
+}
