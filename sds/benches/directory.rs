@@ -1,0 +1,114 @@
+//! The service directory with 10,000 entries: looking up, searching, watching, each beside the
+//! standard library's map or the bare channel that it stands on.
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test or bench that cannot go on may panic"
+)]
+
+use std::collections::HashMap;
+use std::hint::black_box;
+use std::sync::Arc;
+
+use criterion::{Criterion, criterion_group, criterion_main};
+use fipa_sds::{
+    Change, Directory, Exchange, MemoryDirectory, MergedDirectory, Mts, Query, Registration,
+    StaticDirectory, resolve,
+};
+use fipa_transport::Incarnation;
+
+const ENTRIES: usize = 10_000;
+
+fn name(number: usize) -> String {
+    format!("robot-{}.arm_{number:05}", number % 20)
+}
+
+fn registration(number: usize) -> Registration {
+    let locations = [
+        "shm://0123456789abcdef#0123456789abcdef",
+        "tcp://10.0.0.2:7788",
+    ];
+    let locations = locations.map(|location| location.parse().unwrap()).to_vec();
+    Registration {
+        agent_type: "gripper".to_owned(),
+        description: "left front".to_owned(),
+        ..Registration::new(name(number), Incarnation::random(), locations)
+    }
+}
+
+/// As a gateway sees it: several back ends, of which one has all the entries.
+fn directory() -> (Arc<MemoryDirectory>, MergedDirectory) {
+    let memory = MemoryDirectory::new(Mts::new("mts", Incarnation::random()));
+    for number in 0..ENTRIES {
+        memory.register(registration(number)).unwrap();
+    }
+    let memory = Arc::new(memory);
+    let gateways = Arc::new(StaticDirectory::new::<&str>([]).unwrap());
+    let told = Exchange::new(1).directory();
+    let back_ends: Vec<Arc<dyn Directory>> = vec![memory.clone(), gateways, told];
+    (memory, MergedDirectory::new(back_ends))
+}
+
+fn looking_up(criterion: &mut Criterion) {
+    let (memory, merged) = directory();
+    let map: HashMap<String, usize> = (0..ENTRIES).map(|number| (name(number), number)).collect();
+    let names: Vec<String> = (0..ENTRIES)
+        .map(|number| name(number * 7 % ENTRIES))
+        .collect();
+    let mut group = criterion.benchmark_group("exact lookup");
+    let mut next = names.iter().cycle();
+    group.bench_function("raw HashMap", |bench| {
+        bench.iter(|| map.get(black_box(next.next().unwrap().as_str())));
+    });
+    group.bench_function("one back end", |bench| {
+        bench.iter(|| memory.lookup(black_box(next.next().unwrap())));
+    });
+    group.bench_function("merged view", |bench| {
+        bench.iter(|| merged.lookup(black_box(next.next().unwrap())));
+    });
+}
+
+fn searching(criterion: &mut Criterion) {
+    let (_, merged) = directory();
+    let pattern = r"robot-7\.arm_.*";
+    let compiled = regex::Regex::new(&format!(r"\A(?:{pattern})\z")).unwrap();
+    let names: Vec<String> = (0..ENTRIES).map(name).collect();
+    let mut group = criterion.benchmark_group("pattern on names");
+    group.bench_function("raw regex over a list", |bench| {
+        bench.iter(|| names.iter().filter(|name| compiled.is_match(name)).count());
+    });
+    group.bench_function("receivers of a multicast", |bench| {
+        bench.iter(|| resolve(&merged, black_box(pattern), "sender").unwrap());
+    });
+    group.bench_function("all entries", |bench| {
+        bench.iter(|| merged.search(&Query::all()).len());
+    });
+}
+
+fn watching(criterion: &mut Criterion) {
+    let (memory, merged) = directory();
+    let mut watch = merged.watch();
+    let (sender, mut raw) = tokio::sync::mpsc::channel(16);
+    let mut agent = registration(ENTRIES);
+    let mut group = criterion.benchmark_group("one change");
+    group.bench_function("raw channel", |bench| {
+        bench.iter(|| {
+            sender.try_send(agent.clone()).unwrap();
+            raw.try_recv().unwrap()
+        });
+    });
+    group.bench_function("registered and told by the merged view", |bench| {
+        let mut number = 0_u64;
+        bench.iter(|| {
+            number += 1;
+            agent.description = number.to_string();
+            memory.register(agent.clone()).unwrap();
+            match watch.try_next() {
+                Some(Change::Joined(entry) | Change::Changed { after: entry, .. }) => entry,
+                other => panic!("{other:?}"),
+            }
+        });
+    });
+}
+
+criterion_group!(benches, looking_up, searching, watching);
+criterion_main!(benches);

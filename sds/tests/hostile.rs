@@ -1,0 +1,193 @@
+//! Records that nobody honest would announce: others are found all the same, and what is kept is
+//! bounded.
+
+// The exception that clippy.toml makes for tests does not reach what they call.
+#![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)]
+
+mod common;
+
+use std::net::{Ipv4Addr, UdpSocket};
+use std::time::Duration;
+
+use common::{eventually, registration};
+use fipa_sds::{Directory, MdnsConfig, MdnsDirectory, Mts};
+use fipa_transport::Incarnation;
+use simple_dns::rdata::{A, PTR, RData, SRV, TXT};
+use simple_dns::{CLASS, CharacterString, Label, Name, Packet, PacketFlag, ResourceRecord};
+
+const SERVICE: [&str; 3] = ["_fipa_service_directory", "_udp", "local"];
+
+/// How many records are announced; `FIPA_FLOOD` says how many else.
+const FLOOD: u32 = 10_000;
+
+struct Attacker {
+    socket: UdpSocket,
+    port: u16,
+}
+
+impl Attacker {
+    fn new(port: u16) -> Self {
+        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        let of_socket = socket2::SockRef::from(&socket);
+        of_socket.set_multicast_if_v4(&Ipv4Addr::LOCALHOST).unwrap();
+        of_socket.set_multicast_ttl_v4(255).unwrap();
+        Self { socket, port }
+    }
+
+    fn send(&self, packet: &[u8]) {
+        let group = (Ipv4Addr::new(224, 0, 0, 251), self.port);
+        self.socket.send_to(packet, group).unwrap();
+    }
+
+    /// A record with these strings, complete with everything that makes it be found.
+    fn announce(&self, label: &[u8], strings: &[&[u8]]) {
+        let service = labels(&[]);
+        let instance = labels(&[label]);
+        let host = Name::new_unchecked("hostile.local");
+        let mut txt = TXT::new();
+        for string in strings {
+            txt.add_char_string(CharacterString::new(string).unwrap());
+        }
+        let mut packet = Packet::new_reply(0);
+        packet.set_flags(PacketFlag::AUTHORITATIVE_ANSWER);
+        let srv = SRV {
+            priority: 0,
+            weight: 0,
+            port: 0,
+            target: host.clone(),
+        };
+        let address = A {
+            address: u32::from(Ipv4Addr::LOCALHOST),
+        };
+        for (name, data) in [
+            (service, RData::PTR(PTR(instance.clone()))),
+            (instance.clone(), RData::SRV(srv)),
+            (instance, RData::TXT(txt)),
+            (host, RData::A(address)),
+        ] {
+            let record = ResourceRecord::new(name, CLASS::IN, 120, data);
+            packet.answers.push(record);
+        }
+        self.send(&packet.build_bytes_vec_compressed().unwrap());
+    }
+}
+
+fn labels<'a>(first: &[&'a [u8]]) -> Name<'a> {
+    let mut labels: Vec<Label<'a>> = first.iter().map(|one| Label::new_unchecked(*one)).collect();
+    labels.extend(SERVICE.map(|label| Label::new_unchecked(label.as_bytes())));
+    Name::new_with_labels(&labels)
+}
+
+fn free_port() -> u16 {
+    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+    socket.local_addr().unwrap().port()
+}
+
+fn open(port: u16, name: &str) -> MdnsDirectory {
+    let config = MdnsConfig {
+        interfaces: vec!["lo".to_owned()],
+        port,
+        ..MdnsConfig::new(Mts::new(name, Incarnation::random()))
+    };
+    MdnsDirectory::open(config).unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn malformed_records_disturb_nobody() {
+    let port = free_port();
+    let (victim, honest) = (open(port, "victim"), open(port, "honest"));
+    honest.register(registration("before")).unwrap();
+    eventually("found before the attack", || victim.lookup("before")).await;
+    let attacker = Attacker::new(port);
+    let long = [b'x'; 250];
+    let endless: Vec<&[u8]> = (0..30).map(|_| &long[..]).collect();
+    attacker.announce(b"endless", &endless);
+    attacker.announce(
+        b"binary",
+        &[
+            b"TYPE=\xff\xfe\x00",
+            b"\x00=\x01",
+            b"",
+            b"=",
+            b"LOCATOR=\xc3\x28;",
+        ],
+    );
+    attacker.announce(b"newline\n", &[b"TYPE=x"]);
+    attacker.announce(b"liar", &[b"fipa-version=1", b"fipa-name=", b"fipa-id=0"]);
+    attacker.announce(b"future", &[b"fipa-version=99"]);
+    // Names that point to themselves and to each other, and lengths that are lies.
+    for packet in [
+        &b"\0\0\x84\0\0\0\0\x01\0\0\0\0\xc0\x0c\0\x10\0\x01\0\0\0\x78\0\0"[..],
+        b"\0\0\x84\0\0\0\0\x02\0\0\0\0\xc0\x0e\xc0\x0c\0\x10\0\x01\0\0\0\x78\0\0",
+        b"\0\0\x84\0\0\0\xff\xff\xff\xff\xff\xff\x01a\0",
+        b"\0\0\x84\0\0\0\0\x01\0\0\0\0\x01a\0\0\x10\0\x01\0\0\0\x78\xff\xff",
+        b"",
+        b"\0",
+        &[0xff; 9000],
+    ] {
+        attacker.send(packet);
+    }
+    // Beacons of a gateway that has a million agents, of nobody, and of the victim itself.
+    for label in ["00000000000000aa", "0000000000000000", "nobody"] {
+        let mut packet = Packet::new_reply(0);
+        let txt = TXT::new().with_string("agents=1000000").unwrap();
+        let txt = txt.with_string("digest=0123456789abcdef").unwrap();
+        let name = format!("{label}._fipa_gateway._udp.local");
+        let name = Name::new_unchecked(&name);
+        packet
+            .answers
+            .push(ResourceRecord::new(name, CLASS::IN, 10, RData::TXT(txt)));
+        attacker.send(&packet.build_bytes_vec_compressed().unwrap());
+    }
+    honest.register(registration("arm")).unwrap();
+    eventually("the honest agent", || victim.lookup("arm")).await;
+    eventually("the liar and the future are refused", || {
+        (victim.status().refused >= 2).then_some(())
+    })
+    .await;
+    let names: Vec<String> = victim
+        .entries()
+        .iter()
+        .map(|entry| entry.name.to_string())
+        .collect();
+    assert!(
+        !names.iter().any(|name| name == "liar" || name == "future"),
+        "{names:?}"
+    );
+    for entry in victim.entries().iter() {
+        assert_eq!(entry.check(), Ok(()));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_flood_of_records_is_bounded_and_others_are_found() {
+    let port = free_port();
+    let (victim, honest) = (open(port, "victim"), open(port, "honest"));
+    honest.register(registration("before")).unwrap();
+    eventually("found before the flood", || victim.lookup("before")).await;
+    let attacker = Attacker::new(port);
+    let before = memory();
+    let flood = std::env::var("FIPA_FLOOD").ok();
+    let flood = flood.map_or(FLOOD, |flood| flood.parse().unwrap());
+    for number in 0..flood {
+        attacker.announce(format!("agent {number}").as_bytes(), &[b"TYPE=x"]);
+        // So that most of it is heard.
+        if number % 50 == 0 {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    }
+    let known = victim.status().known;
+    println!("{known} kept, {} MiB more", (memory() - before) >> 20);
+    assert!(known <= MdnsDirectory::MAX_RECORDS, "{known}");
+    assert!(known > 100, "the flood was not heard at all: {known}");
+    // Who was known stays known, and what is said directly still works.
+    assert!(victim.lookup("before").is_some());
+    assert!(honest.register(registration("after")).is_ok());
+}
+
+/// The memory of this process, in bytes.
+fn memory() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/statm").unwrap();
+    let pages: u64 = status.split(' ').nth(1).unwrap().parse().unwrap();
+    pages * 4096
+}

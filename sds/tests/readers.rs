@@ -1,0 +1,218 @@
+//! What every back end that is only read has to do, whoever fills it: static gateways, those who
+//! have written, what neighbours have told, and the merged view of all. Those that can be written
+//! run the suite in `common` as well.
+
+// The exception that clippy.toml makes for tests does not reach what they call.
+#![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)]
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use fipa_sds::{
+    Change, ContactDirectory, DeregisterError, Directory, Exchange, ExchangeDirectory, Matcher,
+    MemoryDirectory, MergedDirectory, Mts, Query, Reach, RegisterError, Registration, Resolution,
+    Source, StaticDirectory, resolve,
+};
+use fipa_transport::{Incarnation, Location};
+
+const NAMES: [&str; 3] = ["arm_left", "arm_right", "camera"];
+
+fn location(number: u64) -> Location {
+    format!("tcp://10.0.0.{number}:7788#{number:016x}")
+        .parse()
+        .unwrap()
+}
+
+/// A directory that has the agents [`NAMES`], camera at 10.0.0.3, and the others elsewhere.
+fn conforms(directory: &dyn Directory, source: Source) {
+    let entries = directory.entries();
+    let names: Vec<&str> = entries.iter().map(|entry| &*entry.name).collect();
+    assert_eq!(names, NAMES, "by name");
+    assert!(
+        Arc::ptr_eq(&entries, &directory.entries()),
+        "nothing has changed"
+    );
+    for entry in entries.iter() {
+        assert_eq!(entry.source, source);
+        assert!(matches!(entry.reach, Reach::Remote { .. }));
+        assert_eq!(entry.check(), Ok(()));
+        assert_eq!(directory.lookup(&entry.name).as_ref(), Some(entry));
+        assert_eq!(directory.known(&entry.name).as_ref(), Some(entry));
+        if entry.incarnation.is_known() {
+            let found = directory.by_incarnation(entry.incarnation);
+            assert_eq!(found.as_ref(), Some(entry));
+        }
+    }
+    assert_eq!(directory.lookup("arm_"), None);
+    assert_eq!(directory.by_incarnation(Incarnation::UNKNOWN), None);
+    assert_eq!(directory.by_incarnation(Incarnation::from_u64(999)), None);
+
+    let matcher = |text| Some(Matcher::parse(text).unwrap());
+    let none = Query::all;
+    for (query, expected) in [
+        (none(), &NAMES[..]),
+        (
+            Query {
+                name: matcher("arm_.*"),
+                ..none()
+            },
+            &NAMES[..2],
+        ),
+        (
+            Query {
+                name: matcher("camera"),
+                ..none()
+            },
+            &NAMES[2..],
+        ),
+        (
+            Query {
+                location: matcher(r"tcp://10\.0\.0\.3:.*"),
+                ..none()
+            },
+            &NAMES[2..],
+        ),
+        (
+            Query {
+                location: matcher("udp://.*"),
+                ..none()
+            },
+            &[],
+        ),
+        (
+            Query {
+                agent_type: matcher("nothing like it"),
+                ..none()
+            },
+            &[],
+        ),
+        (
+            Query {
+                description: matcher(".+"),
+                name: matcher("arm"),
+                ..none()
+            },
+            &[],
+        ),
+    ] {
+        let found = directory.search(&query);
+        let names: Vec<&str> = found.iter().map(|entry| &*entry.name).collect();
+        assert_eq!(names, expected, "{query:?}");
+    }
+
+    let stranger = Registration::new("stranger", Incarnation::random(), Vec::new());
+    assert!(matches!(
+        directory.register(stranger),
+        Err(RegisterError::ReadOnly)
+    ));
+    assert!(matches!(
+        directory.deregister("camera", Incarnation::random()),
+        Err(DeregisterError::ReadOnly)
+    ));
+}
+
+/// Checks that this is told, in time and in order, of an agent that leaves.
+fn tells_departures(directory: &dyn Directory, leave: impl FnOnce()) {
+    let mut watch = directory.watch();
+    assert_eq!(watch.try_next(), None);
+    let generation = directory.generation();
+    let all = directory.entries().len();
+    leave();
+    assert_ne!(directory.generation(), generation);
+    let mut left = 0;
+    while let Some(change) = watch.try_next() {
+        assert!(matches!(change, Change::Left(_)), "{change:?}");
+        left += 1;
+    }
+    assert!(left > 0);
+    assert_eq!(directory.entries().len(), all - left);
+}
+
+fn contacts() -> (Instant, ContactDirectory) {
+    let (now, contacts) = (Instant::now(), ContactDirectory::new());
+    for (number, name) in (1..).zip(NAMES) {
+        let incarnation = Incarnation::from_u64(number + 100);
+        contacts
+            .heard(now, name, incarnation, location(number))
+            .unwrap();
+    }
+    (now, contacts)
+}
+
+/// Each of the agents is told of by a gateway of its own.
+fn exchange() -> (Instant, Exchange, Arc<ExchangeDirectory>) {
+    let (now, mut exchange) = (Instant::now(), Exchange::new(0));
+    let gateways: Vec<_> = (1..=3)
+        .map(|number| {
+            (
+                Mts::new("mts", Incarnation::from_u64(number)),
+                vec![location(number)],
+            )
+        })
+        .collect();
+    exchange.handle_neighbours(now, &gateways);
+    for (number, name) in (1..).zip(NAMES) {
+        let id = number + 100;
+        let told = format!(
+            r#"{{"version":1,"tell":{{"full":{{"version":1,"first":true,"last":true,
+            "agents":[{{"name":"{name}","id":"{id:016x}","registered":5}}]}}}}}}"#
+        );
+        let from = Incarnation::from_u64(number);
+        exchange.handle_letter(now, from, told.as_bytes()).unwrap();
+    }
+    let directory = exchange.directory();
+    (now, exchange, directory)
+}
+
+#[test]
+fn static_gateways_conform() {
+    let gateways = (1..)
+        .zip(NAMES)
+        .map(|(number, name)| (name, vec![location(number)]));
+    let gateways = StaticDirectory::new(gateways).unwrap();
+    conforms(&gateways, Source::Static);
+    // Nobody means gateways who writes to a pattern.
+    assert_eq!(resolve(&gateways, "arm_.*", "x").unwrap(), Resolution::None);
+}
+
+#[test]
+fn contacts_conform() {
+    let (now, contacts) = contacts();
+    conforms(&contacts, Source::Contact);
+    tells_departures(&contacts, || {
+        contacts.forget(now + ContactDirectory::MEMORY, |_| false)
+    });
+}
+
+#[test]
+fn what_neighbours_tell_conforms() {
+    let (now, mut exchange, directory) = exchange();
+    conforms(&*directory, Source::Exchange);
+    tells_departures(&*directory, || {
+        exchange.handle_neighbours(now, &[]);
+        exchange.handle_timeout(now + Exchange::MEMORY + Duration::from_millis(1));
+    });
+}
+
+#[test]
+fn merged_views_of_them_conform() {
+    let (_, _, told) = exchange();
+    let (now, heard) = contacts();
+    let heard = Arc::new(heard);
+    let nobody = StaticDirectory::new::<&str>([]).unwrap();
+    let view = MergedDirectory::new(vec![Arc::new(nobody), told, heard.clone()]);
+    // Told of is known for longer than heard of; each says where it was learnt.
+    conforms(&view, Source::Exchange);
+    let only_heard = MergedDirectory::new(vec![heard.clone()]);
+    conforms(&only_heard, Source::Contact);
+    tells_departures(&only_heard, || {
+        heard.forget(now + ContactDirectory::MEMORY, |_| false)
+    });
+    // One that can be written makes the view one that can be written.
+    let memory = Arc::new(MemoryDirectory::new(Mts::new("own", Incarnation::random())));
+    let view = MergedDirectory::new(vec![heard, memory.clone()]);
+    let own = Registration::new("own", Incarnation::random(), Vec::new());
+    view.register(own.clone()).unwrap();
+    assert!(memory.lookup("own").is_some());
+    view.deregister("own", own.incarnation).unwrap();
+}
