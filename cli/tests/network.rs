@@ -10,6 +10,7 @@ mod fleet;
 
 use std::time::Duration;
 
+use fipa::Kind;
 use fipa_testbed::{enter, isolated};
 use fleet::{Fleet, Plan};
 
@@ -108,4 +109,46 @@ on_a_network!(a_host_is_cut_off, inside_a_host_is_cut_off, || {
         }
         fleet.network.host(2).plug();
     });
+});
+
+on_a_network!(udp_loses_packets, inside_udp_loses_packets, || {
+    let fleet = Fleet::new(&Plan {
+        transports: &["shm", "udp", "tcp"],
+        ..Plan::default()
+    });
+    for of_a_hundred in [1, 10, 30] {
+        fleet.through(3_500, |fleet| {
+            fleet.lose("udp", of_a_hundred);
+            pause(4000);
+            fleet.lose_nothing();
+        });
+        assert!(fleet.went_by(Kind::Udp), "nothing went by UDP");
+    }
+});
+
+/// Each transport fails while it is the first, and while it is the second.
+fn plugs_are_pulled(transports: &'static [&'static str], first: Kind, second: Kind) {
+    let fleet = Fleet::new(&Plan {
+        transports,
+        ..Plan::default()
+    });
+    fleet.through(3_000, |fleet| {
+        fleet.until_delivered(&[0, 1, 2]);
+        assert!(fleet.went_by(first), "nothing went by {first}");
+        fleet.pull(first.name());
+        fleet.until_delivered(&[0, 1, 2]);
+        assert!(fleet.went_by(second), "nothing went by {second}");
+        fleet.lose_nothing();
+        fleet.pull(second.name());
+        fleet.until_delivered(&[0, 1, 2]);
+        fleet.lose_nothing();
+    });
+}
+
+on_a_network!(udp_then_tcp_fails, inside_udp_then_tcp_fails, || {
+    plugs_are_pulled(&["shm", "udp", "tcp"], Kind::Udp, Kind::Tcp);
+});
+
+on_a_network!(tcp_then_udp_fails, inside_tcp_then_udp_fails, || {
+    plugs_are_pulled(&["shm", "tcp", "udp"], Kind::Tcp, Kind::Udp);
 });

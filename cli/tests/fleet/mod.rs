@@ -16,7 +16,9 @@ use std::task::Poll;
 use std::time::{Duration, Instant};
 
 use fipa::config::Sources;
-use fipa::{Agent, AgentId, Config, Deliveries, Domain, FailureReason, Outcome, Performative};
+use fipa::{
+    Agent, AgentId, Config, Deliveries, Domain, FailureReason, Kind, Outcome, Performative,
+};
 use fipa_testbed::{Host, Network, Running};
 use parking_lot::Mutex;
 use tokio::runtime::Runtime;
@@ -288,7 +290,21 @@ impl Fleet {
         }
     }
 
-    /// Takes back what [`lose`](Self::lose) did.
+    /// Lets nothing of a protocol (`tcp`, `udp`) through between hosts, and says nothing.
+    pub(crate) fn pull(&self, protocol: &str) {
+        for host in self.network.hosts() {
+            filter(host, &format!("iifname eth0 meta l4proto {protocol} drop"));
+        }
+    }
+
+    /// Whether letters of every pair were delivered by this transport.
+    pub(crate) fn went_by(&self, kind: Kind) -> bool {
+        let all = self.accounts.pairs.lock();
+        let went = |account: &Account| account.outcomes.values().any(|it| it.via() == Some(kind));
+        all.values().all(went)
+    }
+
+    /// Takes back what [`lose`](Self::lose) and [`pull`](Self::pull) did.
     pub(crate) fn lose_nothing(&self) {
         for host in self.network.hosts() {
             nft(host, "flush ruleset");
