@@ -27,6 +27,7 @@
 //! * [`config`] is what the owner of a robot chooses, in one TOML file.
 //! * [`blocking`] is for processes without an async runtime.
 //! * [`routes`] tells which way letters would go now, and why.
+//! * [`doctor`] says what is wrong with a machine.
 //! * [`Gateway`] (feature `net`) is what `fipa up` runs; robot processes do not need it.
 //!
 //! What must not live here: delivery (that is `fipa-mts`), transports, terminals.
@@ -37,6 +38,7 @@ compile_error!("fipa needs a transport: enable the feature \"shm\" or \"net\"");
 mod agent;
 pub mod blocking;
 pub mod config;
+pub mod doctor;
 mod domain;
 #[cfg(feature = "net")]
 mod gateway;

@@ -52,14 +52,7 @@ impl Place {
     /// The place of this domain; the directories of all domains are in `base`, or where the
     /// environment says.
     pub(crate) fn prepare(domain: &str) -> Result<Self, PlaceError> {
-        let base = match std::env::var_os(VARIABLE).filter(|value| !value.is_empty()) {
-            Some(base) => PathBuf::from(base),
-            None => PathBuf::from(format!("/tmp/fipa-{}", rustix::process::geteuid().as_raw())),
-        };
-        let place = Self {
-            base,
-            domain: domain.to_owned(),
-        };
+        let place = Self::of(domain);
         let made = || make_private(&place.base).and_then(|()| make_private(&place.path()));
         let mut result = made();
         for _ in 0..RETRIES {
@@ -72,6 +65,33 @@ impl Place {
             }
         }
         result.map(|()| place)
+    }
+
+    /// The place of this domain, whether it is there or not.
+    pub(crate) fn of(domain: &str) -> Self {
+        let base = match std::env::var_os(VARIABLE).filter(|value| !value.is_empty()) {
+            Some(base) => PathBuf::from(base),
+            None => PathBuf::from(format!("/tmp/fipa-{}", rustix::process::geteuid().as_raw())),
+        };
+        Self {
+            base,
+            domain: domain.to_owned(),
+        }
+    }
+
+    /// Whether it is there; as private as it has to be, as far as it is.
+    #[cfg_attr(not(feature = "shm"), expect(dead_code, reason = "nobody asks"))]
+    pub(crate) fn look(&self) -> Result<bool, PlaceError> {
+        for path in [&self.base, &self.path()] {
+            match check_private(path) {
+                Ok(()) => {}
+                Err(PlaceError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
+                    return Ok(false);
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(true)
     }
 
     /// The domain's directory.
@@ -141,9 +161,16 @@ fn make_private(path: &Path) -> Result<(), PlaceError> {
         source,
     };
     match DirBuilder::new().mode(0o700).create(path) {
-        Err(error) if error.kind() != io::ErrorKind::AlreadyExists => return Err(io_error(error)),
-        _ => {}
+        Err(error) if error.kind() != io::ErrorKind::AlreadyExists => Err(io_error(error)),
+        _ => check_private(path),
     }
+}
+
+fn check_private(path: &Path) -> Result<(), PlaceError> {
+    let io_error = |source| PlaceError::Io {
+        path: path.to_owned(),
+        source,
+    };
     let metadata = fs::symlink_metadata(path).map_err(io_error)?;
     let problem = if metadata.is_symlink() {
         "it is a symbolic link".to_owned()

@@ -59,7 +59,15 @@ impl Service {
         let (place, host) = enter(&config.domain, &own, role.gateway)?;
         let view = (role.view)(Arc::clone(&host), &own).inspect_err(|_| place.leave())?;
         let mut refused = Vec::new();
-        let transports = transports(config, &role, &place, incarnation, &handle, &mut refused);
+        let transports = transports(
+            config,
+            &role,
+            &place,
+            &host,
+            incarnation,
+            &handle,
+            &mut refused,
+        );
         let Started {
             mts,
             locations,
@@ -213,6 +221,11 @@ fn transports(
     )]
     role: &Role<'_>,
     place: &Place,
+    #[cfg_attr(
+        not(feature = "shm"),
+        expect(unused_variables, reason = "there is no shared memory")
+    )]
+    host: &HostDirectory,
     incarnation: Incarnation,
     handle: &Handle,
     refused: &mut Vec<(Kind, String)>,
@@ -221,7 +234,7 @@ fn transports(
     for kind in &config.mts.transports {
         let made = match kind {
             #[cfg(feature = "shm")]
-            Kind::Shm => shm(config, place, incarnation, handle),
+            Kind::Shm => shm(config, place, host, incarnation, handle),
             #[cfg(feature = "net")]
             Kind::Tcp => tcp(config, role, place, incarnation, handle),
             #[cfg(feature = "net")]
@@ -244,6 +257,7 @@ fn transports(
 fn shm(
     config: &Config,
     place: &Place,
+    host: &HostDirectory,
     incarnation: Incarnation,
     handle: &Handle,
 ) -> Result<Arc<dyn Transport>, String> {
@@ -255,7 +269,18 @@ fn shm(
         ..ShmConfig::new(place.part("shm"), place.prefix(), incarnation)
     };
     let transport = ShmTransport::new(config, handle.clone()).map_err(|error| error.to_string())?;
-    Ok(Arc::new(transport))
+    let transport = Arc::new(transport);
+    let (mut departures, there) = (host.departures(), Arc::downgrade(&transport));
+    // The directory notices the end of every process, the transport only of those it talks to.
+    handle.spawn(async move {
+        while departures.next().await {
+            match there.upgrade() {
+                Some(transport) => transport.tidy(),
+                None => return,
+            }
+        }
+    });
+    Ok(transport)
 }
 
 #[cfg(feature = "net")]

@@ -5,6 +5,7 @@ mod bench;
 mod config;
 mod decode;
 mod demo;
+mod doctor;
 mod echo;
 mod encode;
 mod routes;
@@ -25,6 +26,7 @@ pub(crate) enum Command {
     Echo(echo::Arguments),
     Routes(routes::Arguments),
     Demo(demo::Arguments),
+    Doctor(doctor::Arguments),
     Bench(bench::Arguments),
     Decode(decode::Arguments),
     Encode(encode::Arguments),
@@ -40,6 +42,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Echo(arguments) => echo::run(arguments, global),
         Command::Routes(arguments) => routes::run(arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),
+        Command::Doctor(arguments) => doctor::run(arguments, global),
         Command::Bench(arguments) => bench::run(arguments, global),
         Command::Decode(arguments) => decode::run(arguments, global),
         Command::Encode(arguments) => encode::run(arguments, global),

@@ -272,6 +272,28 @@ async fn a_name_is_free_before_anybody_has_noticed_the_death() {
 }
 
 #[tokio::test]
+async fn the_end_of_every_process_is_told() {
+    let (_parent, dir) = place();
+    let here = open(&dir);
+    let mut departures = here.departures();
+    let told = async |departures: &mut fipa_sds::Departures| {
+        let watchdog = std::time::Duration::from_secs(60);
+        tokio::time::timeout(watchdog, departures.next())
+            .await
+            .unwrap()
+    };
+    // Neither has registered anything.
+    let mut killed = Process::start(&dir);
+    killed.kill();
+    assert!(told(&mut departures).await);
+    let mut leaves = Process::start(&dir);
+    assert_eq!(leaves.ask("close"), "ok");
+    assert!(told(&mut departures).await);
+    drop(here);
+    while told(&mut departures).await {}
+}
+
+#[tokio::test]
 async fn the_last_one_cleans_up_after_the_killed() {
     let (_parent, dir) = place();
     let mut victims = [Process::start(&dir), Process::start(&dir)];

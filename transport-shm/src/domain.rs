@@ -5,9 +5,10 @@
 //! never lets go of memory for requests that it finds in the mailbox after their sender has been
 //! cleaned up. So whoever cleans up first rings all bells, then waits for [`GRACE`].
 
+use std::collections::HashSet;
 use std::os::fd::OwnedFd;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
@@ -15,7 +16,7 @@ use fipa_transport::Incarnation;
 use iceoryx2::node::{Node, NodeState, NodeView};
 use iceoryx2::prelude::{CallbackProgression, Config};
 use parking_lot::Mutex;
-use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, open, stat};
+use rustix::fs::{FlockOperation, Mode, OFlags, fchmod, flock, fstat, open, stat};
 
 use crate::layout::Svc;
 use crate::memory::SHM;
@@ -156,11 +157,72 @@ impl Domain {
             .map_err(|e| file_error("cannot lock", root, e))
     }
 
+    /// Closes to others what iceoryx2 0.10 leaves open to everybody. To be called under the lock,
+    /// after making a node.
+    pub(crate) fn close_to_others(&self) -> Result<(), ShmError> {
+        for file in files_in(Path::new(SHM)) {
+            let name = file.file_name();
+            let name = name.to_string_lossy();
+            if !name.starts_with(&self.prefix()) || !name.ends_with(".global_mgmt") {
+                continue;
+            }
+            let path = file.path();
+            // Opened first: in a directory where everybody may write, a name proves nothing.
+            let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
+            let closed = open(&path, flags, Mode::empty()).and_then(|file| {
+                let found = fstat(&file)?;
+                if found.st_mode & 0o077 == 0 {
+                    return Ok(());
+                }
+                fchmod(&file, Mode::RUSR | Mode::WUSR)
+            });
+            closed.map_err(|e| file_error("cannot close to other users", &path, e))?;
+        }
+        Ok(())
+    }
+
     /// Rings at every process, and says how many are there.
     pub(crate) fn ring_all(&self) -> Result<usize, ShmError> {
         let all = self.all()?;
         let alive = all.into_iter().filter(|one| self.names.is_alive(*one));
         Ok(alive.map(|one| self.names.ring_once(one)).count())
+    }
+
+    /// How many processes are there, and how many have left traces, at least.
+    pub(crate) fn count(&self) -> Result<(usize, usize), ShmError> {
+        let all = self.all()?;
+        let known = all.len();
+        let alive = all.into_iter().filter(|one| self.names.is_alive(*one));
+        let alive = alive.count();
+        Ok((
+            alive,
+            (known - alive).max(self.made().saturating_sub(alive)),
+        ))
+    }
+
+    /// How many nodes or services there are, of which a living process has one each.
+    fn made(&self) -> usize {
+        let nodes = files_in(&self.config.root.join("nodes"));
+        let nodes = nodes.filter(|node| node.file_type().is_ok_and(|kind| kind.is_dir()));
+        nodes.count().max(files_in(&self.services()).count())
+    }
+
+    /// How long this process leaves it to others to clean up after the dead: the longer, the more
+    /// of the living come before it.
+    pub(crate) fn turn(&self, own: Incarnation) -> Duration {
+        let all = self.all().unwrap_or_default();
+        let before = all
+            .into_iter()
+            .take_while(|one| *one < own)
+            .filter(|one| self.names.is_alive(*one));
+        TURN.saturating_mul(u32::try_from(before.count()).unwrap_or(u32::MAX))
+            .min(PATIENCE)
+    }
+
+    /// Whether there are traces of dead processes, as far as can be told without the lock. Errors
+    /// count as such, which `clean` will meet again.
+    pub(crate) fn has_dead(&self) -> bool {
+        !self.count().is_ok_and(|(_, dead)| dead == 0)
     }
 
     fn all(&self) -> Result<Vec<Incarnation>, ShmError> {
@@ -193,6 +255,8 @@ impl Domain {
             return Ok(cleaned);
         }
         self.remove_empty(&nodes);
+        self.remove_halves(&nodes);
+        self.remove_untagged();
         // Who starts must not wait for what follows: iceoryx2 waits in vain, and for long, for
         // whatever a dead process was making when it was killed.
         drop(lock);
@@ -200,6 +264,7 @@ impl Domain {
             return Ok(cleaned);
         }
         let mut nameless = Vec::new();
+        let dead = nodes.iter().filter(|node| is_dead(node)).count();
         for node in nodes {
             if self.closing.load(Ordering::SeqCst) {
                 break;
@@ -225,6 +290,10 @@ impl Domain {
                     self.remove_node(&dead.id().value().to_string());
                 }
             }
+        }
+        if dead > 0 {
+            // Only who looks into its mailbox lets go of its side of connections with the dead.
+            self.ring_all()?;
         }
         Ok(cleaned)
     }
@@ -254,8 +323,7 @@ impl Domain {
                 continue;
             };
             let directory = self.config.root.join("nodes");
-            let files = std::fs::read_dir(directory.join(dead.id().value().to_string()));
-            for file in files.into_iter().flatten().flatten() {
+            for file in files_in(&directory.join(dead.id().value().to_string())) {
                 let name = file.file_name();
                 let name = name.to_string_lossy();
                 let port = name.strip_prefix(&prefix);
@@ -263,7 +331,7 @@ impl Domain {
                 ports.extend(port.map(str::to_owned));
             }
         }
-        for file in std::fs::read_dir(SHM).into_iter().flatten().flatten() {
+        for file in files_in(Path::new(SHM)) {
             let name = file.file_name();
             let name = name.to_string_lossy();
             let is_empty = || file.metadata().is_ok_and(|metadata| metadata.len() == 0);
@@ -278,7 +346,58 @@ impl Domain {
         }
     }
 
-    /// Removes a node of which iceoryx2 has lost the details.
+    /// Removes the nodes whose process was killed while it was making them, or while it removed
+    /// its own: iceoryx2 takes them for nodes that are about to be there, or that make no sense.
+    /// To be called under the lock, under which nobody makes a node; who removes one does not
+    /// mind help.
+    fn remove_halves(&self, nodes: &[NodeState<Svc>]) {
+        let whole: HashSet<String> = nodes
+            .iter()
+            .filter_map(|node| match node {
+                NodeState::Alive(node) => Some(node.id().value().to_string()),
+                NodeState::Dead(node) => Some(node.id().value().to_string()),
+                _ => None,
+            })
+            .collect();
+        let prefix = self.prefix();
+        for file in files_in(&self.config.root.join("nodes")) {
+            let name = file.file_name();
+            let name = name.to_string_lossy();
+            // A directory is named by the number alone, the files that say who lives by prefix,
+            // number and an ending.
+            let id = name.strip_prefix(&prefix).unwrap_or(&name);
+            let id = id.split('.').next().unwrap_or_default();
+            if !id.is_empty() && id.bytes().all(|b| b.is_ascii_digit()) && !whole.contains(id) {
+                self.remove_node(id);
+            }
+        }
+    }
+
+    /// Removes the services that no node says it uses: what a process leaves that is killed
+    /// between making a service and saying so, or while it removes one. To be called under the
+    /// lock, under which nobody makes a service.
+    fn remove_untagged(&self) {
+        let stem = |file: &std::fs::DirEntry, end: &str| {
+            let name = file.file_name();
+            let name = name.to_str()?.strip_prefix(&self.prefix())?;
+            name.strip_suffix(end).map(str::to_owned)
+        };
+        let nodes = files_in(&self.config.root.join("nodes"));
+        let tags = nodes.flat_map(|node| files_in(&node.path()));
+        let used: HashSet<String> = tags.filter_map(|tag| stem(&tag, ".service_tag")).collect();
+        for file in files_in(&self.services()) {
+            if stem(&file, ".service").is_some_and(|service| !used.contains(&service)) {
+                // Met again next time if it fails.
+                let _ = std::fs::remove_file(file.path());
+            }
+        }
+    }
+
+    fn services(&self) -> PathBuf {
+        self.config.root.join("services")
+    }
+
+    /// Removes what is in the file system of a node.
     fn remove_node(&self, id: &str) {
         let nodes = self.config.root.join("nodes");
         let name = format!("{}{id}.", self.prefix());
@@ -295,11 +414,7 @@ impl Domain {
         remove_files(Path::new(SHM), &prefix);
         for directory in ["nodes", "services", "processes"] {
             let directory = self.config.root.join(directory);
-            for node in std::fs::read_dir(&directory)
-                .into_iter()
-                .flatten()
-                .flatten()
-            {
+            for node in files_in(&directory) {
                 remove_files(&node.path(), &prefix);
                 // Fails when it is a file, or has files of another prefix.
                 let _ = std::fs::remove_dir(node.path());
@@ -314,15 +429,24 @@ impl Domain {
     }
 }
 
+/// How much longer the next one waits before it cleans up.
+const TURN: Duration = Duration::from_millis(20);
+
 /// How often an endpoint tries to enter a domain whose directory others are removing.
 const ENTERING: u32 = 20;
 
 /// How long to wait for somebody else who is removing the traces of the same process.
 const PATIENCE: Duration = Duration::from_secs(1);
 
+/// What is in a directory, as far as it can be read.
+pub(crate) fn files_in(directory: &Path) -> impl Iterator<Item = std::fs::DirEntry> + use<> {
+    let files = std::fs::read_dir(directory);
+    files.into_iter().flatten().flatten()
+}
+
 /// Removes the files with this prefix. What cannot be removed is met again next time.
 fn remove_files(directory: &Path, prefix: &str) {
-    for file in std::fs::read_dir(directory).into_iter().flatten().flatten() {
+    for file in files_in(directory) {
         if file.file_name().to_string_lossy().starts_with(prefix) {
             let _ = std::fs::remove_file(file.path());
         }
@@ -336,6 +460,8 @@ impl Drop for Domain {
         if self.member && self.config.root.exists() {
             // Nobody to report to; what cannot be removed is removed by the next who starts.
             let _ = self.clean(true);
+            // Those who are still there let go of what connected them with this process.
+            let _ = self.ring_all();
         }
     }
 }

@@ -91,6 +91,7 @@ impl Endpoint {
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<Svc>()
             .map_err(|e| failed("cannot make a node", format!("{e:?}")))?;
+        domain.close_to_others()?;
         let inbox = Inbox::create(&config, &node, bell.clone(), tally.clone(), domain.clone())
             .map_err(|reason| failed("cannot make the mailbox", reason))?;
         Ok(Arc::new(Self {
@@ -440,16 +441,28 @@ impl Endpoint {
                     return;
                 };
                 let seen = now.dirty.load(Ordering::SeqCst);
-                let rung = now.domain.ring_all();
+                let turn = now.domain.turn(now.config.incarnation);
                 drop(now);
-                if rung.is_ok_and(|alive| alive > 0) {
+                // One after the other: mostly, the first one does it for all.
+                std::thread::sleep(turn);
+                let Some(now) = endpoint.upgrade().filter(|now| !now.is_closed()) else {
+                    return;
+                };
+                let alive = match now.domain.has_dead() {
+                    true => now.domain.ring_all().unwrap_or(0),
+                    false => 0,
+                };
+                drop(now);
+                if alive > 0 {
                     std::thread::sleep(GRACE);
                 }
                 let Some(now) = endpoint.upgrade().filter(|now| !now.is_closed()) else {
                     return;
                 };
                 // What fails is tried again at the next occasion, by this process or another.
-                let _ = now.domain.clean(false);
+                if alive > 0 {
+                    let _ = now.domain.clean(false);
+                }
                 now.cleaning.store(false, Ordering::SeqCst);
                 let more = now.dirty.load(Ordering::SeqCst) != seen;
                 if !more || now.cleaning.swap(true, Ordering::SeqCst) {

@@ -6,7 +6,7 @@
 //!
 //! * [`ShmTransport`] is the transport, [`ShmConfig`] what it needs to know.
 //! * [`cleanup_dead`] removes what killed processes left behind; every process does so by itself,
-//!   and tools may.
+//!   and tools may. [`inspect`] only looks.
 //! * [`ShmCounters`] says what happened: what was copied, and why.
 //!
 //! Inside: `layout` is what lies in shared memory, `inbox` the receiving and `outbox` the sending
@@ -29,6 +29,7 @@ mod counters;
 mod domain;
 mod endpoint;
 mod inbox;
+mod inspect;
 mod layout;
 mod loan;
 mod memory;
@@ -42,4 +43,5 @@ mod transport;
 pub use config::{ShmConfig, ShmError};
 pub use counters::ShmCounters;
 pub use domain::{Cleaned, cleanup_dead};
+pub use inspect::{Inspection, inspect};
 pub use transport::ShmTransport;

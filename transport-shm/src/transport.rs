@@ -4,8 +4,8 @@ use std::fmt;
 use std::sync::{Arc, Weak};
 
 use fipa_transport::{
-    Answer, AttemptId, Body, Incarnation, Kind, ListenError, LoanedContent, Location, Parcel, Sink,
-    Ticket, Transport, WayError, WayFault,
+    Answer, AttemptId, Body, Kind, ListenError, LoanedContent, Location, Parcel, Sink, Ticket,
+    Transport, WayError, WayFault,
 };
 use parking_lot::Mutex;
 use tokio::io::unix::AsyncFd;
@@ -61,10 +61,11 @@ impl ShmTransport {
         self.endpoint.tally().read()
     }
 
-    /// Somebody knows that a process has ended. What waits for it is concluded, and its traces
-    /// are removed. Need not be called for processes that this one talks to: the kernel tells.
-    pub fn peer_gone(&self, incarnation: Incarnation) {
-        self.endpoint.peer_ended(incarnation);
+    /// Processes of this domain may have ended: removes what dead ones have left, if there is
+    /// anything, in the background. Need not be called for processes that this one talks to,
+    /// whose end the kernel tells.
+    pub fn tidy(&self) {
+        self.endpoint.clean_soon();
     }
 }
 

@@ -112,6 +112,12 @@ impl HostDirectory {
         self.shared.publish(published.into_values().collect())
     }
 
+    /// Tells from now on when processes of this host have ended, in order or not.
+    #[must_use]
+    pub fn departures(&self) -> Departures {
+        Departures(self.shared.departures())
+    }
+
     /// Leaves the directory, with everything that was registered. The last process leaves it
     /// empty. Dropping does the same and can only log what goes wrong.
     ///
@@ -120,6 +126,18 @@ impl HostDirectory {
     pub fn close(&self) -> Result<(), HostError> {
         self.task.abort();
         self.shared.close()
+    }
+}
+
+/// The ends of processes of this host.
+#[derive(Debug)]
+pub struct Departures(tokio::sync::watch::Receiver<u64>);
+
+impl Departures {
+    /// Waits until some process has ended since the last time. False when the directory itself
+    /// has been left, and nothing more will be told.
+    pub async fn next(&mut self) -> bool {
+        self.0.changed().await.is_ok()
     }
 }
 

@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use parking_lot::Mutex;
+use tokio::sync::watch;
 
 use super::HostError;
 use super::file::{self, Entries, FileError};
@@ -21,6 +22,8 @@ pub(super) struct Shared {
     mts: Mts,
     own: Mutex<Own>,
     others: Mutex<Others>,
+    /// Counts processes that have ended.
+    ended: watch::Sender<u64>,
 }
 
 /// What this process tells the others.
@@ -54,7 +57,17 @@ impl Shared {
             mts,
             own: Mutex::default(),
             others: Mutex::default(),
+            ended: watch::Sender::default(),
         }
+    }
+
+    pub(super) fn departures(&self) -> watch::Receiver<u64> {
+        self.ended.subscribe()
+    }
+
+    /// Says that processes have ended.
+    pub(super) fn say_ended(&self) {
+        self.ended.send_modify(|count| *count += 1);
     }
 
     /// Reads what others have written, if anybody has since the last time: one system call when
@@ -80,6 +93,8 @@ impl Shared {
                 self.forget(&mut others, id);
             }
         }
+        // Among those of whom nothing was heard there may be some who have ended.
+        self.say_ended();
         self.scan(&mut others)
     }
 

@@ -187,6 +187,9 @@ impl Ending {
             let Some(end) = self.processes.get_mut(&id) else {
                 continue;
             };
+            if done {
+                shared.say_ended();
+            }
             if done || end.pause > Self::LAST_PAUSE {
                 self.processes.remove(&id);
             } else {

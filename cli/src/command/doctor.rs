@@ -1,0 +1,87 @@
+//! `fipa doctor`: what is wrong with this machine.
+
+use clap::Args;
+use comfy_table::{Table, presets};
+use fipa::doctor::{Check, Verdict, examine};
+use serde_json::json;
+
+use crate::options::Global;
+use crate::output;
+use crate::report::Failure;
+
+/// Examine what is wrong with this machine
+///
+/// Looks at what the configured transports need: the size of /dev/shm, limits, permissions, what
+/// dead processes have left. Changes nothing.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  fipa doctor
+  fipa doctor --set transport.shm.capacity=1GiB
+  fipa doctor --json | jq -r '.checks[] | select(.verdict != \"fine\") | .advice'
+
+Verdicts:
+  fine      as it should be
+  doubtful  works, and may fail under load, or later
+  bad       does not work; the exit code is 1 then
+
+JSON:
+  { \"verdict\": the worst of all,
+    \"checks\": [ { \"area\", \"check\", \"verdict\", \"found\", \"advice\": when it is not fine } ] }")]
+pub(crate) struct Arguments {
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
+    let checks = examine(&global.config()?);
+    let worst = checks.iter().map(|check| check.verdict).max();
+    let worst = worst.unwrap_or(Verdict::Fine);
+    if arguments.json {
+        output::json(&json!({ "verdict": worst, "checks": checks }))?;
+    } else {
+        output::text(&table(&checks))?;
+    }
+    if worst < Verdict::Bad {
+        return Ok(());
+    }
+    let bad = checks.iter().filter(|check| check.verdict == Verdict::Bad);
+    let bad: Vec<String> = bad
+        .map(|check| format!("{}: {}", check.area, check.check))
+        .collect();
+    Err(Failure::failed(
+        "something does not work here",
+        bad.join(", "),
+        "what the table says",
+    ))
+}
+
+fn table(checks: &[Check]) -> String {
+    if checks.is_empty() {
+        return "nothing that is configured needs anything of this machine\n".to_owned();
+    }
+    let mut table = Table::new();
+    table
+        .load_style(presets::NOTHING)
+        .set_header(["VERDICT", "AREA", "CHECK", "FOUND"]);
+    for column in table.column_iter_mut() {
+        column.set_padding((0, 2));
+    }
+    for check in checks {
+        let mut found = check.found.clone();
+        if let Some(advice) = &check.advice {
+            found = format!("{found}\n-> {advice}");
+        }
+        table.add_row([word(check.verdict), check.area, check.check, &found]);
+    }
+    format!("{}\n", table.trim_fmt())
+}
+
+fn word(verdict: Verdict) -> &'static str {
+    match verdict {
+        Verdict::Fine => "fine",
+        Verdict::Doubtful => "doubtful",
+        _ => "bad",
+    }
+}

@@ -1,0 +1,90 @@
+//! `fipa doctor`, as a shell runs it.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+
+mod common;
+
+use std::fs::{Permissions, set_permissions};
+use std::os::unix::fs::PermissionsExt;
+
+use common::Host;
+use serde_json::Value;
+
+/// The verdict and the finding of a check.
+fn check<'a>(report: &'a Value, name: &str) -> (&'a str, &'a str) {
+    let checks = report["checks"].as_array().unwrap();
+    let check = checks.iter().find(|check| check["check"] == name).unwrap();
+    (
+        check["verdict"].as_str().unwrap(),
+        check["found"].as_str().unwrap(),
+    )
+}
+
+#[test]
+fn a_machine_in_order_is_found_so_and_left_so() {
+    let host = Host::new();
+    let small = [
+        "doctor",
+        "--json",
+        "--set",
+        "transport.shm.capacity=2MiB",
+        "--set",
+        "transport.shm.max_letter=1MiB",
+    ];
+    let report = host.run(&small).done_json();
+    for name in [
+        "directory of the domain",
+        "size of /dev/shm",
+        "traces of the dead",
+        "permissions in /dev/shm",
+    ] {
+        assert_eq!(check(&report, name).0, "fine", "{report}");
+    }
+    assert!(host.left_behind().is_empty());
+    let table = host.run(&["doctor"]).done();
+    assert!(table.starts_with("VERDICT"), "{table}");
+    assert!(table.contains("limit of open files"), "{table}");
+    let none = host.run(&["doctor", "--set", "mts.transports=tcp"]).done();
+    assert!(!none.contains("/dev/shm"), "{none}");
+}
+
+#[test]
+fn what_a_killed_process_left_is_found_until_somebody_comes() {
+    let host = Host::new();
+    let parrot = host.echo("parrot");
+    let living = host.run(&["doctor", "--json"]).done_json();
+    assert!(
+        check(&living, "traces of the dead")
+            .1
+            .starts_with("1 processes are there, 0 have")
+    );
+    assert_eq!(
+        check(&living, "permissions in /dev/shm").0,
+        "fine",
+        "{living}"
+    );
+    parrot.signal("-KILL");
+    let dead = host.run(&["doctor", "--json"]).done_json();
+    let (verdict, found) = check(&dead, "traces of the dead");
+    assert_eq!(verdict, "doubtful", "{found}");
+    assert!(
+        found.starts_with("0 processes are there, 1 have died"),
+        "{found}"
+    );
+    host.run(&["agents"]).done();
+    let after = host.run(&["doctor", "--json"]).done_json();
+    assert_eq!(check(&after, "traces of the dead").0, "fine");
+}
+
+#[test]
+fn a_directory_that_others_may_enter_is_bad() {
+    let host = Host::new();
+    let _parrot = host.echo("parrot");
+    let domain = host.path("run").join(&host.domain);
+    set_permissions(&domain, Permissions::from_mode(0o755)).unwrap();
+    let (report, complaint) = host.run(&["doctor", "--json"]).failed_json();
+    assert_eq!(report["verdict"], "bad");
+    assert_eq!(check(&report, "directory of the domain").0, "bad");
+    assert!(complaint.contains("directory of the domain"), "{complaint}");
+    set_permissions(&domain, Permissions::from_mode(0o700)).unwrap();
+}

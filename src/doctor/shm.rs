@@ -1,0 +1,259 @@
+//! What shared memory needs.
+
+use std::path::Path;
+
+use bytesize::ByteSize;
+use fipa_transport::Incarnation;
+use fipa_transport_shm::{Inspection, ShmConfig, inspect};
+use rustix::process::{Resource, geteuid, getrlimit};
+
+use super::{Area, Check, Verdict};
+use crate::Config;
+use crate::place::Place;
+
+const AREA: Area = Area("shared memory");
+
+/// What a process needs of descriptors: some of its own, and some per process it talks to.
+const OWN_DESCRIPTORS: u64 = 40;
+const DESCRIPTORS_PER_PEER: u64 = 10;
+
+/// With fewer processes to talk to than this, the limit of descriptors is doubtful.
+const FEW_PEERS: u64 = 32;
+
+/// With fewer inotify instances than this (one per process), their number is doubtful.
+const FEW_INSTANCES: u64 = 64;
+
+/// User identifiers from here on are of people, whose shared memory systemd may remove.
+const FIRST_PERSON: u32 = 1000;
+
+pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
+    let place = Place::of(&config.domain);
+    checks.push(directory(&place));
+    let settings = ShmConfig {
+        capacity: config.transport.shm.capacity,
+        ..ShmConfig::new(place.part("shm"), place.prefix(), Incarnation::random())
+    };
+    match inspect(&settings) {
+        Ok(found) => {
+            checks.push(size(&found, config.transport.shm.capacity));
+            checks.push(traces(&found));
+            checks.push(exposed(&found));
+        }
+        Err(error) => checks.push(AREA.wrong(
+            "/dev/shm",
+            Verdict::Bad,
+            error.to_string(),
+            "mount it (mount -t tmpfs tmpfs /dev/shm), or take shm out of mts.transports",
+        )),
+    }
+    checks.push(descriptors());
+    checks.extend(instances());
+    checks.extend(remove_ipc(Path::new("/"), geteuid().as_raw()));
+}
+
+fn directory(place: &Place) -> Check {
+    const CHECK: &str = "directory of the domain";
+    let path = place.path();
+    match place.look() {
+        Ok(true) => AREA.fine(CHECK, format!("{} is private", path.display())),
+        Ok(false) => {
+            let found = format!("{} is made when the first process starts", path.display());
+            AREA.fine(CHECK, found)
+        }
+        Err(error) => AREA.wrong(
+            CHECK,
+            Verdict::Bad,
+            error.to_string(),
+            "no process can join the domain until that is so",
+        ),
+    }
+}
+
+fn size(found: &Inspection, capacity: u64) -> Check {
+    const CHECK: &str = "size of /dev/shm";
+    let [total, free, need] = [found.total, found.free, capacity].map(ByteSize::b);
+    let text = format!("{total}, of which {free} are free; capacity of the domain: {need}");
+    let advice = "enlarge it (mount -o remount,size=512M /dev/shm; for containers --shm-size=512m), or \
+                  lower transport.shm.capacity";
+    // Less than this and no process can start.
+    if found.free < 2 << 20 {
+        AREA.wrong(CHECK, Verdict::Bad, text, advice)
+    } else if found.free.saturating_add(found.used) < capacity {
+        AREA.wrong(CHECK, Verdict::Doubtful, text, advice)
+    } else {
+        AREA.fine(CHECK, text)
+    }
+}
+
+fn traces(found: &Inspection) -> Check {
+    const CHECK: &str = "traces of the dead";
+    let text = format!(
+        "{} processes are there, {} have died and left traces; {} of shared memory in use",
+        found.alive,
+        found.dead,
+        ByteSize::b(found.used)
+    );
+    if found.dead == 0 {
+        return AREA.fine(CHECK, text);
+    }
+    let advice = "any process that joins the domain removes them within seconds, for example \
+                  `fipa agents`; if they stay, look for processes of the domain that hang";
+    AREA.wrong(CHECK, Verdict::Doubtful, text, advice)
+}
+
+fn exposed(found: &Inspection) -> Check {
+    const CHECK: &str = "permissions in /dev/shm";
+    match found.exposed.first() {
+        None => AREA.fine(CHECK, "nothing of this domain is open to other users"),
+        Some(file) => AREA.wrong(
+            CHECK,
+            Verdict::Bad,
+            format!("{} is open to other users", file.display()),
+            format!("chmod 600 {}", file.display()),
+        ),
+    }
+}
+
+fn descriptors() -> Check {
+    const CHECK: &str = "limit of open files";
+    let limit = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
+    let peers = limit.saturating_sub(OWN_DESCRIPTORS) / DESCRIPTORS_PER_PEER;
+    let text = format!("{limit}: enough to exchange letters with {peers} processes");
+    let advice = format!(
+        "raise it (ulimit -n, or LimitNOFILE= of the service): {OWN_DESCRIPTORS} are needed per process, \
+         and {DESCRIPTORS_PER_PEER} for each that it talks to"
+    );
+    match peers {
+        0 => AREA.wrong(CHECK, Verdict::Bad, text, advice),
+        few if few < FEW_PEERS => AREA.wrong(CHECK, Verdict::Doubtful, text, advice),
+        _ => AREA.fine(CHECK, text),
+    }
+}
+
+fn instances() -> Option<Check> {
+    const CHECK: &str = "inotify instances";
+    const FILE: &str = "/proc/sys/fs/inotify/max_user_instances";
+    let limit: u64 = std::fs::read_to_string(FILE).ok()?.trim().parse().ok()?;
+    let text = format!("{limit}, and every process of this user needs one");
+    if limit >= FEW_INSTANCES {
+        return Some(AREA.fine(CHECK, text));
+    }
+    let advice = "sysctl fs.inotify.max_user_instances=512";
+    Some(AREA.wrong(CHECK, Verdict::Doubtful, text, advice))
+}
+
+/// None where systemd does not run.
+fn remove_ipc(root: &Path, user: u32) -> Option<Check> {
+    const CHECK: &str = "systemd's RemoveIPC";
+    root.join("run/systemd/system").exists().then(|| {
+        if user < FIRST_PERSON {
+            return AREA.fine(CHECK, "does not concern this user, who is a system user");
+        }
+        if !removes(root) {
+            return AREA.fine(CHECK, "off");
+        }
+        AREA.wrong(
+            CHECK,
+            Verdict::Doubtful,
+            "on: shared memory vanishes when this user's last session ends, also under running processes",
+            "set RemoveIPC=no in /etc/systemd/logind.conf, or run the processes as a system user",
+        )
+    })
+}
+
+/// What logind is told: the last word counts, and nothing said means yes (logind.conf(5)).
+fn removes(root: &Path) -> bool {
+    let mut files = vec![
+        root.join("usr/lib/systemd/logind.conf"),
+        root.join("etc/systemd/logind.conf"),
+    ];
+    let mut later = Vec::new();
+    for directory in ["usr/lib", "run", "etc"] {
+        let directory = root.join(directory).join("systemd/logind.conf.d");
+        let found = std::fs::read_dir(directory).into_iter().flatten().flatten();
+        later.extend(found.map(|file| file.path()));
+    }
+    // By name, wherever they are.
+    later.sort_by_key(|path| path.file_name().map(ToOwned::to_owned));
+    files.extend(later);
+    let texts = files
+        .iter()
+        .filter_map(|file| std::fs::read_to_string(file).ok());
+    let mut answer = true;
+    for text in texts {
+        for line in text.lines() {
+            if let Some(value) = line.trim().strip_prefix("RemoveIPC=") {
+                answer = !matches!(value.trim(), "no" | "false" | "0" | "off" | "n" | "f");
+            }
+        }
+    }
+    answer
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    #[test]
+    fn the_last_word_about_remove_ipc_counts() {
+        let root = tempfile::tempdir().unwrap();
+        let root = root.path();
+        assert_eq!(remove_ipc(root, 1000), None);
+        fs::create_dir_all(root.join("run/systemd/system")).unwrap();
+        fs::create_dir_all(root.join("etc/systemd/logind.conf.d")).unwrap();
+        let verdict = |user| remove_ipc(root, user).unwrap().verdict;
+        assert_eq!(verdict(1000), Verdict::Doubtful);
+        assert_eq!(verdict(0), Verdict::Fine);
+        let main = root.join("etc/systemd/logind.conf");
+        fs::write(&main, "[Login]\n#RemoveIPC=yes\nRemoveIPC=no\n").unwrap();
+        assert_eq!(verdict(1000), Verdict::Fine);
+        let part = root.join("etc/systemd/logind.conf.d/50-robot.conf");
+        fs::write(part, "[Login]\nRemoveIPC=yes\n").unwrap();
+        assert_eq!(verdict(1000), Verdict::Doubtful);
+    }
+
+    #[test]
+    fn a_small_or_full_file_system_is_told() {
+        let found = |total, free, used| Inspection {
+            total,
+            free,
+            used,
+            ..Inspection::default()
+        };
+        let verdict = |found| size(&found, 256 << 20).verdict;
+        assert_eq!(verdict(found(1 << 30, 1 << 29, 0)), Verdict::Fine);
+        assert_eq!(verdict(found(64 << 20, 64 << 20, 0)), Verdict::Doubtful);
+        assert_eq!(verdict(found(1 << 30, 1 << 20, 0)), Verdict::Bad);
+        // What the domain has taken already counts.
+        assert_eq!(
+            verdict(found(300 << 20, 100 << 20, 200 << 20)),
+            Verdict::Fine
+        );
+    }
+
+    #[test]
+    fn what_others_can_open_and_the_dead_are_told() {
+        let fine = Inspection::default();
+        assert_eq!(
+            (traces(&fine).verdict, exposed(&fine).verdict),
+            (Verdict::Fine, Verdict::Fine)
+        );
+        let found = Inspection {
+            dead: 2,
+            exposed: vec!["/dev/shm/x".into()],
+            ..Inspection::default()
+        };
+        assert_eq!(
+            (traces(&found).verdict, exposed(&found).verdict),
+            (Verdict::Doubtful, Verdict::Bad)
+        );
+        assert!(
+            exposed(&found)
+                .advice
+                .unwrap()
+                .contains("chmod 600 /dev/shm/x")
+        );
+    }
+}
