@@ -2,6 +2,7 @@
 
 use std::fmt;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
@@ -19,6 +20,8 @@ pub struct Agent {
     id: AgentId,
     name: Arc<str>,
     incarnation: Incarnation,
+    /// How many unique texts were given out.
+    given_out: AtomicU64,
     registered: bool,
 }
 
@@ -34,6 +37,7 @@ impl Agent {
             id,
             name,
             incarnation,
+            given_out: AtomicU64::new(0),
             registered: true,
         }
     }
@@ -60,6 +64,15 @@ impl Agent {
     #[must_use]
     pub fn domain(&self) -> &Domain {
         &self.domain
+    }
+
+    /// A text that nobody has used before, for a `conversation-id` or a `reply-with`: one word, made
+    /// of the random number of this registration and one that rises.
+    #[must_use]
+    pub fn unique_id(&self) -> String {
+        let number = self.given_out.fetch_add(1, Ordering::Relaxed);
+        // With a letter in front: JADE takes text that begins with a digit for a number.
+        format!("c{}-{number}", self.incarnation)
     }
 
     /// A message from this agent, to be filled in.

@@ -68,13 +68,16 @@ async fn letters_go_both_ways_and_say_by_which_way() {
             here.register("rover").unwrap(),
             there.register("arm").unwrap(),
         );
+        let (conversation, reply_with) = (rover.unique_id(), rover.unique_id());
+        assert_ne!(conversation, reply_with);
+        assert_ne!(conversation, arm.unique_id());
         let question = rover
             .message(Performative::Request)
             .receiver(arm.id().clone())
             .content("lift")
             .protocol("fipa-request")
-            .conversation_id("c-1")
-            .reply_with("q-1")
+            .conversation_id(&conversation)
+            .reply_with(&reply_with)
             .build()
             .unwrap();
         let deliveries = rover.send(question).await.unwrap();
@@ -93,8 +96,8 @@ async fn letters_go_both_ways_and_say_by_which_way() {
             .unwrap();
         assert!(arm.send(answer).await.unwrap().all_succeeded());
         let answered = rover.receive().await.unwrap();
-        assert_eq!(answered.message.in_reply_to(), Some("q-1"));
-        assert_eq!(answered.message.conversation_id(), Some("c-1"));
+        assert_eq!(answered.message.in_reply_to(), Some(&*reply_with));
+        assert_eq!(answered.message.conversation_id(), Some(&*conversation));
         drop((rover, arm));
         here.close().await;
         there.close().await;
