@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
+mod arbitrary;
+
 use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
@@ -12,6 +14,8 @@ use fipa_acl::{
 use proptest::collection::vec;
 use proptest::option;
 use proptest::prelude::*;
+
+use arbitrary::agent_of;
 
 const XML: Representation = Representation::Xml;
 
@@ -39,25 +43,7 @@ fn pairs() -> impl Strategy<Value = Vec<(String, String)>> {
 }
 
 fn agent() -> BoxedStrategy<AgentId> {
-    let plain = (some_text(), vec(some_text(), 0..3), pairs()).prop_map(|(name, urls, pairs)| {
-        let mut agent = AgentId::new(name).unwrap();
-        for url in urls {
-            agent = agent.with_address(url).unwrap();
-        }
-        for (name, value) in pairs {
-            agent = agent.with_user_defined(name, value).unwrap();
-        }
-        agent
-    });
-    plain
-        .prop_recursive(3, 8, 2, |inner| {
-            (inner.clone(), vec(inner, 0..3)).prop_map(|(agent, resolvers)| {
-                resolvers.into_iter().fold(agent, |agent, resolver| {
-                    agent.with_resolver(resolver).unwrap()
-                })
-            })
-        })
-        .boxed()
+    agent_of(some_text(), some_text(), pairs().boxed())
 }
 
 fn date() -> impl Strategy<Value = Time> {

@@ -45,7 +45,16 @@ pub(crate) fn pairs() -> impl Strategy<Value = Vec<(String, String)>> {
 }
 
 pub(crate) fn agent() -> BoxedStrategy<AgentId> {
-    let plain = (some_text(), vec(some_text(), 0..3), pairs()).prop_map(|(name, urls, pairs)| {
+    agent_of(some_text(), some_text(), pairs().boxed())
+}
+
+/// An agent with these names, addresses and user-defined parameters, and the same of its resolvers.
+pub(crate) fn agent_of(
+    name: BoxedStrategy<String>,
+    url: BoxedStrategy<String>,
+    pairs: BoxedStrategy<Vec<(String, String)>>,
+) -> BoxedStrategy<AgentId> {
+    let plain = (name, vec(url, 0..3), pairs).prop_map(|(name, urls, pairs)| {
         let mut agent = AgentId::new(name).unwrap();
         for url in urls {
             agent = agent.with_address(url).unwrap();
@@ -57,7 +66,7 @@ pub(crate) fn agent() -> BoxedStrategy<AgentId> {
     });
     plain
         .prop_recursive(3, 8, 2, |inner| {
-            (inner.clone(), vec(inner, 0..2)).prop_map(|(agent, resolvers)| {
+            (inner.clone(), vec(inner, 0..3)).prop_map(|(agent, resolvers)| {
                 resolvers.into_iter().fold(agent, |agent, resolver| {
                     agent.with_resolver(resolver).unwrap()
                 })
