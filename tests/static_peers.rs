@@ -6,7 +6,10 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use fipa::config::Sources;
-use fipa::{AgentId, Config, Domain, Gateway, Kind, Neighbour, Performative};
+use fipa::{
+    AgentId, Config, Domain, Gateway, Kind, Letter, Message, Neighbour, Outcome, Performative,
+};
+use tokio::io::AsyncReadExt;
 
 fn config(set: &[String]) -> Config {
     static NEXT: AtomicU32 = AtomicU32::new(0);
@@ -188,4 +191,43 @@ async fn the_later_of_two_registrations_is_told_and_not_announced() {
     })
     .await;
     drop(here);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_static_old_peer_gets_its_letters_in_its_dialect() {
+    // It reads one letter per connection, to the end of the stream.
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let at = format!("{};fipa-services", listener.local_addr().unwrap());
+    let config = config(&[knowing("old_arm", &[&at])]);
+    let gateway = Gateway::open(&config).await.unwrap();
+    let host = Domain::open(&config).await.unwrap();
+    let rover = host.register("rover").unwrap();
+    until("the old peer is known", || {
+        host.directory().lookup("old_arm").is_some()
+    })
+    .await;
+    let message = rover
+        .message(Performative::Inform)
+        .receiver(AgentId::new("old_arm").unwrap())
+        .content("hello")
+        .build()
+        .unwrap();
+    let read = tokio::spawn(async move {
+        let (mut stream, _) = listener.accept().await.unwrap();
+        let mut letter = Vec::new();
+        stream.read_to_end(&mut letter).await.unwrap();
+        letter
+    });
+    let sent = rover.send(message).await.unwrap();
+    let outcome = &sent.0[0].outcome;
+    assert!(
+        matches!(outcome, Outcome::Sent { via: Kind::Tcp, .. }),
+        "{sent}"
+    );
+    let letter = read.await.unwrap();
+    let (envelope, message) = Letter::decode(letter.into()).unwrap();
+    assert_eq!(envelope.effective().intended_receivers[0].name(), "old_arm");
+    let message = Message::decode(message.payload()).unwrap();
+    assert_eq!(message.content().unwrap(), "hello");
+    gateway.close().await;
 }

@@ -42,6 +42,8 @@ counters! {
     parcels_in,
     /// Old peers' letters that arrived.
     unframed_in,
+    /// Letters handed to old peers.
+    unframed_out,
     /// Connections closed because of what the peer sent, or because it was too slow.
     refused_nonsense,
     /// Connections refused or pushed out because there were too many.

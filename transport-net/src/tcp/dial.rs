@@ -3,19 +3,27 @@
 use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use bytes::BytesMut;
 use fipa_transport::{Location, Sink, WayError, WayFault};
 use tokio::net::{TcpStream, lookup_host};
-use tokio::time::timeout;
+use tokio::task::JoinSet;
+use tokio::time::{sleep, timeout};
 
 use super::accept::prepare;
+use super::config::Limits;
 use super::endpoint::Endpoint;
 use super::frame::FrameReader;
 use super::link::{Link, Running};
 use crate::address::{self, Target};
 use crate::end::End;
+
+/// How long one address is waited for before the next is tried as well.
+const STAGGER: Duration = Duration::from_millis(250);
+
+/// Most addresses of one name that are tried.
+const MAX_ADDRESSES: usize = 8;
 
 /// Opens the connection of a link that has been made up, and serves it.
 pub(crate) async fn dial(
@@ -30,22 +38,13 @@ pub(crate) async fn dial(
         let detail = format!("{}: {what}", to.address());
         End::NotOpened(WayError::new(WayFault::Unreachable, detail))
     };
-    let target = match address::target(to.address()) {
-        Ok(target) => target,
-        Err(error) => return running.fail(unreachable(&error)),
-    };
     let connected = tokio::select! {
-        connected = timeout(limits.connect_timeout, connect(&target)) => connected,
+        connected = open(&limits, to.address()) => connected,
         end = link.leaving() => return running.fail(end),
     };
     let (stream, peer) = match connected {
-        Ok(Ok(connected)) => connected,
-        Ok(Err(error)) => return running.fail(unreachable(&error)),
-        Err(_) => {
-            let patience = limits.connect_timeout;
-            let what = format!("no connection within {patience:?} (connect_timeout)");
-            return running.fail(unreachable(&what));
-        }
+        Ok(connected) => connected,
+        Err(Unreachable(what)) => return running.fail(unreachable(&what)),
     };
     if let Err(error) = prepare(&stream, &limits) {
         return running.fail(unreachable(&error));
@@ -57,21 +56,120 @@ pub(crate) async fn dial(
         .await;
 }
 
-async fn connect(target: &Target) -> io::Result<(TcpStream, SocketAddr)> {
-    let addresses: Vec<SocketAddr> = match target {
-        Target::Numeric(address) => vec![*address],
-        Target::Named(name, port) => lookup_host((name.as_str(), *port)).await?.collect(),
-    };
-    let mut last = io::Error::new(io::ErrorKind::NotFound, "the name has no address");
-    for address in addresses {
-        match TcpStream::connect(address).await {
-            // Where nobody listens on a port of its own range, a host can connect to itself.
-            Ok(stream) if stream.local_addr()? == stream.peer_addr()? => {
-                last = io::ErrorKind::ConnectionRefused.into();
+/// Why no connection could be opened.
+pub(crate) struct Unreachable(pub(crate) String);
+
+/// Opens a connection to an address.
+pub(crate) async fn open(
+    limits: &Limits,
+    address: &str,
+) -> Result<(TcpStream, SocketAddr), Unreachable> {
+    let target = address::target(address).map_err(|error| Unreachable(error.to_string()))?;
+    let connecting = async {
+        match target {
+            Target::Numeric(address) => race(vec![address]).await,
+            Target::Named(name, port) => {
+                let found = lookup_host((name.as_str(), port)).await?;
+                race(alternating(found.take(MAX_ADDRESSES).collect())).await
             }
-            Ok(stream) => return Ok((stream, address)),
-            Err(error) => last = error,
+        }
+    };
+    let patience = limits.connect_timeout;
+    match timeout(patience, connecting).await {
+        Ok(connected) => connected.map_err(|error| Unreachable(error.to_string())),
+        Err(_) => Err(Unreachable(format!(
+            "no connection within {patience:?} (connect_timeout)"
+        ))),
+    }
+}
+
+/// Connects to whichever address answers first. The next is tried when the one before has failed or
+/// has not answered for a while (RFC 8305 section 5).
+async fn race(addresses: Vec<SocketAddr>) -> io::Result<(TcpStream, SocketAddr)> {
+    let mut last = io::Error::new(io::ErrorKind::NotFound, "the name has no address");
+    let mut waiting = addresses.into_iter();
+    let mut racing = JoinSet::new();
+    loop {
+        if let Some(address) = waiting.next() {
+            racing.spawn(connect(address));
+        } else if racing.is_empty() {
+            return Err(last);
+        }
+        let is_last = waiting.len() == 0;
+        tokio::select! {
+            Some(ended) = racing.join_next() => match ended {
+                Ok(Ok(connected)) => return Ok(connected),
+                Ok(Err(error)) => last = error,
+                Err(error) => last = io::Error::other(error),
+            },
+            () = sleep(STAGGER), if !is_last => {}
         }
     }
-    Err(last)
+}
+
+async fn connect(address: SocketAddr) -> io::Result<(TcpStream, SocketAddr)> {
+    let stream = TcpStream::connect(address).await?;
+    // Where nobody listens on a port of its own range, a host can connect to itself.
+    if stream.local_addr()? == stream.peer_addr()? {
+        return Err(io::ErrorKind::ConnectionRefused.into());
+    }
+    Ok((stream, address))
+}
+
+/// The families take turns, beginning with that of the first address (RFC 8305 section 4).
+fn alternating(addresses: Vec<SocketAddr>) -> Vec<SocketAddr> {
+    let Some(first) = addresses.first().copied() else {
+        return addresses;
+    };
+    let (same, other): (Vec<_>, Vec<_>) = addresses
+        .into_iter()
+        .partition(|address| address.is_ipv4() == first.is_ipv4());
+    let (mut same, mut other) = (same.into_iter(), other.into_iter());
+    let mut all = Vec::new();
+    loop {
+        let turn = [same.next(), other.next()];
+        if turn == [None, None] {
+            return all;
+        }
+        all.extend(turn.into_iter().flatten());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::Ipv4Addr;
+
+    use super::*;
+
+    #[test]
+    fn families_take_turns() {
+        let parse = |texts: &[&str]| -> Vec<SocketAddr> {
+            texts.iter().map(|text| text.parse().unwrap()).collect()
+        };
+        let mixed = parse(&["[::1]:1", "[::2]:1", "[::3]:1", "127.0.0.1:1"]);
+        let turns = parse(&["[::1]:1", "127.0.0.1:1", "[::2]:1", "[::3]:1"]);
+        assert_eq!(alternating(mixed), turns);
+        assert_eq!(alternating(Vec::new()), Vec::new());
+    }
+
+    #[tokio::test]
+    async fn an_address_that_is_silent_or_refuses_holds_up_nobody() {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let there = listener.local_addr().unwrap();
+        // A queue of one, and it is taken: the system answers no more.
+        let full =
+            socket2::Socket::new(socket2::Domain::IPV4, socket2::Type::STREAM, None).unwrap();
+        full.bind(&SocketAddr::from((Ipv4Addr::LOCALHOST, 0)).into())
+            .unwrap();
+        full.listen(0).unwrap();
+        let silent = full.local_addr().unwrap().as_socket().unwrap();
+        let _first = TcpStream::connect(silent).await.unwrap();
+        let refusing = tokio::net::TcpSocket::new_v4().unwrap();
+        refusing.bind("127.0.0.1:0".parse().unwrap()).unwrap();
+        let refusing_at = refusing.local_addr().unwrap();
+        let (_, reached) = race(vec![silent, refusing_at, there]).await.unwrap();
+        assert_eq!(reached, there);
+        assert!(race(vec![refusing_at]).await.is_err());
+        assert!(race(Vec::new()).await.is_err());
+    }
 }

@@ -21,6 +21,7 @@ use tokio::task::AbortHandle;
 use super::config::{Limits, TcpConfig};
 use super::connection::{Connection, Role};
 use super::counters::{Tally, count};
+use super::courier::{self, Couriers};
 use super::link::{Link, MAX_LINKS, of_ticket};
 use crate::address;
 use crate::end::End;
@@ -31,6 +32,8 @@ use crate::seldom::warn_seldom;
 pub(crate) struct Endpoint {
     pub(crate) config: TcpConfig,
     pub(crate) runtime: Handle,
+    /// Letters to old peers.
+    pub(crate) couriers: Couriers,
     tally: Tally,
     registry: Mutex<Registry>,
 }
@@ -97,6 +100,7 @@ impl Endpoint {
         Arc::new(Self {
             config,
             runtime,
+            couriers: Couriers::default(),
             tally: Tally::default(),
             registry: Mutex::default(),
         })
@@ -137,8 +141,14 @@ impl Endpoint {
         self.registry.lock().phase == Phase::New
     }
 
+    /// Where others reach this endpoint at the address that a socket of it has, as a URL.
+    pub(crate) fn reachable_at(&self, local: SocketAddr) -> Option<String> {
+        courier::listening_at(&self.registry.lock().listening, local)
+    }
+
     /// Ends everything. The connections' tasks conclude what is outstanding.
     pub(crate) fn close(&self) {
+        self.couriers.close();
         let (links, tasks) = {
             let mut registry = self.registry.lock();
             registry.phase = Phase::Closed;

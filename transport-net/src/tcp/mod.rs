@@ -5,12 +5,15 @@
 //! * [`link`]: a connection with its socket; [`dial`] and [`accept`] make them.
 //! * [`endpoint`]: what the connections share.
 //! * [`unframed`]: letters of old peers, on the same port.
+//! * [`courier`]: letters to old peers, in their [`dialect`].
 
 mod accept;
 mod config;
 mod connection;
 mod counters;
+mod courier;
 mod dial;
+mod dialect;
 mod endpoint;
 mod frame;
 mod link;
@@ -39,6 +42,9 @@ use crate::end::End;
 /// The first parcel to a location opens a connection, which then carries everything to and from
 /// that peer, whoever opened it, until it has been idle for some time. Letters are written from
 /// the memory they lie in, and read into one piece of memory each.
+///
+/// To a location with the [signature](Signature) of an old peer, each letter goes over a connection
+/// of its own, in that peer's dialect, and is concluded as [handed](fipa_transport::Conclusion::Handed).
 ///
 /// An address is a numeric `address:port`, with a scope where one is needed
 /// (`[fe80::1%eth0]:7788`), or `name:port`.
@@ -78,14 +84,27 @@ impl TcpTransport {
         Ok(())
     }
 
+    /// Hands a letter to who takes those for an old peer.
+    fn hand(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
+        let Some(sink) = self.endpoint.sink() else {
+            return Err(End::Closed.after());
+        };
+        let couriers = &self.endpoint.couriers;
+        if couriers.take(&self.endpoint, attempt, to, parcel)? {
+            let run = courier::run(self.endpoint.clone(), sink, to.clone());
+            let task = self.endpoint.runtime.spawn(run);
+            if task.is_finished() && couriers.take_back(attempt, to) {
+                let detail = "the runtime of this endpoint has been shut down";
+                return Err(WayError::new(WayFault::Closed, detail));
+            }
+        }
+        Ok(())
+    }
+
     fn check(&self, to: &Location, parcel: &Parcel) -> Result<(), WayError> {
         if to.kind() != Kind::Tcp {
             let detail = format!("{to} is no TCP location");
             return Err(WayError::new(WayFault::Unreachable, detail));
-        }
-        if to.signature() != Signature::Frames {
-            let detail = format!("{to} does not understand frames");
-            return Err(WayError::new(WayFault::Incompatible, detail));
         }
         if parcel.receiver.is_empty() || parcel.receiver.len() > Parcel::MAX_NAME {
             let detail = "the receiver's name is empty or too long";
@@ -158,6 +177,9 @@ impl Transport for TcpTransport {
 
     fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
         self.check(to, &parcel)?;
+        if to.signature() != Signature::Frames {
+            return self.hand(attempt, to, parcel);
+        }
         loop {
             let (link, fresh) = match self.endpoint.way_to(to)? {
                 Way::There(link) => (link, None),
@@ -184,6 +206,7 @@ impl Transport for TcpTransport {
         for link in self.endpoint.links() {
             link.abandon(attempt);
         }
+        self.endpoint.couriers.abandon(attempt);
     }
 
     fn answer(&self, ticket: Ticket, answer: Answer) {

@@ -4,8 +4,8 @@ use std::time::Instant;
 
 use fipa_sds::Entry;
 use fipa_transport::{
-    Answer, AttemptId, Conclusion, FailureReason, Kind, Location, Outcome, Report, WayError,
-    WayFault,
+    Answer, AttemptId, Conclusion, FailureReason, Kind, Location, Outcome, Report, Signature,
+    WayError, WayFault,
 };
 
 use super::super::desk::Desk;
@@ -64,6 +64,12 @@ impl Lane {
                 );
             }
             Conclusion::NotSent(error) => self.came_back(now, index, &location, error, desk),
+            Conclusion::Unconfirmed(error) if location.signature() != Signature::Frames => {
+                // An old peer would take a copy for another letter.
+                let delivery = &mut self.letters[index];
+                delivery.failed_at(&location, error);
+                self.fail(index, FailureReason::Unconfirmed, desk);
+            }
             Conclusion::Unconfirmed(error) => {
                 self.letters[index].progress.unconfirmed = true;
                 self.came_back(now, index, &location, error, desk);

@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use fipa_transport::{WayError, WayFault};
+use fipa_transport::{FailureReason, Signature, WayError, WayFault};
 
 use super::super::desk::Desk;
 use super::Lane;
@@ -53,6 +53,12 @@ impl Lane {
                 delivery.progress.unconfirmed = true;
                 self.back();
                 let error = WayError::new(WayFault::TimedOut, "");
+                if location.signature() != Signature::Frames {
+                    // An old peer would take a copy for another letter.
+                    self.letters[index].failed_at(&location, error);
+                    self.fail(index, FailureReason::Unconfirmed, desk);
+                    continue;
+                }
                 self.came_back(now, index, &location, error, desk);
             }
             index += 1;

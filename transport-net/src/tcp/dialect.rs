@@ -1,0 +1,264 @@
+//! Letters in the hands of old peers: the edge at which our letters are translated.
+//!
+//! fipa_services gets a bit-efficient envelope and message in its dialect; JADE's proxy agent an
+//! XML envelope with the length of the payload, and a string message. Both get the letter with the
+//! one receiver it is delivered to.
+
+use bytes::Bytes;
+use fipa_acl::{
+    AclRepresentation, AgentId, DecodeError, Dialect, EncodeError, Envelope, EnvelopeParams,
+    Letter, Message, Representation,
+};
+use fipa_transport::Signature;
+
+/// Why a letter cannot be said to an old peer.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub(crate) enum TranslateError {
+    #[error("the letter cannot be read: {0}")]
+    Read(#[from] DecodeError),
+    #[error("the peer's dialect cannot say it: {0}")]
+    Write(#[from] EncodeError),
+    #[error("the receiver's name cannot be written: {0:?}")]
+    Receiver(String),
+    #[error("{0} is not the dialect of an old peer")]
+    NoDialect(Signature),
+}
+
+/// The letter for one receiver as a peer with that signature reads it: envelope and message.
+/// `here` is where answers can be sent, as a URL: JADE answers to the addresses of the sender, so
+/// it is put there when there are none.
+pub(crate) fn translate(
+    letter: &Letter,
+    receiver: &str,
+    signature: Signature,
+    here: Option<&str>,
+) -> Result<[Bytes; 2], TranslateError> {
+    let envelope = letter.parse_envelope()?;
+    let message = Message::decode(letter.payload())?;
+    let to = receiver_of(&envelope, receiver)?;
+    match signature {
+        Signature::FipaServices => {
+            let (representation, dialect) = (Representation::BitEfficient, Dialect::FipaServices);
+            let message = message.encode(representation, dialect)?;
+            let length = message.len() as u64;
+            let envelope = addressed(envelope, to, AclRepresentation::BitEfficient, length);
+            Ok([envelope.encode(representation, dialect)?, message])
+        }
+        Signature::JadeProxy => {
+            let message = with_address(message, here);
+            let message = message.encode(Representation::String, Dialect::Jade)?;
+            // JADE counts characters, in US-ASCII unless it is told otherwise.
+            let text = std::str::from_utf8(&message).ok();
+            let length = text.map_or(message.len(), |text| text.chars().count()) as u64;
+            let mut envelope = addressed(envelope, to, AclRepresentation::String, length);
+            envelope.base.payload_encoding = (!message.is_ascii()).then(|| "UTF-8".to_owned());
+            if let (Some(from), Some(here)) = (&mut envelope.base.from, here) {
+                add_address(from, here);
+            }
+            let envelope = envelope.encode(Representation::Xml, Dialect::Jade)?;
+            Ok([envelope, message])
+        }
+        other => Err(TranslateError::NoDialect(other)),
+    }
+}
+
+/// The receiver, with what the envelope says about it beside the name.
+fn receiver_of(envelope: &Envelope, name: &str) -> Result<AgentId, TranslateError> {
+    let EnvelopeParams {
+        to,
+        intended_receivers,
+        ..
+    } = envelope.effective();
+    let named = intended_receivers.into_iter().chain(to);
+    match named.into_iter().find(|agent| agent.name() == name) {
+        Some(agent) => Ok(agent),
+        None => AgentId::new(name).map_err(|_| TranslateError::Receiver(name.to_owned())),
+    }
+}
+
+/// The same envelope for this receiver alone, with what is true of the translated message.
+fn addressed(
+    mut envelope: Envelope,
+    to: AgentId,
+    representation: AclRepresentation,
+    length: u64,
+) -> Envelope {
+    for part in [&mut envelope.base]
+        .into_iter()
+        .chain(&mut envelope.extensions)
+    {
+        part.intended_receivers.clear();
+        part.acl_representation = None;
+        part.payload_length = None;
+        part.payload_encoding = None;
+    }
+    envelope.base.intended_receivers = vec![to];
+    envelope.base.acl_representation = Some(representation);
+    envelope.base.payload_length = Some(length);
+    envelope
+}
+
+fn add_address(agent: &mut AgentId, here: &str) {
+    if agent.addresses().is_empty()
+        && let Ok(with) = agent.clone().with_address(here)
+    {
+        *agent = with;
+    }
+}
+
+/// The message, whose sender has an address.
+fn with_address(message: Message, here: Option<&str>) -> Message {
+    let (Some(sender), Some(here)) = (message.sender(), here) else {
+        return message;
+    };
+    if !sender.addresses().is_empty() {
+        return message;
+    }
+    let mut sender = sender.clone();
+    add_address(&mut sender, here);
+    let mut builder = Message::builder(message.performative().clone())
+        .sender(sender)
+        .receivers(message.receivers().iter().cloned());
+    for agent in message.reply_to() {
+        builder = builder.reply_to(agent.clone());
+    }
+    if let Some(content) = message.content() {
+        builder = builder.content(content.clone());
+    }
+    if let Some(language) = message.language() {
+        builder = builder.language(language);
+    }
+    if let Some(encoding) = message.encoding() {
+        builder = builder.encoding(encoding);
+    }
+    if let Some(ontology) = message.ontology() {
+        builder = builder.ontology(ontology);
+    }
+    if let Some(protocol) = message.protocol() {
+        builder = builder.protocol(protocol);
+    }
+    if let Some(conversation) = message.conversation_id() {
+        builder = builder.conversation_id(conversation);
+    }
+    if let Some(reply_with) = message.reply_with() {
+        builder = builder.reply_with(reply_with);
+    }
+    if let Some(in_reply_to) = message.in_reply_to() {
+        builder = builder.in_reply_to(in_reply_to);
+    }
+    if let Some(reply_by) = message.reply_by() {
+        builder = builder.reply_by(reply_by);
+    }
+    for (name, value) in message.user_defined() {
+        builder = builder.user_defined(name, value);
+    }
+    builder.build().unwrap_or(message)
+}
+
+#[cfg(test)]
+mod tests {
+    use fipa_acl::{Performative, Received, Time};
+
+    use super::*;
+
+    fn date() -> Time {
+        "20261120T112644481Z".parse().unwrap()
+    }
+
+    fn message(content: &str) -> Message {
+        Message::builder(Performative::Request)
+            .sender(AgentId::new("rover").unwrap())
+            .receiver(AgentId::new("arm").unwrap())
+            .receiver(AgentId::new("echo").unwrap())
+            .content(content.to_owned())
+            .language("fipa-sl")
+            .protocol("fipa-request")
+            .conversation_id("c-1")
+            .reply_with("r-1")
+            .build()
+            .unwrap()
+    }
+
+    /// A letter to two receivers that came through a gateway.
+    fn letter(content: &str) -> Letter {
+        let to = vec![AgentId::new("arm").unwrap(), AgentId::new("echo").unwrap()];
+        let base = EnvelopeParams {
+            to: to.clone(),
+            intended_receivers: to,
+            from: Some(AgentId::new("rover").unwrap()),
+            acl_representation: Some(AclRepresentation::BitEfficient),
+            date: Some(date()),
+            payload_length: Some(1),
+            ..EnvelopeParams::default()
+        };
+        let stamp = EnvelopeParams {
+            received: Some(Received::new("crex-mts", date())),
+            ..EnvelopeParams::default()
+        };
+        let envelope = Envelope {
+            base,
+            extensions: vec![stamp],
+        };
+        Letter::new(
+            envelope.encode_standard().unwrap(),
+            message(content).to_payload(),
+        )
+    }
+
+    #[test]
+    fn fipa_services_gets_its_dialect_and_one_receiver() {
+        let [envelope, bytes] =
+            translate(&letter("hello"), "echo", Signature::FipaServices, None).unwrap();
+        let (read, len) = Envelope::decode(&envelope).unwrap();
+        assert_eq!(len, envelope.len());
+        let effective = read.effective();
+        assert_eq!(
+            effective.intended_receivers,
+            [AgentId::new("echo").unwrap()]
+        );
+        assert_eq!(effective.payload_length, Some(bytes.len() as u64));
+        assert_eq!(read.extensions.len(), 1);
+        // Its texts are `#n"…`, and its times have no zone.
+        assert!(envelope.windows(9).any(|w| w == b"#4\"echo\0\x01"));
+        let payload = bytes.clone().into();
+        let said = Message::decode(&payload).unwrap();
+        assert_eq!(said, message("hello"));
+        assert!(bytes.windows(9).any(|w| w == b"#5\"hello\0"));
+    }
+
+    #[test]
+    fn jade_gets_xml_a_string_message_its_length_and_where_to_answer() {
+        for content in ["hello", "grüß dich"] {
+            let here = Some("tcp://10.0.0.1:7788");
+            let [envelope, bytes] =
+                translate(&letter(content), "arm", Signature::JadeProxy, here).unwrap();
+            assert!(envelope.starts_with(b"<?xml"));
+            let (read, len) = Envelope::decode(&envelope).unwrap();
+            assert_eq!(len, envelope.len());
+            let text = std::str::from_utf8(&bytes).unwrap();
+            let effective = read.effective();
+            assert_eq!(effective.payload_length, Some(text.chars().count() as u64));
+            assert_eq!(effective.payload_encoding.is_some(), !content.is_ascii());
+            assert_eq!(
+                effective.acl_representation,
+                Some(AclRepresentation::String)
+            );
+            assert_eq!(effective.intended_receivers, [AgentId::new("arm").unwrap()]);
+            let said = Message::decode(&bytes.clone().into()).unwrap();
+            let sender = said.sender().unwrap();
+            assert_eq!(sender.addresses(), ["tcp://10.0.0.1:7788"]);
+            assert_eq!(said.content().unwrap(), content);
+            assert_eq!(said.conversation_id(), Some("c-1"));
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_said_is_refused() {
+        let garbage = Letter::new(Bytes::from_static(b"x"), Bytes::new());
+        let refused = translate(&garbage, "arm", Signature::FipaServices, None);
+        assert!(matches!(refused, Err(TranslateError::Read(_))));
+        let own = translate(&letter("x"), "arm", Signature::Frames, None);
+        assert!(matches!(own, Err(TranslateError::NoDialect(_))));
+    }
+}

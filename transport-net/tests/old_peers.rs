@@ -1,0 +1,210 @@
+//! Letters to old peers, which behave as fipa_services and JADE's proxy agent do: one letter per
+//! connection, read until the end of the stream.
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test or bench that cannot go on may panic"
+)]
+
+mod common;
+
+use std::io::{Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::sync::mpsc::{Receiver, channel};
+use std::thread;
+use std::time::Duration;
+
+use bytes::Bytes;
+use common::{Party, config, letter_parcel, until};
+use fipa_acl::{
+    AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter, Message, Performative,
+};
+use fipa_transport::{
+    AttemptId, Conclusion, Kind, Location, Parcel, Signature, Transport, WayFault,
+};
+
+/// Somebody who takes connections one after the other, and reads each to its end.
+struct OldPeer {
+    location: Location,
+    letters: Receiver<Vec<u8>>,
+}
+
+impl OldPeer {
+    fn new(signature: Signature) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let location = location(&listener, signature);
+        let (sender, letters) = channel();
+        thread::spawn(move || {
+            for stream in listener.incoming() {
+                let mut letter = Vec::new();
+                stream.unwrap().read_to_end(&mut letter).unwrap();
+                if sender.send(letter).is_err() {
+                    return;
+                }
+            }
+        });
+        Self { location, letters }
+    }
+
+    /// The next letter, read as these peers do: an envelope, and the payload to the end.
+    fn letter(&self) -> (Envelope, Message, Vec<u8>) {
+        let bytes = self.letters.recv_timeout(Duration::from_secs(60)).unwrap();
+        let (envelope, len) = Envelope::decode(&bytes).unwrap();
+        let payload = Bytes::copy_from_slice(&bytes[len..]).into();
+        (envelope, Message::decode(&payload).unwrap(), bytes)
+    }
+}
+
+fn location(listener: &TcpListener, signature: Signature) -> Location {
+    let address = listener.local_addr().unwrap().to_string();
+    let plain = Location::new(Kind::Tcp, &address).unwrap();
+    plain.with_signature(signature).unwrap()
+}
+
+fn parcel(sequence: u64, content: &str) -> Parcel {
+    let arm = AgentId::new("arm_1").unwrap();
+    let rover = AgentId::new("rover").unwrap();
+    let message = Message::builder(Performative::Inform)
+        .sender(rover.clone())
+        .receiver(arm.clone())
+        .content(content.to_owned())
+        .conversation_id("c-1")
+        .build()
+        .unwrap();
+    let base = EnvelopeParams {
+        to: vec![arm.clone()],
+        from: Some(rover),
+        acl_representation: Some(AclRepresentation::BitEfficient),
+        date: Some("20261120T112644481Z".parse().unwrap()),
+        intended_receivers: vec![arm],
+        ..EnvelopeParams::default()
+    };
+    let envelope = Envelope {
+        base,
+        extensions: Vec::new(),
+    };
+    let letter = Letter::new(envelope.encode_standard().unwrap(), message.to_payload());
+    letter_parcel(sequence, letter)
+}
+
+#[test]
+fn fipa_services_gets_one_letter_per_connection_in_order() {
+    let (party, peer) = (Party::new(), OldPeer::new(Signature::FipaServices));
+    for number in 0..20 {
+        party
+            .send(number, &peer.location, parcel(number, &number.to_string()))
+            .unwrap();
+    }
+    for number in 0..20 {
+        assert_eq!(party.conclusion(number), Conclusion::Handed);
+        let (envelope, message, bytes) = peer.letter();
+        assert_eq!(bytes[0], 0xfe);
+        assert_eq!(message.content().unwrap(), &number.to_string());
+        let effective = envelope.effective();
+        assert_eq!(effective.intended_receivers[0].name(), "arm_1");
+        let representation = effective.acl_representation;
+        assert_eq!(representation, Some(AclRepresentation::BitEfficient));
+    }
+    assert_eq!(party.transport.counters().unframed_out, 20);
+}
+
+#[test]
+fn jade_gets_xml_and_a_string_message_and_can_answer() {
+    let (party, peer) = (Party::new(), OldPeer::new(Signature::JadeProxy));
+    party.send(1, &peer.location, parcel(1, "hello")).unwrap();
+    assert_eq!(party.conclusion(1), Conclusion::Handed);
+    let (envelope, message, bytes) = peer.letter();
+    assert!(bytes.starts_with(b"<?xml"));
+    assert!(envelope.effective().payload_length.is_some());
+    let here = format!("tcp://{}", party.location().address());
+    assert_eq!(message.sender().unwrap().addresses(), [&*here]);
+    // The answer goes there, and arrives.
+    let mut answer = TcpStream::connect(here.strip_prefix("tcp://").unwrap()).unwrap();
+    answer.write_all(&bytes).unwrap();
+    drop(answer);
+    until("the answer", || {
+        (party.sink.record.lock().unframed.len() == 1).then_some(())
+    });
+}
+
+#[test]
+fn nobody_there_is_said_to_all_who_wait() {
+    let party = Party::new();
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let gone = location(&listener, Signature::FipaServices);
+    drop(listener);
+    for attempt in 0..10 {
+        party.send(attempt, &gone, parcel(attempt, "x")).unwrap();
+    }
+    for attempt in 0..10 {
+        match party.conclusion(attempt) {
+            Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Unreachable, "{error}"),
+            other => panic!("{other:?}"),
+        }
+    }
+}
+
+#[test]
+fn a_peer_that_does_not_read_is_given_up_and_others_are_served() {
+    let mut impatient = config(&["127.0.0.1:0"]);
+    impatient.limits.stall_timeout = Duration::from_millis(300);
+    let (party, good) = (
+        Party::with(impatient),
+        OldPeer::new(Signature::FipaServices),
+    );
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let deaf = location(&listener, Signature::FipaServices);
+    party
+        .send(1, &deaf, parcel(1, &"x".repeat(32 << 20)))
+        .unwrap();
+    party.send(2, &deaf, parcel(2, "waits")).unwrap();
+    party.send(3, &good.location, parcel(3, "y")).unwrap();
+    assert_eq!(party.conclusion(3), Conclusion::Handed);
+    match party.conclusion(1) {
+        Conclusion::Unconfirmed(error) => assert_eq!(error.fault, WayFault::TimedOut, "{error}"),
+        other => panic!("{other:?}"),
+    }
+    // The system takes a small letter for a peer that does not read.
+    assert_eq!(party.conclusion(2), Conclusion::Handed);
+    drop(listener);
+}
+
+#[test]
+fn what_waits_is_bounded_and_what_is_abandoned_or_closed_is_told_once() {
+    let mut few = config(&["127.0.0.1:0"]);
+    few.limits.max_in_flight = 3;
+    let party = Party::with(few);
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let slow = location(&listener, Signature::FipaServices);
+    let large = "x".repeat(32 << 20);
+    party.send(0, &slow, parcel(0, &large)).unwrap();
+    let (mut stream, _) = listener.accept().unwrap();
+    // Now it is certain that the letter has begun.
+    stream.read_exact(&mut [0]).unwrap();
+    for attempt in 1..=3 {
+        party.send(attempt, &slow, parcel(attempt, "x")).unwrap();
+    }
+    let full = party.send(4, &slow, parcel(4, "x")).unwrap_err();
+    assert_eq!(full.fault, WayFault::Congested, "{full}");
+    party.transport.abandon(AttemptId(2));
+    party.transport.close();
+    assert!(matches!(party.conclusion(0), Conclusion::Unconfirmed(_)));
+    for attempt in [1, 3] {
+        assert!(matches!(party.conclusion(attempt), Conclusion::NotSent(_)));
+    }
+    assert_eq!(party.sink.record.lock().concluded.len(), 3);
+    let closed = party.send(5, &slow, parcel(5, "x")).unwrap_err();
+    assert_eq!(closed.fault, WayFault::Closed, "{closed}");
+    drop(stream);
+}
+
+#[test]
+fn what_the_peer_could_not_read_is_not_sent() {
+    let (party, peer) = (Party::new(), OldPeer::new(Signature::FipaServices));
+    party
+        .send(1, &peer.location, common::parcel(1, "not even an envelope"))
+        .unwrap();
+    match party.conclusion(1) {
+        Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Incompatible, "{error}"),
+        other => panic!("{other:?}"),
+    }
+}
