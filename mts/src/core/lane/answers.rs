@@ -224,7 +224,12 @@ impl Lane {
         let taken_by = match &self.letters[index].progress.state {
             // It is being tried again; that somebody failed with it before changes nothing.
             State::Waiting if !delivered => return,
-            State::Waiting => None,
+            // It got there by an attempt that nothing was heard of, the last one most likely.
+            State::Waiting => self.letters[index]
+                .progress
+                .attempts
+                .last()
+                .map(|it| it.via),
             State::Custody { location } => Some(location.kind()),
             // The report overtook the answer.
             State::UnderWay {
