@@ -3,7 +3,7 @@
 //! An announcement or a goodbye is said once or twice. Who was out of range then never hears of
 //! it: the next question is asked within the hour, and a record that is gone is believed in for
 //! minutes. So every gateway says every two seconds how many agents it announces and a digest of
-//! them, in a record of 60 bytes that old peers pass over:
+//! them, in a packet of 100 bytes that old peers pass over:
 //!
 //! `<incarnation>._fipa_gateway._udp.local. TXT "agents=500" "digest=0123456789abcdef"`
 //!
