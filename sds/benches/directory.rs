@@ -96,8 +96,9 @@ fn watching(criterion: &mut Criterion) {
             raw.try_recv().unwrap()
         });
     });
+    // Goes on from one sample to the next, so that every registration is a change.
+    let mut number = 0_u64;
     group.bench_function("registered and told by the merged view", |bench| {
-        let mut number = 0_u64;
         bench.iter(|| {
             number += 1;
             agent.description = number.to_string();
