@@ -290,3 +290,32 @@ fn what_cannot_be_written_is_an_error() {
         Err(EncodeError::Empty("received-by"))
     );
 }
+
+#[test]
+fn the_envelope_around_a_message_is_the_one_of_its_parameters() {
+    let representation = AclRepresentation::BitEfficient;
+    let plain = agent("rover");
+    let reachable = agent("arm_1").with_address("tcp://10.0.0.2:7788").unwrap();
+    let many: Vec<AgentId> = (0..3000)
+        .map(|n| agent(&format!("arm_{n}_of_many")))
+        .collect();
+    for (to, from) in [
+        (vec![plain.clone()], Some(reachable.clone())),
+        (vec![reachable, plain.clone()], None),
+        (Vec::new(), Some(plain.clone())),
+        (many, Some(plain)),
+    ] {
+        let whole = Envelope {
+            base: EnvelopeParams {
+                to: to.clone(),
+                from: from.clone(),
+                payload_length: Some(4711),
+                intended_receivers: to.clone(),
+                ..base()
+            },
+            extensions: Vec::new(),
+        };
+        let quick = Envelope::encode_around(&to, from.as_ref(), &representation, 4711, date());
+        assert_eq!(quick.unwrap(), whole.encode_standard().unwrap());
+    }
+}

@@ -10,5 +10,10 @@ mod post;
 mod runtime;
 mod stamp;
 
+/// A table that is looked into several times for every letter, by a quick hash that is seeded in
+/// every process. Not for what strangers fill without a closer bound: it does not stand up to
+/// somebody who finds out, by how long things take, which keys collide.
+type Map<K, V> = std::collections::HashMap<K, V, foldhash::fast::RandomState>;
+
 pub use post::{PostError, letter_around, letter_for};
 pub use runtime::{Contacts, Mts, RuntimeConfig, Sending, Started};

@@ -4,8 +4,7 @@ use std::time::SystemTime;
 
 use bytes::Bytes;
 use fipa_acl::{
-    AclRepresentation, EncodeError, Envelope, EnvelopeParams, Letter, Message, Payload, Time,
-    TimeError,
+    AclRepresentation, EncodeError, Envelope, Letter, Message, Payload, Time, TimeError,
 };
 
 /// Why a message could not be made into a letter.
@@ -56,18 +55,11 @@ fn envelope_for(
     payload_len: usize,
     utc: SystemTime,
 ) -> Result<Bytes, PostError> {
-    let base = EnvelopeParams {
-        to: message.receivers().to_vec(),
-        from: message.sender().cloned(),
-        acl_representation: Some(AclRepresentation::BitEfficient),
-        payload_length: Some(payload_len as u64),
-        date: Some(Time::from_system_time(utc)?),
-        intended_receivers: message.receivers().to_vec(),
-        ..EnvelopeParams::default()
-    };
-    Ok(Envelope {
-        base,
-        extensions: Vec::new(),
-    }
-    .encode_standard()?)
+    Ok(Envelope::encode_around(
+        message.receivers(),
+        message.sender(),
+        &AclRepresentation::BitEfficient,
+        payload_len as u64,
+        Time::from_system_time(utc)?,
+    )?)
 }

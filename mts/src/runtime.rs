@@ -8,7 +8,6 @@
 //! Whoever waits, for an outcome or a letter, first drives the transports for a short while on
 //! its own thread, and then sleeps until it is woken.
 
-use std::collections::HashMap;
 use std::future::Future;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
@@ -26,6 +25,7 @@ use tokio::runtime::Handle;
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 
+use crate::Map;
 use crate::core::{
     Action, Core, CoreConfig, Now, Peer, PeerState, Received, Route, SendId, Submission, WayState,
 };
@@ -85,8 +85,28 @@ struct State {
     unframed_deadline: Duration,
     /// Until when the timer sleeps.
     armed: Option<Instant>,
-    sends: HashMap<SendId, Arc<Slot>>,
-    agents: HashMap<Incarnation, Arc<Notify>>,
+    sends: Map<SendId, Arc<Slot>>,
+    agents: Map<Incarnation, Arc<Door>>,
+}
+
+/// Where whoever receives for an agent waits. Written under the lock of the state; read without,
+/// by those who look for a letter again and again.
+#[derive(Default)]
+struct Door {
+    /// There is something in the agent's queue.
+    ready: AtomicBool,
+    /// Nothing will come any more.
+    gone: AtomicBool,
+    notify: Notify,
+}
+
+impl Door {
+    fn close(&self) {
+        self.gone.store(true, Ordering::Release);
+        self.notify.notify_waiters();
+        // Whoever is about to wait.
+        self.notify.notify_one();
+    }
 }
 
 /// Where the outcomes of one letter are gathered.
@@ -134,8 +154,8 @@ impl Mts {
             core: Core::new(core, Arc::clone(&directory)),
             unframed_deadline: config.unframed_deadline,
             armed: None,
-            sends: HashMap::new(),
-            agents: HashMap::new(),
+            sends: Map::default(),
+            agents: Map::default(),
         };
         let shared = Arc::new(Shared {
             state: Mutex::new(state),
@@ -175,7 +195,11 @@ impl Mts {
     /// Letters for this agent are taken from now on. It must be in the directory, or about to be.
     pub fn register(&self, name: Arc<str>, incarnation: Incarnation) {
         let mut state = self.shared.state.lock();
-        state.agents.insert(incarnation, Arc::default());
+        let door = Arc::new(Door::default());
+        if self.shared.closed.load(Ordering::Acquire) {
+            door.close();
+        }
+        state.agents.insert(incarnation, door);
         state.core.register(name, incarnation);
     }
 
@@ -183,8 +207,8 @@ impl Mts {
     pub fn deregister(&self, incarnation: Incarnation) {
         let mut state = self.shared.state.lock();
         state.core.deregister(incarnation);
-        if let Some(notify) = state.agents.remove(&incarnation) {
-            notify.notify_waiters();
+        if let Some(door) = state.agents.remove(&incarnation) {
+            door.close();
         }
         self.shared.carry_out(state);
     }
@@ -274,12 +298,15 @@ impl Mts {
     /// The next letter for this agent, or none when the agent was deregistered or the service
     /// closed.
     pub async fn receive(&self, agent: Incarnation) -> Option<Received> {
-        let notify = Arc::clone(self.shared.state.lock().agents.get(&agent)?);
+        let door = Arc::clone(self.shared.state.lock().agents.get(&agent)?);
         self.shared
-            .wait(&notify, || match self.try_receive(agent) {
-                Some(received) => Some(Some(received)),
-                None if self.is_gone(agent) => Some(None),
-                None => None,
+            .wait(&door.notify, || {
+                if door.ready.load(Ordering::Acquire)
+                    && let Some(received) = self.try_receive(agent)
+                {
+                    return Some(Some(received));
+                }
+                door.gone.load(Ordering::Acquire).then_some(None)
             })
             .await
     }
@@ -287,20 +314,18 @@ impl Mts {
     /// The next letter for this agent, if there is one now.
     pub fn try_receive(&self, agent: Incarnation) -> Option<Received> {
         let mut state = self.shared.state.lock();
-        let received = state.core.take(agent)?;
-        if state.core.waiting(agent) > 0 {
-            // Another task may be waiting for the same agent's letters.
-            if let Some(notify) = state.agents.get(&agent) {
-                notify.notify_one();
+        let received = state.core.take(agent);
+        let more = state.core.waiting(agent) > 0;
+        if let Some(door) = state.agents.get(&agent) {
+            door.ready.store(more, Ordering::Release);
+            if more {
+                // Another task may be waiting for the same agent's letters.
+                door.notify.notify_one();
             }
         }
+        let received = received?;
         self.shared.carry_out(state);
         Some(received)
-    }
-
-    fn is_gone(&self, agent: Incarnation) -> bool {
-        self.shared.closed.load(Ordering::Acquire)
-            || !self.shared.state.lock().agents.contains_key(&agent)
     }
 
     /// Memory for the content of a letter to this receiver, to be filled in place: shared memory
@@ -364,9 +389,8 @@ impl Mts {
         }
         let mut state = self.shared.state.lock();
         state.core.give_up();
-        for notify in state.agents.values() {
-            notify.notify_waiters();
-            notify.notify_one();
+        for door in state.agents.values() {
+            door.close();
         }
         self.shared.carry_out(state);
         for transport in &self.shared.transports {
@@ -447,8 +471,9 @@ impl Shared {
                     }
                 }
                 Action::Deliverable { agent } => {
-                    if let Some(notify) = state.agents.get(&agent) {
-                        notify.notify_one();
+                    if let Some(door) = state.agents.get(&agent) {
+                        door.ready.store(true, Ordering::Release);
+                        door.notify.notify_one();
                     }
                 }
             }

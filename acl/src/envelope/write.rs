@@ -47,6 +47,45 @@ impl Envelope {
         encode(self, Dialect::Standard)
     }
 
+    /// The envelope that a sender puts around a message, encoded in the standard's dialect from
+    /// borrowed parts: to the receivers, who are all intended, from the sender, with the length of
+    /// the payload and the date. What every letter needs is made without a value in between.
+    ///
+    /// # Errors
+    /// Like [`encode_standard`](Self::encode_standard).
+    pub fn encode_around(
+        receivers: &[AgentId],
+        from: Option<&AgentId>,
+        representation: &AclRepresentation,
+        payload_length: u64,
+        date: Time,
+    ) -> Result<Bytes, EncodeError> {
+        let mut writer = Writer::new(Dialect::Standard);
+        // Enough for names of usual length, so that the buffer rarely has to grow.
+        writer.out.reserve(128 + 96 * receivers.len().min(16));
+        let start = writer.begin(0xfe);
+        writer.acl_representation(representation)?;
+        writer.time("date", date)?;
+        let to = writer.out.len();
+        writer.agent_ids(0x02, receivers)?;
+        let list = to..writer.out.len();
+        if let Some(from) = from {
+            writer.out.byte(0x03);
+            writer.agent_id(from)?;
+        }
+        writer.out.byte(0x06);
+        writer.payload_length(payload_length)?;
+        // The same list under another code.
+        let intended = writer.out.len();
+        writer.out.extend_from_within(list);
+        if let Some(code) = writer.out.get_mut(intended) {
+            *code = 0x09;
+        }
+        writer.out.byte(0x01);
+        writer.end(start)?;
+        Ok(writer.out.into())
+    }
+
     /// One encoded extension envelope, to be put in front of a letter
     /// ([`Letter::stamped`](crate::Letter::stamped)).
     ///

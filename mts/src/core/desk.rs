@@ -1,7 +1,7 @@
 //! What all lanes share: the list of things to be done, the attempts under way and the health of
 //! the ways.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -14,6 +14,7 @@ use fipa_transport::{
 
 use super::routes::Tallies;
 use super::{CoreConfig, SendId};
+use crate::Map;
 
 /// Something the runtime has to do for the delivery core.
 #[derive(Debug)]
@@ -129,14 +130,14 @@ pub(crate) struct Desk {
     pub(crate) config: CoreConfig,
     pub(crate) directory: Arc<dyn Directory>,
     pub(crate) actions: VecDeque<Action>,
-    pub(crate) attempts: HashMap<AttemptId, Purpose>,
+    pub(crate) attempts: Map<AttemptId, Purpose>,
     pub(crate) undelivered: VecDeque<Undelivered>,
     /// Bytes of all letters in lanes.
     pub(crate) held: usize,
     pub(super) tallies: Tallies,
-    health: HashMap<Location, Health>,
+    health: Map<Location, Health>,
     /// Lanes that found no room on the way to a location, in order.
-    waiting_for_room: HashMap<Location, VecDeque<Stream>>,
+    waiting_for_room: Map<Location, VecDeque<Stream>>,
     next_attempt: u64,
 }
 
@@ -158,12 +159,12 @@ impl Desk {
             config,
             directory,
             actions: VecDeque::new(),
-            attempts: HashMap::new(),
+            attempts: Map::default(),
             undelivered: VecDeque::new(),
             held: 0,
             tallies: Tallies::default(),
-            health: HashMap::new(),
-            waiting_for_room: HashMap::new(),
+            health: Map::default(),
+            waiting_for_room: Map::default(),
             next_attempt: 1,
         }
     }

@@ -28,6 +28,7 @@ pub(crate) struct Inbox {
     pub(crate) name: Arc<str>,
     queue: VecDeque<Received>,
     bound: usize,
+    /// By a keyed hash: strangers choose these, tens of thousands of them.
     senders: HashMap<Incarnation, Taken>,
     /// Who was told that the queue is full and waits for a credit, in order.
     waiting: VecDeque<(Stream, Location)>,

@@ -25,7 +25,7 @@ mod peers;
 mod routes;
 
 use std::cmp::Reverse;
-use std::collections::{BinaryHeap, HashMap};
+use std::collections::BinaryHeap;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -42,6 +42,8 @@ use desk::{Desk, NOTE_TRIES, Note, Origin, Purpose, Undelivered};
 use inbox::Inbox;
 pub use inbox::Received;
 use lane::{Delivery, Lane, Moved};
+
+use crate::Map;
 use peers::Peers;
 pub use peers::{Peer, PeerState};
 pub use routes::{Route, Standing, Way, WayState};
@@ -91,8 +93,8 @@ const IDLE_TIME: Duration = Duration::from_secs(60);
 /// The delivery core. See the module's documentation.
 pub struct Core {
     desk: Desk,
-    lanes: HashMap<Stream, Lane>,
-    agents: HashMap<Incarnation, Inbox>,
+    lanes: Map<Stream, Lane>,
+    agents: Map<Incarnation, Inbox>,
     timers: BinaryHeap<Reverse<(Instant, Stream)>>,
     notes: BinaryHeap<Reverse<LateNote>>,
     peers: Peers,
@@ -133,8 +135,8 @@ impl Core {
     pub fn new(config: CoreConfig, directory: Arc<dyn Directory>) -> Self {
         Self {
             desk: Desk::new(config, directory),
-            lanes: HashMap::new(),
-            agents: HashMap::new(),
+            lanes: Map::default(),
+            agents: Map::default(),
             timers: BinaryHeap::new(),
             notes: BinaryHeap::new(),
             peers: Peers::default(),
@@ -195,9 +197,16 @@ impl Core {
             .map(|inbox| Arc::clone(&inbox.name));
         let mut reached: Vec<Incarnation> = Vec::new();
         let mut count = 0;
+        let only_one = receivers.len() == 1;
         for receiver in receivers {
             let own = sender_name.as_deref().unwrap_or_default();
             let entries = match fipa_sds::resolve(&*directory, &receiver, own) {
+                // What nearly every letter is, without what more of them would take.
+                Ok(Resolution::Exact(entry)) if only_one && entry.incarnation.is_known() => {
+                    self.send_one(now, (send, sender), &entry, letter, deadline);
+                    self.tell_failures(now);
+                    return (send, 1);
+                }
                 Ok(Resolution::Exact(entry)) => vec![entry],
                 Ok(Resolution::Multicast(entries)) => entries,
                 Ok(Resolution::None) | Err(_) => Vec::new(),

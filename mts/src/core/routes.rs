@@ -1,7 +1,6 @@
 //! Routes and ways as people look at them: which way a letter to somebody would go now, and why;
 //! what has happened on each way so far.
 
-use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
@@ -12,6 +11,7 @@ use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
 
 use super::desk::Desk;
+use crate::Map;
 
 /// How letters to one agent would go now.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -97,7 +97,7 @@ pub(crate) struct Tally {
 
 /// The tallies of all ways.
 #[derive(Debug, Default)]
-pub(super) struct Tallies(HashMap<Location, Arc<Tally>>);
+pub(super) struct Tallies(Map<Location, Arc<Tally>>);
 
 /// Ways that are counted, at most.
 const MAX_TALLIES: usize = 4096;
