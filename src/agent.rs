@@ -8,7 +8,7 @@ use std::time::{Duration, SystemTime};
 use bytes::Bytes;
 use fipa_acl::{AgentId, DecodeError, Letter, Message, MessageBuilder, Performative};
 use fipa_mts::core::Submission;
-use fipa_mts::{PostError, letter_around, letter_for};
+use fipa_mts::{PostError, Sending, letter_around, letter_for};
 use fipa_sds::{DeregisterError, Directory};
 use fipa_transport::{Incarnation, Kind, LoanedContent, Outcome};
 
@@ -23,6 +23,10 @@ pub struct Agent {
     /// How many unique texts were given out.
     given_out: AtomicU64,
     registered: bool,
+    #[cfg(feature = "monitor")]
+    checks: Option<crate::checks::Checks>,
+    #[cfg(feature = "monitor")]
+    pub(crate) desk: crate::protocol::Desk,
 }
 
 impl Agent {
@@ -33,6 +37,10 @@ impl Agent {
         incarnation: Incarnation,
     ) -> Self {
         Self {
+            #[cfg(feature = "monitor")]
+            checks: domain.inner.rules.checks(&name),
+            #[cfg(feature = "monitor")]
+            desk: crate::protocol::Desk::default(),
             domain,
             id,
             name,
@@ -158,15 +166,7 @@ impl Agent {
         letter: Result<Letter, PostError>,
         deadline: Duration,
     ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
-        let sending = self.check(message).and_then(|()| {
-            let receivers = message.receivers().iter();
-            Ok(self.domain.inner.service.mts.send(Submission {
-                sender: self.incarnation,
-                letter: letter?,
-                receivers: receivers.map(|id| id.name().into()).collect(),
-                deadline,
-            }))
-        });
+        let sending = self.begin(message, letter, deadline);
         async move {
             let outcomes = sending?.outcomes().await;
             let deliveries = outcomes
@@ -174,6 +174,41 @@ impl Agent {
                 .map(|(receiver, outcome)| Delivery { receiver, outcome });
             Ok(Deliveries(deliveries.collect()))
         }
+    }
+
+    fn begin(
+        &self,
+        message: &Message,
+        letter: Result<Letter, PostError>,
+        deadline: Duration,
+    ) -> Result<Sending, SendError> {
+        self.check(message)?;
+        let letter = letter?;
+        #[cfg(feature = "monitor")]
+        if let Some(checks) = &self.checks {
+            checks.leaving(message)?;
+        }
+        Ok(self.submit(message, letter, deadline))
+    }
+
+    fn submit(&self, message: &Message, letter: Letter, deadline: Duration) -> Sending {
+        let receivers = message.receivers().iter();
+        self.domain.inner.service.mts.send(Submission {
+            sender: self.incarnation,
+            letter,
+            receivers: receivers.map(|id| id.name().into()).collect(),
+            deadline,
+        })
+    }
+
+    /// Sends a message that is not checked, and whose outcomes nobody waits for.
+    #[cfg(feature = "monitor")]
+    pub(crate) fn post_aside(&self, message: &Message) -> Result<(), SendError> {
+        self.check(message)?;
+        let letter = letter_for(message, SystemTime::now())?;
+        // Dropping the future does not stop the letter.
+        drop(self.submit(message, letter, self.domain.inner.deadline));
+        Ok(())
     }
 
     fn check(&self, message: &Message) -> Result<(), SendError> {
@@ -196,11 +231,10 @@ impl Agent {
     /// # Errors
     /// When the domain was closed, or the letter that came holds no message that can be decoded.
     pub async fn receive(&self) -> Result<Incoming, ReceiveError> {
-        let mts = &self.domain.inner.service.mts;
-        match mts.receive(self.incarnation).await {
-            Some(received) => Incoming::decode(received),
-            None => Err(ReceiveError::Closed),
-        }
+        #[cfg(feature = "monitor")]
+        return self.desk.next_other(self).await;
+        #[cfg(not(feature = "monitor"))]
+        self.next_letter().await
     }
 
     /// The next message for this agent, if there is one now.
@@ -208,11 +242,34 @@ impl Agent {
     /// # Errors
     /// When the letter that came holds no message that can be decoded.
     pub fn try_receive(&self) -> Result<Option<Incoming>, ReceiveError> {
+        self.domain.inner.service.mts.drive();
+        #[cfg(feature = "monitor")]
+        return self.desk.other_now(self);
+        #[cfg(not(feature = "monitor"))]
+        self.letter_now().transpose()
+    }
+
+    /// The next message, whatever conversation it belongs to.
+    pub(crate) async fn next_letter(&self) -> Result<Incoming, ReceiveError> {
         let mts = &self.domain.inner.service.mts;
-        mts.drive();
-        mts.try_receive(self.incarnation)
-            .map(Incoming::decode)
-            .transpose()
+        match mts.receive(self.incarnation).await {
+            Some(received) => self.taken(received),
+            None => Err(ReceiveError::Closed),
+        }
+    }
+
+    pub(crate) fn letter_now(&self) -> Option<Result<Incoming, ReceiveError>> {
+        let received = self.domain.inner.service.mts.try_receive(self.incarnation);
+        received.map(|received| self.taken(received))
+    }
+
+    fn taken(&self, received: fipa_mts::core::Received) -> Result<Incoming, ReceiveError> {
+        let incoming = Incoming::decode(received)?;
+        #[cfg(feature = "monitor")]
+        if let Some(checks) = &self.checks {
+            return checks.arrived(self, incoming);
+        }
+        Ok(incoming)
     }
 
     /// Takes the name out of the directory. Letters that wait in the queue are dropped.
@@ -304,6 +361,9 @@ pub struct Incoming {
     pub letter: Letter,
     /// How it came on its last stretch; none for what this process itself told the agent.
     pub via: Option<Kind>,
+    /// How it violates its protocol, where that is checked and the configuration says `warn`.
+    #[cfg(feature = "monitor")]
+    pub violation: Option<Box<fipa_monitor::Violation>>,
 }
 
 impl Incoming {
@@ -314,6 +374,8 @@ impl Incoming {
                 message,
                 letter,
                 via,
+                #[cfg(feature = "monitor")]
+                violation: None,
             }),
             Err(source) => Err(ReceiveError::Malformed {
                 source,
@@ -341,6 +403,10 @@ pub enum SendError {
         /// Whom the message names.
         sender: String,
     },
+    /// It violates its protocol, and the configuration says `enforce`.
+    #[cfg(feature = "monitor")]
+    #[error("not sent: {0}")]
+    Violation(Box<fipa_monitor::Violation>),
     /// It cannot be encoded.
     #[error(transparent)]
     Post(#[from] PostError),
@@ -360,5 +426,14 @@ pub enum ReceiveError {
         source: DecodeError,
         /// The letter.
         letter: Box<Letter>,
+    },
+    /// A message came that violates its protocol, and the configuration says `enforce`.
+    #[cfg(feature = "monitor")]
+    #[error("{violation}")]
+    Violation {
+        /// In which way.
+        violation: Box<fipa_monitor::Violation>,
+        /// The message.
+        incoming: Box<Incoming>,
     },
 }

@@ -30,6 +30,10 @@
 //! mdns = true
 //! interfaces = []                     # empty: all that listen; names or addresses otherwise
 //! static = { crex-mts = ["tcp://10.0.0.2:7788"] }   # (none by default)
+//! [monitor]
+//! check = "off"                       # or warn, enforce: whether agents keep to their protocols
+//! answer = false                      # whether what breaks one is answered with not-understood
+//! protocols = []                      # SCXML files, beyond the protocols of FIPA
 //! ```
 //!
 //! What must not live here: opening anything that the configuration names. A transport that this
@@ -74,6 +78,8 @@ pub struct Config {
     pub transport: Transports,
     /// `[discovery]`: how other hosts are found.
     pub discovery: Discovery,
+    /// `[monitor]`: whether agents keep to their protocols.
+    pub monitor: Monitor,
 }
 
 /// `[mts]`: the message transport service of a process.
@@ -163,6 +169,47 @@ pub struct Peer {
     pub locations: Vec<Location>,
 }
 
+/// `[monitor]`: whether agents keep to their protocols. Without the feature `monitor` nothing is
+/// checked.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Monitor {
+    /// `check`: what is done about messages that violate their protocol.
+    pub check: Check,
+    /// `answer`: whether a message that came and violates its protocol is answered with
+    /// `not-understood`.
+    pub answer: bool,
+    /// `protocols`: paths of SCXML files with protocols beyond FIPA's, or in their place; at most
+    /// 128.
+    pub protocols: Vec<String>,
+}
+
+/// What is done about messages that violate their protocol.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Check {
+    /// Nothing is checked.
+    Off,
+    /// They are logged; those that came say so.
+    Warn,
+    /// They are not sent; those that came are handed over as errors.
+    Enforce,
+}
+
+impl Check {
+    pub(crate) const ALL: [Self; 3] = [Self::Off, Self::Warn, Self::Enforce];
+
+    /// As it stands in the file.
+    #[must_use]
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Off => "off",
+            Self::Warn => "warn",
+            Self::Enforce => "enforce",
+        }
+    }
+}
+
 /// A network interface, as the configuration names it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Interface {
@@ -218,6 +265,11 @@ impl Config {
                 mdns: true,
                 interfaces: Vec::new(),
                 peers: Vec::new(),
+            },
+            monitor: Monitor {
+                check: Check::Off,
+                answer: false,
+                protocols: Vec::new(),
             },
         }
     }

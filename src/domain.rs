@@ -24,6 +24,8 @@ pub struct Domain {
 pub(crate) struct Inner {
     pub(crate) service: Service,
     pub(crate) deadline: std::time::Duration,
+    #[cfg(feature = "monitor")]
+    pub(crate) rules: crate::checks::Rules,
 }
 
 impl Drop for Inner {
@@ -46,6 +48,10 @@ pub enum OpenError {
     /// The domain's directory cannot be used.
     #[error(transparent)]
     Place(#[from] PlaceError),
+    /// A protocol that the configuration names cannot be used.
+    #[cfg(feature = "monitor")]
+    #[error(transparent)]
+    Protocol(#[from] crate::checks::ProtocolError),
     /// The directory of the host cannot be used.
     #[error(transparent)]
     Directory(#[from] HostError),
@@ -87,6 +93,12 @@ impl Domain {
     /// # Errors
     /// When the configuration, the domain's directory or every transport cannot be used.
     pub async fn open(config: &Config) -> Result<Self, OpenError> {
+        #[cfg(feature = "monitor")]
+        let rules = crate::checks::Rules::load(&config.monitor)?;
+        #[cfg(not(feature = "monitor"))]
+        if config.monitor.check != crate::config::Check::Off {
+            tracing::warn!("monitor.check does nothing: built without the feature \"monitor\"");
+        }
         let host = gethostname::gethostname();
         let name = format!("{}-{}", host.to_string_lossy(), std::process::id());
         let service = Service::start(
@@ -101,7 +113,12 @@ impl Domain {
         )?;
         let deadline = config.mts.deadline;
         Ok(Self {
-            inner: Arc::new(Inner { service, deadline }),
+            inner: Arc::new(Inner {
+                service,
+                deadline,
+                #[cfg(feature = "monitor")]
+                rules,
+            }),
         })
     }
 

@@ -37,22 +37,30 @@ compile_error!("fipa needs a transport: enable the feature \"shm\" or \"net\"");
 
 mod agent;
 pub mod blocking;
+#[cfg(feature = "monitor")]
+mod checks;
 pub mod config;
 pub mod doctor;
 mod domain;
 #[cfg(feature = "net")]
 mod gateway;
 mod place;
+#[cfg(feature = "monitor")]
+pub mod protocol;
 pub mod routes;
 mod service;
 
 pub use agent::{Agent, Deliveries, Delivery, Incoming, Loan, ReceiveError, SendError};
+#[cfg(feature = "monitor")]
+pub use checks::ProtocolError;
 pub use config::Config;
 pub use domain::{Domain, OpenError, RegisterOptions};
 pub use fipa_acl::{
     AgentId, AgentIdError, BuildError, DecodeError, Envelope, EnvelopeParams, Letter, Message,
     MessageBuilder, Payload, Performative, Time,
 };
+#[cfg(feature = "monitor")]
+pub use fipa_monitor as monitor;
 pub use fipa_sds::{
     Change, Directory, Entry, Matcher, Pattern, PatternError, Query, Reach, RegisterError, Role,
     Source, Watch, is_pattern,

@@ -8,6 +8,7 @@ mod demo;
 mod doctor;
 mod echo;
 mod encode;
+mod protocol;
 mod routes;
 mod send;
 mod up;
@@ -30,6 +31,7 @@ pub(crate) enum Command {
     Bench(bench::Arguments),
     Decode(decode::Arguments),
     Encode(encode::Arguments),
+    Protocol(protocol::Arguments),
     Config(config::Arguments),
 }
 
@@ -46,6 +48,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Bench(arguments) => bench::run(arguments, global),
         Command::Decode(arguments) => decode::run(arguments, global),
         Command::Encode(arguments) => encode::run(arguments, global),
+        Command::Protocol(arguments) => protocol::run(arguments, global),
         Command::Config(arguments) => config::run(arguments, global),
     }
 }

@@ -79,6 +79,14 @@ impl Failure {
         }
     }
 
+    /// It did not work, and the output says so already.
+    pub(crate) fn already_told() -> Self {
+        Self {
+            code: FAILED,
+            troubles: Vec::new(),
+        }
+    }
+
     /// Prints it.
     pub(crate) fn report(&self) -> ExitCode {
         let mut text = String::new();

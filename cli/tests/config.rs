@@ -108,6 +108,11 @@ listen = [\"127.0.0.1:0\"]             # default
 mdns = true                          # default
 interfaces = []                      # default
 
+[monitor]
+check = \"off\"                        # default
+answer = false                       # default
+protocols = []                       # default
+
 [routes]
 \"arm_.*\" = [\"tcp\"]                   # fipa.toml:5
 ";

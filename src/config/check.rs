@@ -37,6 +37,9 @@ const MAX_INTERFACES: usize = 64;
 /// Most static gateways.
 const MAX_PEERS: usize = 1024;
 
+/// Most files with protocols.
+const MAX_PROTOCOLS: usize = 128;
+
 /// The transports this version of fipa has.
 const BUILT: [Kind; 3] = [Kind::Shm, Kind::Tcp, Kind::Udp];
 
@@ -76,6 +79,7 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
     );
     found.interfaces(&config.discovery.interfaces);
     found.peers(&config.discovery.peers);
+    found.protocols(&config.monitor.protocols);
     found.0
 }
 
@@ -103,6 +107,20 @@ impl Findings {
                     MAX_DOMAIN
                 ),
             );
+        }
+    }
+
+    fn protocols(&mut self, files: &[String]) {
+        let path = ["monitor", "protocols"];
+        if files.len() > MAX_PROTOCOLS {
+            self.add(
+                &path,
+                format_args!("lists {} files", files.len()),
+                format!("at most {MAX_PROTOCOLS} are read"),
+            );
+        }
+        if files.iter().any(String::is_empty) {
+            self.add(&path, "lists a file without a name", "name an SCXML file");
         }
     }
 

@@ -12,7 +12,7 @@ use fipa_transport::{Kind, Location};
 use toml_edit::Value as Toml;
 
 use super::effective::Value;
-use super::{Config, Interface, Peer, Route};
+use super::{Check, Config, Interface, Peer, Route};
 
 /// A key with one place in the configuration.
 pub(super) struct Key {
@@ -142,6 +142,27 @@ pub(super) const KEYS: &[Key] = &[
         write: |config, value| items(value, interface).map(|all| config.discovery.interfaces = all),
         read: |config| Value::list(&config.discovery.interfaces),
     },
+    Key {
+        path: &["monitor", "check"],
+        shape: Shape::Text,
+        expected: r#""off", "warn" or "enforce""#,
+        write: |config, value| choice(value).map(|check| config.monitor.check = check),
+        read: |config| Value::Text(config.monitor.check.as_str().to_owned()),
+    },
+    Key {
+        path: &["monitor", "answer"],
+        shape: Shape::Plain,
+        expected: "true or false",
+        write: |config, value| truth(value).map(|answer| config.monitor.answer = answer),
+        read: |config| Value::Truth(config.monitor.answer),
+    },
+    Key {
+        path: &["monitor", "protocols"],
+        shape: Shape::List,
+        expected: r#"a list of SCXML files such as ["protocols/lift.scxml"]"#,
+        write: |config, value| items(value, text).map(|all| config.monitor.protocols = all),
+        read: |config| Value::list(&config.monitor.protocols),
+    },
 ];
 
 /// Every table of names.
@@ -225,6 +246,13 @@ impl Wrong {
 fn text(value: &Toml) -> Result<String, Wrong> {
     let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
     Ok(text.to_owned())
+}
+
+fn choice(value: &Toml) -> Result<Check, Wrong> {
+    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+    let mut all = Check::ALL.into_iter();
+    all.find(|check| check.as_str() == text)
+        .ok_or_else(|| Wrong::new(value, "no such choice"))
 }
 
 fn truth(value: &Toml) -> Result<bool, Wrong> {

@@ -10,7 +10,7 @@ use fipa_transport::Kind;
 use proptest::prelude::*;
 
 use super::reader::Reader;
-use super::{Config, ConfigError, Effective, Interface, Origin, Peer, Route, Sources};
+use super::{Check, Config, ConfigError, Effective, Interface, Origin, Peer, Route, Sources};
 
 /// Loads a text as if it stood in `./fipa.toml`.
 fn load(text: &str, set: &[&str]) -> Result<Effective, ConfigError> {
@@ -91,6 +91,10 @@ fn every_key_is_read() {
         interfaces = ["wlan0", "10.0.0.7", "fe80::1"]
         [discovery.static]
         sherpa-mts = ["tcp://10.0.0.2:7788", "tcp://sherpa.local:7788"]
+        [monitor]
+        check = "enforce"
+        answer = true
+        protocols = ["lift.scxml"]
         "#,
         &[],
     );
@@ -115,6 +119,9 @@ fn every_key_is_read() {
     );
     assert!(config.transport.udp.listen.is_empty());
     assert!(!config.discovery.mdns);
+    assert_eq!(config.monitor.check, Check::Enforce);
+    assert!(config.monitor.answer);
+    assert_eq!(config.monitor.protocols, ["lift.scxml"]);
     let addresses = ["10.0.0.7", "fe80::1"].map(|text| Interface::Address(text.parse().unwrap()));
     let [first, second] = addresses;
     assert_eq!(
@@ -260,6 +267,11 @@ listen = ["127.0.0.1:0"]             # default
 mdns = true                          # default
 interfaces = []                      # default
 
+[monitor]
+check = "off"                        # default
+answer = false                       # default
+protocols = []                       # default
+
 [routes]
 "a b" = ["tcp"]                      # --set
 "camera_.*" = ["shm"]                # fipa.toml:9
@@ -308,6 +320,8 @@ prop_compose! {
         mdns: bool,
         interfaces in prop::collection::btree_set("[a-z]{1,9}[0-9]", 0..4),
         peers in prop::collection::btree_map("[^\\p{Cc}]{1,20}", 1_u16.., 0..4),
+        check in prop::sample::select(Check::ALL.to_vec()),
+        answer: bool,
     ) -> Config {
         let mut config = Config::for_host("sherpa");
         config.domain = domain;
@@ -337,6 +351,8 @@ prop_compose! {
                 locations: vec![format!("tcp://host:{port}").parse().unwrap()],
             })
             .collect();
+        config.monitor.check = check;
+        config.monitor.answer = answer;
         config
     }
 }

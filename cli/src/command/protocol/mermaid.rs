@@ -1,0 +1,58 @@
+//! A protocol as a Mermaid state diagram.
+
+use std::fmt::Write as _;
+
+use fipa::monitor::Machine;
+
+pub(super) fn diagram(machine: &Machine) -> String {
+    let mut out = "stateDiagram-v2\n".to_owned();
+    let number = |id: &str| machine.states().iter().position(|state| state.id() == id);
+    // Writing to a string cannot fail.
+    for (at, state) in machine.states().iter().enumerate() {
+        let _ = writeln!(out, "    state \"{}\" as s{at}", escaped(state.id()));
+    }
+    let initial = number(machine.initial().id()).unwrap_or(0);
+    let _ = writeln!(out, "    [*] --> s{initial}");
+    for (at, state) in machine.states().iter().enumerate() {
+        for step in state.transitions() {
+            let target = number(machine.target(step)).unwrap_or(at);
+            let optional = if step.is_optional() {
+                " (optional)"
+            } else {
+                ""
+            };
+            let label = format!("{}: {}{optional}", step.from(), step.performative());
+            let _ = writeln!(out, "    s{at} --> s{target} : {}", escaped(&label));
+        }
+        if let Some(timeout) = state.timeout() {
+            let target = number(machine.timeout_target(timeout)).unwrap_or(at);
+            let after = super::after(timeout.after());
+            let _ = writeln!(out, "    s{at} --> s{target} : after {after}");
+        }
+        for sub in state.subprotocols() {
+            let label = format!("protocol {} begun by {}", sub.name(), sub.from());
+            let _ = writeln!(out, "    s{at} --> s{at} : {}", escaped(&label));
+        }
+        if state.is_final() {
+            let _ = writeln!(out, "    s{at} --> [*]");
+        }
+    }
+    out
+}
+
+/// Without what means something to Mermaid.
+fn escaped(text: &str) -> String {
+    let mut out = String::new();
+    for c in text.chars() {
+        match c {
+            '#' => out.push_str("#35;"),
+            ';' => out.push_str("#59;"),
+            '"' => out.push_str("#quot;"),
+            '<' => out.push_str("#lt;"),
+            '>' => out.push_str("#gt;"),
+            c if c.is_control() => out.push(' '),
+            c => out.push(c),
+        }
+    }
+    out
+}

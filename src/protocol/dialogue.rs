@@ -1,0 +1,307 @@
+//! One conversation that is led by a call.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use fipa_acl::{AgentId, BuildError, Message, MessageBuilder, Performative, Time};
+use fipa_monitor::{Header, Monitor, Unchecked, Verdict, Violation};
+use fipa_transport::{FailureReason, Incarnation, Outcome};
+
+use crate::agent::{Agent, Deliveries, ReceiveError, SendError};
+
+/// Why a protocol did not yield what it was begun for.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum DialogueError {
+    /// The other side refused.
+    #[error("refused: {0}")]
+    Refused(Box<Message>),
+    /// The other side tried, and failed.
+    #[error("failed: {0}")]
+    Failed(Box<Message>),
+    /// The other side did not understand what was said to it.
+    #[error("did not understand: {0}")]
+    NotUnderstood(Box<Message>),
+    /// The initiator has cancelled.
+    #[error("cancelled: {0}")]
+    Cancelled(Box<Message>),
+    /// A message did not reach its receiver.
+    #[error("not delivered to {receiver}: {reason}")]
+    NotDelivered {
+        /// The receiver.
+        receiver: String,
+        /// Why not.
+        reason: FailureReason,
+    },
+    /// The message transport service told of a message that was not delivered.
+    #[error("not delivered: {0}")]
+    Undelivered(Box<Message>),
+    /// Nothing was said within the time that was given.
+    #[error("no answer in time")]
+    TimedOut,
+    /// The other side said something that the protocol allows, but nobody waited for.
+    #[error("not waited for: {0}")]
+    Unexpected(Box<Message>),
+    /// The other side broke the protocol.
+    #[error("{violation}")]
+    Violation {
+        /// In which way.
+        violation: Box<Violation>,
+        /// With what.
+        message: Box<Message>,
+    },
+    /// What was to be said breaks the protocol.
+    #[error("not sent: {0}")]
+    WouldViolate(Box<Violation>),
+    /// The protocol cannot be followed with such a message.
+    #[error("cannot be followed: {0}")]
+    Unchecked(Unchecked),
+    /// The message cannot be built.
+    #[error(transparent)]
+    Build(#[from] BuildError),
+    /// The message cannot be sent.
+    #[error(transparent)]
+    Send(#[from] SendError),
+    /// No message can be received.
+    #[error(transparent)]
+    Receive(ReceiveError),
+}
+
+/// What a message that was received means.
+pub(super) struct Heard {
+    pub(super) message: Message,
+    /// Whether the protocol has ended with its sender.
+    pub(super) ended: bool,
+}
+
+/// A conversation. Dropped, it is no longer led; what still comes goes to [`Agent::receive`].
+pub(super) struct Dialogue<'a> {
+    agent: &'a Agent,
+    protocol: String,
+    id: String,
+    monitor: Monitor,
+    replies: u32,
+}
+
+impl<'a> Dialogue<'a> {
+    /// Begins a conversation of this protocol; `due` is when its first answer must have come.
+    pub(super) async fn open(
+        agent: &'a Agent,
+        protocol: &str,
+        first: MessageBuilder,
+        due: Option<Instant>,
+    ) -> Result<(Self, Deliveries), DialogueError> {
+        let id = format!("{}--{}", agent.name(), Incarnation::random());
+        let mut dialogue = Self::led(agent, protocol, id);
+        let deliveries = dialogue.tell(first, due).await?;
+        Ok((dialogue, deliveries))
+    }
+
+    /// Takes part in the conversation that a message has begun.
+    pub(super) fn join(agent: &'a Agent, first: &Message) -> Result<Self, DialogueError> {
+        let id = first.conversation_id();
+        let id = id.ok_or(DialogueError::Unchecked(Unchecked::NoConversation))?;
+        let mut dialogue = Self::led(agent, first.protocol().unwrap_or_default(), id.to_owned());
+        dialogue
+            .check(first)
+            .map_err(|wrong| wrong.of_others(first))?;
+        Ok(dialogue)
+    }
+
+    fn led(agent: &'a Agent, protocol: &str, id: String) -> Self {
+        agent.desk.begin(&id);
+        let library = Arc::clone(agent.domain().inner.rules.library());
+        Self {
+            agent,
+            protocol: protocol.to_owned(),
+            id,
+            monitor: Monitor::agent(library, agent.name()),
+            replies: 0,
+        }
+    }
+
+    /// Says something in this conversation, and that the answer is wanted by then.
+    pub(super) async fn tell(
+        &mut self,
+        message: MessageBuilder,
+        due: Option<Instant>,
+    ) -> Result<Deliveries, DialogueError> {
+        self.replies += 1;
+        let mut message = message
+            .protocol(self.protocol.as_str())
+            .conversation_id(self.id.as_str())
+            .reply_with(format!("{}--{}", self.id, self.replies));
+        if let Some(due) = due {
+            let left = due.saturating_duration_since(Instant::now());
+            let by = SystemTime::now().checked_add(left);
+            if let Some(by) = by.and_then(|by| Time::from_system_time(by).ok()) {
+                message = message.reply_by(by);
+            }
+        }
+        let message = message.build()?;
+        self.check(&message).map_err(Wrong::of_ours)?;
+        Ok(self.agent.send(message).await?)
+    }
+
+    /// Answers a message of this conversation.
+    pub(super) async fn answer(
+        &mut self,
+        to: &Message,
+        act: Performative,
+        content: impl Into<bytes::Bytes>,
+        due: Option<Instant>,
+    ) -> Result<(), DialogueError> {
+        let answer = self.agent.reply(to, act).content(content);
+        only_delivered(&self.tell(answer, due).await?)
+    }
+
+    /// The next message, or none by then. What does not fit the protocol is an error, and so is what
+    /// ends it for reasons of no protocol of its own.
+    pub(super) async fn hear(&mut self, due: Option<Instant>) -> Result<Heard, DialogueError> {
+        let next = self.agent.desk.next_of(self.agent, &self.id);
+        let received = match due {
+            None => next.await,
+            Some(due) => tokio::time::timeout_at(due.into(), next)
+                .await
+                .map_err(|_| DialogueError::TimedOut)?,
+        };
+        let message = match received {
+            Ok(incoming) => incoming.message,
+            Err(ReceiveError::Violation {
+                violation,
+                incoming,
+            }) => {
+                let message = Box::new(incoming.message);
+                return Err(DialogueError::Violation { violation, message });
+            }
+            Err(other) => return Err(DialogueError::Receive(other)),
+        };
+        let state = self.check(&message);
+        let (state, ended) = state.map_err(|wrong| wrong.of_others(&message))?;
+        match state {
+            Standing::NotUnderstood => Err(DialogueError::NotUnderstood(Box::new(message))),
+            Standing::Cancelling => Err(DialogueError::Cancelled(Box::new(message))),
+            Standing::Undelivered => Err(DialogueError::Undelivered(Box::new(message))),
+            Standing::Own => Ok(Heard { message, ended }),
+        }
+    }
+
+    /// Cancels the conversation (FIPA's cancel meta-protocol), and waits whether it is cancelled.
+    pub(super) async fn cancel(
+        &mut self,
+        receivers: Vec<AgentId>,
+        due: Option<Instant>,
+    ) -> Result<(), DialogueError> {
+        let cancel = self
+            .agent
+            .message(Performative::Cancel)
+            .receivers(receivers);
+        only_delivered(&self.tell(cancel, due).await?)?;
+        loop {
+            let heard = self.hear_cancelling(due).await?;
+            match heard {
+                CancelAnswer::Cancelled => return Ok(()),
+                CancelAnswer::Not(message) => return Err(DialogueError::Failed(message)),
+                CancelAnswer::Crossed => {}
+            }
+        }
+    }
+
+    async fn hear_cancelling(
+        &mut self,
+        due: Option<Instant>,
+    ) -> Result<CancelAnswer, DialogueError> {
+        match self.hear(due).await {
+            Ok(heard) if heard.ended => Ok(CancelAnswer::Cancelled),
+            Ok(heard) => Ok(CancelAnswer::Not(Box::new(heard.message))),
+            // What had been said before the cancel came.
+            Err(DialogueError::Cancelled(_)) => Ok(CancelAnswer::Crossed),
+            Err(other) => Err(other),
+        }
+    }
+
+    pub(super) fn id(&self) -> &str {
+        &self.id
+    }
+
+    fn check(&mut self, message: &Message) -> Result<(Standing, bool), Wrong> {
+        match self
+            .monitor
+            .check(&Header::from(message), SystemTime::now())
+        {
+            Verdict::Accepted(accepted) => {
+                let standing = match accepted.state {
+                    "not-understood" => Standing::NotUnderstood,
+                    "cancelling" => Standing::Cancelling,
+                    "undelivered" => Standing::Undelivered,
+                    _ => Standing::Own,
+                };
+                Ok((standing, accepted.ended))
+            }
+            Verdict::Violation(violation) => Err(Wrong::Violation(violation)),
+            Verdict::Unchecked(why) => Err(Wrong::Unchecked(why)),
+            _ => Ok((Standing::Own, false)),
+        }
+    }
+}
+
+impl Drop for Dialogue<'_> {
+    fn drop(&mut self) {
+        self.agent.desk.end(&self.id);
+    }
+}
+
+enum Standing {
+    Own,
+    NotUnderstood,
+    Cancelling,
+    Undelivered,
+}
+
+enum CancelAnswer {
+    Cancelled,
+    Not(Box<Message>),
+    Crossed,
+}
+
+enum Wrong {
+    Violation(Box<Violation>),
+    Unchecked(Unchecked),
+}
+
+impl Wrong {
+    fn of_ours(self) -> DialogueError {
+        match self {
+            Self::Violation(violation) => DialogueError::WouldViolate(violation),
+            Self::Unchecked(why) => DialogueError::Unchecked(why),
+        }
+    }
+
+    fn of_others(self, message: &Message) -> DialogueError {
+        match self {
+            Self::Violation(violation) => DialogueError::Violation {
+                violation,
+                message: Box::new(message.clone()),
+            },
+            Self::Unchecked(why) => DialogueError::Unchecked(why),
+        }
+    }
+}
+
+/// An error unless all receivers have got it.
+pub(super) fn only_delivered(deliveries: &Deliveries) -> Result<(), DialogueError> {
+    for delivery in &deliveries.0 {
+        if let Outcome::Failed { reason, .. } = &delivery.outcome {
+            return Err(DialogueError::NotDelivered {
+                receiver: delivery.receiver.to_string(),
+                reason: *reason,
+            });
+        }
+    }
+    Ok(())
+}
+
+/// When a span from now is over; never, when that is beyond all times.
+pub(super) fn after(span: Duration) -> Option<Instant> {
+    Instant::now().checked_add(span)
+}

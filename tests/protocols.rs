@@ -1,0 +1,458 @@
+//! Protocols between agents of two processes (each a membership of its own, here in one test
+//! process): led by calls, and checked when the configuration wants it.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
+
+use fipa::config::Sources;
+use fipa::monitor::ViolationKind;
+use fipa::protocol::{Decision, DialogueError, Reply, Task};
+use fipa::{
+    Agent, AgentId, Config, Domain, Message, MessageBuilder, OpenError, Performative, ReceiveError,
+    SendError,
+};
+
+/// Longer than any test takes; nothing waits so long unless something is wrong.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+/// A configuration for a domain that no other test has.
+fn config(set: &[&str]) -> Config {
+    static NEXT: AtomicU32 = AtomicU32::new(0);
+    let number = NEXT.fetch_add(1, Ordering::Relaxed);
+    let mut all = vec![
+        format!("domain=protocols-{}-{number}", std::process::id()),
+        "discovery.mdns=false".to_owned(),
+        "mts.deadline=2min".to_owned(),
+    ];
+    all.extend(set.iter().map(|setting| (*setting).to_owned()));
+    Config::load(&Sources {
+        set: all,
+        ..Sources::default()
+    })
+    .unwrap()
+}
+
+async fn two(set: &[&str]) -> (Domain, Domain) {
+    let config = config(set);
+    let member = || async { Domain::open(&config).await.unwrap() };
+    (member().await, member().await)
+}
+
+/// A rover and an arm of another process.
+async fn pair(set: &[&str]) -> (Agent, Agent) {
+    let (here, there) = two(set).await;
+    (
+        here.register("rover").unwrap(),
+        there.register("arm").unwrap(),
+    )
+}
+
+fn to(agent: &Agent, act: Performative, receiver: &Agent, content: &str) -> MessageBuilder {
+    agent
+        .message(act)
+        .receiver(receiver.id().clone())
+        .content(content.to_owned())
+}
+
+/// What a participant does that is called for this message.
+async fn respond(
+    agent: &Agent,
+    first: &Message,
+    handler: impl AsyncFnOnce(&mut Task<'_>) -> Result<Reply, DialogueError>,
+) -> Result<(), DialogueError> {
+    let mut task = agent.take_part(first)?;
+    let reply = handler(&mut task).await?;
+    task.reply(reply).await
+}
+
+fn text(message: &Message) -> &str {
+    std::str::from_utf8(message.content().unwrap()).unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_request_is_agreed_to_and_done() {
+    let (rover, arm) = pair(&["monitor.check=enforce"]).await;
+    let initiator = async {
+        let lift = to(&rover, Performative::Request, &arm, "lift");
+        let mut request = rover.request(lift, PATIENCE).await.unwrap();
+        assert!(request.agreed().await.unwrap());
+        assert_eq!(text(&request.result().await.unwrap()), "lifted");
+    };
+    let participant = async {
+        let first = arm.receive().await.unwrap().message;
+        assert_eq!(first.protocol(), Some("fipa-request"));
+        assert!(first.reply_by().is_some() && first.reply_with().is_some());
+        let handler = async |task: &mut Task<'_>| {
+            assert_eq!(text(task.message()), "lift");
+            task.agree("").await?;
+            Ok(Reply::Inform("lifted".into()))
+        };
+        respond(&arm, &first, handler).await.unwrap();
+    };
+    tokio::join!(initiator, participant);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn answers_of_every_kind() {
+    let (rover, arm) = pair(&[]).await;
+    let initiator = async {
+        let ask = |act| to(&rover, act, &arm, "?");
+        let request = rover.request(ask(Performative::Request), PATIENCE).await;
+        let refused = request.unwrap().result().await;
+        assert!(matches!(&refused, Err(DialogueError::Refused(why)) if text(why) == "busy"));
+        // Without agreeing first.
+        let query = rover.query(ask(Performative::QueryRef), PATIENCE).await;
+        let mut query = query.unwrap();
+        assert!(!query.agreed().await.unwrap());
+        assert_eq!(text(&query.result().await.unwrap()), "42");
+        let when = rover
+            .request_when(ask(Performative::RequestWhen), PATIENCE)
+            .await;
+        let mut when = when.unwrap();
+        assert!(when.agreed().await.unwrap());
+        assert!(matches!(when.result().await, Err(DialogueError::Failed(_))));
+        let decided = rover.propose(ask(Performative::Propose), PATIENCE).await;
+        assert!(matches!(decided, Ok(Decision::Accepted(_))));
+        let decided = rover.propose(ask(Performative::Propose), PATIENCE).await;
+        assert!(matches!(decided, Ok(Decision::Rejected(_))));
+        // What begins no such protocol is not sent.
+        let wrong = rover.request(ask(Performative::Inform), PATIENCE).await;
+        assert!(matches!(wrong, Err(DialogueError::WouldViolate(_))));
+        let nobody = rover
+            .message(Performative::Request)
+            .receiver(AgentId::new("nobody").unwrap());
+        let unknown = rover.request(nobody, PATIENCE).await;
+        assert!(matches!(unknown, Err(DialogueError::NotDelivered { .. })));
+    };
+    let participant = async {
+        for answer in [
+            Reply::Refuse("busy".into()),
+            Reply::Inform("42".into()),
+            Reply::Failure("broken".into()),
+            Reply::Accept("".into()),
+            Reply::Reject("".into()),
+        ] {
+            let first = arm.receive().await.unwrap().message;
+            let when = *first.performative() == Performative::RequestWhen;
+            let handler = async |task: &mut Task<'_>| {
+                if when {
+                    task.agree("").await?;
+                }
+                Ok(answer)
+            };
+            respond(&arm, &first, handler).await.unwrap();
+        }
+    };
+    tokio::join!(initiator, participant);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn silence_and_nonsense_are_errors() {
+    let (rover, arm) = pair(&[]).await;
+    let lift = || to(&rover, Performative::Request, &arm, "lift");
+    let request = rover
+        .request(lift(), Duration::from_millis(50))
+        .await
+        .unwrap();
+    assert!(matches!(
+        request.result().await,
+        Err(DialogueError::TimedOut)
+    ));
+    let first = arm.receive().await.unwrap().message;
+    // Nobody waits for it any more: it goes to whoever receives.
+    let late = arm.reply(&first, Performative::Agree).build().unwrap();
+    assert!(arm.send(late).await.unwrap().all_succeeded());
+    let late = rover.receive().await.unwrap().message;
+    assert_eq!(*late.performative(), Performative::Agree);
+
+    let request = rover.request(lift(), PATIENCE).await.unwrap();
+    let first = arm.receive().await.unwrap().message;
+    let nonsense = arm.reply(&first, Performative::Propose).build().unwrap();
+    arm.send(nonsense).await.unwrap();
+    match request.result().await {
+        Err(DialogueError::Violation { violation, message }) => {
+            assert_eq!(violation.kind, ViolationKind::Unexpected);
+            assert_eq!(*message.performative(), Performative::Propose);
+        }
+        other => panic!("{other:?}"),
+    }
+    let request = rover.request(lift(), PATIENCE).await.unwrap();
+    let first = arm.receive().await.unwrap().message;
+    let answer = arm
+        .reply(&first, Performative::NotUnderstood)
+        .build()
+        .unwrap();
+    arm.send(answer).await.unwrap();
+    let result = request.result().await;
+    assert!(matches!(result, Err(DialogueError::NotUnderstood(_))));
+    // A handler that would break the protocol does not.
+    let _request = rover.request(lift(), PATIENCE).await.unwrap();
+    let first = arm.receive().await.unwrap().message;
+    let wrong = respond(&arm, &first, async |_| Ok(Reply::Accept("".into()))).await;
+    assert!(matches!(wrong, Err(DialogueError::WouldViolate(_))));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn other_messages_are_received_meanwhile() {
+    let (rover, arm) = pair(&[]).await;
+    let lift = to(&rover, Performative::Request, &arm, "lift");
+    let request = rover.request(lift, PATIENCE).await.unwrap();
+    let first = arm.receive().await.unwrap().message;
+    for number in 0..5 {
+        let note = to(&arm, Performative::Inform, &rover, &number.to_string());
+        arm.send(note.build().unwrap()).await.unwrap();
+    }
+    // Read before the result, and after it.
+    let early = rover.receive().await.unwrap().message;
+    assert_eq!(text(&early), "0");
+    let result = tokio::join!(request.result(), async {
+        respond(&arm, &first, async |_| Ok(Reply::Inform("done".into())))
+            .await
+            .unwrap();
+    });
+    assert_eq!(text(&result.0.unwrap()), "done");
+    for number in 1..5 {
+        let note = rover.try_receive().unwrap().unwrap().message;
+        assert_eq!(text(&note), number.to_string());
+    }
+    assert!(rover.try_receive().unwrap().is_none());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_subscription_goes_on_until_it_is_cancelled() {
+    let (rover, arm) = pair(&["monitor.check=enforce"]).await;
+    let initiator = async {
+        let subscribe = to(&rover, Performative::Subscribe, &arm, "pose");
+        let mut poses = rover.subscribe(subscribe, PATIENCE).await.unwrap();
+        for number in 0..10 {
+            assert_eq!(text(&poses.next().await.unwrap()), number.to_string());
+        }
+        poses.cancel(PATIENCE).await.unwrap();
+    };
+    let participant = async {
+        let first = arm.receive().await.unwrap().message;
+        let handler = async |task: &mut Task<'_>| {
+            task.agree("").await?;
+            for number in 0..10 {
+                task.inform(number.to_string()).await?;
+            }
+            task.cancelled().await?;
+            task.confirm_cancel().await
+        };
+        respond(&arm, &first, handler).await.unwrap();
+    };
+    tokio::join!(initiator, participant);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_request_is_cancelled() {
+    let (rover, arm) = pair(&[]).await;
+    let initiator = async {
+        let lift = to(&rover, Performative::Request, &arm, "lift");
+        let mut request = rover.request(lift, PATIENCE).await.unwrap();
+        assert!(request.agreed().await.unwrap());
+        request.cancel(PATIENCE).await.unwrap();
+    };
+    let participant = async {
+        let first = arm.receive().await.unwrap().message;
+        let handler = async |task: &mut Task<'_>| {
+            task.agree("").await?;
+            tokio::select! {
+                () = std::future::pending() => Ok(Reply::Inform("lifted".into())),
+                cancelled = task.cancelled() => {
+                    cancelled?;
+                    task.confirm_cancel().await
+                }
+            }
+        };
+        respond(&arm, &first, handler).await.unwrap();
+    };
+    tokio::join!(initiator, participant);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_contract_net_with_several_participants() {
+    let (here, there) = two(&["monitor.check=enforce"]).await;
+    let rover = here.register("rover").unwrap();
+    let names = ["cheap", "dear", "lazy"];
+    let arms = names.map(|name| there.register(name).unwrap());
+    let mut called: Vec<AgentId> = arms.iter().map(|arm| arm.id().clone()).collect();
+    called.push(AgentId::new("nobody").unwrap());
+    let participants = async {
+        let bid = async |arm: &Agent, price: &'static str| {
+            let call = arm.receive().await.unwrap().message;
+            respond(arm, &call, async |task| {
+                if task.propose(price, PATIENCE).await? {
+                    return Ok(Reply::Inform("carried".into()));
+                }
+                Ok(Reply::Nothing)
+            })
+            .await
+            .unwrap();
+        };
+        let refuse = async |arm: &Agent| {
+            let call = arm.receive().await.unwrap().message;
+            let answer = respond(arm, &call, async |_| Ok(Reply::Refuse("no".into())));
+            answer.await.unwrap();
+        };
+        tokio::join!(bid(&arms[0], "10"), bid(&arms[1], "99"), refuse(&arms[2]));
+    };
+    let initiator = async {
+        let call = rover.message(Performative::Cfp).content("carry");
+        let mut net = rover.contract_net(call, &called, PATIENCE).await.unwrap();
+        let bids = net.bids().clone();
+        assert_eq!(bids.refusals.len(), 1, "{bids:?}");
+        assert_eq!(bids.silent, ["nobody"]);
+        let cheap = bids.proposals.iter().find(|bid| text(bid) == "10");
+        let cheap = cheap.unwrap().clone();
+        let results = net.award(&[cheap], "", PATIENCE).await.unwrap();
+        assert_eq!(results.len(), 1);
+        assert_eq!(results[0].agent, "cheap");
+        assert_eq!(text(results[0].result.as_ref().unwrap()), "carried");
+    };
+    tokio::join!(initiator, participants);
+}
+
+fn in_protocol(from: &Agent, act: Performative, to_: &Agent, id: &str) -> Message {
+    to(from, act, to_, "")
+        .protocol("fipa-contract-net")
+        .conversation_id(id)
+        .build()
+        .unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn enforcing_stops_what_would_break_a_protocol() {
+    let (rover, arm) = pair(&["monitor.check=enforce"]).await;
+    let illegal = in_protocol(&rover, Performative::AcceptProposal, &arm, "c");
+    let refused = rover.send(illegal).await;
+    assert!(
+        matches!(&refused, Err(SendError::Violation(why)) if why.kind == ViolationKind::NotOpened)
+    );
+    rover
+        .send(in_protocol(&rover, Performative::Cfp, &arm, "c"))
+        .await
+        .unwrap();
+    arm.receive().await.unwrap();
+    let early = arm
+        .send(in_protocol(&arm, Performative::Inform, &rover, "c"))
+        .await;
+    let Err(SendError::Violation(violation)) = early else {
+        panic!("{early:?}");
+    };
+    assert_eq!(violation.state.as_deref(), Some("called"));
+    assert!(rover.try_receive().unwrap().is_none());
+    // Messages of no conversation are nobody's business.
+    let note = to(&arm, Performative::Inform, &rover, "hello")
+        .build()
+        .unwrap();
+    arm.send(note).await.unwrap();
+    assert_eq!(text(&rover.receive().await.unwrap().message), "hello");
+}
+
+/// One process that checks, and one that does not.
+async fn only_one_checks(set: &[&str]) -> (Agent, Agent) {
+    let unchecked = config(&[]);
+    let mut checked = config(set);
+    checked.domain.clone_from(&unchecked.domain);
+    let here = Domain::open(&checked).await.unwrap();
+    let there = Domain::open(&unchecked).await.unwrap();
+    (
+        here.register("rover").unwrap(),
+        there.register("arm").unwrap(),
+    )
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_comes_and_breaks_a_protocol_is_handed_over_as_such() {
+    let (rover, arm) = only_one_checks(&["monitor.check=enforce", "monitor.answer=true"]).await;
+    rover
+        .send(in_protocol(&rover, Performative::Cfp, &arm, "c"))
+        .await
+        .unwrap();
+    arm.receive().await.unwrap();
+    arm.send(in_protocol(&arm, Performative::Inform, &rover, "c"))
+        .await
+        .unwrap();
+    match rover.receive().await {
+        Err(ReceiveError::Violation {
+            violation,
+            incoming,
+        }) => {
+            assert_eq!(violation.kind, ViolationKind::OutOfOrder);
+            assert_eq!(*incoming.message.performative(), Performative::Inform);
+        }
+        other => panic!("{other:?}"),
+    }
+    let answer = arm.receive().await.unwrap().message;
+    assert_eq!(*answer.performative(), Performative::NotUnderstood);
+    assert!(text(&answer).contains("expected refuse, propose from arm to rover"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn warning_lets_everything_pass() {
+    let (rover, arm) = only_one_checks(&["monitor.check=warn"]).await;
+    rover
+        .send(in_protocol(&rover, Performative::Cfp, &arm, "c"))
+        .await
+        .unwrap();
+    arm.receive().await.unwrap();
+    arm.send(in_protocol(&arm, Performative::Inform, &rover, "c"))
+        .await
+        .unwrap();
+    let incoming = rover.receive().await.unwrap();
+    assert_eq!(incoming.violation.unwrap().kind, ViolationKind::OutOfOrder);
+    let illegal = in_protocol(&rover, Performative::AcceptProposal, &arm, "c");
+    rover.send(illegal).await.unwrap();
+    let incoming = arm.receive().await.unwrap();
+    assert_eq!(
+        *incoming.message.performative(),
+        Performative::AcceptProposal
+    );
+    assert!(incoming.violation.is_none(), "the arm does not check");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn protocols_of_ones_own_are_read_and_checked() {
+    let place = tempfile::tempdir().unwrap();
+    let file = place.path().join("handover.scxml");
+    let own = r#"<scxml initial="1">
+        <state id="1"><transition performative="propose" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="confirm" from="b" to="a" target="3"/></state>
+        <state id="3" final="yes"/></scxml>"#;
+    std::fs::write(&file, own).unwrap();
+    let set = format!("monitor.protocols={}", file.display());
+    let (rover, arm) = pair(&["monitor.check=enforce", &set]).await;
+    let say = |from: &Agent, act, receiver: &Agent| {
+        let message = to(from, act, receiver, "").protocol("handover");
+        message.conversation_id("c").build().unwrap()
+    };
+    rover
+        .send(say(&rover, Performative::Propose, &arm))
+        .await
+        .unwrap();
+    arm.receive().await.unwrap();
+    let wrong = arm
+        .send(say(&arm, Performative::AcceptProposal, &rover))
+        .await;
+    assert!(matches!(wrong, Err(SendError::Violation(_))));
+    arm.send(say(&arm, Performative::Confirm, &rover))
+        .await
+        .unwrap();
+    rover.receive().await.unwrap();
+
+    std::fs::write(&file, own.replace("target=\"3\"", "target=\"4\"")).unwrap();
+    let error = Domain::open(&config(&[&set])).await.err().unwrap();
+    assert!(matches!(error, OpenError::Protocol(_)));
+    assert!(
+        error
+            .to_string()
+            .contains("handover.scxml:3: there is no state \"4\""),
+        "{error}"
+    );
+    std::fs::remove_file(&file).unwrap();
+    let error = Domain::open(&config(&[&set])).await.err().unwrap();
+    assert!(error.to_string().contains("cannot read"), "{error}");
+}
