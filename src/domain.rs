@@ -72,6 +72,9 @@ pub enum OpenError {
     /// There can be one gateway only.
     #[error("the domain has a gateway already, {0:?}; end it, or name another domain")]
     GatewayRunning(String),
+    /// The socket of a watcher cannot be used.
+    #[error("cannot listen to the processes of the domain: {0}")]
+    Watch(std::io::Error),
     /// Other hosts cannot be looked for.
     #[error("discovery: {0}")]
     Discovery(String),

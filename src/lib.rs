@@ -24,6 +24,7 @@
 //! ```
 //!
 //! * [`Domain`] is this process's membership, [`Agent`] one name in it.
+//! * [`watch`] sees the letters of all processes of a domain on this host pass.
 //! * [`config`] is what the owner of a robot chooses, in one TOML file.
 //! * [`blocking`] is for processes without an async runtime.
 //! * [`routes`] tells which way letters would go now, and why.
@@ -49,6 +50,7 @@ mod place;
 pub mod protocol;
 pub mod routes;
 mod service;
+pub mod watch;
 
 pub use agent::{Agent, Deliveries, Delivery, Incoming, Loan, ReceiveError, SendError};
 #[cfg(feature = "monitor")]

@@ -9,11 +9,13 @@ use fipa_mts::{Contacts, Mts, RuntimeConfig, Started};
 use fipa_sds::{Directory, Entry, HostConfig, HostDirectory, HostError, Pattern};
 use fipa_transport::{Incarnation, Kind, Location, Transport};
 use tokio::runtime::Handle;
+use tokio::task::JoinHandle;
 
 use crate::Config;
 use crate::domain::OpenError;
 use crate::place::{Place, RETRIES};
 use crate::routes::Report;
+use crate::watch::Taps;
 
 /// How often the other end of a quiet connection is asked for a sign of life. One that leads
 /// nowhere any more, because an address has changed, is found out after twice this long, which
@@ -32,6 +34,8 @@ pub(crate) struct Service {
     /// The service as the directory names it.
     pub(crate) own: fipa_sds::Mts,
     place: Place,
+    /// Serves those who watch.
+    tapped: JoinHandle<()>,
 }
 
 /// What differs between a robot process and the gateway.
@@ -58,6 +62,7 @@ impl Service {
         let own = fipa_sds::Mts::new(Arc::clone(&role.name), incarnation);
         let (place, host) = enter(&config.domain, &own, role.gateway)?;
         let view = (role.view)(Arc::clone(&host), &own).inspect_err(|_| place.leave())?;
+        let taps = Arc::new(Taps::new(&own, role.gateway));
         let mut refused = Vec::new();
         let transports = transports(
             config,
@@ -78,12 +83,16 @@ impl Service {
                 spin: config.transport.shm.spin,
                 unframed_deadline: config.mts.deadline,
                 contacts: role.contacts.clone(),
+                tap: Some(Arc::clone(&taps) as Arc<dyn fipa_mts::Tap>),
             },
             view,
             transports,
             &handle,
         );
+        let begun = taps.begin(&host, &mts);
+        let tapped = handle.spawn(taps.run(Arc::clone(&host), mts.clone(), begun));
         let service = Self {
+            tapped,
             mts,
             host,
             locations,
@@ -140,6 +149,7 @@ impl Service {
 
     /// Ends at once and leaves nothing behind.
     pub(crate) fn abort(&self) {
+        self.tapped.abort();
         self.mts.abort();
         if let Err(error) = self.host.close() {
             tracing::warn!(%error, "could not leave the directory of this host in order");
@@ -149,7 +159,7 @@ impl Service {
 }
 
 /// Makes the domain's place and joins the directory there.
-fn enter(
+pub(crate) fn enter(
     domain: &str,
     own: &fipa_sds::Mts,
     gateway: bool,

@@ -40,6 +40,13 @@ pub enum BuildError {
     ContentTooLong(usize),
 }
 
+/// Goes on from a message that exists.
+impl From<Message> for MessageBuilder {
+    fn from(message: Message) -> Self {
+        Self::of(message)
+    }
+}
+
 impl MessageBuilder {
     pub(crate) fn new(performative: Performative) -> Self {
         Self::of(Message::empty(performative))

@@ -173,6 +173,12 @@ impl Message {
         &self.user_defined
     }
 
+    /// Takes the content out, as one who shows messages does before keeping them. What remains is
+    /// a message without content; [`MessageBuilder::from`] gives it another.
+    pub fn take_content(&mut self) -> Option<Bytes> {
+        self.content.take()
+    }
+
     pub(crate) fn empty(performative: Performative) -> Self {
         Self {
             performative,

@@ -12,6 +12,7 @@ mod protocol;
 mod routes;
 mod send;
 mod up;
+mod watch;
 
 use clap::Subcommand;
 
@@ -26,6 +27,7 @@ pub(crate) enum Command {
     Send(Box<send::Arguments>),
     Echo(echo::Arguments),
     Routes(routes::Arguments),
+    Watch(Box<watch::Arguments>),
     Demo(demo::Arguments),
     Doctor(doctor::Arguments),
     Bench(bench::Arguments),
@@ -43,6 +45,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Send(arguments) => send::run(*arguments, global),
         Command::Echo(arguments) => echo::run(arguments, global),
         Command::Routes(arguments) => routes::run(arguments, global),
+        Command::Watch(arguments) => watch::run(*arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),
         Command::Doctor(arguments) => doctor::run(arguments, global),
         Command::Bench(arguments) => bench::run(arguments, global),

@@ -15,17 +15,27 @@ pub(crate) fn text(text: &str) -> Result<(), Failure> {
 
 /// Prints bytes as they are.
 pub(crate) fn bytes(bytes: &[u8]) -> Result<(), Failure> {
+    bytes_if_read(bytes).map(drop)
+}
+
+/// Prints a text that ends its last line itself, and says whether anybody still reads: who prints
+/// for as long as somebody does ends with the reader.
+pub(crate) fn text_if_read(text: &str) -> Result<bool, Failure> {
+    bytes_if_read(text.as_bytes())
+}
+
+fn bytes_if_read(bytes: &[u8]) -> Result<bool, Failure> {
     let mut stdout = io::stdout().lock();
     let written = stdout.write_all(bytes).and_then(|()| stdout.flush());
     match written {
         // Whoever reads has seen enough, as `head` does.
-        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
         Err(error) => Err(Failure::failed(
             format!("cannot write the output: {error}"),
             "standard output",
             "see whether the disk is full, or print to somewhere else",
         )),
-        Ok(()) => Ok(()),
+        Ok(()) => Ok(true),
     }
 }
 

@@ -46,10 +46,11 @@ fn every_step_does_what_it_says() {
         assert_eq!(step["ok"], true, "{step:#}");
     }
     assert!(output.status.success());
-    assert_eq!(steps.len(), 10);
+    assert_eq!(steps.len(), 11);
     let via: Vec<&Value> = steps.iter().map(|step| &step["via"]).collect();
     assert_eq!((via[1], via[2]), (&"shm".into(), &"tcp".into()));
     assert_eq!(steps[6]["attempts"][0]["via"], "shm");
+    assert_eq!(steps[8]["sender"], "arm_3");
     assert_eq!(traces(pid), Vec::<String>::new());
     assert_eq!(parts(pid), 0);
 }

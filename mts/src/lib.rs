@@ -9,6 +9,7 @@ mod failure;
 mod post;
 mod runtime;
 mod stamp;
+pub mod watch;
 
 /// A table that is looked into several times for every letter, by a quick hash that is seeded in
 /// every process. Not for what strangers fill without a closer bound: it does not stand up to
@@ -16,4 +17,4 @@ mod stamp;
 type Map<K, V> = std::collections::HashMap<K, V, foldhash::fast::RandomState>;
 
 pub use post::{PostError, letter_around, letter_for};
-pub use runtime::{Contacts, Mts, RuntimeConfig, Sending, Started};
+pub use runtime::{Contacts, Mts, RuntimeConfig, Sending, Started, Tap};

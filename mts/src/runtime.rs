@@ -27,7 +27,8 @@ use tokio::task::JoinHandle;
 
 use crate::Map;
 use crate::core::{
-    Action, Core, CoreConfig, Now, Peer, PeerState, Received, Route, SendId, Submission, WayState,
+    Action, Core, CoreConfig, Notice, Now, Peer, PeerState, Received, Route, SendId, Submission,
+    WayState,
 };
 
 /// What the runtime is told at its start, besides the core's configuration.
@@ -41,6 +42,8 @@ pub struct RuntimeConfig {
     pub unframed_deadline: Duration,
     /// Whom to tell of other hosts. Must not call the service back.
     pub contacts: Option<Arc<dyn Contacts>>,
+    /// Whom to tell of the letters that pass, while the service is [watched](Mts::watch).
+    pub tap: Option<Arc<dyn Tap>>,
 }
 
 /// Who is told of other hosts: of services that connections are open with, and of agents that
@@ -61,6 +64,13 @@ pub trait Contacts: Send + Sync {
 
 /// Routes that are looked up under one lock.
 const ROUTES_AT_ONCE: usize = 64;
+
+/// Who is told of the letters that pass while the service is [watched](Mts::watch).
+pub trait Tap: Send + Sync {
+    /// Something has happened to a letter. Is called with the service locked, before anything
+    /// else is done about it, and must not wait nor call the service back.
+    fn notice(&self, notice: &Notice);
+}
 
 /// A running message transport service.
 ///
@@ -211,6 +221,12 @@ impl Mts {
             door.close();
         }
         self.shared.carry_out(state);
+    }
+
+    /// Whether the [`Tap`] is told of every letter from now on. While it is not, watching costs
+    /// nothing but looking at a flag, under the lock that is held anyway.
+    pub fn watch(&self, watched: bool) {
+        self.shared.state.lock().core.watch(watched);
     }
 
     /// Sends a letter. The outcomes, one per receiver, come with the future; the letter is on its
@@ -468,6 +484,11 @@ impl Shared {
                 } => {
                     if let Some(contacts) = &self.config.contacts {
                         contacts.heard(&name, agent, location);
+                    }
+                }
+                Action::Notice(notice) => {
+                    if let Some(tap) = &self.config.tap {
+                        tap.notice(&notice);
                     }
                 }
                 Action::Deliverable { agent } => {

@@ -35,7 +35,7 @@ pub use contacts::ContactDirectory;
 pub use directory::{DeregisterError, Directory, RegisterError};
 pub use entry::{Entry, EntryError, Mts, Reach, Registration, Role, Source};
 pub use exchange::{EXCHANGE_ONTOLOGY, Exchange, ExchangeDirectory, ExchangeError};
-pub use host::{Departures, HostConfig, HostDirectory, HostError};
+pub use host::{Departures, HostConfig, HostDirectory, HostError, SocketId};
 #[cfg(feature = "mdns")]
 pub use mdns::{MdnsConfig, MdnsDirectory, MdnsError, MdnsStatus, Withdrawal};
 pub use memory::{MemoryDirectory, StaticDirectory};

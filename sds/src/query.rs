@@ -113,7 +113,9 @@ impl Matcher {
         }
     }
 
-    fn matches(&self, text: &str) -> bool {
+    /// Whether the whole text is the one that is meant, or matches.
+    #[must_use]
+    pub fn matches(&self, text: &str) -> bool {
         match self {
             Self::Exact(exact) => exact == text,
             Self::Pattern(pattern) => pattern.matches(text),

@@ -117,6 +117,7 @@ fn child_process() {
     let _context = runtime.enter();
     let directory = open(&dir);
     println!("@@ready");
+    let (mut listening, mut connected) = (Vec::new(), None);
     for line in std::io::stdin().lines() {
         let line = line.unwrap();
         let (command, name) = line.split_once(' ').unwrap_or((&line, ""));
@@ -136,6 +137,26 @@ fn child_process() {
                     visitor.close().unwrap();
                 }
                 "ok".to_owned()
+            }
+            "listen" => {
+                listening.push(directory.listen().unwrap());
+                "ok".to_owned()
+            }
+            "connect" => {
+                let sockets = directory.sockets();
+                let found =
+                    runtime.block_on(eventually("a socket", || sockets.borrow().first().copied()));
+                connected = Some(directory.connect(found).unwrap());
+                "ok".to_owned()
+            }
+            "hear" => {
+                use rustix::net::{RecvFlags, recv};
+                let mut buffer = [0; 8];
+                let socket = connected.as_ref().unwrap();
+                let (_, len) = runtime.block_on(eventually("a word", || {
+                    recv(socket, &mut buffer, RecvFlags::empty()).ok()
+                }));
+                String::from_utf8(buffer[..len].to_vec()).unwrap()
             }
             "close" => {
                 directory.close().unwrap();
@@ -479,4 +500,75 @@ async fn a_gateway_publishes_what_it_has_learnt() {
     .await;
     drop(gateway);
     assert!(third.lookup("arm").is_some());
+}
+
+#[tokio::test]
+async fn processes_connect_to_the_sockets_they_find() {
+    use rustix::net::{RecvFlags, SendFlags, SocketFlags, accept_with, recv, send};
+    let (_parent, dir) = place();
+    // Longer than the path of a socket can be.
+    let dir = dir.join("x".repeat(120));
+    let (one, mut other) = (open(&dir), Process::start(&dir));
+    let mut sockets = one.sockets();
+    assert_eq!(*sockets.borrow_and_update(), []);
+    assert_eq!(other.ask("listen"), "ok");
+    sockets.changed().await.unwrap();
+    let found = sockets.borrow_and_update().clone();
+    assert_eq!(found.len(), 1);
+    let _connected = one.connect(found[0]).unwrap();
+    assert_eq!(
+        open(&dir).sockets().borrow().clone(),
+        found,
+        "a newcomer sees it too"
+    );
+    let name = files(&dir)
+        .into_iter()
+        .find(|name| name.ends_with(".socket"));
+    let mode = std::fs::metadata(dir.join(name.unwrap()))
+        .unwrap()
+        .permissions();
+    assert_eq!(mode.mode() & 0o7777, 0o600);
+
+    let listening = one.listen().unwrap();
+    assert_eq!(other.ask("connect"), "ok");
+    let accepted = accept_with(&listening, SocketFlags::CLOEXEC).unwrap();
+    send(&accepted, b"hello", SendFlags::empty()).unwrap();
+    assert_eq!(other.ask("hear"), "hello");
+
+    other.kill();
+    sockets.changed().await.unwrap();
+    assert_eq!(*sockets.borrow_and_update(), []);
+    assert!(one.connect(found[0]).is_err());
+    let mut buffer = [0; 8];
+    let (_, len) = recv(&accepted, &mut buffer, RecvFlags::empty()).unwrap();
+    assert_eq!(len, 0, "the end of a process is the end of its connections");
+    one.close().unwrap();
+    assert_eq!(files(&dir), Vec::<String>::new());
+}
+
+#[tokio::test]
+async fn what_is_no_socket_of_ours_is_not_connected_to() {
+    let (_parent, dir) = place();
+    let (one, two) = (open(&dir), open(&dir));
+    let mut sockets = one.sockets();
+    let _listening = two.listen().unwrap();
+    sockets.changed().await.unwrap();
+    let socket = sockets.borrow_and_update()[0];
+    let name = files(&dir)
+        .into_iter()
+        .find(|name| name.ends_with(".socket"))
+        .unwrap();
+    let elsewhere = dir.join("elsewhere");
+    std::fs::rename(dir.join(&name), &elsewhere).unwrap();
+    symlink(&elsewhere, dir.join(&name)).unwrap();
+    assert!(matches!(
+        one.connect(socket),
+        Err(HostError::NotPrivate { .. })
+    ));
+    std::fs::remove_file(dir.join(&name)).unwrap();
+    std::fs::write(dir.join(&name), "").unwrap();
+    assert!(matches!(
+        one.connect(socket),
+        Err(HostError::NotPrivate { .. })
+    ));
 }

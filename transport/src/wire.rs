@@ -149,7 +149,7 @@ impl ParcelHeader {
                 pieces.letter = Some(letter);
             }
             Body::Report(report) => {
-                let body = write_report(report);
+                let body = write_outcome(&report.outcome);
                 header.kind = REPORT;
                 header.head_len = u32_of(body.len())?;
                 pieces.report = Some(body);
@@ -248,7 +248,9 @@ impl ParcelHeader {
                     },
                 ))
             }
-            REPORT => Body::Report(read_report(&front).ok_or(WireError::Report)?),
+            REPORT => Body::Report(Report {
+                outcome: read_outcome(&front).ok_or(WireError::Report)?,
+            }),
             CREDIT => Body::Credit,
             other => return Err(WireError::UnknownKind(other)),
         };
@@ -288,16 +290,21 @@ fn position<T: PartialEq>(all: &[T], one: &T) -> u8 {
         .map_or(u8::MAX, |place| place as u8)
 }
 
-/// Report := tag(0 delivered, 1 sent, 2 failed) code(kind or reason) n(attempts) attempt*
+/// An outcome as it stands in a report.
+///
+/// ```text
+/// outcome := tag(0 delivered, 1 sent, 2 failed) code(kind or reason) n(attempts) attempt*
 /// attempt := kind fault location(u16 length, text) detail(u16 length, text)
-fn write_report(report: &Report) -> Bytes {
+/// ```
+#[must_use]
+pub fn write_outcome(outcome: &Outcome) -> Bytes {
     let mut out = BytesMut::new();
-    let (tag, code) = match &report.outcome {
-        Outcome::Delivered { via, .. } => (0, position(&Kind::ALL, via)),
-        Outcome::Sent { via, .. } => (1, position(&Kind::ALL, via)),
+    let (tag, code) = match outcome {
+        Outcome::Delivered { via, .. } => (0, kind_code(*via)),
+        Outcome::Sent { via, .. } => (1, kind_code(*via)),
         Outcome::Failed { reason, .. } => (2, reason_code(*reason)),
     };
-    let attempts = report.outcome.attempts();
+    let attempts = outcome.attempts();
     let told = &attempts[attempts.len().saturating_sub(MAX_ATTEMPTS)..];
     out.put_slice(&[tag, code, told.len() as u8]);
     for Attempt {
@@ -306,7 +313,7 @@ fn write_report(report: &Report) -> Bytes {
         error,
     } in told
     {
-        out.put_u8(position(&Kind::ALL, via));
+        out.put_u8(kind_code(*via));
         out.put_u8(position(&WayFault::CODES, &error.fault));
         for text in [
             location.to_string().as_str(),
@@ -319,7 +326,9 @@ fn write_report(report: &Report) -> Bytes {
     out.freeze()
 }
 
-fn read_report(bytes: &[u8]) -> Option<Report> {
+/// The outcome in these bytes, unless they are something else. Nothing in them is trusted.
+#[must_use]
+pub fn read_outcome(bytes: &[u8]) -> Option<Outcome> {
     let (&[tag, code, count], mut rest) = bytes.split_first_chunk()?;
     if usize::from(count) > MAX_ATTEMPTS {
         return None;
@@ -355,10 +364,18 @@ fn read_report(bytes: &[u8]) -> Option<Report> {
         },
         _ => return None,
     };
-    Some(Report { outcome })
+    Some(outcome)
 }
 
-fn kind_of_code(code: u8) -> Option<Kind> {
+/// The code of a kind of transport: one byte, stable.
+#[must_use]
+pub fn kind_code(kind: Kind) -> u8 {
+    position(&Kind::ALL, &kind)
+}
+
+/// The kind of transport with this code.
+#[must_use]
+pub fn kind_of_code(code: u8) -> Option<Kind> {
     Kind::ALL.get(usize::from(code)).copied()
 }
 
@@ -487,10 +504,10 @@ mod tests {
 
     #[test]
     fn every_truncation_of_a_report_is_refused() {
-        let whole = write_report(&failed());
+        let whole = write_outcome(&failed().outcome);
         for len in 0..whole.len() {
-            assert_eq!(read_report(&whole[..len]), None, "{len}");
+            assert_eq!(read_outcome(&whole[..len]), None, "{len}");
         }
-        assert_eq!(read_report(&whole), Some(failed()));
+        assert_eq!(read_outcome(&whole), Some(failed().outcome));
     }
 }

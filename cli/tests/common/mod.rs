@@ -229,6 +229,11 @@ impl Running {
         }
     }
 
+    /// The number of its process.
+    pub(crate) fn pid(&self) -> String {
+        self.child.id().to_string()
+    }
+
     /// Sends a signal, waits for its end, and returns the exit code and standard error.
     #[track_caller]
     pub(crate) fn signal(mut self, signal: &str) -> (Option<i32>, String) {

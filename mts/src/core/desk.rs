@@ -13,7 +13,7 @@ use fipa_transport::{
 };
 
 use super::routes::Tallies;
-use super::{CoreConfig, SendId};
+use super::{CoreConfig, News, Notice, SendId};
 use crate::Map;
 
 /// Something the runtime has to do for the delivery core.
@@ -75,6 +75,8 @@ pub enum Action {
         /// The agent.
         agent: Incarnation,
     },
+    /// Tell whoever watches, before anything else is done; only while the core is watched.
+    Notice(Box<Notice>),
 }
 
 /// Where a delivery came from, and who is told its outcome.
@@ -135,6 +137,8 @@ pub(crate) struct Desk {
     /// Bytes of all letters in lanes.
     pub(crate) held: usize,
     pub(super) tallies: Tallies,
+    /// Whether anybody is told of what happens to letters.
+    pub(crate) watched: bool,
     health: Map<Location, Health>,
     /// Lanes that found no room on the way to a location, in order.
     waiting_for_room: Map<Location, VecDeque<Stream>>,
@@ -163,6 +167,7 @@ impl Desk {
             undelivered: VecDeque::new(),
             held: 0,
             tallies: Tallies::default(),
+            watched: false,
             health: Map::default(),
             waiting_for_room: Map::default(),
             next_attempt: 1,
@@ -208,6 +213,24 @@ impl Desk {
         });
     }
 
+    /// Tells whoever watches, if anybody does.
+    pub(crate) fn notice(
+        &mut self,
+        stream: Stream,
+        sequence: u64,
+        receiver: &Arc<str>,
+        news: impl FnOnce() -> News,
+    ) {
+        if self.watched {
+            self.actions.push_back(Action::Notice(Box::new(Notice {
+                stream,
+                sequence,
+                receiver: Arc::clone(receiver),
+                news: news(),
+            })));
+        }
+    }
+
     /// Tells whoever has to know what became of a delivery.
     pub(crate) fn settle(
         &mut self,
@@ -217,6 +240,10 @@ impl Desk {
         receiver: Arc<str>,
         outcome: Outcome,
     ) {
+        self.notice(stream, sequence, &receiver, || News::Settled {
+            outcome: outcome.clone(),
+            sender: !matches!(origin, Origin::Forwarded { .. }),
+        });
         match origin {
             Origin::Local { send } => {
                 self.actions.push_back(Action::Outcome {

@@ -7,13 +7,13 @@ use std::time::{Duration, SystemTime};
 use fipa_acl::{Dialect, Letter, Representation};
 use fipa_sds::{Entry, Mts, Reach, Resolution, Role, Source};
 use fipa_transport::{
-    Answer, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Signature, Stream, Ticket,
-    Verdict,
+    Answer, FailureReason, Hop, Incarnation, Kind, Location, Outcome, Parcel, Signature, Stream,
+    Ticket, Verdict,
 };
 
 use super::desk::{Action, Origin, Undelivered, life_of};
 use super::lane::{Delivery, Lane};
-use super::{Core, MAX_DEADLINE, Now};
+use super::{Core, MAX_DEADLINE, News, Now};
 use crate::failure::Failure;
 use crate::stamp;
 
@@ -30,6 +30,7 @@ impl Core {
     pub(super) fn forward(
         &mut self,
         now: Now,
+        via: Kind,
         parcel: &Parcel,
         letter: Letter,
         from: Hop,
@@ -63,6 +64,12 @@ impl Core {
             lane.wait_for_credit(from.location);
             return Verdict::Now(Answer::Busy);
         }
+        self.desk
+            .notice(stream, parcel.sequence, &entry.name, || News::Passed {
+                via,
+                remote: from.remote,
+                letter: stamped.clone(),
+            });
         let onwards = entry.reach != Reach::Local;
         let deadline = now.instant + parcel.remaining.min(MAX_DEADLINE);
         let mut delivery = Delivery::new(origin, stamped, parcel.sequence, deadline);
@@ -157,17 +164,29 @@ impl Core {
             let mut found = false;
             for entry in here {
                 found = true;
-                if let Some(inbox) = self.agents.get_mut(&entry.incarnation)
-                    && inbox.push_unframed(letter.clone(), via)
-                {
-                    let agent = entry.incarnation;
-                    self.desk.actions.push_back(Action::Deliverable { agent });
-                    continue;
-                }
                 let stream = Stream {
                     sender: stream_sender,
                     receiver: entry.incarnation,
                 };
+                let sequence = self.sequence_of(stream_sender);
+                if let Some(inbox) = self.agents.get_mut(&entry.incarnation)
+                    && inbox.push_unframed(letter.clone(), via)
+                {
+                    self.desk
+                        .notice(stream, sequence, &entry.name, || News::Taken {
+                            via: Some(via),
+                            letter: letter.clone(),
+                        });
+                    let agent = entry.incarnation;
+                    self.desk.actions.push_back(Action::Deliverable { agent });
+                    continue;
+                }
+                self.desk
+                    .notice(stream, sequence, &entry.name, || News::Passed {
+                        via,
+                        remote: true,
+                        letter: letter.clone(),
+                    });
                 if !self.has_room(stream, letter.len()) {
                     self.desk.undelivered.push_back(Undelivered {
                         sender: None,
@@ -176,9 +195,13 @@ impl Core {
                         reason: FailureReason::QueueFull,
                         detail: String::new(),
                     });
+                    self.desk
+                        .notice(stream, sequence, &entry.name, || News::Settled {
+                            outcome: failed(FailureReason::QueueFull),
+                            sender: true,
+                        });
                     continue;
                 }
-                let sequence = self.sequence_of(stream_sender);
                 let until = now.instant + deadline.min(MAX_DEADLINE);
                 let mut delivery = Delivery::new(Origin::Nobody, letter.clone(), sequence, until);
                 delivery.hops = 1;
@@ -186,9 +209,24 @@ impl Core {
             }
             if !found {
                 tracing::info!(%receiver, %sender, "an unframed letter names nobody of this host");
+                let stream = Stream {
+                    sender: stream_sender,
+                    receiver: Incarnation::UNKNOWN,
+                };
+                let name: Arc<str> = receiver.as_str().into();
+                let sequence = self.sequence_of(stream_sender);
+                self.desk.notice(stream, sequence, &name, || News::Passed {
+                    via,
+                    remote: true,
+                    letter: letter.clone(),
+                });
+                self.desk.notice(stream, sequence, &name, || News::Settled {
+                    outcome: failed(FailureReason::NoSuchAgent),
+                    sender: true,
+                });
                 self.desk.undelivered.push_back(Undelivered {
                     sender: None,
-                    receiver: receiver.as_str().into(),
+                    receiver: name,
                     letter: letter.clone(),
                     reason: FailureReason::NoSuchAgent,
                     detail: String::new(),
@@ -213,6 +251,8 @@ impl Core {
             let Some(report) = Failure::of(&letter, &receiver, reason, &detail) else {
                 continue;
             };
+            let own = self.desk.config.incarnation;
+            let sequence = self.sequence_of(own);
             if let Some((agent, inbox)) =
                 sender.and_then(|agent| Some((agent, self.agents.get_mut(&agent)?)))
             {
@@ -223,7 +263,16 @@ impl Core {
                         continue;
                     }
                 };
-                if inbox.push_failure(letter) {
+                if inbox.push_failure(letter.clone()) {
+                    let stream = Stream {
+                        sender: own,
+                        receiver: agent,
+                    };
+                    let name = Arc::clone(&inbox.name);
+                    self.desk.notice(stream, sequence, &name, || News::Taken {
+                        via: None,
+                        letter,
+                    });
                     self.desk.actions.push_back(Action::Deliverable { agent });
                 }
                 continue;
@@ -248,7 +297,6 @@ impl Core {
                     continue;
                 }
             };
-            let sequence = self.sequence_of(self.desk.config.incarnation);
             let deadline = now.instant + FAILURE_DEADLINE;
             let mut delivery = Delivery::new(Origin::Nobody, letter, sequence, deadline);
             delivery.hops = u8::from(entry.reach != Reach::Local);
@@ -256,6 +304,11 @@ impl Core {
                 sender: self.desk.config.incarnation,
                 receiver: life_of(&entry),
             };
+            self.desk
+                .notice(stream, sequence, &entry.name, || News::Sent {
+                    send: None,
+                    letter: delivery.letter.clone(),
+                });
             if said.is_some() {
                 let new = || Lane::new(now.instant, stream, Arc::clone(&entry.name));
                 self.lanes
@@ -308,5 +361,12 @@ fn dialect_of(entry: &Entry) -> Dialect {
         Some(Signature::FipaServices) => Dialect::FipaServices,
         Some(Signature::JadeProxy) => Dialect::Jade,
         _ => Dialect::Standard,
+    }
+}
+
+fn failed(reason: FailureReason) -> Outcome {
+    Outcome::Failed {
+        reason,
+        attempts: Vec::new(),
     }
 }

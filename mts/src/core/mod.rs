@@ -11,6 +11,7 @@
 //! * `peers`: services that the configuration names, and how it stands with them.
 //! * `routes`: which way letters would go and what happened on each way, for people.
 //! * `desk`: what lanes share: attempts, health of ways, things to be done.
+//! * `notice`: what somebody who watches is told.
 //!
 //! A letter's order and identity are its *stream* (one life of the sender, one life of the
 //! receiver) and its sequence. Every letter names the one that must be taken before it, so that
@@ -21,6 +22,7 @@ mod desk;
 mod forward;
 mod inbox;
 mod lane;
+mod notice;
 mod peers;
 mod routes;
 
@@ -42,6 +44,7 @@ use desk::{Desk, NOTE_TRIES, Note, Origin, Purpose, Undelivered};
 use inbox::Inbox;
 pub use inbox::Received;
 use lane::{Delivery, Lane, Moved};
+pub use notice::{News, Notice};
 
 use crate::Map;
 use peers::Peers;
@@ -260,6 +263,10 @@ impl Core {
             return self.undeliverable(send, sender, name, letter, FailureReason::QueueFull);
         }
         let sequence = self.sequence_of(sender);
+        self.desk.notice(stream, sequence, &name, || News::Sent {
+            send: Some(send),
+            letter: letter.clone(),
+        });
         let origin = Origin::Local { send };
         let delivery = Delivery::new(origin, letter, sequence, deadline);
         self.put(now, stream, name, delivery);
@@ -286,6 +293,21 @@ impl Core {
             reason,
             attempts: Vec::new(),
         };
+        let sequence = self.sequence_of(sender);
+        let stream = Stream {
+            sender,
+            receiver: Incarnation::UNKNOWN,
+        };
+        self.desk
+            .notice(stream, sequence, &receiver, || News::Sent {
+                send: Some(send),
+                letter: letter.clone(),
+            });
+        self.desk
+            .notice(stream, sequence, &receiver, || News::Settled {
+                outcome: outcome.clone(),
+                sender: true,
+            });
         self.desk.undelivered.push_back(Undelivered {
             sender: Some(sender),
             receiver: Arc::clone(&receiver),
@@ -358,6 +380,12 @@ impl Core {
         self.desk.choose(now.instant, &entry, &[])
     }
 
+    /// Whether somebody watches: then [`Action::Notice`] tells of every letter, before what is to
+    /// be done about it.
+    pub fn watch(&mut self, watched: bool) {
+        self.desk.watched = watched;
+    }
+
     /// Takes the next letter out of an agent's queue.
     pub fn take(&mut self, agent: Incarnation) -> Option<Received> {
         let inbox = self.agents.get_mut(&agent)?;
@@ -390,16 +418,29 @@ impl Core {
         } = arrival;
         match std::mem::replace(&mut parcel.body, Body::Credit) {
             Body::Letter(letter) => {
+                let watched = self.desk.watched;
                 if let Some(inbox) = self.inbox_for(&parcel) {
+                    let seen = watched.then(|| letter.clone());
                     let answer = inbox.accept(now.instant, &parcel, letter, via, &from.location);
                     if answer == Answer::Accepted {
+                        if let Some(letter) = seen {
+                            let via = Some(via);
+                            let Parcel {
+                                stream, sequence, ..
+                            } = parcel;
+                            self.desk
+                                .notice(stream, sequence, &parcel.receiver, || News::Taken {
+                                    via,
+                                    letter,
+                                });
+                        }
                         let agent = parcel.stream.receiver;
                         self.desk.actions.push_back(Action::Deliverable { agent });
                     }
                     return Verdict::Now(answer);
                 }
                 let unanswered = (!answers_at_once).then_some((via, ticket));
-                let verdict = self.forward(now, &parcel, letter, from, unanswered);
+                let verdict = self.forward(now, via, &parcel, letter, from, unanswered);
                 self.tell_failures(now);
                 verdict
             }

@@ -4,6 +4,7 @@ use std::cmp::Reverse;
 mod checks;
 mod links;
 mod view;
+mod watching;
 mod weather;
 
 use std::collections::{BTreeMap, BinaryHeap, HashMap, HashSet};
@@ -20,6 +21,7 @@ use fipa_transport::{
 use parking_lot::Mutex;
 
 use self::view::{Registered, Registry, View};
+use self::watching::Watching;
 pub(crate) use self::weather::Weather;
 
 const HOSTS: usize = 2;
@@ -121,6 +123,11 @@ pub(crate) struct World {
     /// Agents that are about to read.
     reading: HashSet<Incarnation>,
     failures_told: u64,
+    /// Whether anybody watches: in some worlds, so that the others show that it makes no
+    /// difference.
+    watched: bool,
+    /// Who watches, by host.
+    watching: Vec<Watching>,
 }
 
 impl World {
@@ -144,6 +151,8 @@ impl World {
             names: HashMap::new(),
             reading: HashSet::new(),
             failures_told: 0,
+            watched: seed.is_multiple_of(4),
+            watching: (0..HOSTS).map(|_| Watching::default()).collect(),
         };
         for host in 0..HOSTS {
             world.birth(host, true, &[format!("gateway{host}")]);
@@ -238,6 +247,7 @@ impl World {
             alive: true,
             wake: None,
         };
+        process.core.watch(self.watched);
         for name in names {
             let name: Arc<str> = name.as_str().into();
             let agent = if gateway {
@@ -277,7 +287,8 @@ impl World {
             };
             self.happen(event)?;
         }
-        self.check_end()
+        self.check_end()?;
+        self.check_watched()
     }
 
     fn happen(&mut self, event: Event) -> Result<(), Breach> {
@@ -455,6 +466,11 @@ impl World {
                 }
                 // Everybody knows everybody here.
                 Action::Heard { .. } | Action::Doubtful { .. } => {}
+                Action::Notice(notice) => {
+                    let Now { instant, utc } = self.clocks();
+                    let watching = &mut self.watching[self.processes[at].host];
+                    watching.hear((instant, utc), at, &notice)?;
+                }
                 Action::Deliverable { agent } => {
                     if self.reading.insert(agent) {
                         self.after_ms(1 + self.weather.reading_pause_ms, Event::Read { at, agent });

@@ -16,13 +16,16 @@
 mod file;
 mod place;
 mod shared;
+mod socket;
 mod watcher;
 
 use std::io;
+use std::os::fd::OwnedFd;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use fipa_transport::Incarnation;
+use tokio::sync::watch;
 
 use self::place::{Id, Place};
 use self::shared::Shared;
@@ -68,6 +71,7 @@ impl HostDirectory {
         // Watching before reading, so that nothing is missed in between.
         let begun = Watcher::new(&shared.place).and_then(|watcher| {
             shared.refresh()?;
+            shared.find_sockets()?;
             Ok(watcher)
         });
         let watcher = match begun {
@@ -118,6 +122,31 @@ impl HostDirectory {
         Departures(self.shared.departures())
     }
 
+    /// A socket at which other processes of the domain can connect to this one: listening,
+    /// non-blocking, of the type SOCK_SEQPACKET. They see it in [`sockets`](Self::sockets) for as
+    /// long as this process lives. What is said there is not the directory's business.
+    ///
+    /// # Errors
+    /// When the directory was closed, or the system refuses the socket.
+    pub fn listen(&self) -> Result<OwnedFd, HostError> {
+        self.shared.place.lock()?.listen()
+    }
+
+    /// The other processes that can be connected to, as they come and go.
+    #[must_use]
+    pub fn sockets(&self) -> watch::Receiver<Vec<SocketId>> {
+        self.shared.sockets()
+    }
+
+    /// Connects to another process of the domain and of this user; never waits.
+    ///
+    /// # Errors
+    /// When it has ended, has too many connections that it has not accepted yet
+    /// ([`io::ErrorKind::WouldBlock`]), or is not a socket of this user.
+    pub fn connect(&self, socket: SocketId) -> Result<OwnedFd, HostError> {
+        self.shared.place.connect(socket.0)
+    }
+
     /// Leaves the directory, with everything that was registered. The last process leaves it
     /// empty. Dropping does the same and can only log what goes wrong.
     ///
@@ -131,7 +160,7 @@ impl HostDirectory {
 
 /// The ends of processes of this host.
 #[derive(Debug)]
-pub struct Departures(tokio::sync::watch::Receiver<u64>);
+pub struct Departures(watch::Receiver<u64>);
 
 impl Departures {
     /// Waits until some process has ended since the last time. False when the directory itself
@@ -186,6 +215,10 @@ impl Directory for HostDirectory {
         self.shared.deregister(name, ours)
     }
 }
+
+/// A process that can be connected to; see [`HostDirectory::sockets`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct SocketId(Id);
 
 /// What goes wrong with the directory of a host.
 #[derive(Debug, thiserror::Error)]

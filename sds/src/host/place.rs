@@ -29,6 +29,8 @@ pub(super) enum Name {
     Process(Id),
     /// `<id>.entries`: what the process has registered.
     Entries(Id),
+    /// `<id>.socket`: where the process can be connected to, if it wants to be.
+    Socket(Id),
     /// `<id>.tmp`: what will be renamed to one of the others.
     Temporary(Id),
 }
@@ -46,6 +48,7 @@ impl Name {
         match kind {
             "lock" => Some(Self::Process(id)),
             "entries" => Some(Self::Entries(id)),
+            "socket" => Some(Self::Socket(id)),
             "tmp" => Some(Self::Temporary(id)),
             _ => None,
         }
@@ -58,6 +61,7 @@ impl std::fmt::Display for Name {
             Self::Domain => f.write_str("lock"),
             Self::Process(Id(id)) => write!(f, "{id:016x}.lock"),
             Self::Entries(Id(id)) => write!(f, "{id:016x}.entries"),
+            Self::Socket(Id(id)) => write!(f, "{id:016x}.socket"),
             Self::Temporary(Id(id)) => write!(f, "{id:016x}.tmp"),
         }
     }
@@ -132,6 +136,11 @@ impl Place {
 
     pub(super) fn path(&self) -> &Path {
         &self.path
+    }
+
+    /// The directory.
+    pub(super) fn dir(&self) -> &OwnedFd {
+        &self.dir
     }
 
     /// A path to the directory that no rename can lead elsewhere.
@@ -278,19 +287,19 @@ impl Place {
             .map_err(|error| self.io("create", name)(error.into()))
     }
 
-    fn rename(&self, from: Name, to: Name) -> Result<(), HostError> {
+    pub(super) fn rename(&self, from: Name, to: Name) -> Result<(), HostError> {
         rustix::fs::renameat(&self.dir, from.to_string(), &self.dir, to.to_string())
             .map_err(|error| self.io("rename", from)(error.into()))
     }
 
-    fn remove(&self, name: Name) -> Result<(), HostError> {
+    pub(super) fn remove(&self, name: Name) -> Result<(), HostError> {
         match rustix::fs::unlinkat(&self.dir, name.to_string(), AtFlags::empty()) {
             Ok(()) | Err(Errno::NOENT) => Ok(()),
             Err(error) => Err(self.io("remove", name)(error.into())),
         }
     }
 
-    fn io(&self, what: &'static str, name: Name) -> impl FnOnce(io::Error) -> HostError {
+    pub(super) fn io(&self, what: &'static str, name: Name) -> impl FnOnce(io::Error) -> HostError {
         let path = self.path.join(name.to_string());
         move |source| HostError::Io { what, path, source }
     }
@@ -305,7 +314,7 @@ pub(super) struct Version {
     len: i64,
 }
 
-/// Most files in a directory: three per process, and there are not more processes on a host.
+/// Most files in a directory: four per process, and there are not more processes on a host.
 const MAX_FILES: usize = 100_000;
 
 /// Largest entries file, in bytes.
@@ -315,7 +324,7 @@ const PRIVATE: Mode = Mode::RUSR.union(Mode::WUSR);
 
 /// The lock of the domain, held.
 pub(super) struct Guard<'a> {
-    place: &'a Place,
+    pub(super) place: &'a Place,
     _threads: MutexGuard<'a, ()>,
 }
 
@@ -388,7 +397,7 @@ impl Guard<'_> {
                     self.place.remove(name)?;
                     continue;
                 }
-                Name::Process(id) | Name::Entries(id) => id,
+                Name::Process(id) | Name::Entries(id) | Name::Socket(id) => id,
             };
             let lives = match living.get(&id) {
                 Some(lives) => *lives,
@@ -405,6 +414,7 @@ impl Guard<'_> {
     /// Removes what a dead process has left.
     pub(super) fn bury(&self, id: Id) -> Result<(), HostError> {
         self.place.remove(Name::Entries(id))?;
+        self.place.remove(Name::Socket(id))?;
         self.place.remove(Name::Temporary(id))?;
         self.place.remove(Name::Process(id))
     }
@@ -501,6 +511,7 @@ mod tests {
             Name::Domain,
             Name::Process(id),
             Name::Entries(id),
+            Name::Socket(id),
             Name::Temporary(id),
         ] {
             assert_eq!(Name::parse(&name.to_string()), Some(name));

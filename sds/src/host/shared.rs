@@ -7,6 +7,7 @@ use parking_lot::Mutex;
 use tokio::sync::watch;
 
 use super::HostError;
+use super::SocketId;
 use super::file::{self, Entries, FileError};
 use super::place::{Guard, Id, MAX_ENTRIES_FILE, Name, Place, Version};
 use crate::table::Table;
@@ -24,6 +25,7 @@ pub(super) struct Shared {
     others: Mutex<Others>,
     /// Counts processes that have ended.
     ended: watch::Sender<u64>,
+    sockets: watch::Sender<Vec<SocketId>>,
 }
 
 /// What this process tells the others.
@@ -58,6 +60,7 @@ impl Shared {
             own: Mutex::default(),
             others: Mutex::default(),
             ended: watch::Sender::default(),
+            sockets: watch::Sender::default(),
         }
     }
 
@@ -68,6 +71,29 @@ impl Shared {
     /// Says that processes have ended.
     pub(super) fn say_ended(&self) {
         self.ended.send_modify(|count| *count += 1);
+    }
+
+    pub(super) fn sockets(&self) -> watch::Receiver<Vec<SocketId>> {
+        self.sockets.subscribe()
+    }
+
+    /// Sees which processes have a socket.
+    pub(super) fn find_sockets(&self) -> Result<(), HostError> {
+        let names = self.place.names()?;
+        let mut found: Vec<SocketId> = names
+            .into_iter()
+            .filter_map(|name| match name {
+                Name::Socket(id) if id != self.place.id() => Some(SocketId(id)),
+                _ => None,
+            })
+            .collect();
+        found.sort_unstable();
+        self.sockets.send_if_modified(|known| {
+            let changed = *known != found;
+            *known = found;
+            changed
+        });
+        Ok(())
     }
 
     /// Reads what others have written, if anybody has since the last time: one system call when
@@ -95,7 +121,9 @@ impl Shared {
         }
         // Among those of whom nothing was heard there may be some who have ended.
         self.say_ended();
-        self.scan(&mut others)
+        self.scan(&mut others)?;
+        drop(others);
+        self.find_sockets()
     }
 
     fn scan(&self, others: &mut Others) -> Result<(), HostError> {

@@ -95,6 +95,7 @@ impl Watcher {
 struct News {
     wrote: BTreeSet<Id>,
     ended: BTreeSet<Id>,
+    sockets: bool,
     lost: bool,
 }
 
@@ -112,18 +113,22 @@ impl News {
             {
                 self.ended.insert(id);
             }
+            Some(Name::Socket(_)) => self.sockets = true,
             _ => {}
         }
     }
 
     fn is_empty(&self) -> bool {
-        self.wrote.is_empty() && self.ended.is_empty() && !self.lost
+        self.wrote.is_empty() && self.ended.is_empty() && !self.sockets && !self.lost
     }
 }
 
 fn handle(shared: &Shared, news: News, ending: &mut Ending) -> Result<(), HostError> {
     if news.lost || std::mem::take(&mut ending.rescan) {
         shared.rescan()?;
+    }
+    if news.sockets {
+        shared.find_sockets()?;
     }
     for id in news.wrote {
         shared.process_wrote(id)?;

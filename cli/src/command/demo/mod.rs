@@ -16,7 +16,8 @@ use crate::report::Failure;
 /// Starts two gateways, each with a domain of its own on this machine (standing for two robots),
 /// and several agents, all as separate processes; no root needed, nothing leaves this machine.
 /// Agents converse through shared memory and between the hosts over TCP, large content moves
-/// without a copy, one agent is killed, shared memory is broken, and an old peer's letter arrives.
+/// without a copy, one agent is killed, shared memory is broken, an old peer's letter arrives, and an
+/// agent that breaks its protocol is caught by somebody who watches.
 /// What each step claims is checked by the process that received something.
 ///
 /// Exits with 0 only if every step did what it says, and leaves nothing behind.
@@ -40,6 +41,7 @@ pub(crate) struct Arguments {
 enum Part {
     Agent,
     Gateway,
+    Watcher,
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
@@ -50,6 +52,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             match part {
                 Part::Agent => part::agent(&config, &name).await,
                 Part::Gateway => part::gateway(&config).await,
+                Part::Watcher => part::watcher(&config).await,
             }
         });
         return played.map_err(|error| Failure::failed(error, name, "see the demo's own report"));

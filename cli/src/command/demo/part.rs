@@ -7,11 +7,13 @@
 use std::io::Write;
 use std::time::{Duration, Instant};
 
+use fipa::watch::{WatchOptions, Watcher};
 use fipa::{Agent, AgentId, Config, Deliveries, Domain, Gateway, Incoming, Performative, Reach};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use tokio::io::{AsyncBufReadExt, BufReader, Lines, Stdin};
 
+use crate::command::watch::judge::{Judge, Judged};
 use crate::output;
 
 /// The protocol of messages whose only purpose is the time they take.
@@ -27,6 +29,12 @@ pub(super) enum Order {
         to: String,
         content: String,
         protocol: Option<String>,
+    },
+    /// Send a message of a conversation that follows fipa-contract-net.
+    Converse {
+        performative: String,
+        to: String,
+        conversation: String,
     },
     /// Send content of this length, made in loaned memory, and its checksum with it.
     SendLarge { to: String, len: usize },
@@ -59,6 +67,15 @@ pub(super) enum Event {
     Count { received: u64 },
     /// How long a confirmed message takes, in microseconds.
     Measured { p50_us: f64, p99_us: f64 },
+    /// A letter was seen to break its protocol.
+    Caught {
+        sender: String,
+        performative: String,
+        /// What was wrong, and what was expected of whom.
+        text: String,
+        /// How many letters were seen before that kept to theirs.
+        kept: u64,
+    },
     /// It could not do what it was told.
     Failed { what: String },
 }
@@ -104,6 +121,40 @@ pub(super) async fn gateway(config: &Config) -> Result<(), String> {
     while next(&mut orders).await.is_some() {}
     gateway.close().await;
     Ok(())
+}
+
+/// Watches the domain until standard input ends, and says which letters break their protocols.
+pub(super) async fn watcher(config: &Config) -> Result<(), String> {
+    let watcher = Watcher::open(config, WatchOptions::default()).await;
+    let mut watcher = watcher.map_err(|error| error.to_string())?;
+    let mut judge = Judge::new(None).map_err(|_| "the protocols cannot be read")?;
+    say(&Event::Ready {
+        locations: Vec::new(),
+    });
+    let mut orders = orders();
+    let mut kept = 0;
+    loop {
+        let seen = tokio::select! {
+            line = next(&mut orders) => match line {
+                Some(_) => continue,
+                None => return Ok(()),
+            },
+            seen = watcher.next() => seen,
+        };
+        let fipa::watch::Event::Letter(passage) = seen else {
+            continue;
+        };
+        match judge.judge(&passage) {
+            Judged::Accepted { .. } => kept += 1,
+            Judged::Violation(violation) => say(&Event::Caught {
+                sender: violation.sender.clone(),
+                performative: violation.performative.clone(),
+                text: violation.to_string(),
+                kept,
+            }),
+            _ => {}
+        }
+    }
 }
 
 /// Runs an agent until standard input ends.
@@ -191,6 +242,22 @@ async fn obey(agent: &Agent, line: &str, received: u64) -> Result<Event, String>
                     .await
                     .map_err(|error| error.to_string())?,
             )
+        }
+        Order::Converse {
+            performative,
+            to,
+            conversation,
+        } => {
+            let performative: Performative =
+                performative.parse().map_err(|error| format!("{error}"))?;
+            let message = agent
+                .message(performative)
+                .receiver(id(&to)?)
+                .protocol("fipa-contract-net")
+                .conversation_id(conversation);
+            let message = message.build().map_err(|error| error.to_string())?;
+            let deliveries = agent.send(message).await;
+            outcomes(&deliveries.map_err(|error| error.to_string())?)
         }
         Order::SendLarge { to, len } => send_large(agent, &to, len).await,
         Order::Agents => Ok(Event::Agents {

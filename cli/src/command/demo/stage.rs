@@ -58,6 +58,11 @@ impl Part {
         self.event().await
     }
 
+    /// The next letter that the part, which watches, has seen to break its protocol.
+    pub(super) async fn caught(&mut self) -> Result<Event, String> {
+        self.event().await
+    }
+
     /// The next message that the part has received.
     pub(super) async fn received(&mut self) -> Result<Received, String> {
         if let Some(received) = self.received.pop_front() {

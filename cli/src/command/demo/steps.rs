@@ -120,6 +120,8 @@ impl Play {
         self.step("shared memory breaks, tcp takes over", found);
         let found = self.old_peer().await;
         self.step("a letter of an old peer", found);
+        let found = self.broken_protocol().await;
+        self.step("a protocol is broken, and it is seen", found);
         let found = self.measurement().await;
         self.step("measurement", found);
     }
@@ -420,6 +422,48 @@ impl Play {
         );
         self.say("  echo saw: request from cpp-sender: hello");
         found!("via": "tcp", "sender": seen.sender, "content": seen.content)
+    }
+
+    /// A call for proposals. One arm proposes; the other says that it is done already, and
+    /// nobody has awarded it anything. Nobody has asked the agents whether they are watched.
+    async fn broken_protocol(&mut self) -> Found {
+        self.stage.start("rover", "eye", "watcher").await?;
+        for (from, performative, to) in [
+            ("rover", "cfp", "arm_1"),
+            ("rover", "cfp", "arm_3"),
+            ("arm_1", "propose", "rover"),
+            ("arm_3", "inform", "rover"),
+        ] {
+            let order = Order::Converse {
+                performative: performative.into(),
+                to: to.into(),
+                conversation: "auction-1".into(),
+            };
+            one_delivery(&self.send(from, order).await?)?;
+            let seen = self.received_by(to).await?;
+            ensure!(seen.performative == performative, "{to} saw {seen:?}");
+            self.say(&format!("  {from} says {performative} to {to}"));
+        }
+        let (sender, performative, text, kept) = match self.stage.part("eye")?.caught().await? {
+            Event::Caught {
+                sender,
+                performative,
+                text,
+                kept,
+            } => (sender, performative, text, kept),
+            other => return Err(format!("a violation was expected, not {other:?}")),
+        };
+        ensure!(
+            sender == "arm_3"
+                && performative == "inform"
+                && ["expected", "propose", "from arm_3"]
+                    .iter()
+                    .all(|part| text.contains(part)),
+            "seen was: {text}"
+        );
+        ensure!(kept == 3, "{kept} letters kept to the protocol, not 3");
+        self.say(&format!("  who watches sees: {text}"));
+        found!("sender": sender, "performative": performative, "violation": text, "kept": kept)
     }
 
     async fn measurement(&mut self) -> Found {

@@ -1,0 +1,114 @@
+//! Conversations as one Mermaid sequence diagram, for documents.
+
+use std::collections::HashMap;
+use std::fmt::Write as _;
+use std::path::Path;
+
+use super::conversations::Conversation;
+use crate::report::Failure;
+
+/// The diagram of these conversations, one behind the other.
+pub(super) fn diagram<'a>(conversations: impl Iterator<Item = &'a Conversation>) -> String {
+    let conversations: Vec<&Conversation> = conversations.collect();
+    let mut text = String::from("sequenceDiagram\n");
+    let mut aliases: HashMap<&str, String> = HashMap::new();
+    for name in conversations.iter().flat_map(|it| it.participants()) {
+        if !aliases.contains_key(name) {
+            // Names may be anything, and mean something to Mermaid.
+            let alias = format!("p{}", aliases.len() + 1);
+            let _ = writeln!(text, "    participant {alias} as {}", escaped(name));
+            aliases.insert(name, alias);
+        }
+    }
+    let alias = |name: &str| aliases.get(name).map_or("", String::as_str);
+    for conversation in conversations {
+        let participants = conversation.participants();
+        let (Some(first), Some(last)) = (participants.first(), participants.last()) else {
+            continue;
+        };
+        let title = escaped(&conversation.title());
+        let _ = writeln!(
+            text,
+            "    Note over {},{}: {title}",
+            alias(first),
+            alias(last)
+        );
+        for step in &conversation.steps {
+            let (from, to) = (alias(&step.from), alias(&step.to));
+            let label = escaped(&step.label);
+            let _ = match &step.failed {
+                None => writeln!(text, "    {from}->>{to}: {label}"),
+                Some(why) => writeln!(text, "    {from}-x{to}: {label}: {}", escaped(why)),
+            };
+            if let Some(violation) = &step.violation {
+                let _ = writeln!(
+                    text,
+                    "    Note over {from}: violation: {}",
+                    escaped(violation)
+                );
+            }
+        }
+        if conversation.left_out > 0 {
+            let (over, more) = (alias(first), conversation.left_out);
+            let _ = writeln!(text, "    Note over {over}: and {more} letters more");
+        }
+    }
+    text
+}
+
+/// Without what means something to Mermaid.
+fn escaped(text: &str) -> String {
+    let mut out = String::new();
+    for c in text.chars() {
+        match c {
+            '#' | ';' | ':' | '<' | '>' | '{' | '}' | '%' | '"' | '\\' => {
+                let _ = write!(out, "#{};", u32::from(c));
+            }
+            c if c.is_control() => out.push(' '),
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+pub(super) fn write(file: &Path, text: &str) -> Result<(), Failure> {
+    std::fs::write(file, text).map_err(|error| {
+        Failure::failed(
+            format!("cannot write the diagram: {error}"),
+            file.display().to_string(),
+            "name a file that this user can write",
+        )
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::sequence::tests::contract_net;
+    use super::*;
+
+    #[test]
+    fn a_contract_net_is_drawn() {
+        let conversation = contract_net();
+        assert_eq!(
+            diagram([&conversation].into_iter()),
+            "\
+sequenceDiagram
+    participant p1 as rover
+    participant p2 as arm_1
+    participant p3 as arm_2
+    Note over p1,p3: conversation lift-7 (fipa-contract-net)
+    p1->>p2: cfp
+    p1->>p3: cfp (tcp)
+    p3->>p1: propose (tcp)
+    p2->>p1: inform
+    Note over p2: violation: inform from arm_1 to rover breaks fipa-contract-net
+    p1-xp2: reject-proposal: no such agent
+"
+        );
+    }
+
+    #[test]
+    fn names_mean_nothing_to_mermaid() {
+        assert_eq!(escaped("a;b#1:\n<end>"), "a#59;b#35;1#58; #60;end#62;");
+    }
+}

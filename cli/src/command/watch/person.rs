@@ -1,0 +1,423 @@
+//! What is seen, as lines for people.
+
+use std::io::IsTerminal;
+use std::time::SystemTime;
+
+use anstyle::{AnsiColor, Style};
+use fipa::watch::{Fate, Passage};
+use fipa::{Message, Outcome, Time};
+use unicode_width::{UnicodeWidthChar, UnicodeWidthStr};
+
+use super::judge::{Judged, Overdue};
+
+/// Where the lines are shown.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Look {
+    /// Columns of the terminal; none when it is no terminal.
+    pub(super) width: Option<usize>,
+    pub(super) colour: bool,
+}
+
+/// What stands out, and how.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Ink {
+    Bad,
+    Warning,
+    Good,
+    Quiet,
+}
+
+impl Look {
+    pub(super) fn of_stdout() -> Self {
+        let terminal = std::io::stdout().is_terminal();
+        let plain = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
+        let size = terminal_size::terminal_size();
+        Self {
+            width: size
+                .filter(|_| terminal)
+                .map(|(width, _)| usize::from(width.0)),
+            colour: terminal && !plain,
+        }
+    }
+
+    pub(super) fn paint(self, ink: Ink, text: &str) -> String {
+        if !self.colour || text.is_empty() {
+            return text.to_owned();
+        }
+        let style = match ink {
+            Ink::Bad => AnsiColor::Red.on_default().bold(),
+            Ink::Warning => AnsiColor::Yellow.on_default(),
+            Ink::Good => AnsiColor::Green.on_default(),
+            Ink::Quiet => Style::new().dimmed(),
+        };
+        format!("{style}{text}{style:#}")
+    }
+}
+
+/// Lines for people.
+#[derive(Debug)]
+pub(super) struct Person {
+    pub(super) look: Look,
+}
+
+/// Widths of the columns up to the verdict.
+struct Columns {
+    time: usize,
+    agents: usize,
+    performative: usize,
+    protocol: usize,
+    conversation: usize,
+    size: usize,
+    way: usize,
+    outcome: usize,
+    /// Whether words are cut short.
+    narrow: bool,
+}
+
+const WIDE: Columns = Columns {
+    time: 12,
+    agents: 26,
+    performative: 16,
+    protocol: 18,
+    conversation: 18,
+    size: 10,
+    way: 4,
+    outcome: 10,
+    narrow: false,
+};
+
+const NARROW: Columns = Columns {
+    time: 8,
+    agents: 17,
+    performative: 9,
+    protocol: 9,
+    conversation: 7,
+    size: 7,
+    way: 3,
+    outcome: 1,
+    narrow: true,
+};
+
+/// From this width on, nothing is cut short.
+const WIDE_ENOUGH: usize = 140;
+
+impl Person {
+    pub(super) fn new(look: Look) -> Self {
+        Self { look }
+    }
+
+    fn columns(&self) -> &'static Columns {
+        match self.look.width {
+            Some(width) if width < WIDE_ENOUGH => &NARROW,
+            _ => &WIDE,
+        }
+    }
+
+    /// What stands above the letters.
+    pub(super) fn head(&self, domain: &str, processes: usize) -> String {
+        let columns = self.columns();
+        let outcome = if columns.narrow { "" } else { "OUTCOME" };
+        let names = [
+            "UTC",
+            "FROM → TO",
+            "PERFORMATIVE",
+            "PROTOCOL",
+            "CONVERSATION",
+            "SIZE",
+            "WAY",
+            outcome,
+        ];
+        let head = row(columns, names.map(str::to_owned), "VERDICT");
+        first_line(domain, processes) + &self.look.paint(Ink::Quiet, head.trim_end()) + "\n"
+    }
+
+    /// A letter, and what is wrong with it on lines of its own.
+    pub(super) fn letter(&self, passage: &Passage, judged: &Judged) -> String {
+        let (columns, look) = (self.columns(), self.look);
+        let message = passage.message.as_ref();
+        let protocol = message.and_then(Message::protocol);
+        let protocol = protocol.or_else(|| judged.protocol()).unwrap_or("-");
+        let protocol = match columns.narrow {
+            true => protocol.strip_prefix("fipa-").unwrap_or(protocol),
+            false => protocol,
+        };
+        let cells = [
+            time_of_day(passage.at, columns.time),
+            format!("{} → {}", passage.sender().unwrap_or("?"), passage.receiver),
+            message.map_or_else(
+                || "(unreadable)".to_owned(),
+                |it| it.performative().to_string(),
+            ),
+            protocol.to_owned(),
+            message
+                .and_then(Message::conversation_id)
+                .unwrap_or("-")
+                .to_owned(),
+            size(passage.size),
+            passage.via.map_or("-", fipa::Kind::name).to_owned(),
+            outcome(&passage.fate, columns.narrow).to_owned(),
+        ];
+        let verdict = match judged {
+            Judged::Accepted { state, late, .. } => {
+                let state = look.paint(Ink::Good, &shown(state));
+                let late = if *late { " (late)" } else { "" };
+                format!("{state}{}", look.paint(Ink::Warning, late))
+            }
+            Judged::Violation(_) => look.paint(Ink::Bad, "VIOLATION"),
+            _ => "-".to_owned(),
+        };
+        let mut text = row(columns, cells, &verdict);
+        if is_failure(&passage.fate) {
+            text = look.paint(Ink::Warning, &text);
+        }
+        text.push('\n');
+        let mut below = |ink, what: &str| {
+            text.push_str(&format!("    {}\n", look.paint(ink, &shown(what))));
+        };
+        if let Judged::Violation(violation) = judged {
+            below(Ink::Bad, &format!("✗ {violation}"));
+        }
+        if let Some(told) = trouble(&passage.fate) {
+            below(Ink::Warning, &told);
+        }
+        if !passage.content.is_empty() {
+            below(Ink::Quiet, &content(passage));
+        }
+        text
+    }
+
+    /// News of a letter that was shown before.
+    pub(super) fn later(&self, passage: &Passage) -> String {
+        let what = trouble(&passage.fate).unwrap_or_else(|| {
+            let via = passage
+                .via
+                .map_or(String::new(), |via| format!(" via {via}"));
+            format!("{}{via}", outcome(&passage.fate, false))
+        });
+        let performative = passage
+            .message
+            .as_ref()
+            .map(|it| it.performative().to_string());
+        let text = format!(
+            "    later: {} from {} to {}: {what}",
+            performative.unwrap_or_else(|| "a letter".to_owned()),
+            passage.sender().unwrap_or("?"),
+            passage.receiver,
+        );
+        let ink = if is_failure(&passage.fate) {
+            Ink::Warning
+        } else {
+            Ink::Quiet
+        };
+        self.look.paint(ink, &shown(&text)) + "\n"
+    }
+}
+
+pub(super) fn first_line(domain: &str, processes: usize) -> String {
+    let processes = match processes {
+        0 => "no process yet".to_owned(),
+        1 => "1 process".to_owned(),
+        many => format!("{many} processes"),
+    };
+    format!("watching the domain {domain}, {processes}; Ctrl-C ends it\n")
+}
+
+pub(super) fn lost(look: Look, process: &str, records: u64) -> String {
+    let what = format!(
+        "    {} could not tell everything: {records} records lost; letters may be missing here, \
+         and verdicts wrong",
+        shown(process),
+    );
+    look.paint(Ink::Warning, &what) + "\n"
+}
+
+pub(super) fn refused(look: Look, process: &str, why: &str) -> String {
+    let what = format!(
+        "    {} is not listened to any more: {}",
+        shown(process),
+        shown(why)
+    );
+    look.paint(Ink::Warning, &what) + "\n"
+}
+
+pub(super) fn overdue(look: Look, overdue: &Overdue) -> String {
+    let with = overdue.participant.as_ref().map(|it| format!(" with {it}"));
+    let what = format!(
+        "    overdue: no message came in conversation {:?} of {}, state {:?}{}",
+        overdue.conversation_id,
+        overdue.protocol,
+        overdue.state,
+        with.unwrap_or_default(),
+    );
+    look.paint(Ink::Warning, &shown(&what)) + "\n"
+}
+
+fn row(columns: &Columns, cells: [String; 8], verdict: &str) -> String {
+    let [
+        time,
+        agents,
+        performative,
+        protocol,
+        conversation,
+        size,
+        way,
+        outcome,
+    ] = cells;
+    let gap = if columns.narrow { " " } else { "  " };
+    let left = [
+        (time, columns.time),
+        (agents, columns.agents),
+        (performative, columns.performative),
+        (protocol, columns.protocol),
+        (conversation, columns.conversation),
+    ];
+    let mut text = String::new();
+    for (cell, width) in left {
+        text.push_str(&fitted(&shown(&cell), width));
+        text.push_str(gap);
+    }
+    let blank = " ".repeat(columns.size.saturating_sub(size.width()));
+    text.push_str(&format!("{blank}{size}{gap}"));
+    for (cell, width) in [(way, columns.way), (outcome, columns.outcome)] {
+        text.push_str(&fitted(&cell, width));
+        text.push_str(gap);
+    }
+    text + verdict
+}
+
+/// The text in just so many columns: cut, or filled with blanks.
+pub(super) fn fitted(text: &str, width: usize) -> String {
+    let text = cut(text, width);
+    let blank = " ".repeat(width.saturating_sub(text.width()));
+    text + &blank
+}
+
+/// The text in at most so many columns.
+pub(super) fn cut(text: &str, width: usize) -> String {
+    if text.width() <= width {
+        return text.to_owned();
+    }
+    let mut left = width.saturating_sub(1);
+    let fits = |c: &char| {
+        let needed = c.width().unwrap_or(0);
+        let fits = needed <= left;
+        left = left.saturating_sub(needed);
+        fits
+    };
+    let mut short: String = text.chars().take_while(fits).collect();
+    if width > 0 {
+        short.push('…');
+    }
+    short
+}
+
+/// Without what would play tricks on a terminal.
+pub(super) fn shown(text: &str) -> String {
+    let visible = |c: char| if c.is_control() { '\u{fffd}' } else { c };
+    text.chars().map(visible).collect()
+}
+
+fn time_of_day(at: SystemTime, width: usize) -> String {
+    let time = Time::from_system_time(at).ok().and_then(Time::to_rfc3339);
+    let time = time
+        .as_deref()
+        .and_then(|time| time.get(11..))
+        .unwrap_or("?");
+    time.chars().take(width).collect()
+}
+
+fn size(bytes: u64) -> String {
+    const STEP: f64 = 1024.0;
+    let bytes_as_float = bytes as f64;
+    match bytes {
+        0..10_000 => format!("{bytes} B"),
+        10_000..10_240_000 => format!("{:.0} KiB", bytes_as_float / STEP),
+        _ => format!("{:.0} MiB", bytes_as_float / STEP / STEP),
+    }
+}
+
+fn outcome(fate: &Fate, narrow: bool) -> &'static str {
+    let (word, sign) = match fate {
+        Fate::UnderWay => ("under way", "…"),
+        Fate::Taken => ("taken", "✓"),
+        Fate::Passed(outcome) | Fate::Settled(outcome) => match outcome {
+            Outcome::Delivered { .. } => ("delivered", "✓"),
+            Outcome::Sent { .. } => ("sent", "→"),
+            _ => ("failed", "✗"),
+        },
+    };
+    if narrow { sign } else { word }
+}
+
+fn is_failure(fate: &Fate) -> bool {
+    matches!(
+        fate,
+        Fate::Settled(Outcome::Failed { .. }) | Fate::Passed(Outcome::Failed { .. })
+    )
+}
+
+/// What went wrong on the way, if anything did.
+fn trouble(fate: &Fate) -> Option<String> {
+    match fate {
+        Fate::Settled(outcome) | Fate::Passed(outcome)
+            if is_failure(fate) || !outcome.attempts().is_empty() =>
+        {
+            Some(outcome.to_string())
+        }
+        _ => None,
+    }
+}
+
+fn content(passage: &Passage) -> String {
+    let length = passage.content_len.unwrap_or(0);
+    let rest = length.saturating_sub(passage.content.len() as u64);
+    let text = match std::str::from_utf8(&passage.content) {
+        Ok(text) => text,
+        // The last character was cut in two.
+        Err(error) if error.error_len().is_none() => {
+            std::str::from_utf8(&passage.content[..error.valid_up_to()]).unwrap_or_default()
+        }
+        Err(_) => return format!("{length} bytes that are no text"),
+    };
+    let more = if rest > 0 {
+        format!("… ({length} bytes)")
+    } else {
+        String::new()
+    };
+    format!("{text}{more}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn texts_are_cut_to_columns_not_to_characters() {
+        assert_eq!(fitted("arm", 5), "arm  ");
+        assert_eq!(fitted("manipulator", 5), "mani…");
+        assert_eq!(fitted("机器人手臂", 6), "机器… ");
+        assert_eq!(cut("x", 0), "");
+    }
+
+    #[test]
+    fn nothing_plays_tricks_on_a_terminal() {
+        assert_eq!(shown("a\u{1b}[2J\nb"), "a\u{fffd}[2J\u{fffd}b");
+    }
+
+    #[test]
+    fn colour_is_only_where_it_is_wanted() {
+        let look = Look {
+            width: None,
+            colour: true,
+        };
+        assert_eq!(look.paint(Ink::Good, "x"), "\u{1b}[32mx\u{1b}[0m");
+        assert_eq!(Look::default().paint(Ink::Bad, "x"), "x");
+    }
+
+    #[test]
+    fn sizes_are_short() {
+        assert_eq!(size(271), "271 B");
+        assert_eq!(size(65_536), "64 KiB");
+        assert_eq!(size(64 << 20), "64 MiB");
+    }
+}

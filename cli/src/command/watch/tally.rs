@@ -1,0 +1,129 @@
+//! What was seen, in numbers.
+
+use std::collections::HashSet;
+use std::time::Instant;
+
+use fipa::Outcome;
+use fipa::watch::{Fate, Passage};
+
+use super::judge::Judged;
+use super::person::{Ink, Look};
+
+/// What was seen, in numbers.
+#[derive(Debug)]
+pub(super) struct Tally {
+    began: Instant,
+    pub(super) letters: u64,
+    /// Those that were shown.
+    pub(super) shown: u64,
+    pub(super) delivered: u64,
+    pub(super) failed: u64,
+    /// Those of which more may become known.
+    pub(super) open: u64,
+    pub(super) violations: u64,
+    /// Records that processes could not tell.
+    pub(super) lost: u64,
+    conversations: HashSet<String>,
+}
+
+/// Conversations that are told apart.
+const MAX_CONVERSATIONS: usize = 100_000;
+
+impl Default for Tally {
+    fn default() -> Self {
+        Self {
+            began: Instant::now(),
+            letters: 0,
+            shown: 0,
+            delivered: 0,
+            failed: 0,
+            open: 0,
+            violations: 0,
+            lost: 0,
+            conversations: HashSet::new(),
+        }
+    }
+}
+
+impl Tally {
+    pub(super) fn letter(&mut self, passage: &Passage, judged: &Judged) {
+        self.letters += 1;
+        self.violations += u64::from(judged.is_violation());
+        *self.of(&passage.fate) += 1;
+        let id = passage.message.as_ref().and_then(|it| it.conversation_id());
+        if let Some(id) = id
+            && self.conversations.len() < MAX_CONVERSATIONS
+            && !self.conversations.contains(id)
+        {
+            self.conversations.insert(id.to_owned());
+        }
+    }
+
+    /// News of a letter that was open.
+    pub(super) fn later(&mut self, passage: &Passage) {
+        // Only from under way to something else; what was delivered stays so.
+        if !matches!(passage.fate, Fate::UnderWay) && self.open > 0 {
+            self.open -= 1;
+            *self.of(&passage.fate) += 1;
+        }
+    }
+
+    fn of(&mut self, fate: &Fate) -> &mut u64 {
+        match fate {
+            Fate::UnderWay => &mut self.open,
+            Fate::Settled(Outcome::Failed { .. }) | Fate::Passed(Outcome::Failed { .. }) => {
+                &mut self.failed
+            }
+            Fate::Taken | Fate::Settled(_) | Fate::Passed(_) => &mut self.delivered,
+        }
+    }
+
+    pub(super) fn conversations(&self) -> usize {
+        self.conversations.len()
+    }
+
+    pub(super) fn seconds(&self) -> f64 {
+        self.began.elapsed().as_secs_f64()
+    }
+
+    /// The summary, for people.
+    pub(super) fn told(&self, look: Look) -> String {
+        let mut parts = vec![format!("{} delivered", self.delivered)];
+        if self.failed > 0 {
+            parts.push(look.paint(Ink::Bad, &format!("{} failed", self.failed)));
+        }
+        if self.open > 0 {
+            parts.push(format!("{} of unknown outcome", self.open));
+        }
+        let violations = match self.violations {
+            0 => "no violation".to_owned(),
+            1 => look.paint(Ink::Bad, "1 violation"),
+            many => look.paint(Ink::Bad, &format!("{many} violations")),
+        };
+        let mut text = format!(
+            "\n{} in {:.1} s: {}; {}, {violations}\n",
+            counted(self.letters, "letter"),
+            self.seconds(),
+            parts.join(", "),
+            counted(self.conversations() as u64, "conversation"),
+        );
+        if self.shown < self.letters {
+            text.push_str(&format!("{} of them shown\n", self.shown));
+        }
+        if self.lost > 0 {
+            text.push_str(&look.paint(
+                Ink::Warning,
+                &format!(
+                    "{} lost: letters may be missing, and verdicts after them may be wrong\n",
+                    counted(self.lost, "record")
+                ),
+            ));
+        }
+        text
+    }
+}
+
+fn counted(number: u64, what: &str) -> String {
+    let plural = if number == 1 { "" } else { "s" };
+    format!("{number} {what}{plural}")
+}

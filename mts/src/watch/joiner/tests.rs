@@ -1,0 +1,320 @@
+use std::time::UNIX_EPOCH;
+
+use fipa_acl::{AgentId, Performative};
+use fipa_transport::FailureReason;
+
+use super::*;
+
+const A: Source = Source(1);
+const B: Source = Source(2);
+const GATEWAY: Source = Source(3);
+
+fn id(sender: u64, sequence: u64) -> LetterId {
+    LetterId {
+        stream: Stream {
+            sender: Incarnation::from_u64(sender),
+            receiver: Incarnation::from_u64(99),
+        },
+        sequence,
+        receiver: "arm_1".into(),
+    }
+}
+
+fn letter() -> Box<SeenLetter> {
+    let message = Message::builder(Performative::Request)
+        .sender(AgentId::new("rover").unwrap())
+        .build()
+        .unwrap();
+    Box::new(SeenLetter {
+        envelope: None,
+        message: Some(message),
+        content_len: None,
+        content: Bytes::new(),
+        size: 100,
+    })
+}
+
+fn at(ms: u64) -> SystemTime {
+    UNIX_EPOCH + Duration::from_millis(1_700_000_000_000 + ms)
+}
+
+fn record(ms: u64, body: RecordBody) -> Record {
+    Record {
+        at: at(ms),
+        lost: 0,
+        body,
+    }
+}
+
+fn seen(ms: u64, id: LetterId, place: Seen) -> Record {
+    let letter = letter();
+    record(ms, RecordBody::Letter { id, place, letter })
+}
+
+fn delivered(via: Kind) -> Outcome {
+    Outcome::Delivered {
+        via,
+        attempts: Vec::new(),
+    }
+}
+
+fn failed() -> Outcome {
+    Outcome::Failed {
+        reason: FailureReason::TimedOut,
+        attempts: Vec::new(),
+    }
+}
+
+fn settled(ms: u64, id: LetterId, outcome: Outcome, sender: bool) -> Record {
+    record(
+        ms,
+        RecordBody::Settled {
+            id,
+            outcome,
+            sender,
+        },
+    )
+}
+
+fn all(joiner: &mut Joiner, now: Instant) -> Vec<Event> {
+    std::iter::from_fn(|| joiner.poll_event(now)).collect()
+}
+
+fn only(mut events: Vec<Event>) -> Arc<Passage> {
+    assert_eq!(events.len(), 1, "{events:?}");
+    match events.remove(0) {
+        Event::Letter(passage) | Event::Later(passage) => passage,
+        lost => panic!("{lost:?}"),
+    }
+}
+
+#[test]
+fn sender_and_receiver_tell_of_one_letter() {
+    let (mut joiner, now) = (Joiner::new(), Instant::now());
+    joiner.handle(now, B, seen(2, id(7, 1), Seen::Taken(Some(Kind::Shm))));
+    joiner.handle(now, A, seen(1, id(7, 1), Seen::Sent(Some(4))));
+    joiner.handle(now, A, settled(3, id(7, 1), delivered(Kind::Shm), true));
+    assert!(joiner.poll_event(now).is_none(), "held back for a moment");
+    assert_eq!(joiner.poll_timeout(), Some(now + HOLD));
+    let passage = only(all(&mut joiner, now + HOLD));
+    assert_eq!(
+        (passage.number, passage.send, passage.at),
+        (1, Some(4), at(1))
+    );
+    assert_eq!(passage.fate, Fate::Settled(delivered(Kind::Shm)));
+    assert_eq!(
+        (passage.via, passage.sender()),
+        (Some(Kind::Shm), Some("rover"))
+    );
+    joiner.handle(now, B, seen(2, id(7, 1), Seen::Taken(Some(Kind::Shm))));
+    assert!(
+        all(&mut joiner, now + PATIENCE * 2).is_empty(),
+        "told already"
+    );
+}
+
+#[test]
+fn a_late_outcome_is_an_event_of_its_own() {
+    let (mut joiner, now) = (Joiner::new(), Instant::now());
+    joiner.handle(now, A, seen(1, id(7, 1), Seen::Sent(None)));
+    assert_eq!(only(all(&mut joiner, now + PATIENCE)).fate, Fate::UnderWay);
+    joiner.handle(now, A, settled(900, id(7, 1), failed(), true));
+    let later = only(all(&mut joiner, now + PATIENCE));
+    assert_eq!((later.number, &later.fate), (1, &Fate::Settled(failed())));
+}
+
+#[test]
+fn letters_are_told_in_the_order_in_which_they_were_sent() {
+    let (mut joiner, now) = (Joiner::new(), Instant::now());
+    // The answer's process was quicker to tell than the question's.
+    joiner.handle(now, B, seen(5, id(8, 1), Seen::Sent(None)));
+    joiner.handle(now, B, settled(6, id(8, 1), delivered(Kind::Shm), true));
+    let soon = now + HOLD / 2;
+    joiner.handle(soon, A, seen(1, id(7, 1), Seen::Sent(None)));
+    joiner.handle(soon, A, settled(7, id(7, 1), delivered(Kind::Shm), true));
+    assert!(
+        all(&mut joiner, now + HOLD).is_empty(),
+        "the first is waited for"
+    );
+    let senders: Vec<u64> = all(&mut joiner, soon + HOLD)
+        .iter()
+        .map(|event| match event {
+            Event::Letter(passage) => passage.stream.sender.as_u64(),
+            other => panic!("{other:?}"),
+        })
+        .collect();
+    assert_eq!(senders, [7, 8]);
+}
+
+#[test]
+fn a_letter_through_the_gateway_has_the_way_between_the_hosts() {
+    let (mut joiner, now) = (Joiner::new(), Instant::now());
+    let hello = RecordBody::Hello {
+        name: "rover-mts".into(),
+        incarnation: Incarnation::from_u64(3),
+        gateway: true,
+    };
+    joiner.handle_begin(GATEWAY, "process 3");
+    joiner.handle(now, GATEWAY, record(0, hello));
+    // Out.
+    joiner.handle(now, A, seen(1, id(7, 1), Seen::Sent(None)));
+    joiner.handle(
+        now,
+        GATEWAY,
+        seen(2, id(7, 1), Seen::Passed(Kind::Shm, Origin::Here)),
+    );
+    joiner.handle(
+        now,
+        GATEWAY,
+        settled(3, id(7, 1), delivered(Kind::Tcp), false),
+    );
+    joiner.handle(now, A, settled(4, id(7, 1), delivered(Kind::Tcp), true));
+    let out = only(all(&mut joiner, now + HOLD));
+    assert_eq!(out.via, Some(Kind::Tcp));
+    assert_eq!(out.gateway.as_deref(), Some("rover-mts"));
+    // In.
+    joiner.handle(
+        now,
+        GATEWAY,
+        seen(5, id(9, 1), Seen::Passed(Kind::Tcp, Origin::Elsewhere)),
+    );
+    joiner.handle(now, B, seen(6, id(9, 1), Seen::Taken(Some(Kind::Shm))));
+    joiner.handle(
+        now,
+        GATEWAY,
+        settled(7, id(9, 1), delivered(Kind::Shm), false),
+    );
+    let into = only(all(&mut joiner, now + HOLD));
+    assert_eq!((into.via, into.from_elsewhere), (Some(Kind::Tcp), true));
+    assert_eq!(into.fate, Fate::Taken);
+}
+
+#[test]
+fn what_is_lost_is_told_once() {
+    let (mut joiner, now) = (Joiner::new(), Instant::now());
+    joiner.handle_begin(A, "process 1");
+    for lost in [0, 3, 3, 10] {
+        let record = Record {
+            lost,
+            ..record(0, RecordBody::Lost)
+        };
+        joiner.handle(now, A, record);
+    }
+    let lost: Vec<u64> = all(&mut joiner, now)
+        .iter()
+        .map(|event| match event {
+            Event::Lost { records, .. } => *records,
+            other => panic!("{other:?}"),
+        })
+        .collect();
+    assert_eq!(lost, [3, 7]);
+}
+
+#[test]
+fn who_tells_nonsense_is_named() {
+    let mut joiner = Joiner::new();
+    joiner.handle_begin(A, "process 1");
+    joiner.handle_malformed(A, RecordError::Version(9));
+    let event = joiner.poll_event(Instant::now());
+    let Some(Event::Refused { process, why }) = event else {
+        panic!("{event:?}");
+    };
+    assert_eq!((&*process, why), ("process 1", RecordError::Version(9)));
+}
+
+#[test]
+fn what_nobody_settles_does_not_take_more_and_more_memory() {
+    let (mut joiner, now) = (Joiner::new(), Instant::now());
+    let mut told = 0;
+    for sequence in 0..(MAX_WAITING + MAX_TOLD + 5000) as u64 {
+        joiner.handle(now, A, seen(sequence, id(7, sequence), Seen::Sent(None)));
+        joiner.handle(now, A, settled(1, id(8, sequence), failed(), true));
+        told += all(&mut joiner, now).len();
+    }
+    assert_eq!(told, MAX_TOLD + 5000);
+    assert!(joiner.waiting.len() <= MAX_WAITING && joiner.told.len() <= MAX_TOLD);
+    assert!(joiner.letters.len() <= MAX_WAITING + MAX_TOLD && joiner.early.len() <= MAX_EARLY);
+}
+
+/// Letters of several senders, told by up to four records each that arrive late, in any order,
+/// twice or not at all: each letter of which anything was seen is told once, in the order of
+/// sending, with the outcome that its sender knows.
+#[test]
+fn whatever_arrives_each_letter_is_told_once_and_in_order() {
+    for seed in 0..300 {
+        let mut random = fastrand::Rng::with_seed(seed);
+        let start = Instant::now();
+        let mut arrivals: Vec<(u64, Source, Record)> = Vec::new();
+        let mut expected: HashMap<Key, Option<Outcome>> = HashMap::new();
+        for ms in 0..60 {
+            let (sender, sequence) = (random.u64(1..4), ms + 1);
+            let letter = || id(sender, sequence);
+            let outcome = if random.bool() {
+                delivered(Kind::Shm)
+            } else {
+                failed()
+            };
+            let told = random.u8(..);
+            let records = [
+                (A, seen(ms, letter(), Seen::Sent(Some(sequence)))),
+                (B, seen(ms, letter(), Seen::Taken(Some(Kind::Shm)))),
+                (
+                    GATEWAY,
+                    seen(ms, letter(), Seen::Passed(Kind::Shm, Origin::Here)),
+                ),
+                (A, settled(ms, letter(), outcome.clone(), true)),
+            ];
+            for (bit, (source, record)) in records.into_iter().enumerate() {
+                if told & (1 << bit) == 0 {
+                    continue;
+                }
+                for _ in 0..random.u8(1..3) {
+                    let late = ms + random.u64(..HOLD.as_millis() as u64);
+                    arrivals.push((late, source, record.clone()));
+                }
+            }
+            if told & 0b0111 != 0 {
+                let known = (told & 0b1000 != 0).then_some(outcome);
+                expected.insert((Incarnation::from_u64(sender), sequence), known);
+            }
+        }
+        random.shuffle(&mut arrivals);
+        arrivals.sort_by_key(|(ms, ..)| *ms);
+        let mut joiner = Joiner::new();
+        let mut told: Vec<(SystemTime, Key, Fate)> = Vec::new();
+        let mut take = |joiner: &mut Joiner, now| {
+            while let Some(event) = joiner.poll_event(now) {
+                match event {
+                    Event::Letter(it) => {
+                        told.push((it.at, (it.stream.sender, it.sequence), it.fate.clone()));
+                    }
+                    Event::Later(it) => {
+                        let key = (it.stream.sender, it.sequence);
+                        let first = told.iter_mut().find(|(_, told, _)| *told == key);
+                        first.expect("told before").2 = it.fate.clone();
+                    }
+                    other => panic!("{other:?}"),
+                }
+            }
+        };
+        for (ms, source, record) in arrivals {
+            let now = start + Duration::from_millis(ms);
+            joiner.handle(now, source, record);
+            take(&mut joiner, now);
+        }
+        take(&mut joiner, start + Duration::from_secs(10));
+        assert!(
+            told.is_sorted_by_key(|(at, ..)| *at),
+            "seed {seed}: {told:?}"
+        );
+        assert_eq!(told.len(), expected.len(), "seed {seed}");
+        for (_, key, fate) in &told {
+            match expected.remove(key) {
+                Some(Some(outcome)) => assert_eq!(*fate, Fate::Settled(outcome), "seed {seed}"),
+                Some(None) => assert!(!matches!(fate, Fate::Settled(_)), "seed {seed}"),
+                None => panic!("seed {seed}: {key:?} was told twice, or never sent"),
+            }
+        }
+        assert!(joiner.finish().is_none() && joiner.poll_timeout().is_none());
+    }
+}

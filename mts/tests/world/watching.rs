@@ -1,0 +1,115 @@
+//! Somebody who watches each host: every letter is seen once, in order, with the outcome that its
+//! sender is told.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::{Instant, SystemTime};
+
+use fipa_mts::core::Notice;
+use fipa_mts::watch::record::{self, Wish};
+use fipa_mts::watch::{Event, Fate, Joiner, Passage, Record, Source};
+use fipa_transport::{Incarnation, Outcome, wire};
+
+use super::{Breach, World};
+
+/// The watcher of a host, and what it has seen.
+#[derive(Default)]
+pub(super) struct Watching {
+    joiner: Joiner,
+    /// By the sender's life and its sequence.
+    seen: HashMap<(Incarnation, u64), Arc<Passage>>,
+    last: HashMap<Incarnation, u64>,
+}
+
+impl Watching {
+    /// A process tells of a letter, as real ones do.
+    pub(super) fn hear(
+        &mut self,
+        (now, utc): (Instant, SystemTime),
+        process: usize,
+        notice: &Notice,
+    ) -> Result<(), Breach> {
+        // The content is the number of the letter.
+        let bytes = record::of(notice, Wish { content: 64 }, utc);
+        let record = Record::parse(&bytes.into()).map_err(|error| error.to_string())?;
+        self.joiner.handle(now, Source(process as u64), record);
+        while let Some(event) = self.joiner.poll_event(now) {
+            self.see(event)?;
+        }
+        Ok(())
+    }
+
+    fn see(&mut self, event: Event) -> Result<(), Breach> {
+        let (passage, later) = match event {
+            Event::Letter(passage) => (passage, false),
+            Event::Later(passage) => (passage, true),
+            other => return Err(format!("watched: {other:?}")),
+        };
+        let sender = passage.stream.sender;
+        let key = (sender, passage.sequence);
+        if self.seen.contains_key(&key) != later {
+            return Err(format!(
+                "seen twice, or news of what was not seen: {passage:?}"
+            ));
+        }
+        // Of senders on this host, whose beginnings are told.
+        if passage.send.is_some() && !later {
+            let last = self.last.insert(sender, passage.sequence).unwrap_or(0);
+            if last >= passage.sequence {
+                return Err(format!("{passage:?} was seen after the letter {last}"));
+            }
+        }
+        let content = self.seen.remove(&key).map(|before| before.content.clone());
+        let passage = match content {
+            // What was told before is not told again.
+            Some(content) => Arc::new(Passage {
+                content,
+                ..Passage::clone(&passage)
+            }),
+            None => passage,
+        };
+        self.seen.insert(key, passage);
+        Ok(())
+    }
+}
+
+impl World {
+    pub(super) fn check_watched(&mut self) -> Result<(), Breach> {
+        for watching in &mut self.watching {
+            while let Some(event) = watching.joiner.finish() {
+                watching.see(event)?;
+            }
+        }
+        if !self.watched {
+            return Ok(());
+        }
+        let mut settled = HashMap::new();
+        for watching in &self.watching {
+            for passage in watching.seen.values().filter(|it| !it.from_service) {
+                let outcome = match (&passage.fate, passage.via) {
+                    (Fate::Settled(outcome), _) => outcome.clone(),
+                    // Nothing else was told to the sender, or there would have been news.
+                    (Fate::Taken, Some(via)) if passage.send.is_some() => Outcome::Delivered {
+                        via,
+                        attempts: Vec::new(),
+                    },
+                    _ => continue,
+                };
+                let number = String::from_utf8_lossy(&passage.content).into_owned();
+                settled.insert((number, Arc::clone(&passage.receiver)), outcome);
+            }
+        }
+        for (number, sent) in &self.sent {
+            for (receiver, outcome) in &sent.outcomes {
+                let seen = settled.get(&(number.to_string(), Arc::clone(receiver)));
+                // Of very many attempts the first are not told.
+                if seen.map(wire::write_outcome) != Some(wire::write_outcome(outcome)) {
+                    return Err(format!(
+                        "letter {number} to {receiver}: {outcome}, and seen was {seen:?}"
+                    ));
+                }
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,79 @@
+//! Sockets in the directory: how processes of a domain that find each other there can talk.
+
+use std::os::fd::OwnedFd;
+
+use rustix::fs::{AtFlags, FileType, Mode, OFlags};
+use rustix::io::Errno;
+use rustix::net::sockopt::socket_peercred;
+use rustix::net::{
+    AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, connect, listen, socket_with,
+};
+
+use super::HostError;
+use super::place::{Guard, Id, Name, Place};
+
+/// Connections that wait to be accepted.
+const BACKLOG: i32 = 1024;
+
+impl Guard<'_> {
+    pub(super) fn listen(&self) -> Result<OwnedFd, HostError> {
+        let place = self.place;
+        let temporary = Name::Temporary(place.id());
+        place.remove(temporary)?;
+        let socket = new_socket()
+            .and_then(|socket| {
+                // The path of the directory may be longer than that of a socket can be.
+                let path = place.pinned_path().join(temporary.to_string());
+                bind(&socket, &SocketAddrUnix::new(&path)?)?;
+                let private = Mode::RUSR | Mode::WUSR;
+                rustix::fs::chmodat(
+                    place.dir(),
+                    temporary.to_string(),
+                    private,
+                    AtFlags::empty(),
+                )?;
+                listen(&socket, BACKLOG)?;
+                Ok(socket)
+            })
+            .map_err(|error| place.io("listen at", temporary)(error.into()))?;
+        // Seen only now, when it can be connected to.
+        place.rename(temporary, Name::Socket(place.id()))?;
+        Ok(socket)
+    }
+}
+
+impl Place {
+    pub(super) fn connect(&self, id: Id) -> Result<OwnedFd, HostError> {
+        use std::os::fd::AsRawFd as _;
+        let name = Name::Socket(id);
+        let failed = |error: Errno| self.io("connect to", name)(error.into());
+        // What is examined here is what is connected to below, whatever the name is given to.
+        let flags = OFlags::PATH | OFlags::NOFOLLOW | OFlags::CLOEXEC;
+        let file = rustix::fs::openat(self.dir(), name.to_string(), flags, Mode::empty());
+        let file = file.map_err(failed)?;
+        let stat = rustix::fs::fstat(&file).map_err(failed)?;
+        let me = rustix::process::geteuid();
+        let refused = |why: &str| HostError::NotPrivate {
+            path: self.path().join(name.to_string()),
+            why: why.to_owned(),
+        };
+        if FileType::from_raw_mode(stat.st_mode) != FileType::Socket || stat.st_uid != me.as_raw() {
+            return Err(refused("it is not a socket of this user"));
+        }
+        let path = format!("/proc/self/fd/{}", file.as_raw_fd());
+        let connected = new_socket().and_then(|socket| {
+            connect(&socket, &SocketAddrUnix::new(path)?)?;
+            Ok(socket)
+        });
+        let socket = connected.map_err(failed)?;
+        if socket_peercred(&socket).map_err(failed)?.uid != me {
+            return Err(refused("another user listens there"));
+        }
+        Ok(socket)
+    }
+}
+
+fn new_socket() -> Result<OwnedFd, Errno> {
+    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+    socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)
+}

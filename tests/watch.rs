@@ -1,0 +1,318 @@
+//! What somebody who watches a domain sees, and that agents do not notice.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
+
+use fipa::config::Sources;
+use fipa::watch::{Event, Fate, Passage, WatchOptions, Watcher};
+use fipa::{Agent, AgentId, Config, Domain, FailureReason, Kind, Message, Outcome, Performative};
+use rustix::net::{AddressFamily, SendFlags, SocketAddrUnix, SocketType};
+
+/// Ends a test that hangs.
+const WATCHDOG: Duration = Duration::from_secs(60);
+
+/// A configuration for a domain that no other test has.
+fn config() -> Config {
+    static NEXT: AtomicU32 = AtomicU32::new(0);
+    let number = NEXT.fetch_add(1, Ordering::Relaxed);
+    Config::load(&Sources {
+        set: vec![
+            format!("domain=watch-{}-{number}", std::process::id()),
+            "discovery.mdns=false".to_owned(),
+        ],
+        ..Sources::default()
+    })
+    .unwrap()
+}
+
+/// Where the processes of the domain meet.
+fn place(config: &Config) -> PathBuf {
+    let base = std::env::var_os("FIPA_RUNTIME_DIR").map_or_else(
+        || format!("/tmp/fipa-{}", rustix::process::geteuid().as_raw()).into(),
+        PathBuf::from,
+    );
+    base.join(&config.domain).join("directory")
+}
+
+/// The socket of the watcher.
+fn socket(config: &Config) -> Option<PathBuf> {
+    let files = std::fs::read_dir(place(config)).ok()?;
+    let mut files = files.map(|file| file.unwrap().path());
+    files.find(|path| path.extension().is_some_and(|it| it == "socket"))
+}
+
+fn request(from: &Agent, to: &str, content: &str) -> Message {
+    from.message(Performative::Request)
+        .receiver(AgentId::new(to).unwrap())
+        .protocol("fipa-request")
+        .conversation_id("c1")
+        .content(content.to_owned())
+        .build()
+        .unwrap()
+}
+
+async fn next(watcher: &mut Watcher) -> Event {
+    let next = tokio::time::timeout(WATCHDOG, watcher.next()).await;
+    next.expect("something is seen")
+}
+
+async fn letter(watcher: &mut Watcher) -> Arc<Passage> {
+    match next(watcher).await {
+        Event::Letter(passage) => passage,
+        other => panic!("{other:?}"),
+    }
+}
+
+/// Sends until the watcher sees something: processes learn of it in their own time.
+async fn until_seen(watcher: &mut Watcher, from: &Agent, to: &str) {
+    loop {
+        from.send(request(from, to, "are you watched?"))
+            .await
+            .unwrap();
+        if tokio::time::timeout(Duration::from_millis(50), watcher.next())
+            .await
+            .is_ok()
+        {
+            break;
+        }
+    }
+    // Everything before this has been seen then.
+    from.send(request(from, to, "yes")).await.unwrap();
+    while letter(watcher).await.content_len != Some(3) {}
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn each_letter_is_seen_once_with_its_outcome() {
+    let config = config();
+    let (here, there) = (
+        Domain::open(&config).await.unwrap(),
+        Domain::open(&config).await.unwrap(),
+    );
+    let rover = here.register("rover").unwrap();
+    let arms = ["arm_1", "arm_2"].map(|name| there.register(name).unwrap());
+    let mut watcher = Watcher::open(&config, WatchOptions::default())
+        .await
+        .unwrap();
+    until_seen(&mut watcher, &rover, "arm_1").await;
+    until_seen(&mut watcher, &arms[0], "rover").await;
+
+    rover
+        .send(request(&rover, "arm_1", "lift sample-3"))
+        .await
+        .unwrap();
+    let seen = letter(&mut watcher).await;
+    assert_eq!((seen.sender(), &*seen.receiver), (Some("rover"), "arm_1"));
+    assert_eq!(seen.stream.sender, rover.incarnation());
+    assert_eq!(seen.stream.receiver, arms[0].incarnation());
+    let message = seen.message.as_ref().unwrap();
+    assert_eq!(*message.performative(), Performative::Request);
+    assert_eq!(message.protocol(), Some("fipa-request"));
+    assert_eq!(message.conversation_id(), Some("c1"));
+    assert_eq!(
+        (seen.content_len, seen.content.len()),
+        (Some(13), 0),
+        "content is not told"
+    );
+    let envelope = seen.envelope.as_ref().unwrap();
+    assert_eq!(envelope.base.from.as_ref().unwrap().name(), "rover");
+    assert_eq!(seen.via, Some(Kind::Shm));
+    assert!(matches!(
+        &seen.fate,
+        Fate::Settled(Outcome::Delivered { via: Kind::Shm, .. })
+    ));
+
+    // One message to several: the letters say that they are one.
+    rover.send(request(&rover, "arm_.*", "all")).await.unwrap();
+    let (one, two) = (letter(&mut watcher).await, letter(&mut watcher).await);
+    assert_ne!(one.receiver, two.receiver);
+    assert!(one.send.is_some() && one.send == two.send);
+
+    // One that fails, and what its sender is told.
+    rover
+        .send(request(&rover, "nobody", "hello?"))
+        .await
+        .unwrap();
+    let failed = letter(&mut watcher).await;
+    let Fate::Settled(Outcome::Failed { reason, .. }) = &failed.fate else {
+        panic!("{failed:?}");
+    };
+    assert_eq!(
+        (&*failed.receiver, *reason),
+        ("nobody", FailureReason::NoSuchAgent)
+    );
+    let told = letter(&mut watcher).await;
+    assert_eq!(
+        *told.message.as_ref().unwrap().performative(),
+        Performative::Failure
+    );
+    assert!(told.from_service && !failed.from_service);
+
+    // Whoever joins later is watched, too.
+    let late = Domain::open(&config).await.unwrap();
+    let late = late.register("late").unwrap();
+    until_seen(&mut watcher, &late, "rover").await;
+    assert!(watcher.directory().lookup("late").is_some());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn content_is_seen_by_who_asks_for_it() {
+    let config = config();
+    let domain = Domain::open(&config).await.unwrap();
+    let (rover, _arm) = (
+        domain.register("rover").unwrap(),
+        domain.register("arm").unwrap(),
+    );
+    let options = WatchOptions { content: 4 };
+    let (mut curious, mut discreet) = (
+        Watcher::open(&config, options).await.unwrap(),
+        Watcher::open(&config, WatchOptions::default())
+            .await
+            .unwrap(),
+    );
+    until_seen(&mut curious, &rover, "arm").await;
+    until_seen(&mut discreet, &rover, "arm").await;
+    while tokio::time::timeout(Duration::from_millis(300), curious.next())
+        .await
+        .is_ok()
+    {}
+    rover.send(request(&rover, "arm", "secret")).await.unwrap();
+    let seen = letter(&mut curious).await;
+    assert_eq!(
+        (&seen.content[..], seen.content_len),
+        (&b"secr"[..], Some(6))
+    );
+    let mut seen = letter(&mut discreet).await;
+    while seen.content_len != Some(6) {
+        seen = letter(&mut discreet).await;
+    }
+    assert!(seen.content.is_empty());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_watcher_leaves_nothing_behind() {
+    let config = config();
+    let domain = Domain::open(&config).await.unwrap();
+    let (rover, arm) = (
+        domain.register("rover").unwrap(),
+        domain.register("arm").unwrap(),
+    );
+    for _ in 0..3 {
+        let mut watcher = Watcher::open(&config, WatchOptions::default())
+            .await
+            .unwrap();
+        assert!(socket(&config).is_some());
+        until_seen(&mut watcher, &rover, "arm").await;
+        drop(watcher);
+        assert!(socket(&config).is_none());
+        rover
+            .send(request(&rover, "arm", "alone again"))
+            .await
+            .unwrap();
+    }
+    drop((rover, arm));
+    domain.close().await;
+    assert!(!place(&config).exists());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_watcher_that_does_not_look_slows_nobody_and_is_told_what_it_missed() {
+    const LETTERS: u64 = 6_000;
+    let config = config();
+    let (here, there) = (
+        Domain::open(&config).await.unwrap(),
+        Domain::open(&config).await.unwrap(),
+    );
+    let rover = here.register("rover").unwrap();
+    let arm = there.register("arm").unwrap();
+    let reading = tokio::spawn(async move {
+        let mut last = String::new();
+        while last != "end" {
+            let content = arm.receive().await.unwrap().message.content().cloned();
+            last = String::from_utf8(content.unwrap().to_vec()).unwrap();
+        }
+        arm
+    });
+    let mut watcher = Watcher::open(&config, WatchOptions::default())
+        .await
+        .unwrap();
+    until_seen(&mut watcher, &rover, "arm").await;
+    for number in 0..LETTERS {
+        let deliveries = rover
+            .send(request(&rover, "arm", &number.to_string()))
+            .await
+            .unwrap();
+        assert!(deliveries.all_succeeded(), "{deliveries}");
+    }
+    rover.send(request(&rover, "arm", "end")).await.unwrap();
+    let _arm = tokio::time::timeout(WATCHDOG, reading)
+        .await
+        .unwrap()
+        .unwrap();
+
+    let (mut seen, mut lost) = (0, BTreeMap::new());
+    // Until everything that was kept has come: a process that lost something says so last.
+    loop {
+        match tokio::time::timeout(Duration::from_secs(2), watcher.next()).await {
+            Ok(Event::Letter(_)) => seen += 1,
+            Ok(Event::Lost { process, records }) => {
+                *lost.entry(process.to_string()).or_insert(0) += records;
+            }
+            Ok(Event::Later(_)) => {}
+            Ok(other) => panic!("{other:?}"),
+            Err(_) => break,
+        }
+    }
+    let all: u64 = lost.values().sum();
+    assert!(seen > 0 && seen < LETTERS, "{seen} seen");
+    // Two records are the sender's, one the receiver's.
+    assert!(all > 0 && all <= 3 * (LETTERS + 1), "{lost:?}");
+    assert!(seen + all >= LETTERS, "{seen} seen, {lost:?}");
+    assert!(
+        lost.keys()
+            .all(|name| name.contains(&std::process::id().to_string())),
+        "{lost:?}"
+    );
+    // And goes on from there.
+    until_seen(&mut watcher, &rover, "arm").await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nonsense_is_refused_and_nobody_else_notices() {
+    let config = config();
+    let domain = Domain::open(&config).await.unwrap();
+    let (rover, _arm) = (
+        domain.register("rover").unwrap(),
+        domain.register("arm").unwrap(),
+    );
+    let mut watcher = Watcher::open(&config, WatchOptions::default())
+        .await
+        .unwrap();
+    until_seen(&mut watcher, &rover, "arm").await;
+    let address = SocketAddrUnix::new(socket(&config).unwrap()).unwrap();
+    for nonsense in [&b"hello"[..], b"fipw\x09", &[0; 60_000], &[0xff; 96]] {
+        let socket = rustix::net::socket(AddressFamily::UNIX, SocketType::SEQPACKET, None).unwrap();
+        rustix::net::connect(&socket, &address).unwrap();
+        rustix::net::send(&socket, nonsense, SendFlags::empty()).unwrap();
+        let Event::Refused { process, why } = next(&mut watcher).await else {
+            panic!("{nonsense:?} was taken for something else");
+        };
+        assert_eq!(&*process, format!("process {}", std::process::id()));
+        assert!(why.to_string().starts_with("not a record"), "{why}");
+    }
+    // One who connects and says nothing, and one who goes at once.
+    let silent = rustix::net::socket(AddressFamily::UNIX, SocketType::SEQPACKET, None).unwrap();
+    rustix::net::connect(&silent, &address).unwrap();
+    let gone = rustix::net::socket(AddressFamily::UNIX, SocketType::SEQPACKET, None).unwrap();
+    rustix::net::connect(&gone, &address).unwrap();
+    drop(gone);
+    rover
+        .send(request(&rover, "arm", "still there"))
+        .await
+        .unwrap();
+    assert_eq!(letter(&mut watcher).await.content_len, Some(11));
+}
