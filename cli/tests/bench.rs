@@ -130,9 +130,76 @@ fn an_interrupted_measurement_leaves_nothing_behind() {
 }
 
 #[test]
-fn what_cannot_be_measured_is_wrong_usage() {
-    let output = bench(&["shm", "--sizes", "1GiB"]).output().unwrap();
-    assert_eq!(output.status.code(), Some(2));
+fn the_evaluation_of_the_paper_is_repeated() {
+    let directory = tempfile::tempdir().unwrap();
+    let output = bench(&["paper", "--quick", "--json", "--dir"])
+        .arg(directory.path())
+        .output()
+        .unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
-    assert!(said.contains("--sizes"), "{said}");
+    assert!(output.status.success(), "{said}");
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert!(number(&report["machine"]["cores"]) >= 1.0);
+    assert!(number(&report["cycles"]) >= 1.0);
+
+    let messages = ["bit-efficient", "string", "XML"];
+    let letters = |message: &'static str| {
+        let envelopes = [Value::Null, "bit-efficient".into(), "XML".into()];
+        envelopes.map(|envelope| (Value::from(message), envelope))
+    };
+    let pairs: Vec<_> = messages.into_iter().flat_map(letters).collect();
+    let is_of =
+        |row: &Value, pair: &(Value, Value)| row["message"] == pair.0 && row["envelope"] == pair.1;
+    let sizes = report["sizes"].as_array().unwrap();
+    let times = report["times"].as_array().unwrap();
+    assert_eq!((sizes.len(), times.len()), (pairs.len(), 3 * pairs.len()));
+    for pair in &pairs {
+        let size = sizes.iter().find(|row| is_of(row, pair)).unwrap();
+        assert!(number(&size["bytes"]) > 100.0, "{size:#}");
+        for content in [1, 1 << 10, 1 << 20] {
+            let mut rows = times.iter().filter(|row| is_of(row, pair));
+            let row = rows.find(|row| row["content"] == content).unwrap();
+            for key in ["encode_us", "decode_us"] {
+                assert!(number(&row[key]["mean"]) > 0.0, "{row:#}");
+                assert!(number(&row[key]["deviation"]) >= 0.0, "{row:#}");
+            }
+        }
+    }
+    let bytes = |message: &str, envelope: Value| {
+        let pair = (message.into(), envelope);
+        number(&sizes.iter().find(|row| is_of(row, &pair)).unwrap()["bytes"])
+    };
+    assert!(bytes("bit-efficient", Value::Null) < bytes("string", Value::Null));
+    assert!(bytes("string", Value::Null) < bytes("XML", Value::Null));
+
+    let written = |name: &str| std::fs::read_to_string(directory.path().join(name)).unwrap();
+    let tables = written("paper.md");
+    assert!(tables.contains("measured elsewhere"), "{tables}");
+    assert!(
+        tables.contains("| bit-efficient | XML | 1 MB |"),
+        "{tables}"
+    );
+    for picture in ["paper-sizes.svg", "paper-times.svg"] {
+        assert!(tables.contains(picture), "{tables}");
+        let drawn = written(picture);
+        assert!(drawn.starts_with("<svg"), "{picture}");
+        assert!(drawn.contains("string in XML envelope"), "{picture}");
+        assert!(drawn.contains("C++, measured elsewhere"), "{picture}");
+    }
+}
+
+#[test]
+fn what_cannot_be_measured_is_wrong_usage() {
+    let cases: [(&[&str], &str); 4] = [
+        (&["shm", "--sizes", "1GiB"], "--sizes"),
+        (&["shm", "--dir", "/tmp"], "--dir"),
+        (&["paper", "--svg", "/dev/null"], "--svg"),
+        (&["paper", "--dir", "/nowhere"], "--dir"),
+    ];
+    for (arguments, wrong) in cases {
+        let output = bench(arguments).output().unwrap();
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}");
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(said.contains(wrong), "{said}");
+    }
 }

@@ -1,5 +1,6 @@
 //! The machine that something is measured on, and whether it has anything else to do.
 
+use std::fmt;
 use std::fs;
 use std::time::Duration;
 
@@ -24,6 +25,28 @@ pub(super) struct Machine {
     pub(super) optimised: bool,
     /// The share of all processors that others used just before.
     pub(super) busy: f64,
+}
+
+impl fmt::Display for Machine {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let gibibytes = self.memory_bytes as f64 / f64::from(1 << 30);
+        let Self {
+            processor,
+            cores,
+            system,
+            fipa,
+            ..
+        } = self;
+        write!(
+            f,
+            "{processor}, {cores} cores, {gibibytes:.0} GiB, {system}, fipa {fipa}"
+        )?;
+        if self.optimised {
+            Ok(())
+        } else {
+            f.write_str(" without optimisation")
+        }
+    }
 }
 
 impl Machine {

@@ -9,16 +9,19 @@
 //! * [`stage`] starts, tells and ends the processes.
 //! * [`measure`] takes the turns and makes rows of them.
 //! * [`report`] and [`plot`] show them; [`machine`] says on what machine that was.
+//! * [`paper`] is another measurement, of encodings, with [`bars`] to show it.
 
+mod bars;
 mod machine;
 mod measure;
+mod paper;
 mod part;
 mod plot;
 mod report;
 mod stage;
 mod way;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use bytesize::ByteSize;
@@ -48,7 +51,8 @@ use crate::{membership, output};
   fipa bench
   fipa bench shm --quick
   fipa bench net --json | jq '.rows[] | {path, size, p50: .one_way_us.p50, ratio}'
-  fipa bench --svg latency.svg")]
+  fipa bench --svg latency.svg
+  fipa bench paper --dir docs")]
 pub(crate) struct Arguments {
     /// What to compare; everything unless given
     #[arg(value_enum)]
@@ -62,7 +66,7 @@ pub(crate) struct Arguments {
     /// Measure less, in a few seconds: figures scatter more
     #[arg(long)]
     quick: bool,
-    /// Sizes of content
+    /// Sizes of content; `paper` has its own
     #[arg(
         long,
         value_delimiter = ',',
@@ -70,6 +74,9 @@ pub(crate) struct Arguments {
         default_value = "100B,1KiB,64KiB,1MiB,4MiB"
     )]
     sizes: Vec<ByteSize>,
+    /// Where `paper` writes its tables and pictures [default: docs]
+    #[arg(long, value_name = "DIRECTORY")]
+    dir: Option<PathBuf>,
     /// Play a part in somebody else's measurement
     #[arg(long, hide = true)]
     part: Option<String>,
@@ -84,6 +91,8 @@ enum What {
     Shm,
     /// Over the network: two agents directly, and through a gateway on either side
     Net,
+    /// Encodings, as in the evaluation of the C++ libraries; writes tables and pictures
+    Paper,
 }
 
 /// Largest content that can be asked for.
@@ -97,6 +106,16 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         let played = kept.and(part).and_then(|part| part::play(part, &config));
         let advice = "see what the measurement itself reports";
         return played.map_err(|error| Failure::failed(error, "a part of fipa bench", advice));
+    }
+    if arguments.what == Some(What::Paper) {
+        return again(&arguments);
+    }
+    if arguments.dir.is_some() {
+        return Err(Failure::wrong_usage(
+            "only `fipa bench paper` writes into a directory",
+            "--dir",
+            "leave it out, or use --svg FILE for a picture",
+        ));
     }
     let effort = effort(&arguments)?;
     let (machine, measured) = membership::run(measure(&arguments, &config, &effort))?;
@@ -117,6 +136,55 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         return output::json(&report::json(&machine, &effort, &measured));
     }
     output::text(&report::text(&machine, &effort, &measured))
+}
+
+/// The paper's evaluation again.
+fn again(arguments: &Arguments) -> Result<(), Failure> {
+    if arguments.svg.is_some() {
+        return Err(Failure::wrong_usage(
+            "`fipa bench paper` draws pictures of its own",
+            "--svg",
+            "leave it out, and name with --dir where the pictures go",
+        ));
+    }
+    let directory = arguments.dir.as_deref().unwrap_or(Path::new("docs"));
+    if !directory.is_dir() {
+        return Err(Failure::wrong_usage(
+            format!("{} is no directory", directory.display()),
+            "--dir",
+            "run it where the sources are, or name the directory to write into",
+        ));
+    }
+    let paper = membership::run(async {
+        let machine = Machine::look().await;
+        for warning in machine.warnings() {
+            warn(&warning);
+        }
+        let progress = progress(paper::STEPS);
+        let told = |what: &str| {
+            progress.inc(1);
+            progress.set_message(what.to_owned());
+        };
+        let cycles = if arguments.quick {
+            paper::QUICK_CYCLES
+        } else {
+            paper::CYCLES
+        };
+        let paper = paper::measure(machine, cycles, &told).await;
+        progress.finish_and_clear();
+        paper.map_err(|error| {
+            let advice = "report it: these messages are the same everywhere";
+            Failure::failed(error, "fipa bench paper", advice)
+        })
+    })?;
+    paper.write(directory).map_err(|error| {
+        let place = directory.display().to_string();
+        Failure::failed(error, place, "see whether this user can write there")
+    })?;
+    if arguments.json {
+        return output::json(&paper);
+    }
+    output::text(&paper.text())
 }
 
 fn effort(arguments: &Arguments) -> Result<Effort, Failure> {
@@ -158,10 +226,7 @@ async fn measure(
         )
     })?;
     let wanted = wanted(arguments.what, &config.mts.transports);
-    // Hidden by itself when standard error is no terminal.
-    let progress = ProgressBar::new((wanted.len() + effort.sizes.len() * 3) as u64);
-    progress.set_style(style());
-    progress.enable_steady_tick(Duration::from_millis(200));
+    let progress = progress(wanted.len() + effort.sizes.len() * 3);
     let told = |what: &str| {
         progress.inc(1);
         progress.set_message(what.to_owned());
@@ -184,9 +249,13 @@ async fn measure(
     Ok((machine, measured))
 }
 
-fn style() -> ProgressStyle {
-    ProgressStyle::with_template("{bar:30} {pos}/{len} {elapsed} {msg}")
-        .unwrap_or_else(|_| ProgressStyle::default_bar())
+/// Hidden by itself when standard error is no terminal.
+fn progress(steps: usize) -> ProgressBar {
+    let progress = ProgressBar::new(steps as u64);
+    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} {elapsed} {msg}");
+    progress.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+    progress.enable_steady_tick(Duration::from_millis(200));
+    progress
 }
 
 /// The ways to be measured, each followed by what it is compared with.

@@ -184,12 +184,18 @@ fn span(lines: &[Line], of: impl Fn(&(f64, f64)) -> f64) -> (f64, f64) {
     })
 }
 
-fn duration(micros: f64) -> String {
+/// A time in microseconds as it is said.
+pub(super) fn duration(micros: f64) -> String {
     match micros {
-        micros if micros >= 1e6 => format!("{} s", micros / 1e6),
-        micros if micros >= 1e3 => format!("{} ms", micros / 1e3),
-        micros => format!("{micros} µs"),
+        micros if micros >= 1e6 => format!("{} s", round(micros / 1e6)),
+        micros if micros >= 1e3 => format!("{} ms", round(micros / 1e3)),
+        micros => format!("{} µs", round(micros)),
     }
+}
+
+/// Without what a power of ten leaves behind the digits that count.
+fn round(value: f64) -> f64 {
+    (value * 1e4).round() / 1e4
 }
 
 /// A logarithmic axis that is labelled at the sizes that were measured, or at powers of ten.

@@ -23,17 +23,7 @@ pub(super) fn json(machine: &Machine, effort: &Effort, measured: &Measured) -> V
 /// The whole for people.
 pub(super) fn text(machine: &Machine, effort: &Effort, measured: &Measured) -> String {
     let mut text = format!(
-        "{}, {} cores, {:.0} GiB, {}, fipa {}{}; others used {:.0} % of the processors before\n",
-        machine.processor,
-        machine.cores,
-        machine.memory_bytes as f64 / f64::from(1 << 30),
-        machine.system,
-        machine.fipa,
-        if machine.optimised {
-            ""
-        } else {
-            " without optimisation"
-        },
+        "{machine}; others used {:.0} % of the processors before\n",
         machine.busy * 100.0,
     );
     text.push_str(&format!(
