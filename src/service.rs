@@ -133,6 +133,7 @@ impl Service {
     }
 
     /// Uses the orders and the deadline of this configuration from now on.
+    #[cfg(feature = "net")]
     pub(crate) fn reorder(&self, config: &Config) {
         let mut order = config.mts.transports.clone();
         let open: Vec<Kind> = self.mts.kinds().collect();
