@@ -221,7 +221,7 @@ async fn a_watcher_leaves_nothing_behind() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_watcher_that_does_not_look_slows_nobody_and_is_told_what_it_missed() {
-    const LETTERS: u64 = 6_000;
+    const LETTERS: u64 = 12_000;
     let config = config();
     let (here, there) = (
         Domain::open(&config).await.unwrap(),
