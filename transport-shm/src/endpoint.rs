@@ -64,7 +64,8 @@ impl Endpoint {
         // Under the lock, so that nobody takes what is half made for the traces of the dead.
         let lock = domain.enter()?;
         let domain = Arc::new(domain.joined());
-        let opened = Self::open_locked(config, runtime, budget, domain);
+        let opened = Self::open_locked(config, runtime, budget, Arc::clone(&domain));
+        // Before the domain, whose last owner takes the lock to clean up when nothing was opened.
         drop(lock);
         let endpoint = opened?;
         endpoint.clean_soon();

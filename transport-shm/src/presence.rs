@@ -27,6 +27,9 @@ use crate::memory::SHM;
 
 const PAGE_LEN: usize = 4096;
 
+/// Nobody but the owner.
+const PRIVATE: Mode = Mode::RUSR.union(Mode::WUSR);
+
 /// Names of the files of processes.
 #[derive(Debug, Clone)]
 pub(crate) struct Names {
@@ -119,6 +122,8 @@ pub(crate) struct Presence {
 impl Presence {
     /// Makes the files. To be called under the domain's lock.
     pub(crate) fn create(names: Names, own: Incarnation) -> io::Result<Self> {
+        // Before anything is removed again: what is there already is somebody else's.
+        mknodat(CWD, &names.live(own), FileType::Fifo, PRIVATE, 0)?;
         let created = Self::create_files(&names, own);
         if created.is_err() {
             names.remove(own);
@@ -127,12 +132,9 @@ impl Presence {
     }
 
     fn create_files(names: &Names, own: Incarnation) -> io::Result<Self> {
-        let private = Mode::RUSR | Mode::WUSR;
-        let live = names.live(own);
-        mknodat(CWD, &live, FileType::Fifo, private, 0)?;
-        let _live = fifo(true).open(&live)?;
+        let _live = fifo(true).open(names.live(own))?;
         let bell = names.bell(own);
-        mknodat(CWD, &bell, FileType::Fifo, private, 0)?;
+        mknodat(CWD, &bell, FileType::Fifo, PRIVATE, 0)?;
         let bell = open_bell(&bell)?;
         let mut page = File::options()
             .read(true)

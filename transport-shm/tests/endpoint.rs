@@ -141,3 +141,18 @@ fn wrong_configurations_and_open_directories_are_refused() {
     assert!(matches!(refused(config), ShmError::NotPrivate { .. }));
     assert_eq!(place.traces(), Vec::<String>::new());
 }
+
+#[test]
+fn what_cannot_be_opened_waits_for_nobody_and_harms_nobody() {
+    let place = Place::new();
+    let config = place.config();
+    let (one, _) = place.listening_with(config.clone());
+    // Its files are there already.
+    let again = ShmTransport::new(config, place.runtime.handle().clone());
+    assert!(matches!(again.unwrap_err(), ShmError::File { .. }));
+    let (other, told) = place.listening();
+    other
+        .dispatch(attempt(), &one.location(), parcel(Bytes::new()))
+        .unwrap();
+    wait_for("answer", || told.conclusions() == 1);
+}
