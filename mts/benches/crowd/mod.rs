@@ -1,0 +1,148 @@
+//! A delivery core among 1,000 peers with 10,000 agents, one letter at a time.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use fipa_acl::{Letter, Payload};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
+use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+use fipa_transport::{
+    Answer, Arrival, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel, Stream, Ticket,
+    Verdict,
+};
+
+const PEERS: usize = 1_000;
+const AGENTS: usize = 10_000;
+/// This life of the service.
+const HERE: Incarnation = Incarnation::from_u64(0x4e5e);
+/// This life of the agent that sends and receives here.
+const ROVER: Incarnation = Incarnation::from_u64(0x50e4);
+
+/// The core with one agent, and everybody else.
+pub(crate) struct Crowd {
+    core: Core,
+    letter: Letter,
+    now: Now,
+    name: Arc<str>,
+    /// Where letters come from.
+    peer: Location,
+    /// Letters that arrived.
+    arrived: u64,
+}
+
+impl Crowd {
+    /// The names of the agents there are.
+    pub(crate) fn names() -> Vec<Arc<str>> {
+        (0..AGENTS).map(|n| format!("arm_{n}").into()).collect()
+    }
+
+    /// A core that knows where the agents of these names are.
+    pub(crate) fn new(names: &[Arc<str>]) -> Self {
+        let config = CoreConfig::new("here-mts", HERE, vec![Kind::Tcp]);
+        let mut core = Core::new(config, directory(names));
+        let name: Arc<str> = "rover".into();
+        core.register(Arc::clone(&name), ROVER);
+        Self {
+            core,
+            letter: letter(),
+            now: Now::read(),
+            name,
+            peer: peer(0),
+            arrived: 0,
+        }
+    }
+
+    /// Which way a letter for this agent would go first.
+    pub(crate) fn route(&self, receiver: &str) -> Option<Location> {
+        self.core.first_way(self.now, receiver)
+    }
+
+    /// A letter of 1 KB for this agent, from its submission to its outcome.
+    pub(crate) fn send(&mut self, receiver: &Arc<str>) {
+        self.core.send(
+            self.now,
+            Submission {
+                sender: ROVER,
+                letter: self.letter.clone(),
+                receivers: vec![Arc::clone(receiver)],
+                deadline: Duration::from_secs(5),
+            },
+        );
+        let Some(Action::Dispatch { attempt, .. }) = self.core.poll_action() else {
+            panic!("a letter that is not dispatched");
+        };
+        let conclusion = Conclusion::Answered(Answer::Accepted);
+        self.core.handle_conclusion(self.now, attempt, conclusion);
+        let Some(Action::Outcome { outcome, .. }) = self.core.poll_action() else {
+            panic!("a letter without an outcome");
+        };
+        assert!(outcome.is_success());
+        assert!(self.core.poll_action().is_none());
+    }
+
+    /// A letter of 1 KB for the agent here, from one of the others, until the agent has it.
+    pub(crate) fn receive(&mut self, from: usize) {
+        self.arrived += 1;
+        let parcel = Parcel {
+            receiver: Arc::clone(&self.name),
+            stream: Stream {
+                sender: agent(from),
+                receiver: ROVER,
+            },
+            sequence: self.arrived,
+            after: 0,
+            remaining: Duration::from_secs(5),
+            hops: 0,
+            body: Body::Letter(self.letter.clone()),
+        };
+        let from = Hop {
+            location: self.peer.clone(),
+            remote: true,
+        };
+        let arrival = Arrival {
+            parcel,
+            from,
+            ticket: Ticket(self.arrived),
+        };
+        let verdict = self
+            .core
+            .handle_arrival(self.now, Kind::Tcp, false, arrival);
+        assert_eq!(verdict, Verdict::Now(Answer::Accepted));
+        let Some(Action::Deliverable { agent }) = self.core.poll_action() else {
+            panic!("a letter that is not delivered");
+        };
+        assert!(self.core.take(agent).is_some());
+        assert!(self.core.poll_action().is_none());
+    }
+}
+
+/// Every agent at one of the peers.
+fn directory(names: &[Arc<str>]) -> Arc<MemoryDirectory> {
+    let directory = MemoryDirectory::new(Mts::new("here-mts", HERE));
+    let peers: Vec<Location> = (0..PEERS).map(peer).collect();
+    for (n, (name, location)) in names.iter().zip(peers.iter().cycle()).enumerate() {
+        let locations = vec![location.clone()];
+        let agent = Registration::new(Arc::clone(name), agent(n), locations);
+        directory.register(agent).unwrap();
+    }
+    Arc::new(directory)
+}
+
+fn peer(n: usize) -> Location {
+    let address = format!("10.0.{}.{}:7788", n / 250, n % 250 + 1);
+    let location = Location::new(Kind::Tcp, &address).unwrap();
+    location.with_incarnation(Incarnation::from_u64(0x1_0000 + n as u64))
+}
+
+fn agent(n: usize) -> Incarnation {
+    Incarnation::from_u64(0x100_0000 + n as u64)
+}
+
+fn letter() -> Letter {
+    let payload = Payload {
+        head: vec![1; 120].into(),
+        content: vec![7; 1 << 10].into(),
+        tail: vec![1].into(),
+    };
+    Letter::new(vec![2; 80].into(), payload)
+}
