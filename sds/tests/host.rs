@@ -127,6 +127,11 @@ fn child_process() {
                 Err(RegisterError::AlreadyRegistered { .. }) => "taken".to_owned(),
                 Err(other) => other.to_string(),
             },
+            "many" => {
+                let one = |number| directory.register(registration(&format!("{name}_{number}")));
+                let failed = (0..AGENTS).find_map(|number| one(number).err());
+                failed.map_or("ok".to_owned(), |error| error.to_string())
+            }
             "lookup" => directory.lookup(name).is_some().to_string(),
             "churn" => {
                 for round in 0..25 {
@@ -328,6 +333,45 @@ async fn the_last_one_cleans_up_after_the_killed() {
     assert_eq!(here.entries().len(), 0);
     drop(here);
     assert_eq!(files(&dir), Vec::<String>::new());
+}
+
+/// How many agents a process registers that is told to register many.
+const AGENTS: usize = 20;
+
+#[tokio::test]
+async fn many_processes_register_at_once_and_all_succeed() {
+    const PROCESSES: usize = 50;
+    let (_parent, dir) = place();
+    let directory = open(&dir);
+    let mut processes: Vec<_> = (0..PROCESSES)
+        .map(|_| Process::start_unready(&dir))
+        .collect();
+    for (number, process) in processes.iter_mut().enumerate() {
+        process.tell(&format!("many agent_{number}"));
+    }
+    for process in &mut processes {
+        assert_eq!(process.answer(), "ready");
+        assert_eq!(process.answer(), "ok");
+    }
+    for process in 0..PROCESSES {
+        for number in 0..AGENTS {
+            let name = format!("agent_{process}_{number}");
+            assert!(directory.lookup(&name).is_some(), "{name} is missing");
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_process_that_is_stopped_in_its_turn_keeps_nobody_from_registering() {
+    let (_parent, dir) = place();
+    let directory = open(&dir);
+    // What it holds then; a newcomer has had no turn yet.
+    let stopped = std::fs::File::open(&dir).unwrap();
+    stopped.lock().unwrap();
+    let newcomer = open(&dir);
+    newcomer.register(registration("other")).unwrap();
+    assert!(directory.lookup("other").is_some());
+    drop(stopped);
 }
 
 #[tokio::test]

@@ -234,7 +234,8 @@ pub enum HostError {
     },
     /// The lock of the domain was not to be had.
     #[error(
-        "another process holds the lock {} and does not let go; is one stopped (state T in ps)?",
+        "the lock {} was not to be had: another process holds it and does not let go (is one \
+         stopped, state T in ps?), or too many change the directory all the time",
         path.display()
     )]
     Busy {

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use parking_lot::{Mutex, MutexGuard};
-use rustix::fs::{AtFlags, FileType, Mode, OFlags, Timespec, Timestamps};
+use rustix::fs::{AtFlags, FileType, FlockOperation, Mode, OFlags, Timespec, Timestamps};
 use rustix::io::Errno;
 
 use super::HostError;
@@ -73,16 +73,28 @@ pub(super) struct Place {
     path: PathBuf,
     dir: OwnedFd,
     domain: File,
-    /// An advisory lock belongs to the open file, which the threads of this process share.
-    threads: Mutex<()>,
+    /// An advisory lock belongs to the open file, which the threads of this process share. Within
+    /// is when the turn of this process began.
+    threads: Mutex<Option<Instant>>,
     id: Id,
     /// Never read: holding it, open for writing, says that this process lives.
     process: Mutex<Option<File>>,
 }
 
-/// How long to wait for the lock of the domain, which is held for less than a millisecond unless
-/// its holder has been stopped.
+/// How long to wait for the lock of the domain while nothing changes in the directory. It is held
+/// for some milliseconds at most, unless its holder has been stopped.
 const PATIENCE: Duration = Duration::from_secs(10);
+
+/// How long to wait while others have their turn: some processes of a robot with hundreds may
+/// start at the same time on a machine that is busy.
+const LONGEST: Duration = Duration::from_secs(60);
+
+/// How long a process that does not take its turn holds up the others.
+const SKIPPED: Duration = Duration::from_secs(1);
+
+/// How long a turn lasts, in which a process may take the lock more than once: after each turn of
+/// another there is something to read, which takes longer than to register.
+const TURN: Duration = Duration::from_millis(20);
 
 impl Place {
     /// Opens the directory, creates it if need be, checks it, and joins as a process with this
@@ -95,11 +107,11 @@ impl Place {
             domain: open_domain(&dir, &path)?,
             path,
             dir,
-            threads: Mutex::new(()),
+            threads: Mutex::default(),
             id,
             process: Mutex::new(None),
         };
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Instant::now() + LONGEST;
         while !place.try_join()? {
             // The last process has left in between, and taken the lock file with it.
             place.domain = open_domain(&place.dir, &place.path)?;
@@ -176,30 +188,91 @@ impl Place {
         let Some(threads) = self.threads.try_lock() else {
             return Ok(None);
         };
-        match self.domain.try_lock() {
-            Ok(()) => Ok(Some(Guard {
+        Ok(self.try_domain()?.then_some(Guard {
+            place: self,
+            _threads: threads,
+        }))
+    }
+
+    /// Waits for the lock of the domain, in turn.
+    ///
+    /// Nothing hands an advisory lock on: whoever asks at the right moment has it, and that is
+    /// whoever has just let go and asks again. So a second lock, that on the directory itself,
+    /// says whose turn it is: one process waits for the domain, and the others, with equal
+    /// chances however long they have waited, for being next.
+    fn lock_any(&self) -> Result<Guard<'_>, HostError> {
+        let busy = || HostError::Busy {
+            path: self.path.join(Name::Domain.to_string()),
+        };
+        let began = Instant::now();
+        let mut threads = self.threads.try_lock_for(LONGEST).ok_or_else(busy)?;
+        let in_turn = threads.is_some_and(|began| began.elapsed() < TURN);
+        if in_turn && self.try_domain()? {
+            return Ok(Guard {
                 place: self,
                 _threads: threads,
-            })),
-            Err(TryLockError::WouldBlock) => Ok(None),
+            });
+        }
+        let mut turn = None;
+        let (mut seen, mut moved) = (None, Instant::now());
+        loop {
+            if turn.is_none() {
+                turn = self.try_turn()?;
+            }
+            // Who has the turn may have been stopped, and the domain be free all the same.
+            let waited = moved.elapsed();
+            if (turn.is_some() || waited > SKIPPED) && self.try_domain()? {
+                *threads = Some(Instant::now());
+                return Ok(Guard {
+                    place: self,
+                    _threads: threads,
+                });
+            }
+            let now = Some((self.generation()?, self.changed()?));
+            if seen != now {
+                (seen, moved) = (now, Instant::now());
+            } else if waited > PATIENCE {
+                return Err(busy());
+            }
+            if began.elapsed() > LONGEST {
+                return Err(busy());
+            }
+            std::thread::sleep(match turn {
+                Some(_) => Duration::from_micros(200),
+                None => Duration::from_millis(2),
+            });
+        }
+    }
+
+    fn try_domain(&self) -> Result<bool, HostError> {
+        match self.domain.try_lock() {
+            Ok(()) => Ok(true),
+            Err(TryLockError::WouldBlock) => Ok(false),
             Err(TryLockError::Error(source)) => Err(self.io("lock", Name::Domain)(source)),
         }
     }
 
-    fn lock_any(&self) -> Result<Guard<'_>, HostError> {
-        let deadline = Instant::now() + PATIENCE;
-        let mut pause = Duration::from_micros(50);
-        loop {
-            if let Some(guard) = self.try_lock()? {
-                return Ok(guard);
-            }
-            if Instant::now() > deadline {
-                return Err(HostError::Busy {
-                    path: self.path.join(Name::Domain.to_string()),
-                });
-            }
-            std::thread::sleep(pause);
-            pause = (pause * 2).min(Duration::from_millis(4));
+    fn try_turn(&self) -> Result<Option<Turn<'_>>, HostError> {
+        match rustix::fs::flock(&self.dir, FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => Ok(Some(Turn(self))),
+            Err(Errno::WOULDBLOCK) => Ok(None),
+            Err(error) => Err(HostError::Io {
+                what: "lock",
+                path: self.path.clone(),
+                source: error.into(),
+            }),
+        }
+    }
+
+    /// When a file has come, gone or been replaced for the last time.
+    fn changed(&self) -> Result<(i64, u64), HostError> {
+        match rustix::fs::fstat(&self.dir) {
+            Ok(stat) => Ok((stat.st_mtime, stat.st_mtime_nsec)),
+            Err(error) => Err(HostError::Io {
+                what: "examine",
+                path: self.path.clone(),
+                source: error.into(),
+            }),
         }
     }
 
@@ -322,10 +395,21 @@ pub(super) const MAX_ENTRIES_FILE: usize = 32 * 1024 * 1024;
 
 const PRIVATE: Mode = Mode::RUSR.union(Mode::WUSR);
 
+/// The turn to wait for the lock of the domain; passed on when dropped.
+struct Turn<'a>(&'a Place);
+
+impl Drop for Turn<'_> {
+    fn drop(&mut self) {
+        if let Err(error) = rustix::fs::flock(&self.0.dir, FlockOperation::Unlock) {
+            tracing::error!(%error, path = %self.0.path.display(), "cannot pass the turn on");
+        }
+    }
+}
+
 /// The lock of the domain, held.
 pub(super) struct Guard<'a> {
     pub(super) place: &'a Place,
-    _threads: MutexGuard<'a, ()>,
+    _threads: MutexGuard<'a, Option<Instant>>,
 }
 
 impl Drop for Guard<'_> {
