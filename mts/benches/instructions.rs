@@ -1,0 +1,63 @@
+//! The hot paths of the delivery core, one at a time, to count their instructions under valgrind:
+//! `.ci/instructions`.
+//!
+//! The name of a path is the argument; without one, all names are listed. What is to be counted
+//! happens inside of `measured`, a thousand times, after everything was made ready: tables are
+//! seeded anew in every run, and one look-up is now cheaper, now dearer.
+
+#![allow(clippy::unwrap_used, reason = "a bench that cannot go on may panic")]
+
+mod crowd;
+
+use std::hint::black_box;
+use std::sync::Arc;
+
+use self::crowd::Crowd;
+
+/// Letters of a path, each of or for another agent.
+const LETTERS: usize = 1_000;
+
+type Path = (&'static str, fn(&mut Crowd, &[Arc<str>]));
+
+const PATHS: &[Path] = &[
+    ("core/route/1000", |crowd, names| {
+        measured(|| {
+            for name in names {
+                black_box(crowd.route(black_box(name)).unwrap());
+            }
+        });
+    }),
+    ("core/letter/1000", |crowd, names| {
+        let mut round = || names.iter().for_each(|name| crowd.send(black_box(name)));
+        round();
+        measured(round);
+    }),
+    ("core/arrival/1000", |crowd, names| {
+        let mut round = || (0..names.len()).for_each(|from| crowd.receive(black_box(from)));
+        round();
+        measured(round);
+    }),
+];
+
+#[allow(clippy::print_stdout, reason = "the names are what is asked for")]
+fn main() {
+    // Cargo's own arguments begin with a hyphen.
+    let asked = std::env::args().skip(1).find(|name| !name.starts_with('-'));
+    match asked {
+        None => PATHS.iter().for_each(|(name, _)| println!("{name}")),
+        Some(asked) => {
+            let path = PATHS.iter().find(|(name, _)| *name == asked);
+            let (_, run) = path.unwrap_or_else(|| panic!("there is no path {asked}"));
+            let names = Crowd::names();
+            let mut crowd = Crowd::new(&names);
+            run(&mut crowd, names.get(..LETTERS).unwrap());
+        }
+    }
+}
+
+/// The instructions of what is given are counted.
+#[inline(never)]
+fn measured(run: impl FnOnce()) {
+    run();
+    black_box(());
+}
