@@ -123,7 +123,7 @@ impl Presence {
     /// Makes the files. To be called under the domain's lock.
     pub(crate) fn create(names: Names, own: Incarnation) -> io::Result<Self> {
         // Before anything is removed again: what is there already is somebody else's.
-        mknodat(CWD, &names.live(own), FileType::Fifo, PRIVATE, 0)?;
+        mknodat(CWD, names.live(own), FileType::Fifo, PRIVATE, 0)?;
         let created = Self::create_files(&names, own);
         if created.is_err() {
             names.remove(own);
