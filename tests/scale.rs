@@ -1,0 +1,193 @@
+//! A thousand agents in fifty processes of one host: all are found, and no process takes more than
+//! its share of descriptors and memory.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use fipa::config::Sources;
+use fipa::{Config, Domain, Matcher, Query};
+
+const PROCESSES: usize = 50;
+const AGENTS: usize = 20;
+
+/// What a process may take that talks to nobody.
+const DESCRIPTORS: usize = 60;
+const MEMORY: u64 = 4 << 20;
+
+const DOMAIN: &str = "FIPA_SCALE_DOMAIN";
+const NUMBER: &str = "FIPA_SCALE_NUMBER";
+
+fn config(domain: &str) -> Config {
+    let set = [&format!("domain={domain}"), "discovery.mdns=false"];
+    Config::load(&Sources {
+        set: set.map(|setting| (*setting).to_owned()).to_vec(),
+        ..Sources::default()
+    })
+    .unwrap()
+}
+
+/// Registers agents, says so, and leaves when its input ends.
+#[tokio::test]
+#[ignore = "started by the other test"]
+async fn a_process_of_its_own() {
+    let Ok(domain) = std::env::var(DOMAIN) else {
+        return;
+    };
+    let number = std::env::var(NUMBER).unwrap();
+    let before = private_memory(std::process::id());
+    let domain = Domain::open(&config(&domain)).await.unwrap();
+    let agents: Vec<_> = (0..AGENTS)
+        .map(|agent| domain.register(&format!("agent-{number}-{agent}")).unwrap())
+        .collect();
+    let line = format!("ready {before}\n");
+    std::io::stdout().write_all(line.as_bytes()).unwrap();
+    let waiting = tokio::task::spawn_blocking(|| {
+        let mut rest = Vec::new();
+        std::io::stdin().read_to_end(&mut rest)
+    });
+    waiting.await.unwrap().unwrap();
+    drop(agents);
+    domain.close().await;
+}
+
+/// Memory of a process that is its own and written to, in bytes.
+fn private_memory(pid: u32) -> u64 {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
+    let line = status
+        .lines()
+        .find_map(|line| line.strip_prefix("RssAnon:"));
+    let kib: u64 = line
+        .unwrap()
+        .trim()
+        .trim_end_matches(" kB")
+        .parse()
+        .unwrap();
+    kib << 10
+}
+
+struct Process {
+    child: Child,
+    /// What it took before it joined.
+    before: u64,
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        // Has left already, or the test has failed.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn start(domain: &str, directory: &std::path::Path) -> Vec<Process> {
+    let spawned: Vec<Child> = (0..PROCESSES)
+        .map(|number| {
+            Command::new(std::env::current_exe().unwrap())
+                .args([
+                    "--ignored",
+                    "--exact",
+                    "--nocapture",
+                    "a_process_of_its_own",
+                ])
+                .env(DOMAIN, domain)
+                .env(NUMBER, number.to_string())
+                .env("FIPA_RUNTIME_DIR", directory)
+                .stdin(Stdio::piped())
+                .stdout(Stdio::piped())
+                .spawn()
+                .unwrap()
+        })
+        .collect();
+    let ready = |mut child: Child| {
+        let lines = BufReader::new(child.stdout.take().unwrap()).lines();
+        let mut lines = lines.map_while(Result::ok);
+        let before = lines.find_map(|line| line.split_once("ready ")?.1.parse().ok());
+        let before = before.expect("a process that says that it is ready");
+        // The test harness in it says more at its end, and would fail if nobody read that.
+        std::thread::spawn(move || lines.for_each(drop));
+        Process { child, before }
+    };
+    spawned.into_iter().map(ready).collect()
+}
+
+#[test]
+fn a_thousand_agents_in_fifty_processes() {
+    let directory = tempfile::tempdir().unwrap();
+    let domain = format!("scale-{}", std::process::id());
+    let place = directory.path().join("run");
+    let mut processes = start(&domain, &place);
+
+    // A process like the others, that looks for all of them.
+    let looking = Command::new(std::env::current_exe().unwrap())
+        .args(["--ignored", "--exact", "--nocapture", "one_who_looks"])
+        .env(DOMAIN, &domain)
+        .env("FIPA_RUNTIME_DIR", &place)
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&looking.stdout).into_owned();
+    assert!(looking.status.success(), "{said}");
+    assert!(said.contains("found 1000 of 1000"), "{said}");
+
+    for process in &processes {
+        let pid = process.child.id();
+        let open = std::fs::read_dir(format!("/proc/{pid}/fd"))
+            .unwrap()
+            .count();
+        assert!(open <= DESCRIPTORS, "{open} descriptors");
+        let taken = private_memory(pid).saturating_sub(process.before);
+        assert!(taken <= MEMORY, "{taken} bytes of memory");
+    }
+    let prefix = format!("fipa_{domain}_");
+    let shared = || {
+        let files = std::fs::read_dir("/dev/shm").unwrap().flatten();
+        files.filter(|file| file.file_name().to_string_lossy().starts_with(&prefix))
+    };
+    let blocks = |file: std::fs::DirEntry| {
+        std::os::unix::fs::MetadataExt::blocks(&file.metadata().unwrap()) * 512
+    };
+    let bytes: u64 = shared().map(blocks).sum();
+    assert!(
+        bytes <= MEMORY * PROCESSES as u64,
+        "{bytes} bytes of shared memory"
+    );
+
+    for process in &mut processes {
+        drop(process.child.stdin.take());
+        assert!(process.child.wait().unwrap().success());
+    }
+    assert_eq!(shared().count(), 0);
+}
+
+#[tokio::test]
+#[ignore = "started by the other test"]
+async fn one_who_looks() {
+    let Ok(name) = std::env::var(DOMAIN) else {
+        return;
+    };
+    let domain = Domain::open(&config(&name)).await.unwrap();
+    let directory = domain.directory();
+    let total = PROCESSES * AGENTS;
+    let exact = || {
+        let names = (0..total).map(|n| format!("agent-{}-{}", n / AGENTS, n % AGENTS));
+        names
+            .filter(|name| directory.lookup(name).is_some())
+            .count()
+    };
+    let all = Query::by_name(Matcher::parse("agent-.*").unwrap());
+    let began = std::time::Instant::now();
+    while (exact(), directory.search(&all).len()) != (total, total) {
+        // Ends a test that hangs.
+        assert!(
+            began.elapsed() < Duration::from_secs(60),
+            "found {}",
+            exact()
+        );
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    let line = format!("found {} of {total}\n", exact());
+    std::io::stdout().write_all(line.as_bytes()).unwrap();
+    domain.close().await;
+}
