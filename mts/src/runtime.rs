@@ -8,23 +8,25 @@
 //! Whoever waits, for an outcome or a letter, first drives the transports for a short while on
 //! its own thread, and then sleeps until it is woken.
 
+mod receiving;
+
 use std::future::Future;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use fipa_acl::Letter;
 use fipa_sds::{Directory, Entry, Pattern};
 use fipa_transport::{
-    Arrival, AttemptId, Conclusion, Incarnation, Introduction, Kind, ListenError, LoanedContent,
-    Location, Outcome, Sink, Transport, Verdict,
+    Conclusion, Incarnation, Introduction, Kind, ListenError, LoanedContent, Location, Outcome,
+    Transport,
 };
 use parking_lot::{Mutex, MutexGuard};
 use tokio::runtime::Handle;
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 
+use self::receiving::Receiving;
 use crate::Map;
 use crate::core::{
     Action, Core, CoreConfig, Notice, Now, Peer, PeerState, Received, Route, SendId, Submission,
@@ -55,10 +57,11 @@ pub trait Contacts: Send + Sync {
     /// A service may be gone; see [`Action::Doubtful`].
     fn doubtful(&self, mts: Incarnation);
 
-    /// A service has introduced itself on a connection; see [`Sink::introduced`].
+    /// A service has introduced itself on a connection; see
+    /// [`Sink::introduced`](fipa_transport::Sink::introduced).
     fn introduced(&self, peer: &Introduction);
 
-    /// A connection has ended; see [`Sink::parted`].
+    /// A connection has ended; see [`Sink::parted`](fipa_transport::Sink::parted).
     fn parted(&self, peer: &Introduction);
 }
 
@@ -582,84 +585,6 @@ impl IntoFuture for Sending {
     fn into_future(self) -> Self::IntoFuture {
         Box::pin(self.outcomes())
     }
-}
-
-/// What a transport sees of the service.
-struct Receiving {
-    shared: Weak<Shared>,
-    kind: Kind,
-    answers_at_once: bool,
-}
-
-impl Sink for Receiving {
-    fn arrived(&self, arrival: Arrival) -> Verdict {
-        let Some(shared) = self.shared.upgrade() else {
-            return closing();
-        };
-        let mut state = shared.state.lock();
-        if shared.closed.load(Ordering::Acquire) {
-            return closing();
-        }
-        let at_once = self.answers_at_once;
-        let verdict = state
-            .core
-            .handle_arrival(Now::read(), self.kind, at_once, arrival);
-        shared.carry_out(state);
-        verdict
-    }
-
-    fn arrived_unframed(&self, letter: Letter, via: Kind) {
-        let Some(shared) = self.shared.upgrade() else {
-            return;
-        };
-        let mut state = shared.state.lock();
-        let deadline = state.unframed_deadline;
-        state
-            .core
-            .handle_unframed(Now::read(), deadline, letter, via);
-        shared.carry_out(state);
-    }
-
-    fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {
-        let Some(shared) = self.shared.upgrade() else {
-            return;
-        };
-        let mut state = shared.state.lock();
-        state
-            .core
-            .handle_conclusion(Now::read(), attempt, conclusion);
-        shared.carry_out(state);
-    }
-
-    fn introduced(&self, peer: &Introduction) {
-        if let Some(shared) = self.shared.upgrade()
-            && let Some(contacts) = &shared.config.contacts
-        {
-            contacts.introduced(peer);
-        }
-    }
-
-    fn parted(&self, peer: &Introduction) {
-        let Some(shared) = self.shared.upgrade() else {
-            return;
-        };
-        if let Some(contacts) = &shared.config.contacts {
-            contacts.parted(peer);
-        }
-        if let Some(dialled) = &peer.dialled {
-            let mut state = shared.state.lock();
-            state.core.handle_parted(Now::read(), dialled);
-            shared.carry_out(state);
-        }
-    }
-}
-
-fn closing() -> Verdict {
-    let reason = fipa_transport::FailureReason::NoSuchAgent;
-    Verdict::Now(fipa_transport::Answer::failed(
-        reason,
-        "the process is ending",
-    ))
 }
 
 /// Calls the core when something is due by the clock.

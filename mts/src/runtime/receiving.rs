@@ -1,0 +1,87 @@
+//! The side of the runtime that transports see: what they tell is handed to the core.
+
+use std::sync::Weak;
+use std::sync::atomic::Ordering;
+
+use fipa_acl::Letter;
+use fipa_transport::{
+    Answer, Arrival, AttemptId, Conclusion, FailureReason, Introduction, Kind, Sink, Verdict,
+};
+
+use super::Shared;
+use crate::core::Now;
+
+/// What a transport sees of the service.
+pub(super) struct Receiving {
+    pub(super) shared: Weak<Shared>,
+    pub(super) kind: Kind,
+    pub(super) answers_at_once: bool,
+}
+
+impl Sink for Receiving {
+    fn arrived(&self, arrival: Arrival) -> Verdict {
+        let Some(shared) = self.shared.upgrade() else {
+            return closing();
+        };
+        let mut state = shared.state.lock();
+        if shared.closed.load(Ordering::Acquire) {
+            return closing();
+        }
+        let at_once = self.answers_at_once;
+        let verdict = state
+            .core
+            .handle_arrival(Now::read(), self.kind, at_once, arrival);
+        shared.carry_out(state);
+        verdict
+    }
+
+    fn arrived_unframed(&self, letter: Letter, via: Kind) {
+        let Some(shared) = self.shared.upgrade() else {
+            return;
+        };
+        let mut state = shared.state.lock();
+        let deadline = state.unframed_deadline;
+        state
+            .core
+            .handle_unframed(Now::read(), deadline, letter, via);
+        shared.carry_out(state);
+    }
+
+    fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {
+        let Some(shared) = self.shared.upgrade() else {
+            return;
+        };
+        let mut state = shared.state.lock();
+        state
+            .core
+            .handle_conclusion(Now::read(), attempt, conclusion);
+        shared.carry_out(state);
+    }
+
+    fn introduced(&self, peer: &Introduction) {
+        if let Some(shared) = self.shared.upgrade()
+            && let Some(contacts) = &shared.config.contacts
+        {
+            contacts.introduced(peer);
+        }
+    }
+
+    fn parted(&self, peer: &Introduction) {
+        let Some(shared) = self.shared.upgrade() else {
+            return;
+        };
+        if let Some(contacts) = &shared.config.contacts {
+            contacts.parted(peer);
+        }
+        if let Some(dialled) = &peer.dialled {
+            let mut state = shared.state.lock();
+            state.core.handle_parted(Now::read(), dialled);
+            shared.carry_out(state);
+        }
+    }
+}
+
+fn closing() -> Verdict {
+    let reason = FailureReason::NoSuchAgent;
+    Verdict::Now(Answer::failed(reason, "the process is ending"))
+}
