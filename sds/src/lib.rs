@@ -16,6 +16,10 @@
 //! What must not live here: letters, routes, connections. Which of an agent's locations is tried
 //! first is the delivery core's business.
 
+// First, for its macro.
+#[macro_use]
+mod table;
+
 mod contacts;
 mod directory;
 mod entry;
@@ -28,7 +32,6 @@ mod merged;
 mod name;
 mod query;
 mod resolve;
-mod table;
 mod watch;
 
 pub use contacts::ContactDirectory;

@@ -31,25 +31,7 @@ impl MemoryDirectory {
 }
 
 impl Directory for MemoryDirectory {
-    fn known(&self, name: &str) -> Option<Arc<Entry>> {
-        self.table.known(name)
-    }
-
-    fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
-        self.table.known_incarnation(incarnation)
-    }
-
-    fn entries(&self) -> Arc<[Arc<Entry>]> {
-        self.table.entries()
-    }
-
-    fn generation(&self) -> u64 {
-        self.table.generation()
-    }
-
-    fn subscribe(&self, subscriber: &Subscriber) {
-        self.table.subscribe(subscriber);
-    }
+    reads_its_table!(table);
 
     fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {
         let entry = Arc::new(registration.into_entry(&self.mts, Source::Memory)?);
@@ -118,23 +100,5 @@ impl StaticDirectory {
 }
 
 impl Directory for StaticDirectory {
-    fn known(&self, name: &str) -> Option<Arc<Entry>> {
-        self.table.known(name)
-    }
-
-    fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
-        self.table.known_incarnation(incarnation)
-    }
-
-    fn entries(&self) -> Arc<[Arc<Entry>]> {
-        self.table.entries()
-    }
-
-    fn generation(&self) -> u64 {
-        self.table.generation()
-    }
-
-    fn subscribe(&self, subscriber: &Subscriber) {
-        self.table.subscribe(subscriber);
-    }
+    reads_its_table!(table);
 }

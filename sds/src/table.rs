@@ -12,6 +12,33 @@ use parking_lot::RwLock;
 use crate::watch::Hub;
 use crate::{Change, Entry, Subscriber};
 
+/// What a back end reads from its [`Table`] and nowhere else: the part of
+/// [`Directory`](crate::Directory) that all of them have in common. The field is named as it is
+/// reached from `self`.
+macro_rules! reads_its_table {
+    ($($field:ident).+) => {
+        fn known(&self, name: &str) -> Option<Arc<Entry>> {
+            self.$($field).+.known(name)
+        }
+
+        fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
+            self.$($field).+.known_incarnation(incarnation)
+        }
+
+        fn entries(&self) -> Arc<[Arc<Entry>]> {
+            self.$($field).+.entries()
+        }
+
+        fn generation(&self) -> u64 {
+            self.$($field).+.generation()
+        }
+
+        fn subscribe(&self, subscriber: &Subscriber) {
+            self.$($field).+.subscribe(subscriber);
+        }
+    };
+}
+
 /// Entries by the origin that claims them (a process, a record). When several claim one name, the
 /// entry that [precedes](Entry::precedes) has it, and the others wait for it to leave.
 #[derive(Debug)]

@@ -108,23 +108,5 @@ impl ExchangeDirectory {
 }
 
 impl Directory for ExchangeDirectory {
-    fn known(&self, name: &str) -> Option<Arc<Entry>> {
-        self.table.known(name)
-    }
-
-    fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
-        self.table.known_incarnation(incarnation)
-    }
-
-    fn entries(&self) -> Arc<[Arc<Entry>]> {
-        self.table.entries()
-    }
-
-    fn generation(&self) -> u64 {
-        self.table.generation()
-    }
-
-    fn subscribe(&self, subscriber: &Subscriber) {
-        self.table.subscribe(subscriber);
-    }
+    reads_its_table!(table);
 }

@@ -179,30 +179,12 @@ impl Drop for HostDirectory {
 }
 
 impl Directory for HostDirectory {
-    fn known(&self, name: &str) -> Option<Arc<Entry>> {
-        self.shared.table.known(name)
-    }
-
-    fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
-        self.shared.table.known_incarnation(incarnation)
-    }
+    reads_its_table!(shared.table);
 
     fn refresh(&self) {
         if let Err(error) = self.shared.refresh() {
             tracing::error!(%error, "the view of the host's directory may be out of date");
         }
-    }
-
-    fn entries(&self) -> Arc<[Arc<Entry>]> {
-        self.shared.table.entries()
-    }
-
-    fn generation(&self) -> u64 {
-        self.shared.table.generation()
-    }
-
-    fn subscribe(&self, subscriber: &Subscriber) {
-        self.shared.table.subscribe(subscriber);
     }
 
     fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {

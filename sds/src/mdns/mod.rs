@@ -204,25 +204,7 @@ impl Drop for MdnsDirectory {
 }
 
 impl Directory for MdnsDirectory {
-    fn known(&self, name: &str) -> Option<Arc<Entry>> {
-        self.shared.table.known(name)
-    }
-
-    fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
-        self.shared.table.known_incarnation(incarnation)
-    }
-
-    fn entries(&self) -> Arc<[Arc<Entry>]> {
-        self.shared.table.entries()
-    }
-
-    fn generation(&self) -> u64 {
-        self.shared.table.generation()
-    }
-
-    fn subscribe(&self, subscriber: &Subscriber) {
-        self.shared.table.subscribe(subscriber);
-    }
+    reads_its_table!(shared.table);
 
     /// Announces the agent. Its locations are those at which this gateway takes letters for it.
     fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {
