@@ -23,6 +23,7 @@ use crate::memory::Budget;
 use crate::outbox::{Opening, Outbox, Posted};
 use crate::peers::Peer;
 use crate::presence::{Bell, GLANCE, Neighbour, Presence};
+use crate::shift::Shift;
 use crate::{ShmConfig, ShmError};
 
 /// What a transport and its tasks share.
@@ -31,10 +32,8 @@ pub(crate) struct Endpoint {
     runtime: Handle,
     sink: OnceLock<Arc<dyn Sink>>,
     closed: AtomicBool,
-    /// Somebody wants the mailbox and the answers to be looked at.
-    wanted: AtomicBool,
-    /// The mailbox; whoever has the lock does the work.
-    inbox: Mutex<Option<Inbox>>,
+    /// The mailbox; whoever has it looks after answers, too.
+    inbox: Shift<Option<Inbox>>,
     /// How many parcels have no answer yet.
     waiting: Arc<AtomicUsize>,
     /// Who has been answered, and has not been made to look for it yet.
@@ -100,8 +99,7 @@ impl Endpoint {
             runtime,
             sink: OnceLock::new(),
             closed: AtomicBool::new(false),
-            wanted: AtomicBool::new(false),
-            inbox: Mutex::new(Some(inbox)),
+            inbox: Shift::new(Some(inbox)),
             waiting: Arc::default(),
             answered: Mutex::default(),
             ended: AtomicBool::new(false),
@@ -208,36 +206,24 @@ impl Endpoint {
 
     /// Whether `work` would find something. When another thread is working, that one looks again.
     fn has_work(&self) -> bool {
-        self.wanted.store(true, Ordering::SeqCst);
-        let Some(inbox) = self.inbox.try_lock() else {
-            return false;
-        };
-        self.wanted.store(false, Ordering::SeqCst);
-        inbox.as_ref().is_some_and(Inbox::has_parcels)
-            || self.waits_for_answers() && self.peers.read().values().any(|peer| peer.has_answer())
+        self.inbox.has_any(|inbox| {
+            inbox.as_ref().is_some_and(Inbox::has_parcels)
+                || self.waits_for_answers()
+                    && self.peers.read().values().any(|peer| peer.has_answer())
+        })
     }
 
     fn waits_for_answers(&self) -> bool {
         self.waiting.load(Ordering::SeqCst) > 0
     }
 
-    /// Looks into the mailbox and after answers. Says whether there was anything.
-    ///
-    /// One thread does it at a time. Whoever comes meanwhile leaves word, and whoever is at it
-    /// looks again before leaving for good; so nothing is overlooked, and nobody waits.
+    /// Looks into the mailbox and after answers. Says whether there was anything. When another
+    /// thread is at it, that one looks again.
     pub(crate) fn work(self: &Arc<Self>) -> bool {
-        let mut found = false;
-        self.wanted.store(true, Ordering::SeqCst);
-        while self.wanted.load(Ordering::SeqCst) {
-            let Some(mut inbox) = self.inbox.try_lock() else {
-                return found;
-            };
-            self.wanted.store(false, Ordering::SeqCst);
-            if let (Some(inbox), Some(sink)) = (&mut *inbox, self.sink.get()) {
-                found |= self.work_once(inbox, &**sink);
-            }
-        }
-        found
+        self.inbox.work(|inbox| match (inbox, self.sink.get()) {
+            (Some(inbox), Some(sink)) => self.work_once(inbox, &**sink),
+            _ => false,
+        })
     }
 
     fn work_once(self: &Arc<Self>, inbox: &mut Inbox, sink: &dyn Sink) -> bool {

@@ -38,6 +38,7 @@ mod peers;
 mod presence;
 #[cfg(feature = "raw")]
 pub mod raw;
+mod shift;
 mod transport;
 
 pub use config::{ShmConfig, ShmError};

@@ -209,6 +209,9 @@ impl Outbox {
         if self.is_retired() {
             return Ok(Posted::Retired);
         }
+        // Before it is sent: the answer may be there before this returns, and whoever hears the
+        // bell looks for it only where one is waited for; then behind the lock that is held here.
+        let expected = self.waiting.one_more();
         if let Some(loan) = self.loan_of(&mut state, content) {
             let fits = loan.has_room(front, tail) && loan.segment == state.segment.number;
             match fits
@@ -223,7 +226,7 @@ impl Outbox {
                         return Ok(Posted::Retired);
                     }
                     count(&self.tally.loans_sent);
-                    self.queue(&mut state, attempt, token, Memory::Loaned(loan));
+                    self.queue(&mut state, attempt, token, Memory::Loaned(loan), expected);
                     return Ok(Posted::Yes);
                 }
                 None => count(&self.tally.loans_copied),
@@ -243,17 +246,24 @@ impl Outbox {
         if pending.number_of_server_connections() == 0 {
             return Err(self.nobody_reached(&pending));
         }
-        self.queue(&mut state, attempt, token, Memory::Own(pending));
+        self.queue(&mut state, attempt, token, Memory::Own(pending), expected);
         Ok(Posted::Yes)
     }
 
-    fn queue(&self, state: &mut State, attempt: AttemptId, token: u64, memory: Memory) {
+    fn queue(
+        &self,
+        state: &mut State,
+        attempt: AttemptId,
+        token: u64,
+        memory: Memory,
+        expected: Expected<'_>,
+    ) {
         state.queue.push_back(Sent {
             attempt,
             token,
             memory,
         });
-        self.waiting.one_more();
+        expected.will_come();
     }
 
     fn nobody_reached(&self, pending: &Pending) -> WayError {
@@ -472,10 +482,27 @@ struct Waiting {
     of_all: Arc<AtomicUsize>,
 }
 
+/// An answer is waited for from now on; not any more when this is dropped.
+struct Expected<'a>(&'a Waiting);
+
+impl Expected<'_> {
+    /// The parcel is on its way: it is waited for until it is collected.
+    fn will_come(self) {
+        std::mem::forget(self);
+    }
+}
+
+impl Drop for Expected<'_> {
+    fn drop(&mut self) {
+        self.0.one_less();
+    }
+}
+
 impl Waiting {
-    fn one_more(&self) {
+    fn one_more(&self) -> Expected<'_> {
         self.here.fetch_add(1, Ordering::AcqRel);
         self.of_all.fetch_add(1, Ordering::AcqRel);
+        Expected(self)
     }
 
     fn one_less(&self) {

@@ -178,6 +178,8 @@ impl Presence {
     /// The bell has been silenced, and what it rang for is about to be looked at.
     pub(crate) fn heard(&self) {
         self.page.words().heard.fetch_add(1, Ordering::SeqCst);
+        // Whoever has read the count from before has put in what is found now.
+        fence(Ordering::SeqCst);
     }
 }
 
