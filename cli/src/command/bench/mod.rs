@@ -52,6 +52,7 @@ use crate::{membership, output};
   fipa bench shm --quick
   fipa bench net --json | jq '.rows[] | {path, size, p50: .one_way_us.p50, ratio}'
   fipa bench --svg latency.svg
+  fipa bench --zenoh comparison/zenoh/target/release/fipa-comparison-zenoh
   fipa bench paper --dir docs")]
 pub(crate) struct Arguments {
     /// What to compare; everything unless given
@@ -77,6 +78,9 @@ pub(crate) struct Arguments {
     /// Where `paper` writes its tables and pictures [default: docs]
     #[arg(long, value_name = "DIRECTORY")]
     dir: Option<PathBuf>,
+    /// Measure zenoh in the same rounds, through this program (see comparison/zenoh)
+    #[arg(long, value_name = "PROGRAM")]
+    zenoh: Option<PathBuf>,
     /// Play a part in somebody else's measurement
     #[arg(long, hide = true)]
     part: Option<String>,
@@ -145,6 +149,13 @@ fn again(arguments: &Arguments) -> Result<(), Failure> {
             "`fipa bench paper` draws pictures of its own",
             "--svg",
             "leave it out, and name with --dir where the pictures go",
+        ));
+    }
+    if arguments.zenoh.is_some() {
+        return Err(Failure::wrong_usage(
+            "`fipa bench paper` is about encodings, which zenoh has none of",
+            "--zenoh",
+            "leave it out, or leave out `paper`",
         ));
     }
     let directory = arguments.dir.as_deref().unwrap_or(Path::new("docs"));
@@ -218,14 +229,18 @@ async fn measure(
     for warning in machine.warnings() {
         warn(&warning);
     }
-    let mut stage = Stage::new().map_err(|error| {
+    let zenoh_program = arguments.zenoh.as_deref().map(program).transpose()?;
+    let mut stage = Stage::new(zenoh_program).map_err(|error| {
         Failure::failed(
             error,
             "fipa bench",
             "see whether this user can write to $TMPDIR",
         )
     })?;
-    let wanted = wanted(arguments.what, &config.mts.transports);
+    let mut wanted = wanted(arguments.what, &config.mts.transports);
+    if arguments.zenoh.is_some() {
+        wanted.extend(zenoh(arguments.what));
+    }
     let progress = progress(wanted.len() + effort.sizes.len() * 3);
     let told = |what: &str| {
         progress.inc(1);
@@ -284,6 +299,26 @@ fn wanted(what: Option<What>, transports: &[Kind]) -> Vec<(Sort, Wait)> {
     add(Sort::Socket(Socket::Unix), Wait::Block);
     add(Sort::Socket(Socket::Tcp), Wait::Block);
     wanted
+}
+
+/// Where a program is, whatever the directory that its processes run in.
+fn program(given: &Path) -> Result<PathBuf, Failure> {
+    given.canonicalize().map_err(|error| {
+        Failure::wrong_usage(
+            format!("{}: {error}", given.display()),
+            "--zenoh",
+            "build it: cargo build --release --manifest-path comparison/zenoh/Cargo.toml",
+        )
+    })
+}
+
+/// Zenoh with its shared memory and without, as far as there is a limit beside it.
+fn zenoh(what: Option<What>) -> Vec<(Sort, Wait)> {
+    let all = [(What::Net, true), (What::Shm, false)];
+    let wanted = all.into_iter().filter(|(other, _)| what != Some(*other));
+    wanted
+        .map(|(_, shared_memory)| (Sort::Zenoh { shared_memory }, Wait::Block))
+        .collect()
 }
 
 fn draw(file: &PathBuf, machine: &Machine, measured: &Measured) -> Result<(), Failure> {

@@ -6,15 +6,15 @@
 
 mod agent;
 mod iceoryx;
+mod orders;
 mod relay;
 mod socket;
 
-use std::io::Write as _;
-
 use fipa::Config;
 use fipa_transport_shm::raw::Wait as RawWait;
-use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
+
+pub(super) use self::orders::{End, Event, Fill, Letters, Order};
 
 /// What a process is in a measurement; the argument of `--part`.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -44,14 +44,6 @@ impl Part {
     }
 }
 
-/// Which end of a way.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub(super) enum End {
-    Sender,
-    Receiver,
-}
-
 /// A kind of socket.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -78,104 +70,6 @@ impl From<Wait> for RawWait {
     }
 }
 
-/// Where content comes from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub(super) enum Fill {
-    /// The memory is loaned and not written.
-    Loaned,
-    /// The memory is loaned and all of it written, which counts.
-    Filled,
-    /// It lies in memory of the application.
-    Copied,
-}
-
-/// Letters of one sort.
-#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
-pub(super) struct Letters {
-    pub(super) count: usize,
-    pub(super) size: usize,
-    pub(super) fill: Fill,
-    /// How many may be without an answer.
-    pub(super) window: usize,
-}
-
-/// What a part is told to do.
-#[derive(Debug, Serialize, Deserialize)]
-#[serde(tag = "do", rename_all = "snake_case")]
-pub(super) enum Order {
-    /// Find the other end: an agent's name or an address.
-    Find { to: String },
-    /// Receive letters.
-    Receive(Letters),
-    /// Send letters.
-    Send(Letters),
-    /// Say how much processor time this process has used.
-    Cpu,
-}
-
-/// What a part saw. Times are in nanoseconds, of the clock that all processes share.
-#[derive(Debug, Serialize, Deserialize)]
-#[serde(tag = "event", rename_all = "snake_case")]
-pub(super) enum Event {
-    /// It is there, and can be found under this address.
-    Ready { address: String },
-    /// It has found the other end.
-    Found,
-    /// It is about to receive.
-    Receiving,
-    /// When each letter was there, decoded.
-    Received { at: Vec<u64>, cpu_ns: u64 },
-    /// When each letter was begun, and when its sender knew that it had arrived.
-    Sent {
-        began: Vec<u64>,
-        ended: Vec<u64>,
-        cpu_ns: u64,
-    },
-    /// Processor time used so far.
-    Cpu { ns: u64 },
-    /// It could not do what it was told.
-    Failed { what: String },
-}
-
-/// When letters were begun, and when their senders knew that they had arrived.
-#[derive(Debug, Default)]
-struct Sent {
-    began: Vec<u64>,
-    ended: Vec<u64>,
-}
-
-impl Sent {
-    fn with_room(letters: &Letters) -> Self {
-        Self {
-            began: Vec::with_capacity(letters.count),
-            ended: Vec::with_capacity(letters.count),
-        }
-    }
-}
-
-/// One sort of process.
-trait Peer {
-    /// The next order; none when there will be none.
-    fn next_order(&mut self) -> Option<String> {
-        let mut line = String::new();
-        let read = std::io::stdin().read_line(&mut line);
-        read.is_ok_and(|bytes| bytes > 0).then_some(line)
-    }
-
-    fn find(&mut self, _to: &str) -> Result<(), String> {
-        Err("this part looks for nobody".to_owned())
-    }
-
-    fn receive(&mut self, _letters: &Letters) -> Result<Vec<u64>, String> {
-        Err("this part receives nothing".to_owned())
-    }
-
-    fn send(&mut self, _letters: &Letters) -> Result<Sent, String> {
-        Err("this part sends nothing".to_owned())
-    }
-}
-
 /// Plays a part until standard input ends.
 pub(super) fn play(part: Part, config: &Config) -> Result<(), String> {
     match part {
@@ -185,92 +79,4 @@ pub(super) fn play(part: Part, config: &Config) -> Result<(), String> {
         Part::Socket { end, kind } => socket::play(end, kind),
         Part::Relay { end } => relay::play(config, end),
     }
-}
-
-/// Obeys until there are no more orders.
-fn obey(peer: &mut impl Peer, address: String) {
-    say(&Event::Ready { address });
-    while let Some(line) = peer.next_order() {
-        let event = follow(peer, &line);
-        say(&event.unwrap_or_else(|what| Event::Failed { what }));
-    }
-}
-
-fn follow(peer: &mut impl Peer, line: &str) -> Result<Event, String> {
-    let order: Order = serde_json::from_str(line).map_err(told)?;
-    let before = cpu_ns();
-    Ok(match order {
-        Order::Find { to } => {
-            peer.find(&to)?;
-            Event::Found
-        }
-        Order::Receive(letters) => {
-            say(&Event::Receiving);
-            let at = peer.receive(&letters)?;
-            let cpu_ns = cpu_ns() - before;
-            Event::Received { at, cpu_ns }
-        }
-        Order::Send(letters) => {
-            let Sent { began, ended } = peer.send(&letters)?;
-            let cpu_ns = cpu_ns() - before;
-            Event::Sent {
-                began,
-                ended,
-                cpu_ns,
-            }
-        }
-        Order::Cpu => Event::Cpu { ns: before },
-    })
-}
-
-fn say(event: &Event) {
-    // Who listens may be gone; then standard input ends too.
-    if let Ok(line) = serde_json::to_string(event) {
-        let mut out = std::io::stdout().lock();
-        let _ = writeln!(out, "{line}").and_then(|()| out.flush());
-    }
-}
-
-fn told(error: impl std::fmt::Display) -> String {
-    error.to_string()
-}
-
-/// The time that all processes of this machine share.
-fn now_ns() -> u64 {
-    nanoseconds(ClockId::Monotonic)
-}
-
-/// The processor time of this process, all its threads together.
-fn cpu_ns() -> u64 {
-    nanoseconds(ClockId::ProcessCPUTime)
-}
-
-fn nanoseconds(clock: ClockId) -> u64 {
-    let time = clock_gettime(clock);
-    let whole = u64::try_from(time.tv_sec).unwrap_or(0);
-    whole * 1_000_000_000 + u64::try_from(time.tv_nsec).unwrap_or(0)
-}
-
-/// What the content of the letter with this number consists of.
-fn byte_of(number: usize) -> u8 {
-    number.to_le_bytes()[0]
-}
-
-/// Whether content is what was sent, as far as that can be seen without reading all of it.
-fn check(content: &[u8], letters: &Letters, number: usize) -> Result<(), String> {
-    let byte = byte_of(number);
-    let whole = content.len() == letters.size;
-    let intact = letters.fill == Fill::Loaned
-        || [content.first(), content.last()]
-            .iter()
-            .all(|found| *found == Some(&byte));
-    if whole && intact {
-        return Ok(());
-    }
-    Err(format!(
-        "letter {number} of {} bytes came as {} bytes of {:?}",
-        letters.size,
-        content.len(),
-        content.first()
-    ))
 }

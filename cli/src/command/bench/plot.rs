@@ -92,6 +92,10 @@ fn look(sort: Sort, fill: Fill) -> (usize, RGBColor) {
         Sort::Gateways(Kind::Udp) => (7, RGBColor(0xb0, 0x3a, 0x7a)),
         Sort::Gateways(_) => (8, RGBColor(0x7b, 0x3f, 0xb5)),
         Sort::Relay => (9, RGBColor(0x7b, 0x3f, 0xb5)),
+        Sort::Zenoh { shared_memory } => {
+            let order = if shared_memory { 10 } else { 11 };
+            (order, RGBColor(0x9a, 0x2a, 0x2a))
+        }
     }
 }
 

@@ -21,6 +21,8 @@ const ENDING: Duration = Duration::from_secs(5);
 /// was interrupted.
 pub(super) struct Stage {
     program: PathBuf,
+    /// The program with ends that go through zenoh, if they are to be measured too.
+    zenoh: Option<PathBuf>,
     place: PathBuf,
     processes: Vec<Process>,
     /// The processors that this process may use.
@@ -39,7 +41,7 @@ struct Process {
 }
 
 impl Stage {
-    pub(super) fn new() -> Result<Self, String> {
+    pub(super) fn new(zenoh: Option<PathBuf>) -> Result<Self, String> {
         let program = std::env::current_exe().map_err(|error| error.to_string())?;
         let place = std::env::temp_dir().join(format!("fipa-bench-{}", std::process::id()));
         let mut private = std::fs::DirBuilder::new();
@@ -48,6 +50,7 @@ impl Stage {
         made.map_err(|error| format!("cannot make {}: {error}", place.display()))?;
         Ok(Self {
             program,
+            zenoh,
             place,
             processes: Vec::new(),
             cores: super::machine::cores(),
@@ -82,6 +85,29 @@ impl Stage {
         for setting in settings {
             command.args(["--set", setting]);
         }
+        self.spawn(command, format!("{part:?} in {domain}")).await
+    }
+
+    /// Starts an end that goes through zenoh. Its threads run where they like.
+    pub(super) async fn start_zenoh(
+        &mut self,
+        end: End,
+        shared_memory: bool,
+    ) -> Result<(Who, String), String> {
+        let program = self.zenoh.as_ref().ok_or("there is no program for it")?;
+        let mut command = Command::new(program);
+        command.args(match end {
+            End::Sender => ["--end", "sender"],
+            End::Receiver => ["--end", "receiver"],
+        });
+        if shared_memory {
+            command.arg("--shared-memory");
+        }
+        self.spawn(command, format!("the {end:?} of zenoh")).await
+    }
+
+    async fn spawn(&mut self, mut command: Command, name: String) -> Result<(Who, String), String> {
+        let program = command.as_std().get_program().to_owned();
         let mut child = command
             .env("FIPA_RUNTIME_DIR", &self.place)
             .env_remove("FIPA_CONFIG")
@@ -93,13 +119,13 @@ impl Stage {
             .process_group(0)
             .kill_on_drop(true)
             .spawn()
-            .map_err(|error| format!("cannot start {}: {error}", self.program.display()))?;
+            .map_err(|error| format!("cannot start {}: {error}", program.display()))?;
         let orders = child.stdin.take();
         let stdout = child.stdout.take();
         let stdout = stdout.ok_or("a process without standard output")?;
         let who = Who(self.processes.len());
         self.processes.push(Process {
-            name: format!("{part:?} in {domain}"),
+            name,
             child,
             orders,
             events: BufReader::new(stdout).lines(),

@@ -16,6 +16,8 @@ pub(super) enum Sort {
     Iceoryx,
     /// A bare socket.
     Socket(Socket),
+    /// Publications of zenoh, in shared memory of its own or through TCP alone.
+    Zenoh { shared_memory: bool },
     /// Bare iceoryx2, then bare TCP, then bare iceoryx2.
     Relay,
 }
@@ -28,6 +30,10 @@ impl Sort {
             Self::Agents(Kind::Udp) => Some(Self::Socket(Socket::Udp)),
             Self::Agents(_) => Some(Self::Socket(Socket::Tcp)),
             Self::Gateways(_) => Some(Self::Relay),
+            Self::Zenoh {
+                shared_memory: true,
+            } => Some(Self::Iceoryx),
+            Self::Zenoh { .. } => Some(Self::Socket(Socket::Tcp)),
             Self::Iceoryx | Self::Socket(_) | Self::Relay => None,
         }
     }
@@ -40,13 +46,24 @@ impl Sort {
             Self::Socket(Socket::Tcp) => "raw tcp".to_owned(),
             Self::Socket(Socket::Unix) => "raw unix socket".to_owned(),
             Self::Socket(Socket::Udp) => "raw udp".to_owned(),
+            Self::Zenoh {
+                shared_memory: true,
+            } => "zenoh shm".to_owned(),
+            Self::Zenoh { .. } => "zenoh tcp".to_owned(),
             Self::Relay => "raw relay".to_owned(),
         }
     }
 
     /// Whether there is memory to loan, which makes a difference between filling it and not.
     pub(super) fn loans(self) -> bool {
-        matches!(self, Self::Agents(Kind::Shm) | Self::Iceoryx)
+        matches!(
+            self,
+            Self::Agents(Kind::Shm)
+                | Self::Iceoryx
+                | Self::Zenoh {
+                    shared_memory: true
+                }
+        )
     }
 
     /// What may be too large is tried before.
@@ -151,6 +168,11 @@ impl Way {
                 let [from, to] = ends.map(|end| Part::Socket { end, kind });
                 let (receiver, address) = stage.start(&to, "raw", &[]).await?;
                 let (sender, _) = stage.start(&from, "raw", &[]).await?;
+                (sender, receiver, Some(address))
+            }
+            Sort::Zenoh { shared_memory } => {
+                let (receiver, address) = stage.start_zenoh(End::Receiver, shared_memory).await?;
+                let (sender, _) = stage.start_zenoh(End::Sender, shared_memory).await?;
                 (sender, receiver, Some(address))
             }
             Sort::Relay => {
@@ -270,7 +292,7 @@ fn short(sort: Sort, wait: Wait) -> String {
         Sort::Agents(kind) => format!("{kind}{wait}"),
         Sort::Gateways(kind) => format!("g{kind}{wait}"),
         Sort::Iceoryx => format!("ice{wait}"),
-        Sort::Socket(_) => "raw".to_owned(),
+        Sort::Socket(_) | Sort::Zenoh { .. } => "raw".to_owned(),
         Sort::Relay => format!("rel{wait}"),
     }
 }

@@ -11,7 +11,7 @@ use fipa::{AgentId, Config, Deliveries, Domain, Gateway, MessageBuilder, Perform
 use tokio::io::{AsyncBufReadExt, BufReader, Lines, Stdin};
 use tokio::runtime::{Builder, Runtime};
 
-use super::{Fill, Letters, Peer, Sent, byte_of, check, now_ns, told};
+use super::orders::{Fill, Letters, Peer, Sent, byte_of, check, now_ns, obey, told};
 
 /// One agent.
 pub(super) struct Agent {
@@ -47,7 +47,7 @@ impl Agent {
             agent: Some(agent),
             runtime,
         };
-        super::obey(&mut running, name.to_owned());
+        obey(&mut running, name.to_owned());
         let Running { agent, runtime } = running;
         drop(agent);
         runtime.block_on(domain.close());
@@ -211,7 +211,7 @@ pub(super) fn gateway(config: &Config) -> Result<(), String> {
     let gateway = runtime.block_on(Gateway::open(config)).map_err(told)?;
     let orders = runtime.block_on(async { orders() });
     let mut forwarding = Forwarding { orders, runtime };
-    super::obey(&mut forwarding, String::new());
+    obey(&mut forwarding, String::new());
     let runtime = forwarding.runtime;
     runtime.block_on(gateway.close());
     runtime.shutdown_background();

@@ -9,7 +9,7 @@ use fipa_transport::Incarnation;
 use fipa_transport_shm::ShmConfig;
 use fipa_transport_shm::raw::{RawClient, RawNode, RawPending, RawServer, Wait};
 
-use super::{End, Fill, Letters, Peer, Sent, byte_of, check, now_ns, told};
+use super::orders::{End, Fill, Letters, Peer, Sent, byte_of, check, now_ns, obey, told};
 
 /// The name of the service between the two.
 const NAME: &str = "raw";
@@ -19,7 +19,7 @@ pub(super) fn play(config: &Config, end: End, wait: Wait) -> Result<(), String> 
     match end {
         End::Receiver => {
             let server = node.serve(NAME).map_err(told)?;
-            super::obey(&mut Receiver { server, wait }, String::new());
+            obey(&mut Receiver { server, wait }, String::new());
         }
         End::Sender => {
             let client = node.connect(NAME).map_err(told)?;
@@ -29,7 +29,7 @@ pub(super) fn play(config: &Config, end: End, wait: Wait) -> Result<(), String> 
                 wait,
                 ready,
             };
-            super::obey(&mut sender, String::new());
+            obey(&mut sender, String::new());
         }
     }
     Ok(())

@@ -12,7 +12,7 @@ use fipa::Config;
 use fipa_transport_shm::raw::{RawClient, RawNode, RawPending, RawRequest, RawServer, Wait};
 
 use super::iceoryx::node;
-use super::{End, Peer, told};
+use super::orders::{End, Event, Peer, obey, say, told};
 
 /// The name of the service on either side.
 const NAME: &str = "raw";
@@ -38,7 +38,7 @@ fn near(node: &RawNode) -> Result<(), String> {
             scope.spawn(move || ended(answer(server, back, &answers)));
             Ok(())
         };
-        super::obey(&mut Half { start }, String::new());
+        obey(&mut Half { start }, String::new());
         // The threads wait for the other processes, which may be gone; they end with this one.
         std::process::exit(0)
     })
@@ -110,7 +110,7 @@ fn far(node: &RawNode) -> Result<(), String> {
             }
         });
         let nobody = |_| Err("this half is connected to".to_owned());
-        super::obey(&mut Half { start: nobody }, address);
+        obey(&mut Half { start: nobody }, address);
         std::process::exit(0)
     })
 }
@@ -150,7 +150,7 @@ fn acknowledge(
 
 fn ended(result: Result<(), String>) {
     if let Err(what) = result {
-        super::say(&super::Event::Failed { what });
+        say(&Event::Failed { what });
     }
 }
 

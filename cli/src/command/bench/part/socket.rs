@@ -6,8 +6,9 @@ use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::PathBuf;
 use std::time::Duration;
 
+use super::Socket;
 use super::iceoryx::make_ready;
-use super::{End, Fill, Letters, Peer, Sent, Socket, byte_of, check, now_ns, told};
+use super::orders::{End, Fill, Letters, Peer, Sent, byte_of, check, now_ns, obey, told};
 
 /// How long a datagram is waited for before it is sent again.
 const LOST: Duration = Duration::from_millis(50);
@@ -25,7 +26,7 @@ pub(super) fn play(end: End, kind: Socket) -> Result<(), String> {
                 stream.set_nodelay(true)?;
                 Ok(stream)
             };
-            super::obey(&mut Receiver::new(accept), address);
+            obey(&mut Receiver::new(accept), address);
         }
         (Socket::Unix, End::Receiver) => {
             let place =
@@ -33,12 +34,12 @@ pub(super) fn play(end: End, kind: Socket) -> Result<(), String> {
             let path = PathBuf::from(place).join("socket");
             let listener = UnixListener::bind(&path).map_err(told)?;
             let accept = move || Ok(listener.accept()?.0);
-            super::obey(&mut Receiver::new(accept), path.display().to_string());
+            obey(&mut Receiver::new(accept), path.display().to_string());
         }
         (Socket::Udp, End::Receiver) => {
             let socket = UdpSocket::bind("127.0.0.1:0").map_err(told)?;
             let address = socket.local_addr().map_err(told)?.to_string();
-            super::obey(&mut Datagrams::new(socket), address);
+            obey(&mut Datagrams::new(socket), address);
         }
         (Socket::Tcp, End::Sender) => {
             let connect = |to: &str| {
@@ -46,15 +47,15 @@ pub(super) fn play(end: End, kind: Socket) -> Result<(), String> {
                 stream.set_nodelay(true)?;
                 Ok(stream)
             };
-            super::obey(&mut Sender::new(connect), String::new());
+            obey(&mut Sender::new(connect), String::new());
         }
         (Socket::Unix, End::Sender) => {
             let connect = |to: &str| UnixStream::connect(to);
-            super::obey(&mut Sender::new(connect), String::new());
+            obey(&mut Sender::new(connect), String::new());
         }
         (Socket::Udp, End::Sender) => {
             let socket = UdpSocket::bind("127.0.0.1:0").map_err(told)?;
-            super::obey(&mut Datagrams::new(socket), String::new());
+            obey(&mut Datagrams::new(socket), String::new());
         }
     }
     Ok(())

@@ -1,0 +1,245 @@
+//! One end of the measurement of `fipa bench --zenoh PROGRAM` that goes through zenoh.
+//!
+//! It obeys the same orders as the ends of `fipa bench` itself: a letter is a publication, and what
+//! acknowledges it is an empty publication in return. Peers are connected directly, over TCP on
+//! the loopback interface, with zenoh's shared memory or without.
+
+use std::sync::mpsc::{Receiver as Queue, Sender as Into, channel};
+use std::time::{Duration, Instant};
+
+use clap::Parser;
+use orders::{End, Fill, Letters, Peer, Sent, byte_of, check, now_ns, obey, told};
+use zenoh::bytes::ZBytes;
+use zenoh::pubsub::{Publisher, Subscriber};
+use zenoh::qos::{CongestionControl, Priority};
+use zenoh::shm::{
+    BlockOn, GarbageCollect, PosixShmProviderBackend, ShmProvider, ShmProviderBuilder,
+};
+use zenoh::{Config, Session, Wait as _};
+
+#[path = "../../../cli/src/command/bench/part/orders.rs"]
+mod orders;
+
+/// Play one end of `fipa bench --zenoh` (which starts this program)
+#[derive(Debug, Parser)]
+struct Arguments {
+    /// Which end
+    #[arg(long, value_enum)]
+    end: End,
+    /// Use zenoh's shared memory
+    #[arg(long)]
+    shared_memory: bool,
+}
+
+const LETTERS: &str = "bench/letters";
+const ANSWERS: &str = "bench/answers";
+
+/// As much as `fipa bench` gives its own transport.
+const CAPACITY: usize = 1 << 30;
+
+/// How long something may take that usually takes less than a second.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// How long the other end is given to answer a greeting before the next.
+const GREETING: Duration = Duration::from_millis(50);
+
+fn main() -> Result<(), String> {
+    let Arguments { end, shared_memory } = Arguments::parse();
+    match end {
+        End::Sender => {
+            let mut sender = Sender {
+                shared_memory,
+                connected: None,
+            };
+            obey(&mut sender, String::new());
+        }
+        End::Receiver => {
+            let session = open("listen", "tcp/127.0.0.1:0", shared_memory)?;
+            let locators = session.info().locators().wait();
+            let address = locators.first().ok_or("zenoh listens nowhere")?;
+            let address = address.to_string();
+            let mut receiver = Receiver::new(session)?;
+            obey(&mut receiver, address);
+        }
+    }
+    Ok(())
+}
+
+/// Opens a session that has one address to listen on or to connect to, and looks for nobody else.
+fn open(how: &str, address: &str, shared_memory: bool) -> Result<Session, String> {
+    let mut config = Config::default();
+    let other = if how == "listen" { "connect" } else { "listen" };
+    for (key, value) in [
+        ("mode", "\"peer\"".to_owned()),
+        ("scouting/multicast/enabled", "false".to_owned()),
+        (&format!("{how}/endpoints"), format!("[\"{address}\"]")),
+        (&format!("{other}/endpoints"), "[]".to_owned()),
+        ("transport/shared_memory/enabled", shared_memory.to_string()),
+    ] {
+        config.insert_json5(key, &value).map_err(told)?;
+    }
+    zenoh::open(config).wait().map_err(told)
+}
+
+/// A publisher that sends each publication at once, and blocks rather than drops it.
+fn publisher(session: &Session, key: &'static str) -> Result<Publisher<'static>, String> {
+    let publisher = session
+        .declare_publisher(key)
+        .congestion_control(CongestionControl::Block)
+        .priority(Priority::RealTime)
+        .express(true);
+    publisher.wait().map_err(told)
+}
+
+struct Receiver {
+    arrived: Queue<(u64, ZBytes)>,
+    _letters: Subscriber<()>,
+    _session: Session,
+}
+
+impl Receiver {
+    fn new(session: Session) -> Result<Self, String> {
+        let answers = publisher(&session, ANSWERS)?;
+        let (into, arrived): (Into<(u64, ZBytes)>, _) = channel();
+        let letters = session
+            .declare_subscriber(LETTERS)
+            .callback(move |sample| {
+                let at = now_ns();
+                let content = sample.payload().clone();
+                // What fails here, the sender misses.
+                let _answered = answers.put(ZBytes::new()).wait();
+                // A greeting has no content, and is only answered.
+                if !content.is_empty() {
+                    let _taken = into.send((at, content));
+                }
+            })
+            .wait()
+            .map_err(told)?;
+        Ok(Self {
+            arrived,
+            _letters: letters,
+            _session: session,
+        })
+    }
+}
+
+impl Peer for Receiver {
+    fn receive(&mut self, letters: &Letters) -> Result<Vec<u64>, String> {
+        let mut at = Vec::with_capacity(letters.count);
+        for number in 0..letters.count {
+            let (arrived, content) = self.arrived.recv_timeout(PATIENCE).map_err(told)?;
+            check(&content.to_bytes(), letters, number)?;
+            at.push(arrived);
+        }
+        Ok(at)
+    }
+}
+
+struct Sender {
+    shared_memory: bool,
+    connected: Option<Connected>,
+}
+
+struct Connected {
+    letters: Publisher<'static>,
+    answered: Queue<u64>,
+    memory: Option<ShmProvider<PosixShmProviderBackend>>,
+    _answers: Subscriber<()>,
+    _session: Session,
+}
+
+impl Connected {
+    fn to(address: &str, shared_memory: bool) -> Result<Self, String> {
+        let session = open("connect", address, shared_memory)?;
+        let (into, answered) = channel();
+        let answers = session
+            .declare_subscriber(ANSWERS)
+            .callback(move |_| {
+                let _taken = into.send(now_ns());
+            })
+            .wait()
+            .map_err(told)?;
+        let memory = if shared_memory {
+            let backend = PosixShmProviderBackend::builder(CAPACITY).wait();
+            let backend = backend.map_err(told)?;
+            Some(ShmProviderBuilder::backend(backend).wait())
+        } else {
+            None
+        };
+        let connected = Self {
+            letters: publisher(&session, LETTERS)?,
+            answered,
+            memory,
+            _answers: answers,
+            _session: session,
+        };
+        connected.greet()?;
+        Ok(connected)
+    }
+
+    /// Until both ends know that the other listens.
+    fn greet(&self) -> Result<(), String> {
+        let until = Instant::now() + PATIENCE;
+        while Instant::now() < until {
+            self.letters.put(ZBytes::new()).wait().map_err(told)?;
+            if self.answered.recv_timeout(GREETING).is_ok() {
+                // Greetings that were answered late.
+                while self.answered.recv_timeout(GREETING * 4).is_ok() {}
+                return Ok(());
+            }
+        }
+        Err("the other end does not answer".to_owned())
+    }
+
+    /// Makes the content of a letter and notes when it was begun.
+    fn content(&self, letters: &Letters, number: usize, began: &mut Vec<u64>) -> Result<ZBytes, String> {
+        let byte = byte_of(number);
+        let (Some(memory), true) = (&self.memory, letters.fill != Fill::Copied) else {
+            // There is no memory to be loaned: what is not filled is there before.
+            if letters.fill == Fill::Filled {
+                let mut content = vec![0; letters.size];
+                began.push(now_ns());
+                content.fill(byte);
+                return Ok(content.into());
+            }
+            let content = ZBytes::from(vec![byte; letters.size]);
+            began.push(now_ns());
+            return Ok(content);
+        };
+        began.push(now_ns());
+        let loan = memory.alloc(letters.size);
+        let loan = loan.with_policy::<BlockOn<GarbageCollect>>().wait();
+        let mut loan = loan.map_err(told)?;
+        if letters.fill == Fill::Filled {
+            loan.fill(byte);
+        }
+        Ok(loan.into())
+    }
+
+    fn answer(&self) -> Result<u64, String> {
+        self.answered.recv_timeout(PATIENCE).map_err(told)
+    }
+}
+
+impl Peer for Sender {
+    fn find(&mut self, to: &str) -> Result<(), String> {
+        self.connected = Some(Connected::to(to, self.shared_memory)?);
+        Ok(())
+    }
+
+    fn send(&mut self, letters: &Letters) -> Result<Sent, String> {
+        let connected = self.connected.as_ref().ok_or("not connected")?;
+        let mut sent = Sent::with_room(letters);
+        for number in 0..letters.count {
+            while sent.began.len() - sent.ended.len() >= letters.window {
+                sent.ended.push(connected.answer()?);
+            }
+            let content = connected.content(letters, number, &mut sent.began)?;
+            connected.letters.put(content).wait().map_err(told)?;
+        }
+        while sent.ended.len() < sent.began.len() {
+            sent.ended.push(connected.answer()?);
+        }
+        Ok(sent)
+    }
+}
