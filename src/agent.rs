@@ -272,29 +272,41 @@ impl Agent {
         Ok(incoming)
     }
 
-    /// Takes the name out of the directory. Letters that wait in the queue are dropped.
+    /// Takes the name out of the directory, and returns the messages that have been delivered and
+    /// not received yet, in order. The name can be registered anew at once, here or on another
+    /// host: letters on their way follow it there, or fail.
     ///
     /// # Errors
-    /// When the directory cannot be written; the agent receives nothing any more all the same.
-    pub fn deregister(mut self) -> Result<(), DeregisterError> {
-        self.leave()
+    /// When the directory cannot be written; the agent receives nothing any more all the same, and
+    /// what was not received is dropped.
+    pub fn deregister(mut self) -> Result<Unread, DeregisterError> {
+        let unread = self.leave()?;
+        #[cfg(feature = "monitor")]
+        let mut all = self.desk.drain();
+        #[cfg(not(feature = "monitor"))]
+        let mut all = Unread::new();
+        all.extend(unread.into_iter().map(|received| self.taken(received)));
+        Ok(all)
     }
 
-    fn leave(&mut self) -> Result<(), DeregisterError> {
+    fn leave(&mut self) -> Result<Vec<fipa_mts::core::Received>, DeregisterError> {
         self.registered = false;
         let service = &self.domain.inner.service;
-        let result = service.host.deregister(&self.name, self.incarnation);
-        service.mts.deregister(self.incarnation);
-        result
+        let left = service.host.deregister(&self.name, self.incarnation);
+        let unread = service.mts.deregister(self.incarnation);
+        left.map(|()| unread)
     }
 }
+
+/// What an agent that was deregistered had not received, as [`Agent::receive`] would have told it.
+pub type Unread = Vec<Result<Incoming, ReceiveError>>;
 
 impl Drop for Agent {
     fn drop(&mut self) {
         if self.registered {
             match self.leave() {
                 // The domain was closed before, and has taken the name with it.
-                Ok(()) | Err(DeregisterError::Closed) => {}
+                Ok(_) | Err(DeregisterError::Closed) => {}
                 Err(error) => tracing::warn!(%error, agent = %self.name, "not deregistered"),
             }
         }

@@ -10,7 +10,7 @@ use fipa_acl::{Message, MessageBuilder, Performative};
 use fipa_sds::{DeregisterError, Directory, RegisterError};
 use tokio::runtime::{Builder, Runtime};
 
-use crate::{AgentId, Config, Deliveries, Incoming, Loan, ReceiveError, SendError};
+use crate::{AgentId, Config, Deliveries, Incoming, Loan, ReceiveError, SendError, Unread};
 
 /// Why a domain could not be joined.
 #[derive(Debug, thiserror::Error)]
@@ -177,7 +177,7 @@ impl Agent {
     ///
     /// # Errors
     /// See [`crate::Agent::deregister`].
-    pub fn deregister(self) -> Result<(), DeregisterError> {
+    pub fn deregister(self) -> Result<Unread, DeregisterError> {
         self.agent.deregister()
     }
 }

@@ -158,7 +158,8 @@ impl Domain {
         match service.host.register(registration) {
             Ok(_) => Ok(Agent::new(self.clone(), id, name, incarnation)),
             Err(error) => {
-                service.mts.deregister(incarnation);
+                // Nobody can have written to it.
+                drop(service.mts.deregister(incarnation));
                 Err(error)
             }
         }

@@ -52,7 +52,7 @@ pub mod routes;
 mod service;
 pub mod watch;
 
-pub use agent::{Agent, Deliveries, Delivery, Incoming, Loan, ReceiveError, SendError};
+pub use agent::{Agent, Deliveries, Delivery, Incoming, Loan, ReceiveError, SendError, Unread};
 #[cfg(feature = "monitor")]
 pub use checks::ProtocolError;
 pub use config::Config;

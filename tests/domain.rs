@@ -118,7 +118,7 @@ async fn a_name_belongs_to_one_at_a_time() {
             Ok(_) => panic!("two agents have one name"),
         }
     }
-    first.deregister().unwrap();
+    assert!(first.deregister().unwrap().is_empty());
     there.register("arm").unwrap();
 }
 
@@ -376,7 +376,11 @@ async fn an_agent_that_left_is_gone_and_its_successor_is_reached() {
             .unwrap()
             .all_succeeded()
     );
-    arm.deregister().unwrap();
+    let unread = arm.deregister().unwrap();
+    let [Ok(unread)] = &unread[..] else {
+        panic!("one message waited: {unread:?}");
+    };
+    assert_eq!(unread.message.content().unwrap(), "first life");
     let gone = rover.send(inform(&rover, "arm", "between")).await.unwrap();
     assert_eq!(reason(&gone), FailureReason::NoSuchAgent);
     let arm = there.register("arm").unwrap();

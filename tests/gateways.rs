@@ -176,7 +176,7 @@ async fn hosts_find_each_other_and_exchange_letters() {
     );
 
     // What happens to the agent there is known here.
-    arm.deregister().unwrap();
+    drop(arm.deregister().unwrap());
     forgotten(&at_home, &there.name("arm")).await;
     let gone = rover
         .send(inform(&rover, &there.name("arm"), "?"))

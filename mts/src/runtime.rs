@@ -16,7 +16,7 @@ use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use fipa_sds::{Directory, Entry, Pattern};
+use fipa_sds::{Change, Directory, Entry, Pattern};
 use fipa_transport::{
     Conclusion, Incarnation, Introduction, Kind, ListenError, LoanedContent, Location, Outcome,
     Transport,
@@ -216,14 +216,17 @@ impl Mts {
         state.core.register(name, incarnation);
     }
 
-    /// The agent goes away; see [`Core::deregister`].
-    pub fn deregister(&self, incarnation: Incarnation) {
+    /// The agent goes away; see [`Core::deregister`]. Returns the letters that it has not taken
+    /// out of its queue.
+    pub fn deregister(&self, incarnation: Incarnation) -> Vec<Received> {
         let mut state = self.shared.state.lock();
+        let unread = std::iter::from_fn(|| state.core.take(incarnation)).collect();
         state.core.deregister(incarnation);
         if let Some(door) = state.agents.remove(&incarnation) {
             door.close();
         }
         self.shared.carry_out(state);
+        unread
     }
 
     /// Whether the [`Tap`] is told of every letter from now on. While it is not, watching costs
@@ -612,12 +615,20 @@ async fn keep_time(shared: Weak<Shared>, timer: Arc<Notify>) {
 /// Tells the core when the directory has changed.
 async fn watch_directory(shared: Weak<Shared>, directory: Arc<dyn Directory>) {
     let mut watch = directory.watch();
-    while watch.next().await.is_some() {
+    while let Some(change) = watch.next().await {
         let Some(shared) = shared.upgrade() else {
             return;
         };
+        let now = Now::read();
         let mut state = shared.state.lock();
-        state.core.handle_directory_change(Now::read());
+        match &change {
+            Change::Left(entry) => state.core.handle_departure(now, entry),
+            Change::Changed { before, after } if before.incarnation != after.incarnation => {
+                state.core.handle_departure(now, before);
+            }
+            _ => {}
+        }
+        state.core.handle_directory_change(now);
         shared.carry_out(state);
     }
 }

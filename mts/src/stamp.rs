@@ -38,6 +38,21 @@ pub(crate) fn carries(
         .any(|stamp| stamp.by().as_str() == name && stamp.id().is_some_and(|it| it.as_str() == id)))
 }
 
+/// Whether the letter carries the stamp of a service with this incarnation, whatever its name.
+pub(crate) fn passed(letter: &Letter, incarnation: Incarnation) -> Result<bool, DecodeError> {
+    let envelope = letter.envelope();
+    let view = EnvelopeView::parse(&envelope)?;
+    let id = incarnation.to_string();
+    let mut stamps = view.stamps();
+    Ok(stamps.any(|stamp| stamp.id().is_some_and(|it| it.as_str() == id)))
+}
+
+/// How many services have stamped the letter.
+pub(crate) fn count(letter: &Letter) -> Result<usize, DecodeError> {
+    let envelope = letter.envelope();
+    Ok(EnvelopeView::parse(&envelope)?.stamps().count())
+}
+
 /// The letter with the stamp of this service in front.
 pub(crate) fn put(
     letter: Letter,

@@ -23,16 +23,18 @@ fn seeds() -> Vec<u64> {
     (0..number("FIPA_SIM_SEEDS").unwrap_or(100)).collect()
 }
 
-fn run(weather: Weather) {
-    let mut letters = 0;
+fn run(weather: Weather) -> u64 {
+    let (mut letters, mut followed) = (0, 0);
     for seed in seeds() {
         let mut world = World::new(seed, weather);
         if let Err(breach) = world.run() {
             panic!("seed {seed}, {weather:?}: {breach}");
         }
         letters += world.letters();
+        followed += world.followed();
     }
     assert!(letters > 0, "nothing was sent");
+    followed
 }
 
 #[test]
@@ -83,6 +85,35 @@ fn deaths_and_rebirths_break_no_promise() {
 }
 
 #[test]
+fn letters_to_agents_that_move_follow_or_fail() {
+    let followed = run(Weather {
+        moves: 60,
+        news_ms: 60,
+        hosts: 3,
+        ..Weather::calm()
+    });
+    assert!(
+        followed > 0,
+        "no letter came to a host that its receiver had left"
+    );
+}
+
+#[test]
+fn moves_in_foul_weather_break_no_promise() {
+    run(Weather {
+        moves: 60,
+        news_ms: 60,
+        hosts: 3,
+        loss: 0.1,
+        answer_loss: 0.1,
+        refusal: 0.1,
+        silence: 0.05,
+        deaths: 4,
+        ..Weather::calm()
+    });
+}
+
+#[test]
 fn everything_at_once_breaks_no_promise() {
     run(Weather {
         loss: 0.1,
@@ -94,5 +125,6 @@ fn everything_at_once_breaks_no_promise() {
         answering_ms: 30,
         queue: 8,
         outages: 6,
+        ..Weather::calm()
     });
 }

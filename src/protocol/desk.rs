@@ -71,6 +71,14 @@ impl Desk {
         }
     }
 
+    /// Everything that was put aside, for nobody will read it any more.
+    pub(crate) fn drain(&self) -> Vec<Received> {
+        let mut state = self.state.lock();
+        let mut all: Vec<Received> = state.others.drain(..).collect();
+        all.extend(state.led.drain().flat_map(|(_, queue)| queue));
+        all
+    }
+
     async fn next(&self, agent: &Agent, reader: Reader<'_>) -> Received {
         loop {
             // Before looking, so that what changes afterwards is noticed.

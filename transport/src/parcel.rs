@@ -40,7 +40,8 @@ pub struct Parcel {
     /// What is left of the letter's deadline. Time spent on the way is not subtracted: hosts need
     /// not agree on the clock.
     pub remaining: Duration,
-    /// How many times the letter went from host to host so far.
+    /// How many times the letter went from host to host so far; at least
+    /// [`LAST_HOPS`](Self::LAST_HOPS) when it must not follow a receiver that has moved.
     pub hops: u8,
     /// What it is about.
     pub body: Body,
@@ -49,6 +50,10 @@ pub struct Parcel {
 impl Parcel {
     /// Longest name of a receiver, in bytes.
     pub const MAX_NAME: usize = 4096;
+
+    /// With this many [`hops`](Self::hops) a letter is for this life of its receiver only: it has
+    /// followed its receiver once, or an attempt that nothing was heard of may have delivered it.
+    pub const LAST_HOPS: u8 = 2;
 }
 
 /// The kinds of parcels.

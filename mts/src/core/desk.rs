@@ -87,6 +87,8 @@ pub(crate) enum Origin {
     /// Another message transport service, which is told by a late answer or by a report.
     Forwarded {
         back: Location,
+        /// The stream it came with. It left with another one when its receiver had moved.
+        stream: Stream,
         /// The arrival that still has no answer.
         unanswered: Option<(Kind, Ticket)>,
     },
@@ -252,7 +254,11 @@ impl Desk {
                     outcome,
                 });
             }
-            Origin::Forwarded { back, unanswered } => {
+            Origin::Forwarded {
+                back,
+                stream,
+                unanswered,
+            } => {
                 let brief = match &outcome {
                     Outcome::Delivered { attempts, .. } if attempts.is_empty() => {
                         Some(Answer::Accepted)

@@ -17,8 +17,6 @@ use super::{Core, MAX_DEADLINE, News, Now};
 use crate::failure::Failure;
 use crate::stamp;
 
-/// How far from the network a letter may come before a gateway refuses to pass it on.
-const MAX_HOPS: u8 = 1;
 /// When the sender of a letter is told that it is in custody, if its outcome takes longer.
 const CUSTODY_AFTER: Duration = Duration::from_millis(200);
 /// How long a failure message to an old peer's agent may take.
@@ -43,7 +41,12 @@ impl Core {
         if from.remote {
             self.hear(parcel.stream.sender, &stamped, &from);
         }
-        let (bound, stream, ending) = (self.desk.config.lane, parcel.stream, self.ending);
+        let stream = Stream {
+            receiver: life_of(&entry),
+            ..parcel.stream
+        };
+        let moved = stream != parcel.stream;
+        let (bound, ending) = (self.desk.config.lane, self.ending);
         let bytes = self.desk.held.saturating_add(stamped.len());
         let too_many_bytes = self.desk.held > 0 && bytes > self.desk.config.custody_bytes;
         let new_lane = || Lane::new(now.instant, stream, Arc::clone(&entry.name));
@@ -52,8 +55,11 @@ impl Core {
             Some(_) => Verdict::Later,
             None => Verdict::Now(Answer::Custody),
         };
-        let back = from.location.clone();
-        let origin = Origin::Forwarded { back, unanswered };
+        let origin = Origin::Forwarded {
+            back: from.location.clone(),
+            stream: parcel.stream,
+            unanswered,
+        };
         let Some(origin) = lane.adopt(parcel.sequence, origin, &mut self.desk) else {
             return taken;
         };
@@ -73,7 +79,8 @@ impl Core {
         let onwards = entry.reach != Reach::Local;
         let deadline = now.instant + parcel.remaining.min(MAX_DEADLINE);
         let mut delivery = Delivery::new(origin, stamped, parcel.sequence, deadline);
-        delivery.after = parcel.after;
+        // The one before it was for the earlier life.
+        delivery.after = if moved { 0 } else { parcel.after };
         delivery.hops = parcel.hops.saturating_add(u8::from(onwards));
         delivery.custody_due = unanswered.map(|_| now.instant + CUSTODY_AFTER);
         self.put(now, stream, Arc::clone(&entry.name), delivery);
@@ -94,16 +101,30 @@ impl Core {
         if !config.forwards {
             return Err(unknown("the agent is not in this process any more"));
         }
-        let entry = self.desk.receiver(parcel.stream.receiver, &parcel.receiver);
+        let life = parcel.stream.receiver;
+        let here = self.desk.receiver(life, &parcel.receiver);
+        let moved = here.is_none() && from.remote && parcel.hops < Parcel::LAST_HOPS;
+        let entry = match here {
+            None if moved => self.departed.successor(life, &*self.desk.directory),
+            here => here,
+        };
         let entry = entry.ok_or_else(|| unknown("the agent is not known to the gateway"))?;
-        if entry.role == Role::Gateway {
+        if entry.role != Role::Agent {
             return Err(refused(
                 "letters for another gateway are not passed on".to_owned(),
             ));
         }
-        // Never between strangers: what comes from the network is for this host.
-        if from.remote && (entry.reach != Reach::Local || parcel.hops > MAX_HOPS) {
+        // Never between strangers: what comes from the network is for this host, or for who has
+        // just left it.
+        if from.remote && !moved && entry.reach != Reach::Local {
             return Err(unknown("the agent is not on the gateway's host"));
+        }
+        // Where the letter has been before, its sender can do better.
+        if moved
+            && let Reach::Remote { gateway } = entry.reach
+            && stamp::passed(&letter, gateway).map_err(|error| refused(error.to_string()))?
+        {
+            return Err(unknown("the agent has moved"));
         }
         match stamp::carries(&letter, &config.name, config.incarnation) {
             Ok(true) => return Err(Answer::failed(FailureReason::Loop, &*config.name)),
@@ -115,13 +136,17 @@ impl Core {
         Ok((entry, stamped))
     }
 
-    /// Makes known who has written, if nobody has told of that agent yet: it can be answered.
+    /// Makes known who has written this stamped letter, if nobody has told of that agent yet: it can be answered.
     fn hear(&mut self, agent: Incarnation, letter: &Letter, from: &Hop) {
         let directory = &self.desk.directory;
         if !agent.is_known() || directory.known_incarnation(agent).is_some() {
             return;
         }
+        // Passed on by the gateway that its receiver has left, it does not come from where its
+        // sender is.
+        let direct = stamp::count(letter).is_ok_and(|stamps| stamps <= 2);
         if let Some(name) = stamp::sender(letter)
+            && direct
             && directory.known(&name).is_none()
         {
             let location = from.location.clone();

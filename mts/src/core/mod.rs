@@ -8,6 +8,7 @@
 //! * `lane`: letters of one stream on their way, in order, one way at a time.
 //! * `inbox`: the receiving end, where letters are taken once and in order.
 //! * `forward`: letters for somebody else.
+//! * `departed`: agents of this host that have moved, which letters follow once.
 //! * `peers`: services that the configuration names, and how it stands with them.
 //! * `routes`: which way letters would go and what happened on each way, for people.
 //! * `desk`: what lanes share: attempts, health of ways, things to be done.
@@ -18,6 +19,7 @@
 //! letters that failed leave no hole that would be waited for.
 
 mod config;
+mod departed;
 mod desk;
 mod forward;
 mod inbox;
@@ -39,6 +41,7 @@ use fipa_transport::{
 };
 
 pub use config::{CoreConfig, MAX_DEADLINE};
+use departed::Departed;
 pub use desk::Action;
 use desk::{Desk, NOTE_TRIES, Note, Origin, Purpose, Undelivered};
 use inbox::Inbox;
@@ -101,6 +104,7 @@ pub struct Core {
     timers: BinaryHeap<Reverse<(Instant, Stream)>>,
     notes: BinaryHeap<Reverse<LateNote>>,
     peers: Peers,
+    departed: Departed,
     /// No more letters of others are taken.
     ending: bool,
     next_send: u64,
@@ -143,6 +147,7 @@ impl Core {
             timers: BinaryHeap::new(),
             notes: BinaryHeap::new(),
             peers: Peers::default(),
+            departed: Departed::default(),
             ending: false,
             next_send: 1,
             next_sequence: 1,
@@ -518,6 +523,15 @@ impl Core {
             });
         }
         self.tell_failures(now);
+    }
+
+    /// This entry has left the directory, or its name has another one now. Comes before
+    /// [`handle_directory_change`](Self::handle_directory_change). A gateway passes letters for an
+    /// agent that has left its host on to where the name is registered next, for half a minute.
+    pub fn handle_departure(&mut self, now: Now, entry: &Entry) {
+        if self.desk.config.forwards {
+            self.departed.left(now.instant, entry);
+        }
     }
 
     /// Time has passed: call this when [`poll_timeout`](Self::poll_timeout) says so.

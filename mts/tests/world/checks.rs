@@ -34,11 +34,12 @@ impl World {
                         return Err(format!("letter {number} was delivered, but {outcome}"));
                     }
                     // Nobody refuses anything in this world: it was overtaken. Only when a gateway
-                    // dies together with its report of a failure, others go on without that letter.
+                    // dies together with its report of a failure, others go on without that letter; and
+                    // one that follows its receiver is overtaken by one sent to its new life.
                     Outcome::Failed {
                         reason: FailureReason::Refused,
                         ..
-                    } if self.weather.deaths == 0 => {
+                    } if self.weather.deaths + self.weather.moves == 0 => {
                         return Err(format!("letter {number} was left out: {outcome}"));
                     }
                     Outcome::Failed { reason, .. } => {

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use fipa_transport::{
-    Arrival, AttemptId, Conclusion, Hop, Kind, Location, Parcel, Ticket, Verdict, WayError,
+    Arrival, AttemptId, Body, Conclusion, Hop, Kind, Location, Parcel, Ticket, Verdict, WayError,
     WayFault,
 };
 
@@ -113,6 +113,10 @@ impl World {
         let now = self.clocks();
         let location = way(kind, self.processes[from].incarnation);
         let remote = self.processes[from].host != self.processes[to].host;
+        let is_letter = matches!(parcel.body, Body::Letter(_));
+        if is_letter && remote && parcel.hops >= Parcel::LAST_HOPS {
+            self.followed += 1;
+        }
         let process = &mut self.processes[to];
         process.next_ticket += 1;
         let ticket = Ticket(process.next_ticket);

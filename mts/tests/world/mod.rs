@@ -3,6 +3,7 @@
 use std::cmp::Reverse;
 mod checks;
 mod links;
+mod moves;
 mod view;
 mod watching;
 mod weather;
@@ -14,7 +15,7 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::{AgentId, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, SendId, Submission};
 use fipa_mts::letter_for;
-use fipa_sds::Role;
+use fipa_sds::{Entry, Role};
 use fipa_transport::{
     AttemptId, Conclusion, Incarnation, Kind, Outcome, Parcel, Ticket, WayError, WayFault,
 };
@@ -24,7 +25,6 @@ use self::view::{Registered, Registry, View};
 use self::watching::Watching;
 pub(crate) use self::weather::Weather;
 
-const HOSTS: usize = 2;
 const PROCESSES: usize = 3;
 const AGENTS: usize = 2;
 const LETTERS: u64 = 120;
@@ -84,6 +84,17 @@ enum Event {
     Reborn {
         process: usize,
     },
+    /// An agent leaves its process.
+    Move,
+    /// It is registered in another one.
+    Settle {
+        name: Arc<str>,
+    },
+    /// What has changed becomes known on a host, to these processes as a departure.
+    News {
+        host: usize,
+        departed: Vec<(usize, Arc<Entry>)>,
+    },
     Outage {
         host: usize,
         kind: Kind,
@@ -123,6 +134,8 @@ pub(crate) struct World {
     /// Agents that are about to read.
     reading: HashSet<Incarnation>,
     failures_told: u64,
+    /// Letters that came to the host to which their receiver had moved.
+    followed: u64,
     /// Whether anybody watches: in some worlds, so that the others show that it makes no
     /// difference.
     watched: bool,
@@ -151,10 +164,11 @@ impl World {
             names: HashMap::new(),
             reading: HashSet::new(),
             failures_told: 0,
+            followed: 0,
             watched: seed.is_multiple_of(4),
-            watching: (0..HOSTS).map(|_| Watching::default()).collect(),
+            watching: (0..weather.hosts).map(|_| Watching::default()).collect(),
         };
-        for host in 0..HOSTS {
+        for host in 0..weather.hosts {
             world.birth(host, true, &[format!("gateway{host}")]);
             for process in 0..PROCESSES {
                 let names: Vec<String> = (0..AGENTS)
@@ -171,9 +185,13 @@ impl World {
             let at = world.some_time();
             world.at(at, Event::Die);
         }
+        for _ in 0..weather.moves {
+            let at = world.some_time();
+            world.at(at, Event::Move);
+        }
         for _ in 0..weather.outages {
             let at = world.some_time();
-            let host = world.random.usize(..HOSTS);
+            let host = world.random.usize(..weather.hosts);
             let kind = *world
                 .random
                 .choice(&[Kind::Shm, Kind::Tcp, Kind::Udp])
@@ -185,6 +203,10 @@ impl World {
 
     pub(crate) fn letters(&self) -> usize {
         self.sent.len()
+    }
+
+    pub(crate) fn followed(&self) -> u64 {
+        self.followed
     }
 
     fn incarnation(&mut self) -> Incarnation {
@@ -267,6 +289,8 @@ impl World {
                 host,
                 mts: incarnation,
                 role,
+                known: Vec::new(),
+                left: Vec::new(),
             };
             self.registry.lock().entries.push(registered);
         }
@@ -282,6 +306,7 @@ impl World {
                 break;
             }
             self.now = at;
+            self.registry.lock().now = Some(at);
             let Some(event) = self.due.remove(&number) else {
                 continue;
             };
@@ -352,6 +377,9 @@ impl World {
                 self.birth(host, gateway, &names);
                 self.directory_changed()
             }
+            Event::Move => self.leave(),
+            Event::Settle { name } => self.settle(name),
+            Event::News { host, departed } => self.news(host, &departed),
             Event::Outage { host, kind } => {
                 self.down.insert((host, kind));
                 self.after_ms(800, Event::OutageEnds { host, kind });
@@ -382,8 +410,11 @@ impl World {
         let Some(&at) = self.random.choice(&living) else {
             return Ok(());
         };
-        let (name, sender) = self.processes[at].agents[self.random.usize(..AGENTS)].clone();
-        let host = self.random.usize(..HOSTS);
+        let agents = self.processes[at].agents.iter();
+        let Some((name, sender)) = self.random.choice(agents).cloned() else {
+            return Ok(());
+        };
+        let host = self.random.usize(..self.weather.hosts);
         // Few pairs and bursts: order is worth nothing if nobody sends twice.
         let receiver = match self.random.u32(..10) {
             0 => format!("h{host}_.*"),

@@ -1,7 +1,8 @@
 //! The directory of a simulated world, as it is seen from each of its processes.
 
+use std::collections::HashSet;
 use std::sync::Arc;
-use std::time::SystemTime;
+use std::time::{Instant, SystemTime};
 
 use fipa_sds::{Directory, Entry, Mts, Reach, Role, Source, Subscriber};
 use fipa_transport::{Incarnation, Kind, Location};
@@ -11,6 +12,7 @@ use parking_lot::Mutex;
 #[derive(Default)]
 pub(super) struct Registry {
     pub(super) entries: Vec<Registered>,
+    pub(super) now: Option<Instant>,
 }
 
 pub(super) struct Registered {
@@ -19,6 +21,17 @@ pub(super) struct Registered {
     pub(super) host: usize,
     pub(super) mts: Incarnation,
     pub(super) role: Role,
+    /// When it is known on each host, if not from the beginning.
+    pub(super) known: Vec<Instant>,
+    /// When it is known on each host that it has left, once it has.
+    pub(super) left: Vec<Instant>,
+}
+
+impl Registered {
+    fn is_seen(&self, host: usize, now: Option<Instant>) -> bool {
+        let past = |times: &[Instant]| Some(*times.get(host)? <= now?);
+        past(&self.known).unwrap_or(true) && !past(&self.left).unwrap_or(false)
+    }
 }
 
 pub(super) struct View {
@@ -67,7 +80,11 @@ impl View {
 
     fn find(&self, matches: impl Fn(&Registered) -> bool) -> Option<Arc<Entry>> {
         let registry = self.registry.lock();
-        let found = registry.entries.iter().find(|entry| matches(entry))?;
+        let mut seen = registry
+            .entries
+            .iter()
+            .filter(|entry| entry.is_seen(self.host, registry.now));
+        let found = seen.find(|entry| matches(entry))?;
         self.entry(&registry, found)
     }
 }
@@ -83,9 +100,13 @@ impl Directory for View {
 
     fn entries(&self) -> Arc<[Arc<Entry>]> {
         let registry = self.registry.lock();
+        // Who has the name keeps it, until it is known to have left.
+        let mut names = HashSet::new();
         registry
             .entries
             .iter()
+            .filter(|entry| entry.is_seen(self.host, registry.now))
+            .filter(|entry| names.insert(Arc::clone(&entry.name)))
             .filter_map(|entry| self.entry(&registry, entry))
             .collect()
     }

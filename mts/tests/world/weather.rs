@@ -13,6 +13,12 @@ pub(crate) struct Weather {
     pub silence: f64,
     /// How many processes die in the course of the run. Most come back as a new life.
     pub deaths: u32,
+    /// How often an agent leaves its process and is registered in another one, mostly elsewhere.
+    pub moves: u32,
+    /// How long news of that takes to another host, at most.
+    pub news_ms: u64,
+    /// How many hosts there are.
+    pub hosts: usize,
     /// How often one kind of transport stops working on one host for a while.
     pub outages: u32,
     /// How long agents wait between two letters they read.
@@ -32,6 +38,9 @@ impl Weather {
             refusal: 0.0,
             silence: 0.0,
             deaths: 0,
+            moves: 0,
+            news_ms: 0,
+            hosts: 2,
             outages: 0,
             reading_pause_ms: 1,
             answering_ms: 2,
@@ -42,6 +51,7 @@ impl Weather {
     pub(super) fn is_calm(&self) -> bool {
         self.loss + self.answer_loss + self.refusal + self.silence == 0.0
             && self.deaths == 0
+            && self.moves == 0
             && self.outages == 0
             && self.queue >= 64
     }

@@ -244,7 +244,10 @@ impl Lane {
             sequence: delivery.sequence,
             after,
             remaining: left - HOP_MARGIN.min(left / 8),
-            hops: delivery.hops,
+            hops: match delivery.progress.unconfirmed {
+                true => delivery.hops.max(Parcel::LAST_HOPS),
+                false => delivery.hops,
+            },
             body: Body::Letter(delivery.letter.clone()),
         };
         let size = delivery.letter.len() as u64;
