@@ -3,6 +3,9 @@
 //! A hidden thread takes letters in and answers for them while the application is busy with
 //! something else; it sleeps when there is nothing to do.
 
+#[cfg(feature = "monitor")]
+mod protocol;
+
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -11,6 +14,9 @@ use fipa_sds::{DeregisterError, Directory, RegisterError};
 use tokio::runtime::{Builder, Runtime};
 
 use crate::{AgentId, Config, Deliveries, Incoming, Loan, ReceiveError, SendError, Unread};
+
+#[cfg(feature = "monitor")]
+pub use self::protocol::Side;
 
 /// Why a domain could not be joined.
 #[derive(Debug, thiserror::Error)]

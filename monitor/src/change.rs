@@ -40,6 +40,7 @@ pub(crate) struct Change<'a> {
     pub(crate) due: u64,
     pub(crate) opened: bool,
     pub(crate) late: bool,
+    pub(crate) void: bool,
     pub(crate) state: Option<u16>,
 }
 
@@ -91,6 +92,12 @@ impl Change<'_> {
         let answers = party.last != side && !made.told;
         self.late |= party.deadline != 0 && party.deadline < self.now && answers;
         let cancels = lead.state == CANCELLING && party.state != CANCELLING;
+        if lead.void {
+            (party.state, party.resume, party.echo) = (lead.state, lead.resume, lead.echo);
+            self.state = self.state.or(Some(party.state));
+            (self.late, self.void) = (true, true);
+            return;
+        }
         if made.told || lead.state == FAILED {
             // What failed may be said again, from the state before it.
             (party.state, party.resume, party.echo) = (lead.state, lead.resume, lead.echo);
@@ -107,6 +114,7 @@ impl Change<'_> {
         } else {
             let index = side_index(side);
             party.acts[index] = act_number(self.heard.act);
+            party.asked_before[index] = party.asked[index];
             party.asked[index] = self.heard.reply_with;
         }
         (party.state, party.resume, party.echo) = (lead.state, lead.resume, lead.echo);

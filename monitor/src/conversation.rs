@@ -7,7 +7,7 @@ use smallvec::SmallVec;
 
 use crate::act::{Act, CANCEL, FAILURE, INFORM, NOT_UNDERSTOOD};
 use crate::machine::{Cancel, Machine, Roles, Scope, Transition, step};
-use crate::names::Name;
+use crate::names::{Name, Names};
 use crate::verdict::ViolationKind as Kind;
 
 /// Nobody, or nothing.
@@ -86,6 +86,8 @@ pub(crate) struct Party {
     pub(crate) acts: [u8; 2],
     /// The fingerprint of the last `reply-with` of each side; 0 for none.
     pub(crate) asked: [u64; 2],
+    /// Of the one before that.
+    pub(crate) asked_before: [u64; 2],
     /// That of the cancel.
     pub(crate) cancel: u64,
     /// When the next message is due, in milliseconds since 1970; 0 for no time.
@@ -104,6 +106,7 @@ impl Party {
             echo: false,
             acts: [0; 2],
             asked: [0; 2],
+            asked_before: [0; 2],
             cancel: 0,
             deadline: 0,
         }
@@ -137,6 +140,40 @@ pub(crate) struct Conversation {
     pub(crate) unnamed: Option<Box<Party>>,
 }
 
+impl Conversation {
+    /// Whether the agent has said anything here, or been told.
+    pub(crate) fn takes_part(&self, names: &Names, agent: &str) -> bool {
+        let peers = self.parties.iter().map(|party| party.peer);
+        let bound = self.bound.iter().map(|bound| bound.agent);
+        let mut known = peers.chain(bound).chain([self.initiator]);
+        known.any(|name| names.is(name, agent))
+    }
+}
+
+/// Who has which role in a conversation, as far as one party is concerned.
+pub(crate) struct Holders<'a> {
+    pub(crate) conversation: &'a Conversation,
+    pub(crate) machine: &'a Machine,
+    pub(crate) party: &'a Party,
+    pub(crate) names: &'a Names,
+}
+
+impl Holders<'_> {
+    pub(crate) fn of(&self, agent: &str) -> u32 {
+        let initiator = 1_u32 << self.machine.initiator;
+        match self.machine.scope {
+            Scope::Participant if self.names.is(self.conversation.initiator, agent) => initiator,
+            Scope::Participant if self.names.is(self.party.peer, agent) => !initiator,
+            Scope::Participant => 0,
+            Scope::Conversation => {
+                let bound = self.conversation.bound.iter();
+                let held = bound.filter(|bound| self.names.is(bound.agent, agent));
+                held.fold(0, |mask, bound| mask | (1 << bound.role))
+            }
+        }
+    }
+}
+
 /// A message as far as one party of its conversation is concerned.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Said<'a> {
@@ -163,6 +200,8 @@ pub(crate) struct Lead {
     pub(crate) echo: bool,
     /// Whether the message was sent before its sender could know of the last one.
     pub(crate) crossed: bool,
+    /// Whether it answers what has been said anew since: it was too late, and changes nothing.
+    pub(crate) void: bool,
     /// The roles of the sender and the receivers in the step that was taken; 0 for none.
     pub(crate) roles: (u32, u32),
 }
@@ -174,6 +213,7 @@ impl Lead {
             resume: state,
             echo: false,
             crossed: false,
+            void: false,
             roles: (0, 0),
         }
     }
@@ -267,8 +307,13 @@ fn in_state(machine: &Machine, party: &Party, state: u16, said: &Said<'_>) -> Re
         })
     };
     if let Some(step) = taken {
-        in_reply(party, said)?;
-        return Ok(Lead::taking(step));
+        return Ok(match in_reply(party, said)? {
+            Reply::ToLast => Lead::taking(step),
+            Reply::ToEarlier => Lead {
+                void: true,
+                ..Lead::to(state)
+            },
+        });
     }
     if proxied() {
         return Ok(Lead::to(state));
@@ -312,13 +357,24 @@ fn by_default(machine: &Machine, party: &Party, state: u16, said: &Said<'_>) -> 
     }
 }
 
-fn in_reply(party: &Party, said: &Said<'_>) -> Result<(), Kind> {
-    let asked = party.asked[side_index(said.side.opposite())];
-    let mismatch = said.answers && said.in_reply_to != 0 && asked != 0 && said.in_reply_to != asked;
-    if mismatch {
-        Err(Kind::WrongReply)
+/// What a message answers.
+enum Reply {
+    /// The last one of the other side, as far as it tells.
+    ToLast,
+    /// The one before, which its sender took for the last: the two have crossed, as a bid and the
+    /// next call of an auction may.
+    ToEarlier,
+}
+
+fn in_reply(party: &Party, said: &Said<'_>) -> Result<Reply, Kind> {
+    let other = side_index(said.side.opposite());
+    let (asked, before) = (party.asked[other], party.asked_before[other]);
+    if !said.answers || [0, asked].contains(&said.in_reply_to) || asked == 0 {
+        Ok(Reply::ToLast)
+    } else if said.in_reply_to == before && !said.own {
+        Ok(Reply::ToEarlier)
     } else {
-        Ok(())
+        Err(Kind::WrongReply)
     }
 }
 

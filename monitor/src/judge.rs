@@ -21,6 +21,8 @@ pub(crate) struct Heard<'a> {
     pub(crate) in_reply_to: u64,
     /// Whether the sender is the agent that watches itself.
     pub(crate) own: bool,
+    /// Which of the receivers is, when it is told by somebody else.
+    pub(crate) told: Option<usize>,
 }
 
 /// One change.
@@ -118,7 +120,12 @@ impl Judge<'_> {
 
     fn by_initiator(&self, moves: &mut Vec<Move>) -> Result<(), Fault> {
         let fresh = Party::new(NONE, self.machine.initial);
+        // Who watches himself does not know what others who are told the same have answered before.
+        let told = self.heard.told.and_then(|at| self.heard.receivers.get(at));
         for (number, receiver) in self.heard.receivers.iter().enumerate() {
+            if told.is_some_and(|agent| receiver != agent && !is_pattern(receiver)) {
+                continue;
+            }
             let (who, party) = match self.party(receiver) {
                 Some((at, party)) => (Who::Party(at), party),
                 None if is_pattern(receiver) => {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use crate::change::{Change, expire, expire_party, millis, span_millis};
-use crate::conversation::{NONE, Party, is_final, is_over, state_name};
+use crate::conversation::{Holders, NONE, Party, is_final, is_over, state_name};
 use crate::deadlines::{Deadline, Deadlines};
 use crate::judge::{Fault, Heard, Move, Who, judge};
 use crate::limits::MAX_TEXT;
@@ -78,6 +78,7 @@ struct Passed {
     opened: bool,
     complete: bool,
     late: bool,
+    void: bool,
 }
 
 impl Monitor {
@@ -162,8 +163,10 @@ impl Monitor {
             state: state_name(machine, passed.state),
             opened: passed.opened,
             ended: is_final(machine, passed.state),
+            over: is_over(machine, passed.state),
             complete: passed.complete,
             late: passed.late,
+            void: passed.void,
         })
     }
 
@@ -188,6 +191,7 @@ impl Monitor {
         {
             return unchecked(Unchecked::TooLarge);
         }
+        let agent = self.agent.as_deref();
         let fingerprint = |text: Option<&str>| text.map_or(0, |text| self.hasher.hash_one(text));
         let heard = Heard {
             act: header.act(),
@@ -195,7 +199,11 @@ impl Monitor {
             receivers,
             reply_with: fingerprint(header.reply_with_text()),
             in_reply_to: fingerprint(header.in_reply_to_text()),
-            own: self.agent.as_deref() == Some(sender),
+            own: agent == Some(sender),
+            told: agent.filter(|agent| *agent != sender).and_then(|agent| {
+                let mut receivers = receivers.iter();
+                receivers.position(|receiver| *receiver == agent)
+            }),
         };
         let Some(main) = self.table.find(id) else {
             let Some(protocol) = header.protocol_name() else {
@@ -245,6 +253,9 @@ impl Monitor {
             child = self.table.slot(child).map_or(NONE, |slot| slot.sibling);
         }
         if !may_begin {
+            if denied.is_none() && self.began_elsewhere(library, main, name, heard.sender) {
+                return Err(Denied::Unchecked(Unchecked::BegunElsewhere));
+            }
             let fault = Fault::plain(Kind::WrongProtocol);
             return Err(denied.unwrap_or(Denied::Fault(fault, main)));
         }
@@ -266,25 +277,42 @@ impl Monitor {
 
     /// Whether the agent may begin a conversation of this protocol within another.
     fn may_begin(&self, library: &Library, at: u32, protocol: &str, sender: &str) -> bool {
+        self.is_begun(library, at, protocol, |roles| roles.of(sender))
+    }
+
+    /// Whether somebody else than the agent that watches itself can have begun a conversation of
+    /// this protocol within one of its own, in which a stranger speaks to it now: as the recruited
+    /// do to who has them recruited.
+    fn began_elsewhere(&self, library: &Library, at: u32, protocol: &str, sender: &str) -> bool {
+        let Some(agent) = &self.agent else {
+            return false;
+        };
+        let takes_part = |name: &str| {
+            let slot = self.table.slot(at);
+            slot.is_some_and(|slot| slot.conversation.takes_part(&self.names, name))
+        };
+        !takes_part(sender) && self.is_begun(library, at, protocol, |roles| !roles.of(agent))
+    }
+
+    /// Whether those with certain roles may begin it now.
+    fn is_begun(
+        &self,
+        library: &Library,
+        at: u32,
+        protocol: &str,
+        by: impl Fn(&Holders<'_>) -> u32,
+    ) -> bool {
         let Some((slot, machine)) = self.table.slot(at).zip(self.machine_of(library, at)) else {
             return false;
         };
-        let conversation = &slot.conversation;
         let inner = library.find(protocol);
-        let begins = self.names.is(conversation.initiator, sender);
-        conversation.parties.iter().any(|party| {
-            let roles = match machine.scope {
-                Scope::Participant if begins => 1 << machine.initiator,
-                Scope::Participant if self.names.is(party.peer, sender) => {
-                    !(1_u32 << machine.initiator)
-                }
-                Scope::Participant => 0,
-                Scope::Conversation => {
-                    let bound = conversation.bound.iter();
-                    let held = bound.filter(|bound| self.names.is(bound.agent, sender));
-                    held.fold(0, |mask, bound| mask | (1 << bound.role))
-                }
-            };
+        slot.conversation.parties.iter().any(|party| {
+            let roles = by(&Holders {
+                conversation: &slot.conversation,
+                machine,
+                party,
+                names: &self.names,
+            });
             let state = machine.state(party.state);
             let mut embedded = state.into_iter().flat_map(|state| &state.embedded);
             embedded.any(|sub| {
@@ -394,6 +422,7 @@ impl Monitor {
             due,
             opened: false,
             late: false,
+            void: false,
             state: None,
         };
         for made in &self.moves {
@@ -405,7 +434,8 @@ impl Monitor {
         if change.names_designated(&slot.conversation) {
             change.designate(&mut slot.conversation, header);
         }
-        let (opened, late, moved) = (change.opened, change.late, change.state);
+        let (opened, moved) = (change.opened, change.state);
+        let (late, void) = (change.late, change.void);
         let parties = &slot.conversation.parties;
         let first = parties.first().map_or(machine.initial, |party| party.state);
         let complete = slot.conversation.unnamed.is_none()
@@ -416,6 +446,7 @@ impl Monitor {
             opened,
             complete,
             late,
+            void,
         };
         let is_main = slot.parent == NONE;
         if is_main {

@@ -43,10 +43,15 @@ pub struct Accepted<'m> {
     pub opened: bool,
     /// Whether the protocol may end in the new state.
     pub ended: bool,
+    /// Whether nothing can follow in the new state but an answer to this message.
+    pub over: bool,
     /// Whether it may end in the states of all participants.
     pub complete: bool,
-    /// Whether it came after the `reply-by` of the message it answers.
+    /// Whether it came after the `reply-by` of the message it answers, or is void.
     pub late: bool,
+    /// Whether it answers a message in whose place another had come before: it was too late, and
+    /// changes nothing.
+    pub void: bool,
 }
 
 /// A message that does not fit.
@@ -133,6 +138,10 @@ pub enum Unchecked {
     /// It names nobody to whom it is sent.
     #[error("the message has no receiver")]
     NoReceiver,
+    /// It belongs to a protocol within its conversation that began between others: the agent that
+    /// watches itself was not told.
+    #[error("the protocol within the conversation began between others")]
+    BegunElsewhere,
     /// A conversation id or name is too long to be kept, or there are too many receivers.
     #[error(
         "the message is beyond what is watched: an id or a name too long, or too many receivers"

@@ -164,6 +164,9 @@ const ENGLISH: Table = Table {
         ("2", '>', "inform", "F"),
         ("bid", '>', "accept-proposal", "leads"),
         ("bid", '>', "reject-proposal", "lost"),
+        // What was bid crossed the next call, or the end.
+        ("bid", '>', "cfp", "2"),
+        ("bid", '>', "inform", "F"),
         ("lost", '>', "cfp", "2"),
         ("lost", '>', "inform", "F"),
         ("leads", '>', "cfp", "2 leading"),
@@ -187,6 +190,9 @@ const DUTCH: Table = Table {
         ("2", '>', "inform", "F"),
         ("3", '>', "accept-proposal", "Fbought"),
         ("3", '>', "reject-proposal", "Flate"),
+        // What was bid crossed the next call, or the end.
+        ("3", '>', "cfp", "2"),
+        ("3", '>', "inform", "F"),
         ("Fbought", '>', "cfp", "2"),
         ("Fbought", '>', "inform", "F"),
         ("Flate", '>', "cfp", "2"),
@@ -290,11 +296,13 @@ impl<'t> Walk<'t> {
         }
         let act = if act == "*" { "request" } else { act };
         let name = self.table.name;
+        let over = !self.table.rows.iter().any(|row| row.0 == to);
         let verdict = self.say(side, &act.parse().unwrap());
         match verdict {
             Verdict::Accepted(accepted) => {
                 assert_eq!(accepted.protocol, name);
                 let ended = to.starts_with('F');
+                assert_eq!(accepted.over, ended && over, "{name}: {before} {side}{act}");
                 let so = (accepted.ended, accepted.complete, accepted.opened);
                 assert_eq!(
                     so,

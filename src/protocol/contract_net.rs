@@ -1,12 +1,11 @@
-//! Calling for proposals and accepting some (FIPA00029).
+//! Calling for proposals and accepting some (FIPA00029), in several rounds if need be (FIPA00030).
 
-use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
-use fipa_transport::Outcome;
 
-use super::dialogue::{Dialogue, DialogueError, after};
+use super::bids::Bids;
+use super::dialogue::{Dialogue, DialogueError, after, name_of, unreached};
 use crate::agent::Agent;
 
 impl Agent {
@@ -32,49 +31,30 @@ impl Agent {
     /// ```
     ///
     /// # Errors
-    /// When the message is none that begins the protocol, or a participant breaks it.
+    /// When the message is none that begins the protocol, or cannot be sent.
     pub async fn contract_net(
         &self,
         call: MessageBuilder,
         receivers: &[AgentId],
         patience: Duration,
     ) -> Result<ContractNet<'_>, DialogueError> {
-        let due = after(patience);
-        let call = receivers
-            .iter()
-            .fold(call, |call, receiver| call.receiver(receiver.clone()));
-        let (dialogue, sent) = Dialogue::open(self, "fipa-contract-net", call, due).await?;
-        let mut silent = Vec::new();
-        let mut called = Vec::new();
-        for delivery in sent.0 {
-            let name = delivery.receiver.to_string();
-            match delivery.outcome {
-                Outcome::Failed { .. } => silent.push(name),
-                _ => called.push(name),
-            }
-        }
-        let mut net = ContractNet {
-            dialogue,
-            bids: Bids {
-                silent,
-                ..Bids::default()
-            },
-        };
-        net.collect(called, due).await?;
-        Ok(net)
+        ContractNet::begin(self, "fipa-contract-net", call, receivers, patience).await
     }
-}
 
-/// What came of a call.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-#[non_exhaustive]
-pub struct Bids {
-    /// The proposals, in the order in which they came.
-    pub proposals: Vec<Message>,
-    /// Who refused, or did not understand.
-    pub refusals: Vec<Message>,
-    /// Who did not answer in time, or could not be reached.
-    pub silent: Vec<String>,
+    /// The same with the leave to call again for better proposals
+    /// ([`ContractNet::call_again`], FIPA00030).
+    ///
+    /// # Errors
+    /// See [`contract_net`](Self::contract_net).
+    pub async fn iterated_contract_net(
+        &self,
+        call: MessageBuilder,
+        receivers: &[AgentId],
+        patience: Duration,
+    ) -> Result<ContractNet<'_>, DialogueError> {
+        let protocol = "fipa-iterated-contract-net";
+        ContractNet::begin(self, protocol, call, receivers, patience).await
+    }
 }
 
 /// A call for proposals whose time is up. Every proposal is to be decided upon with
@@ -83,6 +63,8 @@ pub struct Bids {
 pub struct ContractNet<'a> {
     dialogue: Dialogue<'a>,
     bids: Bids,
+    /// With whom it has not ended.
+    open: Vec<AgentId>,
 }
 
 /// What an agent whose proposal was accepted made of it.
@@ -95,8 +77,30 @@ pub struct Awarded {
     pub result: Result<Message, DialogueError>,
 }
 
-impl ContractNet<'_> {
-    /// What came of the call.
+impl<'a> ContractNet<'a> {
+    async fn begin(
+        agent: &'a Agent,
+        protocol: &str,
+        call: MessageBuilder,
+        receivers: &[AgentId],
+        patience: Duration,
+    ) -> Result<Self, DialogueError> {
+        let due = after(patience);
+        let call = call.receivers(receivers.to_vec());
+        let (dialogue, sent) = Dialogue::open(agent, protocol, call, due).await?;
+        let mut net = Self {
+            dialogue,
+            bids: Bids::default(),
+            open: receivers.to_vec(),
+        };
+        net.lose(unreached(&sent));
+        let called = net.open.iter().map(|agent| agent.name().to_owned());
+        let called = called.collect();
+        net.collect(called, due).await?;
+        Ok(net)
+    }
+
+    /// What came of the last call.
     #[must_use]
     pub fn bids(&self) -> &Bids {
         &self.bids
@@ -108,37 +112,53 @@ impl ContractNet<'_> {
         self.dialogue.id()
     }
 
-    async fn collect(
+    /// Calls those who made some of the proposals for better ones, and rejects the others
+    /// (FIPA00030); what came of it is in [`bids`](Self::bids), which holds the proposals of the
+    /// last round only.
+    ///
+    /// # Errors
+    /// When the protocol is not the iterated one, the message is no `cfp`, or cannot be sent.
+    pub async fn call_again(
         &mut self,
-        mut called: Vec<String>,
-        due: Option<Instant>,
+        invited: &[Message],
+        call: MessageBuilder,
+        patience: Duration,
     ) -> Result<(), DialogueError> {
-        while !called.is_empty() {
-            let message = match self.dialogue.hear(due).await {
-                Ok(heard) => heard.message,
-                Err(DialogueError::NotUnderstood(message)) => *message,
-                Err(DialogueError::TimedOut) => break,
-                // Who it is about is in the outcomes already.
-                Err(DialogueError::Undelivered(_)) => continue,
-                Err(other) => return Err(other),
-            };
-            let from = message.sender().map(|sender| sender.name().to_owned());
-            called.retain(|name| Some(name) != from.as_ref());
-            match message.performative() {
-                Performative::Propose => self.bids.proposals.push(message),
-                Performative::Failure => {}
-                _ => self.bids.refusals.push(message),
-            }
+        let due = after(patience);
+        let before = std::mem::take(&mut self.bids.proposals);
+        let (again, others): (Vec<_>, Vec<_>) = before
+            .into_iter()
+            .partition(|proposal| invited.contains(proposal));
+        let senders = again.iter().filter_map(|proposal| proposal.sender());
+        let senders: Vec<AgentId> = senders.cloned().collect();
+        let mut called: Vec<String> = again.iter().map(name_of).collect();
+        let sent = match senders.is_empty() {
+            true => None,
+            false => match self.dialogue.tell(call.receivers(senders), due).await {
+                Ok(sent) => Some(sent),
+                Err(error) => {
+                    // They can still be accepted.
+                    self.bids.proposals = again.into_iter().chain(others).collect();
+                    return Err(error);
+                }
+            },
+        };
+        self.bids = Bids::default();
+        if let Some(sent) = &sent {
+            self.lose(unreached(sent));
+            called.retain(|name| !unreached(sent).any(|lost| lost == name));
         }
-        self.bids.silent.extend(called);
-        Ok(())
+        for proposal in &others {
+            self.reject(proposal, "").await?;
+        }
+        self.collect(called, due).await
     }
 
     /// Accepts these proposals and rejects all others, and waits for what those who were accepted
     /// make of it. `content` goes with both.
     ///
     /// # Errors
-    /// When an answer cannot be sent, or somebody breaks the protocol.
+    /// When an answer cannot be sent. What becomes of each award is in the list.
     pub async fn award(
         &mut self,
         accepted: &[Message],
@@ -147,76 +167,135 @@ impl ContractNet<'_> {
     ) -> Result<Vec<Awarded>, DialogueError> {
         let due = after(patience);
         let mut results = Vec::new();
-        let mut at_work: HashMap<String, ()> = HashMap::new();
+        let mut at_work = Vec::new();
         for proposal in std::mem::take(&mut self.bids.proposals) {
+            if !accepted.contains(&proposal) {
+                self.reject(&proposal, content).await?;
+                continue;
+            }
             let agent = name_of(&proposal);
-            let (act, due) = if accepted.contains(&proposal) {
-                (Performative::AcceptProposal, due)
-            } else {
-                (Performative::RejectProposal, None)
-            };
-            let is_accepted = act == Performative::AcceptProposal;
+            let act = Performative::AcceptProposal;
             let answered = self
                 .dialogue
-                .answer(&proposal, act, content.to_owned(), due)
-                .await;
-            match answered {
-                Ok(()) if is_accepted => {
-                    at_work.insert(agent, ());
-                }
-                Ok(()) => {}
-                // Who has gone away needs no rejection.
-                Err(error @ DialogueError::NotDelivered { .. }) if is_accepted => {
+                .answer(&proposal, act, content.to_owned(), due);
+            match answered.await {
+                Ok(()) => at_work.push(agent),
+                Err(error @ DialogueError::NotDelivered { .. }) => {
+                    self.open.retain(|open| open.name() != agent);
                     let result = Err(error);
                     results.push(Awarded { agent, result });
                 }
-                Err(DialogueError::NotDelivered { .. }) => {}
                 Err(other) => return Err(other),
             }
         }
         while !at_work.is_empty() {
-            let result = match self.dialogue.hear(due).await {
-                Ok(heard) => Ok(heard.message),
-                Err(DialogueError::TimedOut) => break,
-                Err(DialogueError::NotUnderstood(message)) => {
-                    Err(DialogueError::NotUnderstood(message))
-                }
-                Err(DialogueError::Undelivered(_)) => continue,
-                Err(other) => return Err(other),
-            };
-            let (agent, result) = match result {
-                Ok(message) if *message.performative() == Performative::Failure => {
-                    let agent = name_of(&message);
-                    (agent, Err(DialogueError::Failed(Box::new(message))))
-                }
-                Ok(message) if *message.performative() == Performative::Propose => {
-                    // After the time of the call: what is late is rejected.
-                    let reject = Performative::RejectProposal;
-                    match self.dialogue.answer(&message, reject, "late", None).await {
-                        Ok(()) | Err(DialogueError::NotDelivered { .. }) => continue,
-                        Err(other) => return Err(other),
+            let (agent, result) = match self.dialogue.hear(due).await {
+                Ok(heard) if heard.meaning.void => continue,
+                Ok(heard) => {
+                    let message = heard.message;
+                    match message.performative() {
+                        Performative::Inform => (name_of(&message), Ok(message)),
+                        Performative::Failure => {
+                            let agent = name_of(&message);
+                            (agent, Err(DialogueError::Failed(Box::new(message))))
+                        }
+                        _ => {
+                            self.late(&message).await?;
+                            continue;
+                        }
                     }
                 }
-                Ok(message) => (name_of(&message), Ok(message)),
                 Err(DialogueError::NotUnderstood(message)) => {
                     let agent = name_of(&message);
                     (agent, Err(DialogueError::NotUnderstood(message)))
                 }
+                Err(DialogueError::Violation { violation, message }) => {
+                    let agent = name_of(&message);
+                    (agent, Err(DialogueError::Violation { violation, message }))
+                }
+                Err(DialogueError::TimedOut) => break,
+                Err(DialogueError::Undelivered(_)) => continue,
                 Err(other) => return Err(other),
             };
-            if at_work.remove(&agent).is_some() {
+            if let Some(at) = at_work.iter().position(|name| *name == agent) {
+                at_work.swap_remove(at);
+                if !matches!(result, Err(DialogueError::Violation { .. })) {
+                    self.open.retain(|open| open.name() != agent);
+                }
                 results.push(Awarded { agent, result });
             }
         }
-        for agent in at_work.into_keys() {
+        for agent in at_work {
             let result = Err(DialogueError::TimedOut);
             results.push(Awarded { agent, result });
         }
         Ok(results)
     }
-}
 
-fn name_of(message: &Message) -> String {
-    let sender = message.sender();
-    sender.map_or_else(String::new, |sender| sender.name().to_owned())
+    /// Cancels the call, with all with whom it has not ended: those who have not answered, whose
+    /// proposals are not decided upon, or who have not told the result. Waits until all have said
+    /// whether it is cancelled.
+    ///
+    /// # Errors
+    /// When somebody goes on ([`DialogueError::Failed`]), cannot be reached, or does not say in time
+    /// whether it does.
+    pub async fn cancel(mut self, patience: Duration) -> Result<(), DialogueError> {
+        self.dialogue.cancel(self.open, after(patience)).await
+    }
+
+    /// Waits until these have answered.
+    async fn collect(
+        &mut self,
+        mut called: Vec<String>,
+        due: Option<Instant>,
+    ) -> Result<(), DialogueError> {
+        while !called.is_empty() {
+            let Some((answer, over)) = self.bids.next(&mut self.dialogue, due).await? else {
+                break;
+            };
+            let from = name_of(&answer);
+            if over {
+                self.open.retain(|open| open.name() != from);
+            }
+            match called.iter().position(|name| *name == from) {
+                Some(at) => {
+                    called.swap_remove(at);
+                    self.bids.add(answer);
+                }
+                None => self.late(&answer).await?,
+            }
+        }
+        self.bids.silent.extend(called);
+        Ok(())
+    }
+
+    /// What is proposed after the time of the call is rejected; what else comes then ends by itself.
+    async fn late(&mut self, answer: &Message) -> Result<(), DialogueError> {
+        if *answer.performative() == Performative::Propose {
+            self.reject(answer, "late").await?;
+        }
+        Ok(())
+    }
+
+    async fn reject(&mut self, proposal: &Message, content: &str) -> Result<(), DialogueError> {
+        let from = name_of(proposal);
+        self.open.retain(|open| open.name() != from);
+        let act = Performative::RejectProposal;
+        let rejected = self
+            .dialogue
+            .answer(proposal, act, content.to_owned(), None);
+        match rejected.await {
+            // Who has gone away needs no rejection.
+            Ok(()) | Err(DialogueError::NotDelivered { .. }) => Ok(()),
+            Err(other) => Err(other),
+        }
+    }
+
+    /// These cannot be reached.
+    fn lose<'n>(&mut self, names: impl Iterator<Item = &'n str>) {
+        for name in names {
+            self.open.retain(|open| open.name() != name);
+            self.bids.silent.push(name.to_owned());
+        }
+    }
 }

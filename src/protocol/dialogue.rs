@@ -7,7 +7,7 @@ use fipa_acl::{AgentId, BuildError, Message, MessageBuilder, Performative, Time}
 use fipa_monitor::{Header, Monitor, Unchecked, Verdict, Violation};
 use fipa_transport::{FailureReason, Incarnation, Outcome};
 
-use crate::agent::{Agent, Deliveries, ReceiveError, SendError};
+use crate::agent::{Agent, Deliveries, Delivery, ReceiveError, SendError};
 
 /// Why a protocol did not yield what it was begun for.
 #[derive(Debug, thiserror::Error)]
@@ -56,6 +56,9 @@ pub enum DialogueError {
     /// The protocol cannot be followed with such a message.
     #[error("cannot be followed: {0}")]
     Unchecked(Unchecked),
+    /// Nobody has won the auction.
+    #[error("nobody has won the auction: no bid was accepted")]
+    NoWinner,
     /// The message cannot be built.
     #[error(transparent)]
     Build(#[from] BuildError),
@@ -67,11 +70,33 @@ pub enum DialogueError {
     Receive(ReceiveError),
 }
 
-/// What a message that was received means.
+/// A message that was received, and what it means.
 pub(super) struct Heard {
     pub(super) message: Message,
-    /// Whether the protocol has ended with its sender.
-    pub(super) ended: bool,
+    pub(super) meaning: Meaning,
+}
+
+/// What a message means to its conversation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Meaning {
+    pub(super) standing: Standing,
+    /// Whether nothing can follow from its sender any more.
+    pub(super) over: bool,
+    /// Whether it answers what has been said anew since, and changes nothing.
+    pub(super) void: bool,
+}
+
+/// Where a conversation is after a message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Standing {
+    /// In a state of its protocol.
+    Own,
+    /// It belongs to a protocol within that began between others.
+    Elsewhere,
+    NotUnderstood,
+    Cancelling,
+    Cancelled,
+    Undelivered,
 }
 
 /// A conversation. Dropped, it is no longer led; what still comes goes to [`Agent::receive`].
@@ -80,6 +105,8 @@ pub(super) struct Dialogue<'a> {
     protocol: String,
     id: String,
     monitor: Monitor,
+    /// Where its own protocol is, with whoever the last message concerned.
+    state: String,
     replies: u32,
 }
 
@@ -116,6 +143,7 @@ impl<'a> Dialogue<'a> {
             protocol: protocol.to_owned(),
             id,
             monitor: Monitor::agent(library, agent.name()),
+            state: String::new(),
             replies: 0,
         }
     }
@@ -126,13 +154,24 @@ impl<'a> Dialogue<'a> {
         message: MessageBuilder,
         due: Option<Instant>,
     ) -> Result<Deliveries, DialogueError> {
+        let message = message.protocol(self.protocol.as_str());
+        self.tell_within(message, due).await
+    }
+
+    /// The same in the protocol that the message names, which runs within this one.
+    pub(super) async fn tell_within(
+        &mut self,
+        message: MessageBuilder,
+        due: Option<Instant>,
+    ) -> Result<Deliveries, DialogueError> {
         self.replies += 1;
         let mut message = message
-            .protocol(self.protocol.as_str())
             .conversation_id(self.id.as_str())
             .reply_with(format!("{}--{}", self.id, self.replies));
+        let mut deadline = self.agent.domain().inner.deadline;
         if let Some(due) = due {
             let left = due.saturating_duration_since(Instant::now());
+            deadline = deadline.min(left);
             let by = SystemTime::now().checked_add(left);
             if let Some(by) = by.and_then(|by| Time::from_system_time(by).ok()) {
                 message = message.reply_by(by);
@@ -140,7 +179,7 @@ impl<'a> Dialogue<'a> {
         }
         let message = message.build()?;
         self.check(&message).map_err(Wrong::of_ours)?;
-        Ok(self.agent.send(message).await?)
+        Ok(self.agent.send_within(message, deadline).await?)
     }
 
     /// Answers a message of this conversation.
@@ -176,71 +215,105 @@ impl<'a> Dialogue<'a> {
             }
             Err(other) => return Err(DialogueError::Receive(other)),
         };
-        let state = self.check(&message);
-        let (state, ended) = state.map_err(|wrong| wrong.of_others(&message))?;
-        match state {
+        let meaning = self.check(&message);
+        let meaning = meaning.map_err(|wrong| wrong.of_others(&message))?;
+        match meaning.standing {
             Standing::NotUnderstood => Err(DialogueError::NotUnderstood(Box::new(message))),
             Standing::Cancelling => Err(DialogueError::Cancelled(Box::new(message))),
             Standing::Undelivered => Err(DialogueError::Undelivered(Box::new(message))),
-            Standing::Own => Ok(Heard { message, ended }),
+            _ => Ok(Heard { message, meaning }),
         }
     }
 
-    /// Cancels the conversation (FIPA's cancel meta-protocol), and waits whether it is cancelled.
+    /// Cancels the conversation with these (FIPA's cancel meta-protocol), and waits until all have
+    /// said whether it is cancelled. The first who did not cancel it is the error.
     pub(super) async fn cancel(
         &mut self,
-        receivers: Vec<AgentId>,
+        mut with: Vec<AgentId>,
         due: Option<Instant>,
     ) -> Result<(), DialogueError> {
-        let cancel = self
-            .agent
-            .message(Performative::Cancel)
-            .receivers(receivers);
-        only_delivered(&self.tell(cancel, due).await?)?;
-        loop {
-            let heard = self.hear_cancelling(due).await?;
-            match heard {
-                CancelAnswer::Cancelled => return Ok(()),
-                CancelAnswer::Not(message) => return Err(DialogueError::Failed(message)),
-                CancelAnswer::Crossed => {}
+        if with.is_empty() {
+            return Ok(());
+        }
+        let cancel = self.agent.message(Performative::Cancel);
+        let told = self.tell(cancel.receivers(with.clone()), due).await?;
+        let mut result = only_delivered(&told);
+        with.retain(|agent| !unreached(&told).any(|name| name == agent.name()));
+        while !with.is_empty() {
+            let (from, answer) = match self.hear(due).await {
+                Ok(Heard { message, meaning }) => {
+                    let from = name_of(&message);
+                    match meaning.standing {
+                        Standing::Cancelled => (from, Ok(())),
+                        _ => (from, Err(DialogueError::Failed(Box::new(message)))),
+                    }
+                }
+                Err(DialogueError::NotUnderstood(message)) => {
+                    let from = name_of(&message);
+                    (from, Err(DialogueError::NotUnderstood(message)))
+                }
+                // What had been said before the cancel came, or is known already.
+                Err(DialogueError::Cancelled(_) | DialogueError::Undelivered(_)) => continue,
+                Err(other) => return Err(other),
+            };
+            if let Some(at) = with.iter().position(|agent| agent.name() == from) {
+                with.swap_remove(at);
+                result = result.and(answer);
             }
         }
-    }
-
-    async fn hear_cancelling(
-        &mut self,
-        due: Option<Instant>,
-    ) -> Result<CancelAnswer, DialogueError> {
-        match self.hear(due).await {
-            Ok(heard) if heard.ended => Ok(CancelAnswer::Cancelled),
-            Ok(heard) => Ok(CancelAnswer::Not(Box::new(heard.message))),
-            // What had been said before the cancel came.
-            Err(DialogueError::Cancelled(_)) => Ok(CancelAnswer::Crossed),
-            Err(other) => Err(other),
-        }
+        result
     }
 
     pub(super) fn id(&self) -> &str {
         &self.id
     }
 
-    fn check(&mut self, message: &Message) -> Result<(Standing, bool), Wrong> {
-        match self
-            .monitor
-            .check(&Header::from(message), SystemTime::now())
-        {
+    /// The agent whose side of the conversation this is.
+    pub(super) fn agent(&self) -> &'a Agent {
+        self.agent
+    }
+
+    pub(super) fn state(&self) -> &str {
+        &self.state
+    }
+
+    /// Whether its protocol is the one of this name, whatever the messages call it.
+    pub(super) fn follows(&self, protocol: &str) -> bool {
+        let machine = self.monitor.library().find(&self.protocol);
+        machine.is_some_and(|machine| machine.is_called(protocol))
+    }
+
+    fn check(&mut self, message: &Message) -> Result<Meaning, Wrong> {
+        let now = SystemTime::now();
+        let own = Meaning {
+            standing: Standing::Own,
+            over: false,
+            void: false,
+        };
+        match self.monitor.check(&Header::from(message), now) {
             Verdict::Accepted(accepted) => {
-                let standing = match accepted.state {
-                    "not-understood" => Standing::NotUnderstood,
-                    "cancelling" => Standing::Cancelling,
-                    "undelivered" => Standing::Undelivered,
-                    _ => Standing::Own,
-                };
-                Ok((standing, accepted.ended))
+                if message.protocol().is_none_or(|name| name == self.protocol) {
+                    accepted.state.clone_into(&mut self.state);
+                }
+                Ok(Meaning {
+                    standing: match accepted.state {
+                        "not-understood" => Standing::NotUnderstood,
+                        "cancelling" => Standing::Cancelling,
+                        "cancelled" => Standing::Cancelled,
+                        "undelivered" => Standing::Undelivered,
+                        _ => Standing::Own,
+                    },
+                    over: accepted.over,
+                    void: accepted.void,
+                })
             }
             Verdict::Violation(violation) => Err(Wrong::Violation(violation)),
+            Verdict::Unchecked(Unchecked::BegunElsewhere) => Ok(Meaning {
+                standing: Standing::Elsewhere,
+                ..own
+            }),
             Verdict::Unchecked(why) => Err(Wrong::Unchecked(why)),
-            _ => Ok((Standing::Own, false)),
+            _ => Ok(own),
         }
     }
 }
@@ -249,19 +322,6 @@ impl Drop for Dialogue<'_> {
     fn drop(&mut self) {
         self.agent.desk.end(&self.id);
     }
-}
-
-enum Standing {
-    Own,
-    NotUnderstood,
-    Cancelling,
-    Undelivered,
-}
-
-enum CancelAnswer {
-    Cancelled,
-    Not(Box<Message>),
-    Crossed,
 }
 
 enum Wrong {
@@ -299,6 +359,19 @@ pub(super) fn only_delivered(deliveries: &Deliveries) -> Result<(), DialogueErro
         }
     }
     Ok(())
+}
+
+/// The names of the receivers who have not got it.
+pub(super) fn unreached(deliveries: &Deliveries) -> impl Iterator<Item = &str> {
+    let failed = |delivery: &&Delivery| !delivery.outcome.is_success();
+    let failed = deliveries.0.iter().filter(failed);
+    failed.map(|delivery| &*delivery.receiver)
+}
+
+/// The name of the sender.
+pub(super) fn name_of(message: &Message) -> String {
+    let sender = message.sender();
+    sender.map_or_else(String::new, |sender| sender.name().to_owned())
 }
 
 /// When a span from now is over; never, when that is beyond all times.

@@ -45,6 +45,8 @@ pub(crate) struct Reference<'l> {
 struct Conversation<'l> {
     machine: &'l Machine,
     initiator: &'static str,
+    /// Who watches himself.
+    agent: Option<&'static str>,
     /// One per participant, or a single one without a name.
     talks: Vec<(&'static str, Talk)>,
     /// With the members of a multicast.
@@ -81,11 +83,10 @@ impl<'l> Reference<'l> {
     }
 
     pub(crate) fn hear(&mut self, words: &Words, now: u64) -> Says {
-        let own = self.agent == Some(words.from);
         if let Some(conversation) = self.talks.get_mut(&words.id) {
             let library = self.library;
             return conversation
-                .hear_any(library, words, own, now)
+                .hear_any(library, words, now)
                 .unwrap_or_else(Says::Wrong);
         }
         let named = words
@@ -95,8 +96,8 @@ impl<'l> Reference<'l> {
         let Some(machine) = named else {
             return Says::Nothing;
         };
-        let mut conversation = Conversation::new(machine, words.from);
-        match conversation.hear(words, own, now) {
+        let mut conversation = Conversation::new(machine, words.from, self.agent);
+        match conversation.hear(words, now) {
             Ok(says) => {
                 self.talks.insert(words.id.clone(), conversation);
                 says
@@ -107,7 +108,7 @@ impl<'l> Reference<'l> {
 }
 
 impl<'l> Conversation<'l> {
-    fn new(machine: &'l Machine, initiator: &'static str) -> Self {
+    fn new(machine: &'l Machine, initiator: &'static str, agent: Option<&'static str>) -> Self {
         let mut talks = Vec::new();
         if machine.scope() == Scope::Conversation {
             talks.push(("", Talk::new(machine)));
@@ -115,6 +116,7 @@ impl<'l> Conversation<'l> {
         Self {
             machine,
             initiator,
+            agent,
             talks,
             multicast: None,
             roles: Vec::new(),
@@ -128,12 +130,11 @@ impl<'l> Conversation<'l> {
         &mut self,
         library: &'l Library,
         words: &Words,
-        own: bool,
         now: u64,
     ) -> Result<Says, &'static str> {
         let name = match &words.protocol {
             Some(name) if !self.machine.is_called(name) => name,
-            _ => return self.hear(words, own, now),
+            _ => return self.hear(words, now),
         };
         let may_begin = self.may_begin(library, name, words.from)
             || self
@@ -143,13 +144,19 @@ impl<'l> Conversation<'l> {
         let mut first_wrong = None;
         for inner in &mut self.inner {
             if inner.machine.is_called(name) {
-                match inner.hear(words, own, now) {
+                match inner.hear(words, now) {
                     Ok(says) => return Ok(says),
                     Err(wrong) => first_wrong = first_wrong.or(Some(wrong)),
                 }
             }
         }
         if !may_begin {
+            if let (Some(agent), None) = (self.agent, first_wrong)
+                && !self.takes_part(words.from)
+                && self.others_may_begin(library, name, agent)
+            {
+                return Ok(Says::Nothing);
+            }
             return Err(first_wrong.unwrap_or("wrong-protocol"));
         }
         let Some(machine) = library.find(name) else {
@@ -158,30 +165,60 @@ impl<'l> Conversation<'l> {
         if self.inner.len() == 64 {
             return Err("too-many");
         }
-        let mut inner = Conversation::new(machine, words.from);
+        let mut inner = Conversation::new(machine, words.from, self.agent);
         let says = inner
-            .hear(words, own, now)
+            .hear(words, now)
             .map_err(|_| first_wrong.unwrap_or("not-opened"))?;
         self.inner.insert(0, inner);
         Ok(says)
     }
 
     fn may_begin(&self, library: &Library, name: &str, from: &str) -> bool {
+        self.is_begun(library, name, |peer| {
+            let machine = self.machine;
+            match machine.scope() {
+                Scope::Participant if from == self.initiator => vec![machine.initiator()],
+                Scope::Participant if from == peer => self.roles_but(&[machine.initiator()]),
+                Scope::Participant => Vec::new(),
+                _ => self.roles_of(from),
+            }
+        })
+    }
+
+    /// Whether it can have begun behind the back of the agent that watches itself.
+    fn others_may_begin(&self, library: &Library, name: &str, agent: &str) -> bool {
         let machine = self.machine;
-        let roles: Vec<&str> = match machine.scope() {
-            Scope::Participant if from == self.initiator => vec![machine.initiator()],
-            Scope::Participant => {
-                let others = machine
-                    .roles()
-                    .iter()
-                    .filter(|role| *role != machine.initiator());
-                others.map(String::as_str).collect()
-            }
-            _ => {
-                let held = self.roles.iter().filter(|(_, agent)| *agent == from);
-                held.map(|(role, _)| role.as_str()).collect()
-            }
-        };
+        self.is_begun(library, name, |peer| match machine.scope() {
+            Scope::Participant if agent == self.initiator => self.roles_but(&[machine.initiator()]),
+            Scope::Participant if agent == peer => vec![machine.initiator()],
+            Scope::Participant => self.roles_but(&[]),
+            _ => self.roles_but(&self.roles_of(agent)),
+        })
+    }
+
+    fn roles_of(&self, agent: &str) -> Vec<&str> {
+        let held = self.roles.iter().filter(|(_, other)| *other == agent);
+        held.map(|(role, _)| role.as_str()).collect()
+    }
+
+    fn roles_but(&self, held: &[&str]) -> Vec<&str> {
+        let roles = self.machine.roles().iter().map(String::as_str);
+        roles.filter(|role| !held.contains(role)).collect()
+    }
+
+    fn takes_part(&self, agent: &str) -> bool {
+        agent == self.initiator
+            || self.talks.iter().any(|(peer, _)| *peer == agent)
+            || self.roles.iter().any(|(_, bound)| *bound == agent)
+    }
+
+    /// Whether those who have these roles with somebody may begin such a conversation within.
+    fn is_begun<'s>(
+        &'s self,
+        library: &Library,
+        name: &str,
+        by: impl Fn(&str) -> Vec<&'s str>,
+    ) -> bool {
         let names: Vec<&str> = match library.find(name) {
             Some(inner) => {
                 let aliases = inner.aliases().iter().map(String::as_str);
@@ -193,28 +230,28 @@ impl<'l> Conversation<'l> {
             let Spot::At(id) = &talk.spot else {
                 return false;
             };
-            let his = machine.scope() == Scope::Conversation || from == self.initiator;
-            (his || *peer == from)
-                && state(machine, id).subprotocols().iter().any(|sub| {
-                    roles.iter().any(|role| matches(sub.from(), role))
-                        && names.iter().any(|name| matches(sub.name(), name))
-                })
+            let roles = by(peer);
+            let mut embedded = state(self.machine, id).subprotocols().iter();
+            embedded.any(|sub| {
+                roles.iter().any(|role| matches(sub.from(), role))
+                    && names.iter().any(|name| matches(sub.name(), name))
+            })
         })
     }
 }
 
 impl Conversation<'_> {
-    fn hear(&mut self, words: &Words, own: bool, now: u64) -> Result<Says, &'static str> {
+    fn hear(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
         for (_, talk) in &mut self.talks {
             talk.expire(self.machine, now);
         }
         match self.machine.scope() {
-            Scope::Participant => self.hear_each(words, own, now),
-            _ => self.hear_all(words, own, now),
+            Scope::Participant => self.hear_each(words, now),
+            _ => self.hear_all(words, now),
         }
     }
 
-    fn view<'w>(&self, words: &'w Words, by_initiator: bool, own: bool) -> View<'w> {
+    fn view<'w>(&self, words: &'w Words, by_initiator: bool) -> View<'w> {
         let begins = self.machine.initiator();
         let (one, other): (Vec<String>, Vec<String>) = self
             .machine
@@ -234,11 +271,11 @@ impl Conversation<'_> {
             to,
             known: true,
             compares: true,
-            own,
+            own: self.agent == Some(words.from),
         }
     }
 
-    fn hear_each(&mut self, words: &Words, own: bool, now: u64) -> Result<Says, &'static str> {
+    fn hear_each(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
         let place = |talks: &[(&'static str, Talk)], name: &str| {
             talks.iter().position(|(peer, _)| *peer == name)
         };
@@ -256,7 +293,7 @@ impl Conversation<'_> {
             if words.to.iter().any(|name| addressed(&name)) {
                 return Err("wrong-receiver");
             }
-            let step = judge(machine, &talk, &self.view(words, false, own))?;
+            let step = judge(machine, &talk, &self.view(words, false))?;
             let at = known.unwrap_or_else(|| {
                 self.talks.push((words.from, talk));
                 self.talks.len() - 1
@@ -266,7 +303,14 @@ impl Conversation<'_> {
         }
         // To everybody or to nobody.
         let mut steps: Vec<(&'static str, bool, Step)> = Vec::new();
+        let witness = self
+            .agent
+            .filter(|agent| words.to.contains(agent) && words.from != *agent);
         for name in &words.to {
+            // What the others know is unknown.
+            if witness.is_some_and(|agent| agent != *name && !name.contains('*')) {
+                continue;
+            }
             let talk = match place(&self.talks, name) {
                 Some(at) => self.talks[at].1.clone(),
                 None if name.contains('*') && self.multicast.is_some() => {
@@ -275,10 +319,10 @@ impl Conversation<'_> {
                 None => Talk::new(machine),
             };
             let mut side = true;
-            let mut step = judge(machine, &talk, &self.view(words, true, own));
+            let mut step = judge(machine, &talk, &self.view(words, true));
             if step.is_err()
                 && *name == words.from
-                && let Ok(other) = judge(machine, &talk, &self.view(words, false, own))
+                && let Ok(other) = judge(machine, &talk, &self.view(words, false))
             {
                 (side, step) = (false, Ok(other));
             }
@@ -357,7 +401,7 @@ impl Conversation<'_> {
         Ok(self.says_state(first, false, false))
     }
 
-    fn hear_all(&mut self, words: &Words, own: bool, now: u64) -> Result<Says, &'static str> {
+    fn hear_all(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
         let machine = self.machine;
         let free: Vec<String> = machine
             .roles()
@@ -385,7 +429,7 @@ impl Conversation<'_> {
             to: to_roles,
             known: knows(words.from) && words.to.iter().all(|name| knows(name)),
             compares: self.roles.len() == 2,
-            ..self.view(words, words.from == self.initiator, own)
+            ..self.view(words, words.from == self.initiator)
         };
         let strange = words.to.iter().any(|name| nobody(name));
         let step = match judge(machine, &self.talks[0].1, &view) {

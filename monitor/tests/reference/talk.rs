@@ -39,6 +39,8 @@ pub(super) struct Step {
     pub(super) spot: Spot,
     pub(super) roles: Option<(String, String)>,
     pub(super) crossed: bool,
+    /// Answers what was said before the last thing.
+    pub(super) void: bool,
 }
 
 pub(super) fn to(spot: Spot) -> Step {
@@ -46,6 +48,7 @@ pub(super) fn to(spot: Spot) -> Step {
         spot,
         roles: None,
         crossed: false,
+        void: false,
     }
 }
 
@@ -103,6 +106,12 @@ impl Talk {
     pub(super) fn last_of(&self, initiator: bool) -> Option<&Said> {
         let mut said = self.said.iter().rev();
         said.find(|said| said.by_initiator == initiator && !said.cancels)
+    }
+
+    pub(super) fn earlier_of(&self, initiator: bool) -> Option<&Said> {
+        let said = self.said.iter().rev();
+        let mut his = said.filter(|said| said.by_initiator == initiator && !said.cancels);
+        his.nth(1)
     }
 
     pub(super) fn cancel(&self) -> Option<&Said> {
@@ -223,6 +232,7 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
                     spot: Spot::Cancelling(id),
                     crossed: true,
                     roles: step.roles,
+                    void: step.void,
                 },
                 // While cancelling, a failure counts as under way, too.
                 Spot::Undelivered(_) => Step {
@@ -251,7 +261,14 @@ pub(super) fn judge_at(
         if let (true, Some(asked), Some(answer)) = (view.compares, asked, &words.in_reply_to)
             && asked != answer
         {
-            return Err("wrong-reply");
+            let earlier = talk.earlier_of(!view.by_initiator);
+            return match earlier.and_then(|said| said.reply_with.as_ref()) {
+                Some(earlier) if earlier == answer && !view.own => Ok(Step {
+                    void: true,
+                    ..to(Spot::At(id.to_owned()))
+                }),
+                _ => Err("wrong-reply"),
+            };
         }
         return Ok(Step {
             roles: Some((taken.from().to_owned(), taken.to().to_owned())),
@@ -353,6 +370,10 @@ impl Talk {
         }
         let late =
             self.due.is_some_and(|due| due < now) && self.last_by_initiator() != by_initiator;
+        if step.void {
+            self.spot = step.spot;
+            return (opened, true);
+        }
         let cancels =
             matches!(step.spot, Spot::Cancelling(_)) && !matches!(self.spot, Spot::Cancelling(_));
         if !matches!(self.spot, Spot::Undelivered(_)) {

@@ -3,6 +3,8 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+mod plain;
+
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
@@ -505,107 +507,87 @@ fn the_recruited_answer_whom_they_are_told_to() {
     stage.wrong(recruit("inform rec>ann"));
 }
 
-/// The form of fipa_acl has one state for all.
-mod plain {
-    use super::*;
-
-    fn stage(text: &str) -> Stage {
-        let mut library = Library::standard();
-        library.add(Machine::read("lift", text).unwrap()).unwrap();
-        Stage::new(Monitor::observer(Arc::new(library)))
+#[test]
+fn a_bid_that_crosses_the_next_call_is_late_and_no_violation() {
+    let auction = |words| say_in("fipa-auction-english", words);
+    let call = |text| auction("cfp auc>ben").reply_with(text);
+    let bid = |text| auction("propose ben>auc").in_reply_to(text);
+    for name in [None, Some("auc")] {
+        let mut stage = Stage::new(match name {
+            None => Monitor::observer(library()),
+            Some(name) => Monitor::agent(library(), name),
+        });
+        stage.right(auction("inform auc>ben"));
+        stage.right(call("10"));
+        stage.right(call("20"));
+        assert_eq!(stage.wrong(bid("5")).kind, Kind::WrongReply);
+        let late = bid("10");
+        let Verdict::Accepted(accepted) = stage.check(&late) else {
+            panic!();
+        };
+        assert_eq!((accepted.state, accepted.late), ("called", true));
+        assert!(accepted.void);
+        // It was void: there is nothing to accept, and the last call can be answered.
+        stage.wrong(auction("accept-proposal auc>ben"));
+        assert_eq!(stage.right(bid("20")), "bidding");
     }
+    // Who bids knows the last call, or else the call comes when the bid has left.
+    let mut stage = Stage::new(Monitor::agent(library(), "ben"));
+    stage.right(auction("inform auc>ben"));
+    stage.right(call("10"));
+    stage.right(call("20"));
+    assert_eq!(stage.wrong(bid("10")).kind, Kind::WrongReply);
+    stage.right(bid("20"));
+    assert_eq!(stage.right(call("30")), "called");
+    stage.right(bid("30"));
+    assert_eq!(stage.right(auction("inform auc>ben")), "closed");
+}
 
-    fn lift(words: &'static str) -> Header<'static> {
-        say_in("lift", words)
-    }
+#[test]
+fn an_agent_knows_nothing_of_others_who_are_told_the_same() {
+    let iterated = |words| say_in("fipa-iterated-contract-net", words);
+    let mut stage = Stage::new(Monitor::agent(library(), "ben"));
+    stage.right(iterated("cfp ann>ben,cid"));
+    stage.right(iterated("propose ben>ann"));
+    // That cid has proposed, too, only ann can tell.
+    assert_eq!(stage.right(iterated("cfp ann>cid,ben")), "called");
+    assert_eq!(
+        stage.wrong(iterated("cfp ann>ben,cid")).kind,
+        Kind::OutOfOrder
+    );
+    let mut stage = Stage::observer();
+    stage.right(iterated("cfp ann>ben,cid"));
+    stage.right(iterated("propose ben>ann"));
+    assert_eq!(
+        stage.wrong(iterated("cfp ann>cid,ben")).kind,
+        Kind::OutOfOrder
+    );
+}
 
-    const LIFT: &str = r#"<scxml initial="1">
-        <state id="1"><transition performative="request" from="initiator" to="B" target="2"/></state>
-        <state id="2">
-            <transition performative="refuse" from="B" to="initiator" target="3"/>
-            <transition performative="agree" from="B" to="initiator" target="4"/>
-        </state>
-        <state id="3" final="yes"/>
-        <state id="4" final="yes">
-            <transition performative="inform" from="B" to="initiator" target="4"/>
-            <transition performative="failure" from="B" to="initiator" target="5"/>
-        </state>
-        <state id="5" final="yes"/></scxml>"#;
-
-    #[test]
-    fn a_conversation_has_one_state_for_all() {
-        let mut stage = stage(LIFT);
-        stage.right(lift("request ann>ben,cid"));
-        stage.right(lift("agree ben>ann"));
-        assert_eq!(stage.wrong(lift("agree cid>ann")).kind, Kind::Unexpected);
-        stage.right(lift("inform cid>ann"));
-        assert_eq!(stage.wrong(lift("inform dan>ann")).kind, Kind::Stranger);
-        assert_eq!(
-            stage.wrong(lift("inform ben>dan")).kind,
-            Kind::WrongReceiver
-        );
-        assert_eq!(stage.wrong(lift("inform ann>ben")).kind, Kind::WrongSender);
-        stage.right(lift("inform ben>ann"));
-        assert_eq!(stage.right(lift("failure ben>ann")), "5");
-        assert_eq!(stage.wrong(lift("inform ben>ann")).kind, Kind::Ended);
-    }
-
-    #[test]
-    fn anybody_cancels_and_fails() {
-        for (words, state) in [
-            ("not-understood ann>ben", "not-understood"),
-            ("not-understood ben>ann", "not-understood"),
-            ("cancel ann>ben", "cancelling"),
-            ("cancel ben>ann", "cancelling"),
-            ("failure ben>ann", "undelivered"),
-            ("failure host-mts>ann", "undelivered"),
-        ] {
-            let mut stage = stage(LIFT);
-            stage.right(lift("request ann>ben"));
-            assert_eq!(stage.right(lift(words)), state, "{words}");
-        }
-        let mut stage = stage(LIFT);
-        stage.right(lift("request ann>ben"));
-        stage.right(lift("cancel ben>ann"));
-        assert_eq!(stage.right(lift("inform ann>ben")), "cancelled");
-    }
-
-    #[test]
-    fn roles_are_given_when_they_are_first_used() {
-        let mut stage = stage(
-            r#"<scxml initial="1">
-            <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
-            <state id="2"><transition performative="propagate" from="b" to="c" target="3"/></state>
-            <state id="3"><transition performative="inform" from="c" to="a|b" target="4"/></state>
-            <state id="4" final="yes"><transition performative="my-.*" from=".*" to="a" target="4"/></state>
-            </scxml>"#,
-        );
-        stage.right(lift("request ann>ben"));
-        stage.right(lift("propagate ben>cid"));
-        assert_eq!(stage.wrong(lift("inform dan>ann")).kind, Kind::Stranger);
-        stage.wrong(lift("inform cid>dan"));
-        stage.right(lift("inform cid>ann"));
-        stage.right(lift("my-word zoe>ann"));
-        stage.wrong(lift("your-word zoe>ann"));
-        stage.wrong(lift("my-word ann>zoe"));
-    }
-
-    #[test]
-    fn sub_protocols_begin_where_the_file_allows_it() {
-        let mut stage = stage(
-            r#"<scxml initial="1">
-            <state id="1"><transition performative="propagate" from="i" to="B" target="2"/></state>
-            <state id="2" final="yes"><subprotocol name="fipa-.*" from="B"/></state></scxml>"#,
-        );
-        stage.right(lift("propagate ann>ben"));
-        stage.right(request("request ben>cid"));
-        stage.right(request("agree cid>ben"));
-        let query = stage.wrong(say_in("query", "query-if ben>cid"));
-        assert_eq!(query.kind, Kind::WrongProtocol);
-        stage.wrong(request("request ann>cid"));
-        stage.wrong(lift("inform ben>ann"));
-        stage.right(request("inform cid>ben"));
-    }
+#[test]
+fn who_had_others_recruited_cannot_check_their_answers() {
+    let recruit = |words| say_in("fipa-recruiting", words);
+    let mut stage = Stage::new(Monitor::agent(library(), "ann"));
+    stage.right(recruit("proxy ann>rec"));
+    let answer = || say_in("fipa-query", "inform ben>ann");
+    // Nobody can have been asked yet.
+    assert_eq!(stage.wrong(answer()).kind, Kind::WrongProtocol);
+    stage.right(recruit("agree rec>ann"));
+    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
+    assert_eq!(stage.check(&answer()), elsewhere);
+    stage.right(recruit("inform rec>ann"));
+    assert_eq!(stage.check(&answer()), elsewhere);
+    // Those who take part in the recruiting itself are no strangers.
+    let known = stage.wrong(say_in("fipa-query", "inform rec>ann"));
+    assert_eq!(known.kind, Kind::NotOpened);
+    let own = stage.wrong(say_in("fipa-query", "query-ref ann>ben"));
+    assert_eq!(own.kind, Kind::WrongProtocol);
+    // The recruiter has begun all there is itself.
+    let mut stage = Stage::new(Monitor::agent(library(), "rec"));
+    stage.right(recruit("proxy ann>rec"));
+    stage.right(recruit("agree rec>ann"));
+    let stranger = stage.wrong(say_in("fipa-query", "inform ben>rec"));
+    assert_eq!(stranger.kind, Kind::WrongProtocol);
 }
 
 #[test]

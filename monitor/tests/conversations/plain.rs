@@ -1,0 +1,101 @@
+//! Protocols in the form of fipa_acl, which has one state for all.
+
+use super::*;
+
+fn stage(text: &str) -> Stage {
+    let mut library = Library::standard();
+    library.add(Machine::read("lift", text).unwrap()).unwrap();
+    Stage::new(Monitor::observer(Arc::new(library)))
+}
+
+fn lift(words: &'static str) -> Header<'static> {
+    say_in("lift", words)
+}
+
+const LIFT: &str = r#"<scxml initial="1">
+    <state id="1"><transition performative="request" from="initiator" to="B" target="2"/></state>
+    <state id="2">
+        <transition performative="refuse" from="B" to="initiator" target="3"/>
+        <transition performative="agree" from="B" to="initiator" target="4"/>
+    </state>
+    <state id="3" final="yes"/>
+    <state id="4" final="yes">
+        <transition performative="inform" from="B" to="initiator" target="4"/>
+        <transition performative="failure" from="B" to="initiator" target="5"/>
+    </state>
+    <state id="5" final="yes"/></scxml>"#;
+
+#[test]
+fn a_conversation_has_one_state_for_all() {
+    let mut stage = stage(LIFT);
+    stage.right(lift("request ann>ben,cid"));
+    stage.right(lift("agree ben>ann"));
+    assert_eq!(stage.wrong(lift("agree cid>ann")).kind, Kind::Unexpected);
+    stage.right(lift("inform cid>ann"));
+    assert_eq!(stage.wrong(lift("inform dan>ann")).kind, Kind::Stranger);
+    assert_eq!(
+        stage.wrong(lift("inform ben>dan")).kind,
+        Kind::WrongReceiver
+    );
+    assert_eq!(stage.wrong(lift("inform ann>ben")).kind, Kind::WrongSender);
+    stage.right(lift("inform ben>ann"));
+    assert_eq!(stage.right(lift("failure ben>ann")), "5");
+    assert_eq!(stage.wrong(lift("inform ben>ann")).kind, Kind::Ended);
+}
+
+#[test]
+fn anybody_cancels_and_fails() {
+    for (words, state) in [
+        ("not-understood ann>ben", "not-understood"),
+        ("not-understood ben>ann", "not-understood"),
+        ("cancel ann>ben", "cancelling"),
+        ("cancel ben>ann", "cancelling"),
+        ("failure ben>ann", "undelivered"),
+        ("failure host-mts>ann", "undelivered"),
+    ] {
+        let mut stage = stage(LIFT);
+        stage.right(lift("request ann>ben"));
+        assert_eq!(stage.right(lift(words)), state, "{words}");
+    }
+    let mut stage = stage(LIFT);
+    stage.right(lift("request ann>ben"));
+    stage.right(lift("cancel ben>ann"));
+    assert_eq!(stage.right(lift("inform ann>ben")), "cancelled");
+}
+
+#[test]
+fn roles_are_given_when_they_are_first_used() {
+    let mut stage = stage(
+        r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="propagate" from="b" to="c" target="3"/></state>
+        <state id="3"><transition performative="inform" from="c" to="a|b" target="4"/></state>
+        <state id="4" final="yes"><transition performative="my-.*" from=".*" to="a" target="4"/></state>
+        </scxml>"#,
+    );
+    stage.right(lift("request ann>ben"));
+    stage.right(lift("propagate ben>cid"));
+    assert_eq!(stage.wrong(lift("inform dan>ann")).kind, Kind::Stranger);
+    stage.wrong(lift("inform cid>dan"));
+    stage.right(lift("inform cid>ann"));
+    stage.right(lift("my-word zoe>ann"));
+    stage.wrong(lift("your-word zoe>ann"));
+    stage.wrong(lift("my-word ann>zoe"));
+}
+
+#[test]
+fn sub_protocols_begin_where_the_file_allows_it() {
+    let mut stage = stage(
+        r#"<scxml initial="1">
+        <state id="1"><transition performative="propagate" from="i" to="B" target="2"/></state>
+        <state id="2" final="yes"><subprotocol name="fipa-.*" from="B"/></state></scxml>"#,
+    );
+    stage.right(lift("propagate ann>ben"));
+    stage.right(request("request ben>cid"));
+    stage.right(request("agree cid>ben"));
+    let query = stage.wrong(say_in("query", "query-if ben>cid"));
+    assert_eq!(query.kind, Kind::WrongProtocol);
+    stage.wrong(request("request ann>cid"));
+    stage.wrong(lift("inform ben>ann"));
+    stage.right(request("inform cid>ben"));
+}

@@ -1,0 +1,173 @@
+//! Those who ask for others: brokers and recruiters.
+
+use super::*;
+
+/// A rover, somebody who asks for it, and an arm that is asked: each in a process of its own.
+async fn three(go_between: &str) -> [Agent; 3] {
+    let config = config(&["monitor.check=enforce"]);
+    let join = async |name: &str| {
+        let domain = Domain::open(&config).await.unwrap();
+        domain.register(name).unwrap()
+    };
+    [
+        join("rover").await,
+        join(go_between).await,
+        join("arm").await,
+    ]
+}
+
+fn proxy(rover: &Agent, go_between: &Agent) -> MessageBuilder {
+    to(rover, Performative::Proxy, go_between, "any arm: load?")
+}
+
+fn query(from: &Agent, arm: &str) -> MessageBuilder {
+    from.message(Performative::QueryRef)
+        .receiver(AgentId::new(arm).unwrap())
+        .protocol("fipa-query")
+        .content("load?")
+}
+
+/// Agrees and answers, whoever wants to know.
+async fn answer(arm: &Agent) -> Message {
+    let first = arm.receive().await.unwrap().message;
+    assert_eq!(first.protocol(), Some("fipa-query"));
+    respond(arm, &first, async |task| {
+        task.agree("wait").await?;
+        Ok(Reply::Inform("42".into()))
+    })
+    .await
+    .unwrap();
+    first
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_broker_passes_answers_back() {
+    let [rover, broker, arm] = three("broker").await;
+    let initiator = async {
+        let proxy = proxy(&rover, &broker);
+        let mut answers = rover.brokering(proxy, PATIENCE).await.unwrap();
+        let agreed = answers.next(PATIENCE).await.unwrap();
+        assert_eq!(*agreed.performative(), Performative::Agree);
+        let informed = answers.next(PATIENCE).await.unwrap();
+        assert_eq!(*informed.performative(), Performative::Inform);
+        assert_eq!(informed.sender().unwrap().name(), "broker");
+        assert_eq!(text(&informed), "42");
+        assert_eq!(informed.language(), Some("fipa-sl"));
+        let failed = answers.next(PATIENCE).await;
+        assert!(matches!(&failed, Err(DialogueError::Failed(why)) if text(why) == "no more"));
+    };
+    let goes_between = async {
+        let first = broker.receive().await.unwrap().message;
+        let mut task = broker.take_part(&first).unwrap();
+        // Not before it has agreed.
+        let early = task.pass_on(query(&broker, "arm"), PATIENCE).await;
+        assert!(matches!(early, Err(DialogueError::WouldViolate(_))));
+        task.agree("").await.unwrap();
+        let lost = task.pass_on(query(&broker, "nobody"), PATIENCE).await;
+        assert!(matches!(lost, Err(DialogueError::NotDelivered { .. })));
+        task.pass_on(query(&broker, "arm"), PATIENCE).await.unwrap();
+        task.inform("passed on").await.unwrap();
+        let mut passed = 0;
+        while let Some(answer) = task.next_answer(PATIENCE).await.unwrap() {
+            let mut answer = answer;
+            if *answer.performative() == Performative::Inform {
+                let again = broker.message(Performative::Inform).language("fipa-sl");
+                let content = answer.content().unwrap().clone();
+                answer = again.content(content).build().unwrap();
+            }
+            task.forward(&answer).await.unwrap();
+            passed += 1;
+        }
+        assert_eq!(passed, 2);
+        task.reply(Reply::Failure("no more".into())).await.unwrap();
+    };
+    tokio::join!(initiator, goes_between, answer(&arm));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_recruited_answer_directly() {
+    let [rover, recruiter, arm] = three("recruiter").await;
+    let initiator = async {
+        let proxy = proxy(&rover, &recruiter);
+        let mut answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
+        for act in [Performative::Agree, Performative::Inform] {
+            let answer = answers.next(PATIENCE).await.unwrap();
+            assert_eq!(*answer.performative(), act);
+            assert_eq!(answer.sender().unwrap().name(), "arm");
+        }
+        let none = answers.next(Duration::from_millis(100)).await;
+        assert!(matches!(none, Err(DialogueError::TimedOut)));
+    };
+    let (early, answered) = tokio::sync::oneshot::channel();
+    let goes_between = async {
+        let first = recruiter.receive().await.unwrap().message;
+        let mut task = recruiter.take_part(&first).unwrap();
+        task.agree("").await.unwrap();
+        task.pass_on(query(&recruiter, "arm"), PATIENCE)
+            .await
+            .unwrap();
+        // The recruited may be faster than the word that they are.
+        answered.await.unwrap();
+        task.inform("recruited").await.unwrap();
+        assert!(task.next_answer(PATIENCE).await.unwrap().is_none());
+    };
+    let recruited = async {
+        let first = answer(&arm).await;
+        assert_eq!(first.reply_to()[0].name(), "rover");
+        assert_eq!(first.sender().unwrap().name(), "recruiter");
+        early.send(()).unwrap();
+    };
+    tokio::join!(initiator, goes_between, recruited);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_asks_for_others_may_refuse_and_find_nobody() {
+    let [rover, broker, _arm] = three("broker").await;
+    let initiator = async {
+        let refused = rover.brokering(proxy(&rover, &broker), PATIENCE).await;
+        assert!(matches!(refused.err(), Some(DialogueError::Refused(_))));
+        let nobody = rover.recruiting(proxy(&rover, &broker), PATIENCE).await;
+        assert!(matches!(nobody.err(), Some(DialogueError::Failed(_))));
+        let moment = Duration::from_secs(1);
+        let silent = rover.brokering(proxy(&rover, &broker), moment).await;
+        assert!(matches!(silent.err(), Some(DialogueError::TimedOut)));
+    };
+    let goes_between = async {
+        let first = broker.receive().await.unwrap().message;
+        respond(&broker, &first, async |_| Ok(Reply::Refuse("no".into())))
+            .await
+            .unwrap();
+        let first = broker.receive().await.unwrap().message;
+        respond(&broker, &first, async |task| {
+            task.agree("").await?;
+            Ok(Reply::Failure("no match".into()))
+        })
+        .await
+        .unwrap();
+    };
+    tokio::join!(initiator, goes_between);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn brokering_is_cancelled() {
+    let [rover, broker, arm] = three("broker").await;
+    let initiator = async {
+        let proxy = proxy(&rover, &broker);
+        let answers = rover.brokering(proxy, PATIENCE).await.unwrap();
+        answers.cancel(PATIENCE).await.unwrap();
+    };
+    let goes_between = async {
+        let first = broker.receive().await.unwrap().message;
+        let mut task = broker.take_part(&first).unwrap();
+        task.agree("").await.unwrap();
+        task.pass_on(query(&broker, "arm"), PATIENCE).await.unwrap();
+        task.inform("passed on").await.unwrap();
+        // The arm never answers.
+        let cancelled = task.next_answer(PATIENCE).await;
+        assert!(matches!(cancelled, Err(DialogueError::Cancelled(_))));
+        let nothing = task.confirm_cancel().await.unwrap();
+        task.reply(nothing).await.unwrap();
+    };
+    tokio::join!(initiator, goes_between);
+    assert!(arm.try_receive().unwrap().is_some());
+}

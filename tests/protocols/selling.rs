@@ -1,0 +1,349 @@
+//! The iterated contract net and the auctions; and a contract net that is cancelled or disturbed.
+
+use super::*;
+
+/// A rover here, and others there.
+async fn rover_and<const N: usize>(names: [&str; N]) -> (Agent, [Agent; N]) {
+    let (here, there) = two(&["monitor.check=enforce"]).await;
+    let rover = here.register("rover").unwrap();
+    (rover, names.map(|name| there.register(name).unwrap()))
+}
+
+fn ids(agents: &[Agent]) -> Vec<AgentId> {
+    agents.iter().map(|agent| agent.id().clone()).collect()
+}
+
+fn cfp(agent: &Agent, content: &str) -> MessageBuilder {
+    agent.message(Performative::Cfp).content(content.to_owned())
+}
+
+fn from<'m>(messages: &'m [Message], name: &str) -> &'m Message {
+    let mut messages = messages.iter();
+    let sent = |message: &&Message| message.sender().is_some_and(|sender| sender.name() == name);
+    messages.find(sent).unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_iterated_contract_net_goes_on_with_some() {
+    let (rover, arms) = rover_and(["cheap", "dear", "stubborn"]).await;
+    let called = ids(&arms);
+    // Proposes these prices one after the other; how often it was called.
+    let bid = async |arm: &Agent, prices: &[&'static str]| {
+        let call = arm.receive().await.unwrap().message;
+        let mut task = arm.take_part(&call).unwrap();
+        let mut calls = 1;
+        for price in prices {
+            if task.propose(*price, PATIENCE).await.unwrap() {
+                assert_eq!(text(task.message()), "yours");
+                task.reply(Reply::Inform("carried".into())).await.unwrap();
+                return (calls, true);
+            }
+            match task.next_call(PATIENCE).await.unwrap() {
+                Some(call) => assert_eq!(text(&call), "cheaper?"),
+                None => return (calls, false),
+            }
+            calls += 1;
+        }
+        task.reply(Reply::Refuse("no".into())).await.unwrap();
+        (calls, false)
+    };
+    let initiator = async {
+        let mut net = rover
+            .iterated_contract_net(cfp(&rover, "carry"), &called, PATIENCE)
+            .await
+            .unwrap();
+        assert_eq!(net.bids().proposals.len(), 3);
+        let some = [
+            from(&net.bids().proposals, "cheap").clone(),
+            from(&net.bids().proposals, "stubborn").clone(),
+        ];
+        net.call_again(&some, cfp(&rover, "cheaper?"), PATIENCE)
+            .await
+            .unwrap();
+        let bids = net.bids().clone();
+        assert_eq!((bids.proposals.len(), bids.refusals.len()), (1, 1));
+        assert!(bids.silent.is_empty() && bids.violations.is_empty());
+        let results = net.award(&bids.proposals, "yours", PATIENCE).await.unwrap();
+        assert_eq!(results[0].agent, "cheap");
+        assert_eq!(text(results[0].result.as_ref().unwrap()), "carried");
+    };
+    let (_, cheap, dear, stubborn) = tokio::join!(
+        initiator,
+        bid(&arms[0], &["20", "10"]),
+        bid(&arms[1], &["99"]),
+        bid(&arms[2], &["30"])
+    );
+    assert_eq!(cheap, (2, true));
+    assert_eq!(dear, (1, false), "rejected, and told so");
+    assert_eq!(stubborn, (2, false));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_contract_net_is_not_called_again() {
+    let (rover, arms) = rover_and(["arm"]).await;
+    let initiator = async {
+        let mut net = rover
+            .contract_net(cfp(&rover, "carry"), &ids(&arms), PATIENCE)
+            .await
+            .unwrap();
+        let bids = net.bids().proposals.clone();
+        let again = net.call_again(&bids, cfp(&rover, "cheaper?"), PATIENCE);
+        assert!(matches!(again.await, Err(DialogueError::WouldViolate(_))));
+        // Nothing is lost by that.
+        let results = net.award(&bids, "", PATIENCE).await.unwrap();
+        assert!(results[0].result.is_ok());
+    };
+    let participant = async {
+        let call = arms[0].receive().await.unwrap().message;
+        let mut task = arms[0].take_part(&call).unwrap();
+        assert!(task.propose("10", PATIENCE).await.unwrap());
+        task.reply(Reply::Inform("done".into())).await.unwrap();
+    };
+    tokio::join!(initiator, participant);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_breaks_a_contract_net_spoils_it_for_nobody_else() {
+    // The arms do not check what they send.
+    let unchecked = config(&[]);
+    let mut checked = config(&["monitor.check=enforce"]);
+    checked.domain.clone_from(&unchecked.domain);
+    let (here, there) = (
+        Domain::open(&checked).await.unwrap(),
+        Domain::open(&unchecked).await.unwrap(),
+    );
+    let rover = here.register("rover").unwrap();
+    let arms = ["wild", "tame"].map(|name| there.register(name).unwrap());
+    let [wild, tame] = &arms;
+    let participants = async {
+        let call = wild.receive().await.unwrap().message;
+        let early = wild.reply(&call, Performative::Inform).build().unwrap();
+        wild.send(early).await.unwrap();
+        let late = wild.reply(&call, Performative::Propose).build().unwrap();
+        wild.send(late).await.unwrap();
+        let call = tame.receive().await.unwrap().message;
+        let mut task = tame.take_part(&call).unwrap();
+        assert!(task.propose("10", PATIENCE).await.unwrap());
+        // In the middle of the work of the other.
+        let wrong = wild.reply(&call, Performative::Agree).build().unwrap();
+        wild.send(wrong).await.unwrap();
+        task.reply(Reply::Inform("done".into())).await.unwrap();
+    };
+    let initiator = async {
+        let mut net = rover
+            .contract_net(cfp(&rover, "carry"), &ids(&arms), PATIENCE)
+            .await
+            .unwrap();
+        let bids = net.bids().clone();
+        assert_eq!(bids.proposals.len(), 2);
+        let [violation] = &bids.violations[..] else {
+            panic!("{bids:?}");
+        };
+        assert_eq!(
+            (violation.sender.as_str(), violation.kind),
+            ("wild", ViolationKind::OutOfOrder)
+        );
+        let tame = from(&bids.proposals, "tame").clone();
+        let results = net.award(&[tame], "", PATIENCE).await.unwrap();
+        assert_eq!(results.len(), 1);
+        assert!(results[0].result.is_ok());
+    };
+    tokio::join!(participants, initiator);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_contract_net_is_cancelled_with_all_with_whom_it_goes_on() {
+    let (rover, arms) = rover_and(["waiting", "thinking", "refusing"]).await;
+    let [waiting, thinking, refusing] = &arms;
+    let waits = async {
+        let call = waiting.receive().await.unwrap().message;
+        let mut task = waiting.take_part(&call).unwrap();
+        let cancelled = task.propose("10", PATIENCE).await;
+        assert!(matches!(cancelled, Err(DialogueError::Cancelled(_))));
+        let nothing = task.confirm_cancel().await.unwrap();
+        task.reply(nothing).await.unwrap();
+    };
+    let thinks = async {
+        let call = thinking.receive().await.unwrap().message;
+        let mut task = thinking.take_part(&call).unwrap();
+        task.cancelled().await.unwrap();
+        let nothing = task.confirm_cancel().await.unwrap();
+        task.reply(nothing).await.unwrap();
+    };
+    let refuses = async {
+        let call = refusing.receive().await.unwrap().message;
+        respond(refusing, &call, async |_| Ok(Reply::Refuse("no".into())))
+            .await
+            .unwrap();
+    };
+    let initiator = async {
+        // Long enough for the two that answer, and the third never does.
+        let patience = Duration::from_secs(3);
+        let net = rover
+            .contract_net(cfp(&rover, "carry"), &ids(&arms), patience)
+            .await
+            .unwrap();
+        assert_eq!(net.bids().silent, ["thinking"]);
+        net.cancel(PATIENCE).await.unwrap();
+    };
+    tokio::join!(initiator, waits, thinks, refuses);
+    assert!(refusing.try_receive().unwrap().is_none(), "has ended");
+}
+
+/// Bids while the price is right, and says how often it was called and what it was asked for.
+async fn bidder(
+    agent: &Agent,
+    right: impl Fn(u32) -> bool,
+    buys: usize,
+) -> (usize, usize, Option<String>) {
+    let opening = agent.receive().await.unwrap().message;
+    assert_eq!(text(&opening), "a crate");
+    let mut task = agent.take_part(&opening).unwrap();
+    let (mut calls, mut bought) = (0, 0);
+    while let Some(call) = task.next_call(PATIENCE).await.unwrap() {
+        calls += 1;
+        let price = text(&call).parse().unwrap();
+        if right(price) && task.state() != "called-leading" && bought < buys {
+            bought += usize::from(task.propose("", PATIENCE).await.unwrap());
+        }
+    }
+    let mut asked = None;
+    if task.state() == "won" {
+        asked = Some(text(&task.next(PATIENCE).await.unwrap()).to_owned());
+    }
+    (calls, bought, asked)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_english_auction_is_won_by_who_bids_last() {
+    let (rover, arms) = rover_and(["rich", "poor"]).await;
+    let mut bidders = ids(&arms);
+    bidders.push(AgentId::new("nobody").unwrap());
+    let auctioneer = async {
+        let opening = rover.message(Performative::Inform).content("a crate");
+        let mut auction = rover.english_auction(opening, &bidders).await.unwrap();
+        assert_eq!(auction.bidders(), ids(&arms));
+        // Both bid, and one is accepted; what the other bid is rejected with the next call.
+        let bids = auction.call("10", PATIENCE).await.unwrap();
+        assert_eq!(bids.proposals.len(), 2);
+        auction
+            .accept(from(&bids.proposals, "poor"), "yours")
+            .await
+            .unwrap();
+        assert_eq!(auction.leader().unwrap().name(), "poor");
+        let twice = auction.accept(from(&bids.proposals, "poor"), "").await;
+        assert!(matches!(twice, Err(DialogueError::WouldViolate(_))));
+        let moment = Duration::from_secs(2);
+        let bids = auction.call("20", moment).await.unwrap();
+        assert_eq!(bids.silent, ["poor"], "it leads");
+        auction.accept(&bids.proposals[0], "").await.unwrap();
+        // 30 is more than the other has.
+        let bids = auction.call("30", moment).await.unwrap();
+        assert_eq!(bids.proposals, []);
+        auction.close("sold").await.unwrap();
+        assert_eq!(auction.leader().unwrap().name(), "rich");
+        assert!(auction.close("sold again").await.is_err());
+        auction.ask_winner("take it").await.unwrap();
+    };
+    let (_, rich, poor) = tokio::join!(
+        auctioneer,
+        bidder(&arms[0], |price| price <= 50, 9),
+        bidder(&arms[1], |price| price <= 10, 9)
+    );
+    assert_eq!(rich, (3, 1, Some("take it".to_owned())));
+    assert_eq!(poor, (3, 1, None), "outbid");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_dutch_auction_goes_on_while_something_is_left() {
+    let (rover, arms) = rover_and(["eager", "patient"]).await;
+    let auctioneer = async {
+        let opening = rover.message(Performative::Inform).content("a crate");
+        let mut auction = rover.dutch_auction(opening, &ids(&arms)).await.unwrap();
+        let mut sold = Vec::new();
+        let mut price = 40;
+        while sold.len() < 2 {
+            let moment = Duration::from_secs(1);
+            let bids = auction.call(price.to_string(), moment).await.unwrap();
+            if let Some(first) = bids.proposals.first() {
+                auction.accept(first, "").await.unwrap();
+                let buyer = auction.leader().unwrap().name().to_owned();
+                sold.push((buyer, price));
+            }
+            price -= 10;
+        }
+        auction.close("all gone").await.unwrap();
+        // There is nobody to be asked in this one.
+        let asked = auction.ask_winner("take it").await;
+        assert!(matches!(asked, Err(DialogueError::WouldViolate(_))));
+        sold
+    };
+    let (sold, eager, patient) = tokio::join!(
+        auctioneer,
+        bidder(&arms[0], |price| price <= 30, 1),
+        bidder(&arms[1], |price| price <= 10, 1)
+    );
+    let name = |name: &str, price| (name.to_owned(), price);
+    assert_eq!(sold, [name("eager", 30), name("patient", 10)]);
+    assert_eq!((eager.1, patient.1), (1, 1));
+    assert_eq!((eager.0, patient.0), (4, 4));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_auction_without_a_bid_has_no_winner() {
+    let (rover, arms) = rover_and(["arm"]).await;
+    let auctioneer = async {
+        let opening = rover.message(Performative::Inform).content("a crate");
+        let mut auction = rover.english_auction(opening, &ids(&arms)).await.unwrap();
+        let moment = Duration::from_millis(300);
+        assert!(
+            auction
+                .call("10", moment)
+                .await
+                .unwrap()
+                .proposals
+                .is_empty()
+        );
+        auction.close("not sold").await.unwrap();
+        let nobody = auction.ask_winner("take it").await;
+        assert!(matches!(nobody, Err(DialogueError::NoWinner)));
+    };
+    let (_, bid) = tokio::join!(auctioneer, bidder(&arms[0], |_| false, 0));
+    assert_eq!(bid, (1, 0, None));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_bid_that_crosses_the_next_call_does_not_count() {
+    let (rover, arms) = rover_and(["arm"]).await;
+    let [arm] = &arms;
+    let (first_over, told) = tokio::sync::oneshot::channel();
+    let auctioneer = async {
+        let opening = rover.message(Performative::Inform).content("a crate");
+        let mut auction = rover.english_auction(opening, &ids(&arms)).await.unwrap();
+        let moment = Duration::from_millis(300);
+        let bids = auction.call("10", moment).await.unwrap();
+        assert_eq!(bids.silent, ["arm"]);
+        first_over.send(()).unwrap();
+        let bids = auction.call("20", PATIENCE).await.unwrap();
+        assert_eq!(bids.proposals.len(), 1);
+        assert_eq!(text(&bids.proposals[0]), "for 20");
+        assert!(bids.violations.is_empty());
+        auction.accept(&bids.proposals[0], "").await.unwrap();
+        auction.close("sold").await.unwrap();
+        auction.ask_winner("take it").await.unwrap();
+    };
+    let participant = async {
+        let opening = arm.receive().await.unwrap().message;
+        let mut task = arm.take_part(&opening).unwrap();
+        task.next_call(PATIENCE).await.unwrap().unwrap();
+        // The second call is on its way when this bid leaves.
+        told.await.unwrap();
+        assert!(!task.propose("for 10", PATIENCE).await.unwrap());
+        let second = task.next_call(PATIENCE).await.unwrap().unwrap();
+        assert_eq!(text(&second), "20");
+        assert!(task.propose("for 20", PATIENCE).await.unwrap());
+        assert!(task.next_call(PATIENCE).await.unwrap().is_none());
+        assert_eq!(text(&task.next(PATIENCE).await.unwrap()), "take it");
+    };
+    tokio::join!(auctioneer, participant);
+}
