@@ -520,7 +520,8 @@ impl Shared {
             if let Some(found) = look() {
                 return found;
             }
-            if self.drive() {
+            // Who does not spin is called for everything; a look of its own would be in vain.
+            if !self.config.spin.is_zero() && self.drive() {
                 continue;
             }
             if started.elapsed() < self.config.spin {

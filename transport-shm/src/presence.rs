@@ -212,13 +212,12 @@ impl Drop for Presence {
 pub(crate) struct Bell(File);
 
 impl Bell {
-    /// Takes all bytes out; `WouldBlock` when there are none.
-    pub(crate) fn silence(&self) -> io::Result<()> {
+    /// Takes bytes out. Says whether these were all: then nothing is heard until it is rung again.
+    pub(crate) fn silence(&self) -> bool {
         let mut bytes = [0; 512];
-        match (&self.0).read(&mut bytes)? {
-            0 => Err(ErrorKind::WouldBlock.into()),
-            _ => Ok(()),
-        }
+        // Less than asked for was all there was, and an error is that there is nothing; so the
+        // system need not be asked a second time.
+        !matches!((&self.0).read(&mut bytes), Ok(taken) if taken == bytes.len())
     }
 
     pub(crate) fn ring(&self) {

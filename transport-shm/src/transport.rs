@@ -173,7 +173,9 @@ impl ShmTransport {
 async fn answer_the_bell(bell: AsyncFd<Watched<Bell>>, endpoint: Weak<Endpoint>) {
     while let Ok(mut ready) = bell.readable().await {
         // First silenced, then looked: who rings during the look is heard afterwards.
-        while let Ok(Ok(())) = ready.try_io(|bell| bell.get_ref().get().silence()) {}
+        if bell.get_ref().get().silence() {
+            ready.clear_ready();
+        }
         let Some(endpoint) = endpoint.upgrade() else {
             return;
         };

@@ -237,6 +237,13 @@ impl Lane {
             } => {
                 let kind = location.kind();
                 desk.abandon(kind, *attempt);
+                // If another way was tried before, the report may be from there.
+                if self.letters[index].progress.attempts.is_empty() {
+                    desk.way_worked(location);
+                    if let Some(tally) = self.tally() {
+                        Tally::add(&tally.taken);
+                    }
+                }
                 self.back();
                 Some(kind)
             }
