@@ -2,6 +2,7 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -14,6 +15,7 @@ use fipa_transport::{
     Outcome, Parcel, Stream, Ticket, Verdict,
 };
 
+const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
 const GATEWAY: Incarnation = Incarnation::from_u64(0x6a7e);
 const ROVER: Incarnation = Incarnation::from_u64(0x50e4);
 const ARM: Incarnation = Incarnation::from_u64(0xa53);
@@ -336,7 +338,7 @@ fn an_old_peers_letter_is_for_whom_its_envelope_names() {
     let now = gateway.at(0);
     gateway
         .core
-        .handle_unframed(now, Duration::from_secs(2), letter(), Kind::Tcp);
+        .handle_unframed(now, Duration::from_secs(2), letter(), Kind::Tcp, HERE);
     let (attempt, location, parcel) = gateway.dispatched();
     assert_eq!(location, shm(0x9));
     assert_eq!(&*parcel.receiver, "arm");

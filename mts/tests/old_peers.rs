@@ -3,6 +3,7 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -20,6 +21,9 @@ use fipa_transport::{
 const LETTER: &[u8] = include_bytes!("../../acl/tests/vectors/tcp_letter.bin");
 /// What the service of fipa_services told `cpp-sender` of a letter that failed.
 const FAILURE: &[u8] = include_bytes!("../../acl/tests/vectors/failure_letter.bin");
+
+/// Where that letter came from.
+const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
 
 const OLD_PEER: &str = "tcp://10.0.0.3:6789;fipa-services";
 
@@ -90,7 +94,13 @@ fn nested(content: &[u8]) -> Message {
 fn who_sent_a_recorded_letter_to_nobody_is_told_in_its_own_words() {
     // Where it is, only its letter says.
     let mut core = core(true, &[]);
-    core.handle_unframed(now(), Duration::from_secs(5), recorded(LETTER), Kind::Tcp);
+    core.handle_unframed(
+        now(),
+        Duration::from_secs(5),
+        recorded(LETTER),
+        Kind::Tcp,
+        HERE,
+    );
     let (attempt, location, parcel) = dispatched(&mut core).unwrap();
     assert_eq!(location.to_string(), "tcp://127.0.0.1:45615;fipa-services");
     let ours = message_of(&parcel);
@@ -145,7 +155,13 @@ fn each_receiver_is_told_of_once_and_failures_never() {
     };
     let letter = |performative| letter_for(&message(performative), now().utc).unwrap();
     let deadline = Duration::from_secs(5);
-    core.handle_unframed(now(), deadline, letter(Performative::Request), Kind::Tcp);
+    core.handle_unframed(
+        now(),
+        deadline,
+        letter(Performative::Request),
+        Kind::Tcp,
+        HERE,
+    );
     let mut told = Vec::new();
     while let Some((_, location, parcel)) = dispatched(&mut core) {
         assert_eq!(location.to_string(), OLD_PEER);
@@ -153,8 +169,44 @@ fn each_receiver_is_told_of_once_and_failures_never() {
         told.push(nested(&content).receivers()[0].name().to_owned());
     }
     assert_eq!(told, ["nobody", "nobody-else"]);
-    core.handle_unframed(now(), deadline, letter(Performative::Failure), Kind::Tcp);
+    core.handle_unframed(
+        now(),
+        deadline,
+        letter(Performative::Failure),
+        Kind::Tcp,
+        HERE,
+    );
     assert!(core.poll_action().is_none());
+}
+
+#[test]
+fn nobody_is_told_where_somebody_elses_letter_says_it_is() {
+    let mut core = core(true, &[]);
+    let elsewhere = IpAddr::from([10, 0, 0, 66]);
+    let deadline = Duration::from_secs(5);
+    core.handle_unframed(now(), deadline, recorded(LETTER), Kind::Tcp, elsewhere);
+    assert!(core.poll_action().is_none(), "it came from {elsewhere}");
+}
+
+#[test]
+fn failure_messages_that_nobody_takes_are_bounded() {
+    let mut core = core(true, &[]);
+    let most = core.config().lane;
+    for _ in 0..2 * most {
+        core.handle_unframed(
+            now(),
+            Duration::from_secs(5),
+            recorded(LETTER),
+            Kind::Tcp,
+            HERE,
+        );
+    }
+    let mut told = 0;
+    while let Some((attempt, _, _)) = dispatched(&mut core) {
+        told += 1;
+        core.handle_conclusion(now(), attempt, Conclusion::Handed);
+    }
+    assert_eq!(told, most);
 }
 
 #[test]

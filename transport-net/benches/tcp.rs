@@ -7,6 +7,7 @@
 
 use std::hint::black_box;
 use std::io;
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
@@ -35,7 +36,7 @@ impl Sink for Accepting {
         Verdict::Now(Answer::Accepted)
     }
 
-    fn arrived_unframed(&self, letter: Letter, _: Kind) {
+    fn arrived_unframed(&self, letter: Letter, _: Kind, _: IpAddr) {
         black_box(letter);
     }
 

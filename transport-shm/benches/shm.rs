@@ -13,6 +13,7 @@
 
 use std::collections::VecDeque;
 use std::hint::{black_box, spin_loop};
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -179,7 +180,7 @@ impl Sink for Count {
         Verdict::Now(Answer::Accepted)
     }
 
-    fn arrived_unframed(&self, _letter: Letter, _via: Kind) {}
+    fn arrived_unframed(&self, _letter: Letter, _via: Kind, _from: IpAddr) {}
 
     fn concluded(&self, _attempt: AttemptId, conclusion: Conclusion) {
         assert_eq!(conclusion, Conclusion::Answered(Answer::Accepted));

@@ -1,6 +1,7 @@
 //! A transport that fails on purpose.
 
 use std::collections::HashMap;
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -206,8 +207,8 @@ impl Sink for Filter {
         self.sink.arrived(arrival)
     }
 
-    fn arrived_unframed(&self, letter: Letter, via: Kind) {
-        self.sink.arrived_unframed(letter, via);
+    fn arrived_unframed(&self, letter: Letter, via: Kind, from: IpAddr) {
+        self.sink.arrived_unframed(letter, via, from);
     }
 
     fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {

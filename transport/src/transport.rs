@@ -1,6 +1,7 @@
 //! The trait that every way of moving a letter implements, and the one it reports to.
 
 use std::fmt;
+use std::net::IpAddr;
 use std::sync::Arc;
 
 use fipa_acl::Letter;
@@ -107,9 +108,9 @@ pub trait Sink: Send + Sync {
     /// A parcel arrived. The verdict is what the sender is told.
     fn arrived(&self, arrival: Arrival) -> Verdict;
 
-    /// An old peer's letter arrived, which has no header and gets no answer. Its envelope has
-    /// been brought into the standard dialect; whom it is for stands in there.
-    fn arrived_unframed(&self, letter: Letter, via: Kind);
+    /// An old peer's letter arrived from this address, without a header; it gets no answer. Its
+    /// envelope has been brought into the standard dialect; whom it is for stands in there.
+    fn arrived_unframed(&self, letter: Letter, via: Kind, from: IpAddr);
 
     /// An attempt came to its end.
     fn concluded(&self, attempt: AttemptId, conclusion: Conclusion);

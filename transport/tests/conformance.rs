@@ -233,7 +233,7 @@ mod faults {
             Verdict::Now(Answer::Accepted)
         }
 
-        fn arrived_unframed(&self, _: fipa_acl::Letter, _: Kind) {}
+        fn arrived_unframed(&self, _: fipa_acl::Letter, _: Kind, _: std::net::IpAddr) {}
 
         fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {
             self.concluded.lock().push((attempt, conclusion));

@@ -2,6 +2,7 @@
 //! the ways.
 
 use std::collections::VecDeque;
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -92,15 +93,25 @@ pub(crate) enum Origin {
         /// The arrival that still has no answer.
         unanswered: Option<(Kind, Ticket)>,
     },
-    /// Nobody is told but by a failure message: an old peer's letter, or a failure message.
+    /// An old peer, which has sent it from this address, and is told by a failure message.
+    OldPeer { from: IpAddr },
+    /// Nobody is told: it is a failure message.
     Nobody,
+}
+
+/// Who is told of a failure by a message.
+#[derive(Debug)]
+pub(crate) enum Author {
+    /// This agent of this process.
+    Ours(Incarnation),
+    /// An old peer's agent, whose letter came from this address.
+    OldPeer { from: IpAddr },
 }
 
 /// A delivery that did not succeed, for the failure message.
 #[derive(Debug)]
 pub(crate) struct Undelivered {
-    /// The agent of this process that sent it, if one did.
-    pub(crate) sender: Option<Incarnation>,
+    pub(crate) sender: Author,
     pub(crate) receiver: Arc<str>,
     pub(crate) letter: Letter,
     pub(crate) reason: FailureReason,
@@ -295,7 +306,7 @@ impl Desk {
                     }
                 }
             }
-            Origin::Nobody => {}
+            Origin::OldPeer { .. } | Origin::Nobody => {}
         }
     }
 

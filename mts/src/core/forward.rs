@@ -1,6 +1,6 @@
 //! Letters for somebody else: the gateway's role, old peers' letters, and failure messages.
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
@@ -11,7 +11,7 @@ use fipa_transport::{
     Ticket, Verdict,
 };
 
-use super::desk::{Action, Origin, Undelivered, life_of};
+use super::desk::{Action, Author, Origin, Undelivered, life_of};
 use super::lane::{Delivery, Lane};
 use super::{Core, MAX_DEADLINE, News, Now};
 use crate::failure::Failure;
@@ -165,8 +165,16 @@ impl Core {
         lane < self.desk.config.lane && bytes <= self.desk.config.custody_bytes
     }
 
-    /// An old peer's letter arrived, for the agents of this host that its envelope names.
-    pub fn handle_unframed(&mut self, now: Now, deadline: Duration, letter: Letter, via: Kind) {
+    /// An old peer's letter arrived from this address, for the agents of this host that its
+    /// envelope names.
+    pub fn handle_unframed(
+        &mut self,
+        now: Now,
+        deadline: Duration,
+        letter: Letter,
+        via: Kind,
+        from: IpAddr,
+    ) {
         let receivers = match stamp::receivers(&letter) {
             Ok(receivers) => receivers,
             Err(error) => {
@@ -214,7 +222,7 @@ impl Core {
                     });
                 if !self.has_room(stream, letter.len()) {
                     self.desk.undelivered.push_back(Undelivered {
-                        sender: None,
+                        sender: Author::OldPeer { from },
                         receiver: Arc::clone(&entry.name),
                         letter: letter.clone(),
                         reason: FailureReason::QueueFull,
@@ -228,7 +236,8 @@ impl Core {
                     continue;
                 }
                 let until = now.instant + deadline.min(MAX_DEADLINE);
-                let mut delivery = Delivery::new(Origin::Nobody, letter.clone(), sequence, until);
+                let origin = Origin::OldPeer { from };
+                let mut delivery = Delivery::new(origin, letter.clone(), sequence, until);
                 delivery.hops = 1;
                 self.put(now, stream, Arc::clone(&entry.name), delivery);
             }
@@ -250,7 +259,7 @@ impl Core {
                     sender: true,
                 });
                 self.desk.undelivered.push_back(Undelivered {
-                    sender: None,
+                    sender: Author::OldPeer { from },
                     receiver: name,
                     letter: letter.clone(),
                     reason: FailureReason::NoSuchAgent,
@@ -278,8 +287,12 @@ impl Core {
             };
             let own = self.desk.config.incarnation;
             let sequence = self.sequence_of(own);
-            if let Some((agent, inbox)) =
-                sender.and_then(|agent| Some((agent, self.agents.get_mut(&agent)?)))
+            let from = match sender {
+                Author::OldPeer { from } => Some(from),
+                Author::Ours(_) => None,
+            };
+            if let Author::Ours(agent) = sender
+                && let Some(inbox) = self.agents.get_mut(&agent)
             {
                 let letter = match report.written_for(name, Dialect::Standard, now.utc) {
                     Ok(letter) => letter,
@@ -306,7 +319,7 @@ impl Core {
             let known = self.desk.directory.lookup(report.sender.name());
             let said = match known {
                 Some(_) => None,
-                None => said_of_itself(&report),
+                None => from.and_then(|from| said_of_itself(&report, from)),
             };
             let Some(entry) = known.or_else(|| said.clone()) else {
                 tracing::info!(to = %report.sender, %reason, "nobody to send a failure message to");
@@ -322,13 +335,17 @@ impl Core {
                     continue;
                 }
             };
-            let deadline = now.instant + FAILURE_DEADLINE;
-            let mut delivery = Delivery::new(Origin::Nobody, letter, sequence, deadline);
-            delivery.hops = u8::from(entry.reach != Reach::Local);
             let stream = Stream {
                 sender: self.desk.config.incarnation,
                 receiver: life_of(&entry),
             };
+            if !self.has_room(stream, letter.len()) {
+                tracing::info!(to = %report.sender, %reason, "no room for a failure message");
+                continue;
+            }
+            let deadline = now.instant + FAILURE_DEADLINE;
+            let mut delivery = Delivery::new(Origin::Nobody, letter, sequence, deadline);
+            delivery.hops = u8::from(entry.reach != Reach::Local);
             self.desk
                 .notice(stream, sequence, &entry.name, || News::Sent {
                     send: None,
@@ -347,8 +364,9 @@ impl Core {
 }
 
 /// An agent that the directory does not know, as it said itself where it can be reached: the
-/// numeric addresses of an old peer's agent.
-fn said_of_itself(report: &Failure<'_>) -> Option<Arc<Entry>> {
+/// numeric addresses of an old peer's agent, of the host that its letter came from. Others anybody
+/// could claim, and have this service send to them what they never asked for.
+fn said_of_itself(report: &Failure<'_>, from: IpAddr) -> Option<Arc<Entry>> {
     let agent = &report.sender;
     let signature = match report.representation {
         Some(Representation::String) => Signature::JadeProxy,
@@ -356,7 +374,10 @@ fn said_of_itself(report: &Failure<'_>) -> Option<Arc<Entry>> {
     };
     let locations = agent.addresses().iter().filter_map(|address| {
         let location: Location = address.parse().ok()?;
-        location.address().parse::<SocketAddr>().ok()?;
+        let claimed: SocketAddr = location.address().parse().ok()?;
+        if claimed.ip().to_canonical() != from {
+            return None;
+        }
         location.with_signature(signature).ok()
     });
     let locations: Vec<Location> = locations.take(Entry::MAX_LOCATIONS).collect();

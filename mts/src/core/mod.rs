@@ -43,7 +43,7 @@ use fipa_transport::{
 pub use config::{CoreConfig, MAX_DEADLINE};
 use departed::Departed;
 pub use desk::Action;
-use desk::{Desk, NOTE_TRIES, Note, Origin, Purpose, Undelivered};
+use desk::{Author, Desk, NOTE_TRIES, Note, Origin, Purpose, Undelivered};
 use inbox::Inbox;
 pub use inbox::Received;
 use lane::{Delivery, Lane, Moved};
@@ -314,7 +314,7 @@ impl Core {
                 sender: true,
             });
         self.desk.undelivered.push_back(Undelivered {
-            sender: Some(sender),
+            sender: Author::Ours(sender),
             receiver: Arc::clone(&receiver),
             letter,
             reason,

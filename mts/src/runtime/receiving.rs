@@ -1,5 +1,6 @@
 //! The side of the runtime that transports see: what they tell is handed to the core.
 
+use std::net::IpAddr;
 use std::sync::Weak;
 use std::sync::atomic::Ordering;
 
@@ -35,7 +36,7 @@ impl Sink for Receiving {
         verdict
     }
 
-    fn arrived_unframed(&self, letter: Letter, via: Kind) {
+    fn arrived_unframed(&self, letter: Letter, via: Kind, from: IpAddr) {
         let Some(shared) = self.shared.upgrade() else {
             return;
         };
@@ -43,7 +44,7 @@ impl Sink for Receiving {
         let deadline = state.unframed_deadline;
         state
             .core
-            .handle_unframed(Now::read(), deadline, letter, via);
+            .handle_unframed(Now::read(), deadline, letter, via, from);
         shared.carry_out(state);
     }
 

@@ -112,7 +112,7 @@ async fn receive(endpoint: Arc<Endpoint>, place: Stranger, stream: TcpStream, fr
             // A bit-efficient or an XML envelope.
             Some(0xfe | 0xfd | b'<') => match unframed::read(&endpoint, &mut read, begun).await {
                 Ok(letter) => {
-                    unframed::hand_on(&endpoint, letter);
+                    unframed::hand_on(&endpoint, letter, from.ip());
                     return;
                 }
                 Err(refused) => refused.to_string(),

@@ -1,6 +1,8 @@
 //! Letters of old peers (fipa_services, and JADE over its raw TCP extension): one per connection,
 //! without a header, until end of stream. Their envelopes are bit-efficient or XML.
 
+use std::net::IpAddr;
+
 use bytes::{Bytes, BytesMut};
 use fipa_acl::{DecodeError, EncodeError, Envelope, EnvelopeParams, Letter};
 use fipa_transport::Kind;
@@ -89,11 +91,11 @@ fn overrule(older: &mut EnvelopeParams, newer: EnvelopeParams) {
     older.user_defined.extend(newer.user_defined);
 }
 
-/// Hands a letter to the sink, unless the endpoint has been closed.
-pub(crate) fn hand_on(endpoint: &Endpoint, letter: Letter) {
+/// Hands a letter that came from this address to the sink, unless the endpoint has been closed.
+pub(crate) fn hand_on(endpoint: &Endpoint, letter: Letter, from: IpAddr) {
     if let Some(sink) = endpoint.sink() {
         count(&endpoint.tally().unframed_in);
-        sink.arrived_unframed(letter, Kind::Tcp);
+        sink.arrived_unframed(letter, Kind::Tcp, from.to_canonical());
     }
 }
 

@@ -3,6 +3,7 @@
 #![allow(dead_code, reason = "each test file uses a part of it")]
 
 use std::collections::HashMap;
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -91,7 +92,11 @@ impl Sink for Recorder {
         self.verdict.clone()
     }
 
-    fn arrived_unframed(&self, letter: Letter, via: Kind) {
+    fn arrived_unframed(&self, letter: Letter, via: Kind, from: IpAddr) {
+        assert!(
+            from.is_loopback(),
+            "the tests' peers are here, not at {from}"
+        );
         self.record.lock().unframed.push((letter, via));
     }
 

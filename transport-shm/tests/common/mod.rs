@@ -4,6 +4,7 @@
 #![allow(dead_code)]
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on says so")]
 
+use std::net::IpAddr;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -116,7 +117,7 @@ impl Sink for Told {
         Verdict::Now(Answer::Accepted)
     }
 
-    fn arrived_unframed(&self, _letter: Letter, _via: Kind) {
+    fn arrived_unframed(&self, _letter: Letter, _via: Kind, _from: IpAddr) {
         panic!("shared memory has no letters without a frame");
     }
 

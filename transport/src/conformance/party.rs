@@ -1,6 +1,7 @@
 //! Endpoints under test, and what their sinks have heard.
 
 use std::collections::HashMap;
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -42,7 +43,7 @@ impl Sink for Recorder {
         verdict
     }
 
-    fn arrived_unframed(&self, _: Letter, _: Kind) {
+    fn arrived_unframed(&self, _: Letter, _: Kind, _: IpAddr) {
         panic!("nobody sent an unframed letter");
     }
 

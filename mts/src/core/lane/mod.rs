@@ -24,7 +24,7 @@ use fipa_transport::{
 
 pub(crate) use self::delivery::Delivery;
 use self::delivery::State;
-use super::desk::{Desk, Origin, Purpose, Undelivered, life_of};
+use super::desk::{Author, Desk, Origin, Purpose, Undelivered, life_of};
 use super::routes::Tally;
 
 /// How many failed letters of a stream are remembered to mend the order of later ones.
@@ -404,9 +404,9 @@ impl Lane {
         let delivery = &mut self.letters[index];
         let attempts = std::mem::take(&mut delivery.progress.attempts);
         let sender = match delivery.origin {
-            Origin::Local { .. } => Some(Some(self.stream.sender)),
-            Origin::Nobody => Some(None),
-            Origin::Forwarded { .. } => None,
+            Origin::Local { .. } => Some(Author::Ours(self.stream.sender)),
+            Origin::OldPeer { from } => Some(Author::OldPeer { from }),
+            Origin::Forwarded { .. } | Origin::Nobody => None,
         };
         if let Some(sender) = sender {
             let detail = attempts.last().map(ToString::to_string).unwrap_or_default();
