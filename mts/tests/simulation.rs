@@ -25,7 +25,8 @@ fn seeds() -> Vec<u64> {
 
 fn run(weather: Weather) -> u64 {
     let (mut letters, mut followed) = (0, 0);
-    for seed in seeds() {
+    let seeds = seeds();
+    for &seed in &seeds {
         let mut world = World::new(seed, weather);
         if let Err(breach) = world.run() {
             panic!("seed {seed}, {weather:?}: {breach}");
@@ -34,6 +35,7 @@ fn run(weather: Weather) -> u64 {
         followed += world.followed();
     }
     assert!(letters > 0, "nothing was sent");
+    println!("{letters} letters over {} seeds: {weather:?}", seeds.len());
     followed
 }
 
@@ -114,6 +116,29 @@ fn moves_in_foul_weather_break_no_promise() {
 }
 
 #[test]
+fn copies_and_overtaking_break_no_promise() {
+    run(Weather {
+        overtaken: 0.2,
+        copies: 0.2,
+        loss: 0.05,
+        silence: 0.05,
+        ..Weather::calm()
+    });
+}
+
+#[test]
+fn hosts_that_are_cut_off_break_no_promise() {
+    run(Weather {
+        partitions: 4,
+        overtaken: 0.05,
+        copies: 0.05,
+        answer_loss: 0.05,
+        hosts: 3,
+        ..Weather::calm()
+    });
+}
+
+#[test]
 fn everything_at_once_breaks_no_promise() {
     run(Weather {
         loss: 0.1,
@@ -125,6 +150,9 @@ fn everything_at_once_breaks_no_promise() {
         answering_ms: 30,
         queue: 8,
         outages: 6,
+        partitions: 2,
+        overtaken: 0.1,
+        copies: 0.1,
         ..Weather::calm()
     });
 }

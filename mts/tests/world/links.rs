@@ -8,6 +8,7 @@ use fipa_transport::{
 };
 
 use super::view::way;
+use super::weather::LATE_MS;
 use super::{Breach, Event, World};
 
 impl World {
@@ -68,25 +69,45 @@ impl World {
                 },
             );
         }
-        if happens(w.silence) {
+        if happens(w.silence) || self.is_cut(at, receiver) {
             return;
         }
         let mute = happens(w.answer_loss);
+        let between_hosts = self.processes[at].host != self.processes[receiver].host;
+        let mut strays = |rate: f64| between_hosts && rate > 0.0 && self.random.f64() < rate;
+        let (copied, late) = (strays(w.copies), strays(w.overtaken));
+        let arrive = |parcel| Event::Arrive {
+            from: at,
+            to: receiver,
+            kind,
+            attempt,
+            parcel,
+            mute,
+        };
+        if copied {
+            self.after_ms(LATE_MS, arrive(parcel.clone()));
+        }
+        if late {
+            return self.after_ms(LATE_MS, arrive(parcel));
+        }
         let delay = Duration::from_micros(self.random.u64(20..5000));
         let link = self.links.entry((at, receiver, kind)).or_insert(self.now);
         *link = (*link).max(self.now + delay);
         let arrives = *link;
-        self.at(
-            arrives,
-            Event::Arrive {
-                from: at,
-                to: receiver,
-                kind,
-                attempt,
-                parcel,
-                mute,
-            },
-        );
+        self.at(arrives, arrive(parcel));
+    }
+
+    /// Whether nothing passes from one of these processes to the other.
+    pub(super) fn is_cut(&self, one: usize, other: usize) -> bool {
+        let (one, other) = (self.processes[one].host, self.processes[other].host);
+        one != other && (self.cut_off.contains(&one) || self.cut_off.contains(&other))
+    }
+
+    /// A host is cut off from all others, for long enough that attempts are given up.
+    pub(super) fn cut_off(&mut self) {
+        let host = self.random.usize(..self.weather.hosts);
+        self.cut_off.insert(host);
+        self.after_ms(1500, Event::JoinedAgain { host });
     }
 
     pub(super) fn arrive(
@@ -117,6 +138,7 @@ impl World {
         if is_letter && remote && parcel.hops >= Parcel::LAST_HOPS {
             self.followed += 1;
         }
+        let cut = self.is_cut(to, from);
         let process = &mut self.processes[to];
         process.next_ticket += 1;
         let ticket = Ticket(process.next_ticket);
@@ -128,6 +150,8 @@ impl World {
         let at_once = kind == Kind::Shm;
         let verdict = process.core.handle_arrival(now, kind, at_once, arrival);
         match verdict {
+            // The way back is cut.
+            Verdict::Now(_) if cut => {}
             Verdict::Now(answer) => {
                 let conclusion = if mute {
                     broken()

@@ -95,6 +95,10 @@ enum Event {
         host: usize,
         departed: Vec<(usize, Arc<Entry>)>,
     },
+    CutOff,
+    JoinedAgain {
+        host: usize,
+    },
     Outage {
         host: usize,
         kind: Kind,
@@ -126,6 +130,8 @@ pub(crate) struct World {
     /// When the last parcel on a link arrives: links keep their order.
     links: HashMap<(usize, usize, Kind), Instant>,
     down: HashSet<(usize, Kind)>,
+    /// Hosts that nothing gets to or from.
+    cut_off: HashSet<usize>,
     sends: HashMap<(usize, SendId), u64>,
     sent: BTreeMap<u64, Sent>,
     /// Which letters each life of each agent took, in order.
@@ -158,6 +164,7 @@ impl World {
             processes: Vec::new(),
             links: HashMap::new(),
             down: HashSet::new(),
+            cut_off: HashSet::new(),
             sends: HashMap::new(),
             sent: BTreeMap::new(),
             taken: HashMap::new(),
@@ -188,6 +195,10 @@ impl World {
         for _ in 0..weather.moves {
             let at = world.some_time();
             world.at(at, Event::Move);
+        }
+        for _ in 0..weather.partitions {
+            let at = world.some_time();
+            world.at(at, Event::CutOff);
         }
         for _ in 0..weather.outages {
             let at = world.some_time();
@@ -380,6 +391,14 @@ impl World {
             Event::Move => self.leave(),
             Event::Settle { name } => self.settle(name),
             Event::News { host, departed } => self.news(host, &departed),
+            Event::CutOff => {
+                self.cut_off();
+                Ok(())
+            }
+            Event::JoinedAgain { host } => {
+                self.cut_off.remove(&host);
+                Ok(())
+            }
             Event::Outage { host, kind } => {
                 self.down.insert((host, kind));
                 self.after_ms(800, Event::OutageEnds { host, kind });
@@ -470,7 +489,9 @@ impl World {
                     self.processes[at].open.remove(&attempt);
                 }
                 Action::Answer { ticket, answer, .. } => {
-                    if let Some((sender, attempt)) = self.processes[at].tickets.remove(&ticket) {
+                    if let Some((sender, attempt)) = self.processes[at].tickets.remove(&ticket)
+                        && !self.is_cut(at, sender)
+                    {
                         let conclusion = Conclusion::Answered(answer);
                         self.after_ms(
                             2,

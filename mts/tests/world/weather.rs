@@ -1,5 +1,8 @@
 //! What goes wrong in a simulated world.
 
+/// Longer than an attempt may take in these worlds, so that what was given up arrives, too.
+pub(super) const LATE_MS: u64 = 500;
+
 /// What goes wrong, and how often.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Weather {
@@ -11,6 +14,13 @@ pub(crate) struct Weather {
     pub refusal: f64,
     /// A parcel is lost, and nothing is ever heard of it.
     pub silence: f64,
+    /// A parcel between hosts is late, by up to [`LATE_MS`], and others overtake it: more than
+    /// transports allow themselves.
+    pub overtaken: f64,
+    /// A parcel between hosts arrives a second time, up to [`LATE_MS`] later.
+    pub copies: f64,
+    /// How often a host is cut off from the others for a while: nothing passes, and nobody is told.
+    pub partitions: u32,
     /// How many processes die in the course of the run. Most come back as a new life.
     pub deaths: u32,
     /// How often an agent leaves its process and is registered in another one, mostly elsewhere.
@@ -37,6 +47,9 @@ impl Weather {
             answer_loss: 0.0,
             refusal: 0.0,
             silence: 0.0,
+            overtaken: 0.0,
+            copies: 0.0,
+            partitions: 0,
             deaths: 0,
             moves: 0,
             news_ms: 0,
@@ -50,6 +63,8 @@ impl Weather {
 
     pub(super) fn is_calm(&self) -> bool {
         self.loss + self.answer_loss + self.refusal + self.silence == 0.0
+            && self.overtaken + self.copies == 0.0
+            && self.partitions == 0
             && self.deaths == 0
             && self.moves == 0
             && self.outages == 0
