@@ -5,6 +5,8 @@
 //! The core is the very one that the runtime drives. What is simulated is everything around it:
 //! transports, clocks, the directory.
 
+#![expect(clippy::print_stdout, reason = "a long run tells how far it went")]
+
 mod world;
 
 use world::{Weather, World};
