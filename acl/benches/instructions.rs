@@ -16,9 +16,13 @@ const FIPA_SERVICES_LETTER: &[u8] = include_bytes!("../tests/vectors/tcp_letter.
 type Path = (&'static str, fn());
 
 const PATHS: &[Path] = &[
-    ("message/view/1B", || view(1)),
-    ("message/view/1KB", || view(1 << 10)),
-    ("message/view/1MB", || view(1 << 20)),
+    ("message/view/1B", || view(Representation::BitEfficient, 1)),
+    ("message/view/1KB", || {
+        view(Representation::BitEfficient, 1 << 10);
+    }),
+    ("message/view/1MB", || {
+        view(Representation::BitEfficient, 1 << 20);
+    }),
     ("message/decode/1KB", || {
         decode(Representation::BitEfficient, 1 << 10);
     }),
@@ -32,10 +36,14 @@ const PATHS: &[Path] = &[
         let message = message(1 << 20);
         measured(|| black_box(&message).to_payload());
     }),
+    ("string/view/1B", || view(Representation::String, 1)),
+    ("string/view/1KB", || view(Representation::String, 1 << 10)),
     ("string/decode/1B", || decode(Representation::String, 1)),
     ("string/decode/1KB", || {
         decode(Representation::String, 1 << 10);
     }),
+    ("xml/view/1B", || view(Representation::Xml, 1)),
+    ("xml/view/1KB", || view(Representation::Xml, 1 << 10)),
     ("xml/decode/1B", || decode(Representation::Xml, 1)),
     ("xml/decode/1KB", || decode(Representation::Xml, 1 << 10)),
     ("envelope/view", || {
@@ -55,9 +63,12 @@ const PATHS: &[Path] = &[
         let stamp = stamp();
         measured(|| Envelope::encode_extension(black_box(&stamp)).is_ok());
     }),
+    ("envelope/xml/view", || {
+        let bytes = xml_envelope();
+        measured(|| EnvelopeView::parse(black_box(&bytes)).is_ok());
+    }),
     ("envelope/xml/decode", || {
-        let bytes = envelope().encode(Representation::Xml, Dialect::Standard);
-        let bytes = bytes.expect("an envelope");
+        let bytes = xml_envelope();
         measured(|| Envelope::decode(black_box(&bytes)).is_ok());
     }),
 ];
@@ -82,9 +93,11 @@ fn measured<T>(run: impl FnOnce() -> T) -> T {
     black_box(run())
 }
 
-fn view(content_len: usize) {
-    let bytes = message(content_len).to_payload().to_bytes();
-    measured(|| MessageView::parse(black_box(&bytes)).is_ok());
+fn view(representation: Representation, content_len: usize) {
+    let bytes = message(content_len).encode(representation, Dialect::Standard);
+    let bytes = bytes.expect("a message");
+    let view = measured(|| MessageView::parse(black_box(&bytes)));
+    black_box(&view.expect("a message"));
 }
 
 fn encode(content_len: usize) {
@@ -136,6 +149,11 @@ fn envelope() -> Envelope {
     };
     let extensions = Vec::new();
     Envelope { base, extensions }
+}
+
+fn xml_envelope() -> Bytes {
+    let bytes = envelope().encode(Representation::Xml, Dialect::Standard);
+    bytes.expect("an envelope")
 }
 
 fn stamp() -> EnvelopeParams {

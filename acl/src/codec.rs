@@ -5,7 +5,7 @@ use bytes::Bytes;
 use crate::bitefficient::dialects::{self, Peer};
 use crate::envelope::encode as encode_envelope;
 use crate::error::{DecodeError, EncodeError};
-use crate::{Dialect, Envelope, Message, Payload, Representation, bitefficient, string, xml};
+use crate::{Dialect, Envelope, Message, MessageView, Payload, Representation, string, xml};
 
 impl Message {
     /// Reads an encoded message, whichever encoding and dialect it is in: its first bytes tell.
@@ -16,11 +16,13 @@ impl Message {
     /// # Errors
     /// When the payload is not one whole message.
     pub fn decode(payload: &Payload) -> Result<Self, DecodeError> {
-        match Representation::detect(&payload.head) {
-            Some(Representation::String) => string::decode(payload),
-            Some(Representation::Xml) => xml::decode(payload),
-            _ => bitefficient::decode(payload),
+        let text = !matches!(payload.head.first(), Some(0xfa..=0xfe));
+        if text && payload.is_split() {
+            // Nobody splits these; they are read in one piece.
+            let whole = Payload::from(payload.to_bytes());
+            return MessageView::parse_payload(&whole)?.to_message(&whole);
         }
+        MessageView::parse_payload(payload)?.to_message(payload)
     }
 
     /// The encoded message as one piece of memory, in the hand that a reader needs.

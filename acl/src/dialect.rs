@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use crate::Text;
 use crate::error::EncodeError;
 use crate::time::{Time, Zone};
 use crate::word::is_word;
@@ -10,6 +11,13 @@ use crate::word::is_word;
 pub(crate) const JADE_ENCODING: &str = "JADE-Encoding";
 /// The value that says so, whatever its case.
 pub(crate) const BASE64: &str = "Base64";
+
+/// Whether the user-defined parameter makes readers take the content for Base64.
+pub(crate) fn announces_base64(name: &Text<'_>, value: &Text<'_>) -> bool {
+    name.raw().len() >= JADE_ENCODING.len()
+        && name.as_str().eq_ignore_ascii_case(JADE_ENCODING)
+        && value.as_str().trim().eq_ignore_ascii_case(BASE64)
+}
 
 /// Which reader an encoding is written for.
 ///

@@ -48,13 +48,15 @@ mod letter;
 mod message;
 mod performative;
 mod representation;
+mod scan;
 mod string;
 mod time;
+mod view;
 mod word;
 mod xml;
 
 pub use agent_id::{AgentId, AgentIdError};
-pub use bitefficient::{AgentIdView, AgentIds, CodeTable, MessageView, Text};
+pub use bitefficient::CodeTable;
 pub use builder::{BuildError, MessageBuilder};
 pub use dialect::Dialect;
 pub use envelope::{
@@ -67,3 +69,4 @@ pub use message::Message;
 pub use performative::{Performative, PerformativeError, UserPerformative};
 pub use representation::{AclRepresentation, Representation};
 pub use time::{Base, Time, TimeError, Zone};
+pub use view::{AgentIdView, AgentIds, MessageView, Text};

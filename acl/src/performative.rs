@@ -37,6 +37,15 @@ macro_rules! performatives {
                 }
             }
 
+            /// The code of the standard act that has this name, in any case.
+            pub(crate) fn code_of_name(name: &[u8]) -> Option<u8> {
+                // Those of its length are few.
+                $(if name.len() == $name.len() && name.eq_ignore_ascii_case($name.as_bytes()) {
+                    return Some($code);
+                })*
+                None
+            }
+
             /// The code of a standard act (FIPA00069 clause 2.1, `MsgType`).
             pub(crate) fn code(&self) -> Option<u8> {
                 match self {
@@ -130,10 +139,7 @@ impl FromStr for Performative {
 
     /// The standard names are recognised in any case; any other word is a user-defined act.
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let standard = Self::STANDARD
-            .into_iter()
-            .find(|act| act.as_str().eq_ignore_ascii_case(text));
-        match standard {
+        match Self::code_of_name(text.as_bytes()).and_then(Self::of_code) {
             Some(act) => Ok(act),
             None if is_word(text) => Ok(Self::Other(UserPerformative(text.into()))),
             None => Err(PerformativeError(text.chars().take(60).collect())),

@@ -2,17 +2,20 @@
 //!
 //! Shared by all encodings: the bit-efficient one takes both productions over from the string one.
 
+use crate::scan::{self, TOPS};
+
 /// Whether the text is a FIPA00070 `Word`: not empty, no control characters, blanks or
 /// parentheses, and not beginning with a digit, `#`, `-` or `@`. A quotation mark in front is
 /// excluded too, because a reader would take the text for a string literal.
-pub(crate) fn is_word(text: &str) -> bool {
+pub(crate) fn is_word(text: impl AsRef<[u8]>) -> bool {
     Shape::of(text) == Shape::Word
 }
 
 /// Whether the text is a `Word` but for its first character, which peers do not look at: JADE
 /// writes whatever has no blanks as a word.
-pub(crate) fn is_token(text: &str) -> bool {
-    !text.is_empty() && classes(text.as_bytes()).0 == 0
+pub(crate) fn is_token(text: impl AsRef<[u8]>) -> bool {
+    let bytes = text.as_ref();
+    !bytes.is_empty() && classes(bytes).0 == 0
 }
 
 /// How a text can be written.
@@ -27,9 +30,10 @@ pub(crate) enum Shape {
 
 impl Shape {
     #[inline]
-    pub(crate) fn of(text: &str) -> Self {
-        let (no_token, care) = classes(text.as_bytes());
-        let starts_well = match text.as_bytes().first() {
+    pub(crate) fn of(text: impl AsRef<[u8]>) -> Self {
+        let bytes = text.as_ref();
+        let (no_token, care) = classes(bytes);
+        let starts_well = match bytes.first() {
             None | Some(b'0'..=b'9' | b'#' | b'-' | b'@' | b'"') => false,
             Some(_) => true,
         };
@@ -51,11 +55,8 @@ fn classes(bytes: &[u8]) -> (u64, u64) {
     let mut look = |eight: [u8; 8]| {
         let word = u64::from_le_bytes(eight);
         // Exact as to whether there is one.
-        let below = |bound: u64| word.wrapping_sub(ONES * bound) & !word;
-        let zero = |word: u64| word.wrapping_sub(ONES) & !word;
-        let parentheses = (word & (ONES * 0xfe)) ^ (ONES * 0x28);
-        no_token |= (below(0x21) | zero(parentheses)) & TOPS;
-        care |= (zero(word ^ (ONES * 0x22)) | zero(word ^ (ONES * 0x5c))) & TOPS;
+        no_token |= scan::no_token(word) & TOPS;
+        care |= (scan::is(word, b'"') | scan::is(word, b'\\')) & TOPS;
     };
     match (bytes.as_chunks::<8>(), bytes.last_chunk()) {
         // The last eight overlap those in front of them.
@@ -74,9 +75,6 @@ fn classes(bytes: &[u8]) -> (u64, u64) {
     }
     (no_token, care)
 }
-
-const ONES: u64 = 0x0101_0101_0101_0101;
-const TOPS: u64 = ONES << 7;
 
 /// A piece of a string literal.
 pub(crate) enum Piece<'a> {

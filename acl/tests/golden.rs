@@ -187,6 +187,12 @@ fn messages_of_jade() {
     assert_eq!(request.performative(), &Performative::Request);
     assert_eq!(request.content().unwrap(), "hello jade");
     assert!(inform.is_reply_to(&request));
+    // In JADE's own hand it is the same bytes.
+    let written = inform.encode(Representation::BitEfficient, Dialect::Jade);
+    assert_eq!(
+        written.unwrap(),
+        fs::read(vector("jade_inform.be")).unwrap()
+    );
 }
 
 #[test]

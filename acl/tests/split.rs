@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
 use bytes::Bytes;
-use fipa_acl::{Message, MessageView, Payload, Performative, Problem};
+use fipa_acl::{Message, Payload, Performative, Problem, explain};
 
 fn message() -> Message {
     Message::builder(Performative::Inform)
@@ -110,11 +110,11 @@ fn other_encodings_and_code_tables_are_named() {
     assert_eq!(of(b"\xfb\x10\x08\x01"), Problem::CodeTable);
     assert_eq!(of(b"\xfa\x10\x08\x05\x11\x00\x01"), Problem::CodeTable);
     for text in [&b"(inform)"[..], b"<fipa-message/>"] {
-        let error = MessageView::parse(text).unwrap_err();
+        let error = explain(text).error.unwrap();
         let unsupported = matches!(error.problem(), Problem::UnsupportedRepresentation(_));
         assert!(
             unsupported,
-            "{error}: a view is of the bit-efficient encoding"
+            "{error}: only the bit-efficient one is explained"
         );
     }
     assert_eq!(of(b"hello"), Problem::UnknownRepresentation);

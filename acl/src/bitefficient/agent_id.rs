@@ -1,106 +1,31 @@
-//! Agent identifiers in a bit-efficient message, borrowed.
+//! Agent identifiers in a bit-efficient message.
 
-use crate::AgentId;
+use crate::bitefficient::expression::expression;
 use crate::bitefficient::notes::{self, Notes};
 use crate::bitefficient::reader::Reader;
-use crate::bitefficient::text::{Text, expression};
 use crate::error::{DecodeError, Problem};
+use crate::scan::Kind;
+use crate::view::{AgentIdView, AgentIds, Encoding, List, Part, check_name};
 use crate::word::is_token;
+use crate::{AgentId, Text};
 
 const CLAUSE: &str = "FIPA00069 2.1 AID";
 
-/// An agent identifier in an encoded message.
-#[derive(Debug, Clone, Copy)]
-pub struct AgentIdView<'a> {
-    name: &'a str,
-    /// What follows the name, with the end of the identifier.
-    parameters: &'a [u8],
+/// The next of the identifiers in checked bytes, one behind the other.
+pub(crate) fn next<'a>(rest: &mut &'a [u8]) -> Option<AgentIdView<'a>> {
+    (!rest.is_empty()).then_some(())?;
+    let mut reader = Reader::new(rest);
+    let agent = agent_id(&mut reader, AgentId::MAX_DEPTH).ok();
+    *rest = agent.map_or(&[], |_| reader.rest());
+    agent
 }
 
-impl<'a> AgentIdView<'a> {
-    /// The name.
-    #[must_use]
-    pub fn name(&self) -> &'a str {
-        self.name
-    }
-
-    /// Transport addresses, the preferred one first.
-    pub fn addresses(&self) -> impl Iterator<Item = &'a str> + use<'a> {
-        // Of several lists the last one counts.
-        let lists = self.parameters().filter_map(|parameter| match parameter {
-            Parameter::Addresses(bytes) => Some(bytes),
-            _ => None,
-        });
-        let mut reader = Reader::new(lists.last().unwrap_or_default());
-        // Checked when the message was read: an error cannot occur, and would end the list.
-        std::iter::from_fn(move || {
-            (reader.peek()? == 0x10).then(|| reader.skip_peeked())?;
-            reader.plain(CLAUSE, "address").ok()
-        })
-    }
-
-    /// Agents that can resolve the name.
-    #[must_use]
-    pub fn resolvers(&self) -> AgentIds<'a> {
-        let lists = self.parameters().filter_map(|parameter| match parameter {
-            Parameter::Resolvers(bytes) => Some(bytes),
-            _ => None,
-        });
-        AgentIds::new(lists.last().unwrap_or_default())
-    }
-
-    /// User-defined parameters, names without `X-`.
-    pub fn user_defined(&self) -> impl Iterator<Item = (&'a str, Text<'a>)> + use<'a> {
-        self.parameters().filter_map(|parameter| match parameter {
-            Parameter::UserDefined(name, value) => Some((name, value)),
-            _ => None,
-        })
-    }
-
-    fn parameters(&self) -> impl Iterator<Item = Parameter<'a>> + use<'a> {
-        let mut reader = Reader::new(self.parameters);
-        // Checked when the message was read: an error cannot occur, and would end this.
-        std::iter::from_fn(move || parameter(&mut reader, AgentId::MAX_DEPTH).ok()?)
-    }
-
-    /// The identifier as an owned value.
-    pub(crate) fn to_owned(self) -> Result<AgentId, crate::AgentIdError> {
-        let mut agent = AgentId::new(self.name)?;
-        for address in self.addresses() {
-            agent = agent.with_address(address)?;
-        }
-        for resolver in self.resolvers() {
-            agent = agent.with_resolver(resolver.to_owned()?)?;
-        }
-        for (name, value) in self.user_defined() {
-            agent = agent.with_user_defined(name, value.as_str())?;
-        }
-        Ok(agent)
-    }
-}
-
-/// The agent identifiers of a set or sequence in an encoded message.
-#[derive(Debug, Clone, Default)]
-pub struct AgentIds<'a>(&'a [u8]);
-
-impl<'a> AgentIds<'a> {
-    /// The identifiers in checked bytes.
-    pub(crate) fn new(bytes: &'a [u8]) -> Self {
-        Self(bytes)
-    }
-}
-
-impl<'a> Iterator for AgentIds<'a> {
-    type Item = AgentIdView<'a>;
-
-    fn next(&mut self) -> Option<Self::Item> {
-        (!self.0.is_empty()).then_some(())?;
-        let mut reader = Reader::new(self.0);
-        // Checked when the message was read: an error cannot occur, and would end the list.
-        let agent = agent_id(&mut reader, AgentId::MAX_DEPTH).ok();
-        self.0 = agent.map_or(&[], |_| reader.rest());
-        agent
-    }
+/// The next part of a checked identifier.
+pub(crate) fn next_part<'a>(rest: &mut &'a [u8], list: &mut List) -> Option<Part<'a>> {
+    let mut reader = Reader::new(rest);
+    let part = part(&mut reader, list, AgentId::MAX_DEPTH).ok().flatten();
+    *rest = reader.rest();
+    part
 }
 
 /// Reads an agent identifier, whose resolvers may be nested `depth` deep.
@@ -113,8 +38,8 @@ pub(crate) fn agent_id<'a, N: Notes>(
     if N::SILENT
         && let Some(name) = reader.short_agent_name()
     {
-        let parameters = &[0x01];
-        return Ok(AgentIdView { name, parameters });
+        let (name, end) = (Text::plain(name), &[0x01]);
+        return Ok(AgentIdView::new(name, Encoding::BitEfficient, end));
     }
     other_agent_id(reader, depth)
 }
@@ -129,79 +54,107 @@ fn other_agent_id<'a, N: Notes>(
         return Err(reader.unexpected(CLAUSE, code, "an agent identifier"));
     }
     let offset = reader.offset();
-    let name = word(reader, "agent name")?;
-    if name.is_empty() || name.len() > AgentId::MAX_NAME {
-        let problem = match name {
-            "" => Problem::Empty("agent name"),
-            _ => Problem::TooLong("agent name"),
-        };
-        return Err(DecodeError::new(offset, CLAUSE, problem));
-    }
-    reader.note(|| format!("agent identifier: name {}", notes::quoted(name)));
+    let name = Text::plain(word(reader, "agent name")?);
+    check_name(&name, "agent name").map_err(|wrong| DecodeError::new(offset, CLAUSE, wrong))?;
+    reader.note(|| format!("agent identifier: name {}", notes::quoted(&name.as_str())));
     reader.notes().deeper();
     let start = reader.position();
-    while parameter(reader, depth)?.is_some() {}
+    let mut list = List::Outside;
+    while part(reader, &mut list, depth)?.is_some() {}
     reader.notes().shallower();
     reader.note(|| "end of agent identifier".to_owned());
-    let parameters = reader.since(start);
-    Ok(AgentIdView { name, parameters })
+    let parts = reader.since(start);
+    Ok(AgentIdView::new(name, Encoding::BitEfficient, parts))
 }
 
-/// Reads the agent identifiers of a set up to its end, and gives the bytes in front of that.
+/// Reads the agent identifiers of a set up to its end.
+#[inline(always)]
 pub(crate) fn agent_ids<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
-    depth: usize,
     set: &'static str,
-) -> Result<&'a [u8], DecodeError> {
-    reader.set(set, |reader| agent_id(reader, depth))
-}
-
-enum Parameter<'a> {
-    Addresses(&'a [u8]),
-    Resolvers(&'a [u8]),
-    UserDefined(&'a str, Text<'a>),
-}
-
-/// The next parameter of an identifier, or `None` at its end.
-fn parameter<'a, N: Notes>(
-    reader: &mut Reader<'a, N>,
-    depth: usize,
-) -> Result<Option<Parameter<'a>>, DecodeError> {
-    let code = reader.byte(CLAUSE, "an agent identifier")?;
-    Ok(Some(match code {
-        0x01 => return Ok(None),
-        0x02 => Parameter::Addresses(addresses(reader)?),
-        0x03 => {
-            let Some(depth) = depth.checked_sub(1) else {
-                return Err(reader.error(CLAUSE, Problem::TooDeep("resolvers")));
-            };
-            Parameter::Resolvers(agent_ids(reader, depth, "resolvers")?)
-        }
-        0x04 => {
-            let (name, value) = user_defined(reader)?;
-            Parameter::UserDefined(name, value)
-        }
-        other => return Err(reader.unexpected(CLAUSE, other, "a part of an agent identifier")),
-    }))
-}
-
-fn addresses<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<&'a [u8], DecodeError> {
-    reader.note(|| "addresses".to_owned());
-    reader.notes().deeper();
-    let start = reader.position();
-    loop {
-        let addresses = reader.since(start);
-        if reader.take_if(0x01) {
-            reader.notes().shallower();
-            reader.note(|| "end of addresses".to_owned());
-            return Ok(addresses);
-        }
-        let address = word(reader, "address")?;
-        if address.is_empty() {
-            return Err(reader.error(CLAUSE, Problem::Empty("address")));
-        }
-        reader.note(|| format!("address {}", notes::quoted(address)));
+) -> Result<AgentIds<'a>, DecodeError> {
+    if N::SILENT
+        && let Some(members) = reader.short_agent_names()
+    {
+        return Ok(AgentIds::new(Encoding::BitEfficient, members));
     }
+    other_agent_ids(reader, set)
+}
+
+#[inline(never)]
+fn other_agent_ids<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
+    set: &'static str,
+) -> Result<AgentIds<'a>, DecodeError> {
+    let members = reader.set(set, |reader| agent_id(reader, AgentId::MAX_DEPTH))?;
+    Ok(AgentIds::new(Encoding::BitEfficient, members))
+}
+
+/// The next part of an identifier, whose resolvers may be nested `depth` deep, or `None` at its
+/// end.
+fn part<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
+    list: &mut List,
+    depth: usize,
+) -> Result<Option<Part<'a>>, DecodeError> {
+    loop {
+        list.end(reader);
+        match list {
+            List::Addresses => return address(reader).map(Some),
+            List::Resolvers => {
+                let Some(depth) = depth.checked_sub(1) else {
+                    return Err(reader.error(CLAUSE, Problem::TooDeep("resolvers")));
+                };
+                return Ok(Some(Part::Resolver(agent_id(reader, depth)?)));
+            }
+            List::Outside => {}
+        }
+        match reader.byte(CLAUSE, "an agent identifier")? {
+            0x01 => return Ok(None),
+            0x02 => list.begin(List::Addresses, reader),
+            0x03 => list.begin(List::Resolvers, reader),
+            0x04 => {
+                let (name, value) = user_defined(reader)?;
+                return Ok(Some(Part::UserDefined(name, value)));
+            }
+            other => return Err(reader.unexpected(CLAUSE, other, "a part of an agent identifier")),
+        }
+    }
+}
+
+/// Both bit-efficient formats begin lists with a code, and end them with 01.
+impl List {
+    pub(crate) fn begin<N: Notes>(&mut self, list: Self, reader: &mut Reader<'_, N>) {
+        *self = list;
+        reader.note(|| list.name().to_owned());
+        reader.notes().deeper();
+    }
+
+    /// Leaves the list if it ends here.
+    pub(crate) fn end<N: Notes>(&mut self, reader: &mut Reader<'_, N>) {
+        if *self != Self::Outside && reader.take_if(0x01) {
+            reader.notes().shallower();
+            reader.note(|| format!("end of {}", self.name()));
+            *self = Self::Outside;
+        }
+    }
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Outside => "",
+            Self::Addresses => "addresses",
+            Self::Resolvers => "resolvers",
+        }
+    }
+}
+
+fn address<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<Part<'a>, DecodeError> {
+    let address = Text::plain(word(reader, "address")?);
+    if address.is_empty() {
+        return Err(reader.error(CLAUSE, Problem::Empty("address")));
+    }
+    reader.note(|| format!("address {}", notes::quoted(&address.as_str())));
+    Ok(Part::Address(address))
 }
 
 /// Reads a `BinWord`.
@@ -209,18 +162,34 @@ fn addresses<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<&'a [u8], Decod
 pub(crate) fn word<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     what: &'static str,
-) -> Result<&'a str, DecodeError> {
+) -> Result<&'a [u8], DecodeError> {
     match reader.short_word() {
-        Some(word) => Ok(word),
+        Some((word, _)) => Ok(word),
         None => other_word(reader, what),
     }
+}
+
+/// Reads a `BinWord`, and says whether it is one but for its first character.
+#[inline(always)]
+pub(crate) fn token<'a, N: Notes>(
+    reader: &mut Reader<'a, N>,
+    what: &'static str,
+) -> Result<(Text<'a>, bool), DecodeError> {
+    let (word, is_token) = match reader.short_word() {
+        Some((word, kind)) => (word, !word.is_empty() && Kind::is_token(kind)),
+        None => {
+            let word = other_word(reader, what)?;
+            (word, is_token(word))
+        }
+    };
+    Ok((Text::plain(word), is_token))
 }
 
 #[inline(never)]
 fn other_word<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     what: &'static str,
-) -> Result<&'a str, DecodeError> {
+) -> Result<&'a [u8], DecodeError> {
     const CLAUSE: &str = "FIPA00069 2.1 BinWord";
     match reader.byte(CLAUSE, what)? {
         0x10 => reader.plain(CLAUSE, what),
@@ -230,20 +199,22 @@ fn other_word<'a, N: Notes>(
 }
 
 /// Reads name and value of a user-defined parameter; the name comes without `X-`.
+#[inline(never)]
 pub(crate) fn user_defined<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
-) -> Result<(&'a str, Text<'a>), DecodeError> {
+) -> Result<(Text<'a>, Text<'a>), DecodeError> {
     let offset = reader.offset();
     let name = without_x(word(reader, "user-defined name")?);
     if !is_token(name) {
         let problem = Problem::NotAWord("name of a user-defined parameter");
         return Err(DecodeError::new(offset, "FIPA00061 user-defined", problem));
     }
-    reader.note(|| format!("user-defined parameter {}", notes::quoted(name)));
+    let name = Text::plain(name);
+    reader.note(|| format!("user-defined parameter {}", notes::quoted(&name.as_str())));
     // JADE writes an empty value as a lone 00, which is no expression.
     if reader.take_if(0x00) {
         reader.note(|| "user-defined value: none, as JADE writes it".to_owned());
-        return Ok((name, Text::plain("")));
+        return Ok((name, Text::plain(b"")));
     }
     let value = expression(reader, "user-defined value")?;
     reader.note(|| notes::named("user-defined value", &value));
@@ -251,9 +222,9 @@ pub(crate) fn user_defined<'a, N: Notes>(
 }
 
 /// The name of a user-defined parameter without its `X-`, which not every peer writes.
-pub(crate) fn without_x(name: &str) -> &str {
-    match name.as_bytes() {
-        [b'X' | b'x', b'-', _, ..] => name.get(2..).unwrap_or(name),
+pub(crate) fn without_x(name: &[u8]) -> &[u8] {
+    match name {
+        [b'X' | b'x', b'-', rest @ ..] if !rest.is_empty() => rest,
         _ => name,
     }
 }
@@ -270,14 +241,12 @@ mod tests {
         assert_eq!(reader.remaining(), 0);
         assert_eq!(view.name(), "a");
         assert_eq!(view.addresses().collect::<Vec<_>>(), ["u:1", "u:2"]);
-        assert_eq!(
-            view.resolvers().map(|r| r.name()).collect::<Vec<_>>(),
-            ["r"]
-        );
+        let resolvers: Vec<_> = view.resolvers().map(|resolver| resolver.name()).collect();
+        assert_eq!(resolvers, ["r"]);
         let user: Vec<_> = view.user_defined().collect();
-        assert_eq!(user, [("p", Text::plain("7"))]);
+        assert_eq!(user, [(Text::plain(b"p"), Text::plain(b"7"))]);
         assert_eq!(
-            view.to_owned().unwrap().user_defined(),
+            view.to_agent_id().unwrap().user_defined(),
             [("p".into(), "7".into())]
         );
     }

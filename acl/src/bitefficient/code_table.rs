@@ -8,8 +8,8 @@ use std::collections::{BTreeSet, HashMap};
 
 use bytes::Bytes;
 
+use crate::bitefficient::expression::MAX_EXPRESSION_DEPTH;
 use crate::bitefficient::reader::Reader;
-use crate::bitefficient::text::MAX_EXPRESSION_DEPTH;
 use crate::bitefficient::write::{Out, write_len};
 use crate::error::{DecodeError, Problem};
 use crate::{AgentId, Message, Payload};

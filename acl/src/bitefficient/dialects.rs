@@ -41,35 +41,11 @@ impl Writer {
     fn message(&mut self, message: &Message) -> Result<(), EncodeError> {
         self.out.slice(&[0xfa, 0x10]);
         self.performative(&message.performative)?;
-        match &message.sender {
-            Some(sender) => {
-                self.out.byte(0x02);
-                self.agent(sender)?;
-            }
-            // What fipa_services writes itself.
-            None if self.peer == Peer::FipaServices => {
-                self.out.slice(b"\x02\x02\x10");
-                self.out.slice(UNDEFINED_AGENT.as_bytes());
-                self.out.slice(b"\0\x01");
-            }
-            None => {}
+        // Each in its own order, though both read any.
+        match self.peer {
+            Peer::FipaServices => self.as_fipa_services(message)?,
+            Peer::Jade => self.as_jade(message)?,
         }
-        self.agent_set(0x03, &message.receivers)?;
-        self.text(0x05, "reply-with", message.reply_with())?;
-        if let Some(time) = message.reply_by {
-            self.out.byte(0x06);
-            self.time(time)?;
-        }
-        self.text(0x07, "in-reply-to", message.in_reply_to())?;
-        self.agent_set(0x08, &message.reply_to)?;
-        self.text(0x09, "language", message.language())?;
-        self.text(0x0a, "encoding", message.encoding())?;
-        self.text(0x0b, "ontology", message.ontology())?;
-        if let Some(protocol) = &message.protocol {
-            self.out.byte(0x0c);
-            self.word("protocol", protocol)?;
-        }
-        self.text(0x0d, "conversation-id", message.conversation_id())?;
         self.user_defined(0x00, &message.user_defined)?;
         if let Some(content) = &message.content {
             self.out.byte(0x04);
@@ -77,6 +53,65 @@ impl Writer {
         }
         self.out.byte(0x01);
         Ok(())
+    }
+
+    fn as_fipa_services(&mut self, message: &Message) -> Result<(), EncodeError> {
+        if message.sender.is_none() {
+            // What it writes itself.
+            self.out.slice(b"\x02\x02\x10");
+            self.out.slice(UNDEFINED_AGENT.as_bytes());
+            self.out.slice(b"\0\x01");
+        }
+        self.sender(message)?;
+        self.agent_set(0x03, &message.receivers)?;
+        self.text(0x05, "reply-with", message.reply_with())?;
+        self.reply_by(message)?;
+        self.text(0x07, "in-reply-to", message.in_reply_to())?;
+        self.agent_set(0x08, &message.reply_to)?;
+        self.text(0x09, "language", message.language())?;
+        self.text(0x0a, "encoding", message.encoding())?;
+        self.text(0x0b, "ontology", message.ontology())?;
+        self.protocol(message)?;
+        self.text(0x0d, "conversation-id", message.conversation_id())
+    }
+
+    /// As far as its order is known from what it wrote.
+    fn as_jade(&mut self, message: &Message) -> Result<(), EncodeError> {
+        self.text(0x0b, "ontology", message.ontology())?;
+        self.sender(message)?;
+        self.agent_set(0x03, &message.receivers)?;
+        self.agent_set(0x08, &message.reply_to)?;
+        self.text(0x0d, "conversation-id", message.conversation_id())?;
+        self.text(0x07, "in-reply-to", message.in_reply_to())?;
+        self.text(0x05, "reply-with", message.reply_with())?;
+        self.reply_by(message)?;
+        self.text(0x09, "language", message.language())?;
+        self.text(0x0a, "encoding", message.encoding())?;
+        self.protocol(message)
+    }
+
+    fn sender(&mut self, message: &Message) -> Result<(), EncodeError> {
+        let Some(sender) = &message.sender else {
+            return Ok(());
+        };
+        self.out.byte(0x02);
+        self.agent(sender)
+    }
+
+    fn reply_by(&mut self, message: &Message) -> Result<(), EncodeError> {
+        let Some(time) = message.reply_by else {
+            return Ok(());
+        };
+        self.out.byte(0x06);
+        self.time(time)
+    }
+
+    fn protocol(&mut self, message: &Message) -> Result<(), EncodeError> {
+        let Some(protocol) = &message.protocol else {
+            return Ok(());
+        };
+        self.out.byte(0x0c);
+        self.word("protocol", protocol)
     }
 
     fn performative(&mut self, performative: &Performative) -> Result<(), EncodeError> {
@@ -129,7 +164,7 @@ impl Writer {
             self.out.byte(code);
             let what = "name of a user-defined parameter";
             // fipa_services keeps names without X- in its memory, and does not add it here.
-            if self.peer == Peer::FipaServices && without_x(name) == name {
+            if self.peer == Peer::FipaServices && without_x(name.as_bytes()) == name.as_bytes() {
                 self.word(what, name)?;
             } else {
                 self.word(what, &format!("X-{name}"))?;

@@ -5,20 +5,16 @@
 //! strict: version 1.0, words where the text is one and string literals elsewhere, content last
 //! and with its length in front, no code tables. Those are read with a table of the caller's.
 
-mod agent_id;
+pub(crate) mod agent_id;
 mod code_table;
-mod decode;
 pub(crate) mod dialects;
+pub(crate) mod expression;
 pub(crate) mod notes;
 pub(crate) mod reader;
-pub(crate) mod text;
 mod view;
 pub(crate) mod write;
 
 pub(crate) use agent_id::without_x;
-pub use agent_id::{AgentIdView, AgentIds};
 pub use code_table::CodeTable;
-pub(crate) use decode::decode;
-pub use text::Text;
-pub use view::MessageView;
+pub(crate) use view::{next_user_defined, view, view_noting, view_split};
 pub use write::{encode, encoded_len};

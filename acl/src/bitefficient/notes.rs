@@ -5,8 +5,8 @@
 
 use std::fmt::Write as _;
 
-use crate::bitefficient::{Text, without_x};
-use crate::{Time, Zone};
+use crate::bitefficient::without_x;
+use crate::{Text, Time, Zone};
 
 /// Listens to the remarks of a reader.
 pub(crate) trait Notes {
@@ -75,8 +75,11 @@ pub(crate) fn text(text: &Text<'_>) -> String {
 
 /// A user-defined parameter and its text.
 pub(crate) fn user_defined(name: &Text<'_>, value: &Text<'_>) -> String {
-    let name = quoted(without_x(&name.as_str()));
-    named(&format!("user-defined parameter {name}"), value)
+    let name = Text::plain(without_x(name.raw()));
+    named(
+        &format!("user-defined parameter {}", quoted(&name.as_str())),
+        value,
+    )
 }
 
 /// A text as a note repeats it: cut, and without control characters.

@@ -1,17 +1,19 @@
 //! Reading what both bit-efficient formats consist of, with every bound checked.
 
-use ascii::AsciiStr;
+use std::borrow::Cow;
 
+use crate::Text;
 use crate::bitefficient::notes::{Notes, Silent};
-use crate::bitefficient::text::Text;
 use crate::error::{DecodeError, Problem};
+use crate::scan::{Kind, ONES, TOPS, near_text};
 use crate::time::{Base, Fields, Time, Zone};
 
 /// A place in bytes that came from outside.
 #[derive(Debug, Clone)]
 pub(crate) struct Reader<'a, N = Silent> {
     bytes: &'a [u8],
-    position: usize,
+    /// Those that were not read yet.
+    rest: &'a [u8],
     /// Where `bytes` begin in what is decoded, for errors.
     base: usize,
     /// Who is told what the bytes mean.
@@ -31,7 +33,7 @@ impl<'a, N: Notes> Reader<'a, N> {
     pub(crate) fn noting(bytes: &'a [u8], base: usize, notes: N) -> Self {
         Self {
             bytes,
-            position: 0,
+            rest: bytes,
             base,
             notes,
         }
@@ -51,7 +53,7 @@ impl<'a, N: Notes> Reader<'a, N> {
     }
 
     /// Reads a set or sequence member by member up to its end, and gives the bytes in front of that.
-    #[inline]
+    #[inline(always)]
     pub(crate) fn set<T>(
         &mut self,
         name: &'static str,
@@ -76,7 +78,7 @@ impl<'a, N: Notes> Reader<'a, N> {
     pub(crate) fn ahead(&self) -> Reader<'a> {
         Reader {
             bytes: self.bytes,
-            position: self.position,
+            rest: self.rest,
             base: self.base,
             notes: Silent,
         }
@@ -85,42 +87,42 @@ impl<'a, N: Notes> Reader<'a, N> {
     /// Goes on where the one that looked ahead is.
     #[inline]
     pub(crate) fn follow(&mut self, ahead: &Reader<'a>) {
-        self.position = ahead.position;
+        self.rest = ahead.rest;
     }
 
     /// Goes on with other bytes, which begin at the offset `base`.
     pub(crate) fn go_on(&mut self, bytes: &'a [u8], base: usize) {
         self.bytes = bytes;
-        self.position = 0;
+        self.rest = bytes;
         self.base = base;
     }
 
     /// How many bytes were read.
     #[inline]
     pub(crate) fn position(&self) -> usize {
-        self.position
+        self.bytes.len() - self.rest.len()
     }
 
     /// Where the next byte stands in what is decoded.
     #[inline]
     pub(crate) fn offset(&self) -> usize {
-        self.base + self.position
+        self.base + self.position()
     }
 
     #[inline]
     pub(crate) fn remaining(&self) -> usize {
-        self.bytes.len() - self.position
+        self.rest.len()
     }
 
     /// What was not read yet.
     pub(crate) fn rest(&self) -> &'a [u8] {
-        self.bytes.get(self.position..).unwrap_or_default()
+        self.rest
     }
 
     /// What was read since `start`, a former [`position`](Self::position).
     #[inline]
     pub(crate) fn since(&self, start: usize) -> &'a [u8] {
-        self.bytes.get(start..self.position).unwrap_or_default()
+        self.bytes.get(start..self.position()).unwrap_or_default()
     }
 
     #[cold]
@@ -142,9 +144,9 @@ impl<'a, N: Notes> Reader<'a, N> {
 
     #[inline]
     pub(crate) fn byte(&mut self, clause: &'static str, what: &'static str) -> Result<u8> {
-        match self.bytes.get(self.position) {
-            Some(&byte) => {
-                self.position += 1;
+        match self.rest.split_first() {
+            Some((&byte, rest)) => {
+                self.rest = rest;
                 Ok(byte)
             }
             None => Err(self.error(clause, Problem::Truncated(what))),
@@ -153,23 +155,25 @@ impl<'a, N: Notes> Reader<'a, N> {
 
     #[inline]
     pub(crate) fn peek(&self) -> Option<u8> {
-        self.bytes.get(self.position).copied()
+        self.rest.first().copied()
     }
 
     /// Passes over the next byte, which was peeked at.
     #[inline]
     pub(crate) fn skip_peeked(&mut self) {
-        self.position = self.bytes.len().min(self.position + 1);
+        self.rest = self.rest.get(1..).unwrap_or_default();
     }
 
     /// Reads the byte if it is the next one.
     #[inline]
     pub(crate) fn take_if(&mut self, byte: u8) -> bool {
-        let next = self.peek() == Some(byte);
-        if next {
-            self.position += 1;
+        match self.rest.split_first() {
+            Some((next, rest)) if *next == byte => {
+                self.rest = rest;
+                true
+            }
+            _ => false,
         }
-        next
     }
 
     #[inline]
@@ -179,10 +183,9 @@ impl<'a, N: Notes> Reader<'a, N> {
         clause: &'static str,
         what: &'static str,
     ) -> Result<&'a [u8]> {
-        let rest = self.bytes.get(self.position..).unwrap_or_default();
-        match rest.get(..len) {
-            Some(taken) => {
-                self.position += len;
+        match self.rest.split_at_checked(len) {
+            Some((taken, rest)) => {
+                self.rest = rest;
                 Ok(taken)
             }
             None => Err(self.error(clause, Problem::Truncated(what))),
@@ -215,11 +218,15 @@ impl<'a, N: Notes> Reader<'a, N> {
         clause: &'static str,
         what: &'static str,
     ) -> Result<&'a [u8]> {
-        let rest = self.bytes.get(self.position..).unwrap_or_default();
-        match find_nul(rest) {
-            Some(len) => {
-                self.position += len + 1;
-                Ok(rest.get(..len).unwrap_or_default())
+        if let Some((text, rest, _)) = near_text(self.rest) {
+            self.rest = rest;
+            return Ok(text);
+        }
+        let nul = memchr::memchr(0, self.rest);
+        match nul.and_then(|nul| self.rest.split_at_checked(nul)) {
+            Some((text, rest)) => {
+                self.rest = rest.get(1..).unwrap_or_default();
+                Ok(text)
             }
             None => Err(self.error(clause, Problem::Truncated(what))),
         }
@@ -227,49 +234,82 @@ impl<'a, N: Notes> Reader<'a, N> {
 
     /// UTF-8 text up to the next NUL, as it stands.
     #[inline]
-    pub(crate) fn plain(&mut self, clause: &'static str, what: &'static str) -> Result<&'a str> {
+    pub(crate) fn plain(&mut self, clause: &'static str, what: &'static str) -> Result<&'a [u8]> {
+        if let Some((text, rest, kind)) = near_text(self.rest)
+            && kind.is_ascii()
+        {
+            self.rest = rest;
+            return Ok(text);
+        }
+        self.other_plain(clause, what)
+    }
+
+    #[inline(never)]
+    fn other_plain(&mut self, clause: &'static str, what: &'static str) -> Result<&'a [u8]> {
         let bytes = self.until_nul(clause, what)?;
-        self.utf8(bytes, 1, clause, what)
+        self.check_utf8(bytes, 1, clause, what)?;
+        Ok(bytes)
     }
 
     /// The next text, if it is of the kind that nearly all are: short, in ASCII, and a word
-    /// (`10 … 00`) or in quotation marks (`14 "…" 00`).
+    /// (`10 … 00`) or a string (`14 … 00`).
     #[inline(always)]
     pub(crate) fn short_text(&mut self) -> Option<Text<'a>> {
-        let (&code, rest) = self.bytes.get(self.position..)?.split_first()?;
-        let text = match (code, rest.get(..near_nul(rest)?)?) {
-            (0x10, word) => Text::plain(ascii(word)?),
-            (0x14, [b'"', inner @ .., b'"']) => Text::quoted(ascii(inner)?),
-            _ => return None,
-        };
-        // Code and NUL, and the quotation marks.
-        self.position += text.raw().len() + if code == 0x10 { 2 } else { 4 };
-        Some(text)
+        let (&code, rest) = self.rest.split_first()?;
+        if code & !0x04 != 0x10 {
+            return None;
+        }
+        let (bytes, rest, kind) = near_text(rest)?;
+        if !kind.is_ascii() {
+            return None;
+        }
+        self.rest = rest;
+        Some(if code == 0x10 {
+            Text::plain(bytes)
+        } else {
+            Text::string(bytes)
+        })
     }
 
-    /// The next word, if it is short and in ASCII as nearly all are.
+    /// The next word, if it is short and in ASCII as nearly all are, and what kind it is.
     #[inline(always)]
-    pub(crate) fn short_word(&mut self) -> Option<&'a str> {
-        let [0x10, rest @ ..] = self.bytes.get(self.position..)? else {
+    pub(crate) fn short_word(&mut self) -> Option<(&'a [u8], Kind)> {
+        let [0x10, rest @ ..] = self.rest else {
             return None;
         };
-        let word = ascii(rest.get(..near_nul(rest)?)?)?;
-        self.position += word.len() + 2;
-        Some(word)
+        let (word, rest, kind) = near_text(rest)?;
+        kind.is_ascii().then(|| {
+            self.rest = rest;
+            (word, kind)
+        })
     }
 
     /// The next agent identifier, if it is of the kind that nearly all are: a short name in ASCII,
     /// and nothing else (`02 10 … 00 01`).
     #[inline(always)]
-    pub(crate) fn short_agent_name(&mut self) -> Option<&'a str> {
-        let [0x02, 0x10, rest @ ..] = self.bytes.get(self.position..)? else {
+    pub(crate) fn short_agent_name(&mut self) -> Option<&'a [u8]> {
+        let [0x02, 0x10, rest @ ..] = self.rest else {
             return None;
         };
-        let len = near_nul(rest)?;
-        let name = ascii(rest.get(..len)?)?;
-        (len > 0 && rest.get(len + 1) == Some(&0x01)).then(|| {
-            self.position += len + 4;
+        let (name, [0x01, rest @ ..], kind) = near_text(rest)? else {
+            return None;
+        };
+        (kind.is_ascii() && !name.is_empty()).then(|| {
+            self.rest = rest;
             name
+        })
+    }
+
+    /// A set of such agent identifiers, up to its end, which is read too.
+    #[inline(always)]
+    pub(crate) fn short_agent_names(&mut self) -> Option<&'a [u8]> {
+        let mut ahead = self.ahead();
+        let start = ahead.position();
+        while ahead.short_agent_name().is_some() {}
+        let names = ahead.since(start);
+        ahead.take_if(0x01).then(|| {
+            self.follow(&ahead);
+            names
         })
     }
 
@@ -279,66 +319,78 @@ impl<'a, N: Notes> Reader<'a, N> {
         len: usize,
         clause: &'static str,
         what: &'static str,
-    ) -> Result<&'a str> {
+    ) -> Result<&'a [u8]> {
         let offset = self.offset();
         let bytes = self.bytes(len, clause, what)?;
         if memchr::memchr(0, bytes).is_some() {
             return Err(DecodeError::new(offset, clause, Problem::Nul(what)));
         }
-        self.utf8(bytes, 0, clause, what)
+        self.check_utf8(bytes, 0, clause, what)?;
+        Ok(bytes)
     }
 
     /// Text up to the next NUL, by the rule for `String 00` that fits every peer: in quotation
     /// marks (standard, fipa_services), with its length in front (fipa_services), or bare (JADE).
     #[inline]
     pub(crate) fn string(&mut self, clause: &'static str, what: &'static str) -> Result<Text<'a>> {
-        let text = self.plain(clause, what)?;
-        let (form, inner) = string_form(text.as_bytes());
-        // What is taken off is ASCII, so this is always a text.
-        let from = match form {
-            Form::Bare => return Ok(Text::plain(text)),
-            Form::Quoted => 1,
-            Form::Counted => text.len() - inner.len(),
-        };
-        let inner = text.get(from..from + inner.len()).unwrap_or_default();
-        Ok(match form {
-            Form::Quoted => Text::quoted(inner),
-            _ => Text::counted(inner),
-        })
+        self.plain(clause, what).map(Text::string)
     }
 
-    /// Bytes as text, `behind` which bytes more were read. Nearly all text is ASCII, and that is
-    /// quickly found out.
-    #[inline(always)]
-    fn utf8(
+    /// Checks bytes, `behind` which bytes more were read.
+    fn check_utf8(
         &self,
-        bytes: &'a [u8],
+        bytes: &[u8],
         behind: usize,
         clause: &'static str,
         what: &'static str,
-    ) -> Result<&'a str> {
-        match ascii(bytes) {
-            Some(text) => Ok(text),
-            None => self.other_utf8(bytes, behind, clause, what),
+    ) -> Result<()> {
+        let Err(error) = std::str::from_utf8(bytes) else {
+            return Ok(());
+        };
+        let offset = self.offset() - behind - bytes.len() + error.valid_up_to();
+        Err(DecodeError::new(offset, clause, Problem::NotUtf8(what)))
+    }
+
+    /// The next date and time, if it is of the kind that nearly all are: on the calendar, in UTC or
+    /// without a zone, and within what every month and every minute has.
+    #[inline(always)]
+    fn short_date_time(&mut self) -> Option<Time> {
+        let (&[code, first @ .., last], rest) = self.rest.split_first_chunk::<10>()?;
+        let numbers = all_digits(first).filter(|numbers| Fields::are_usual(*numbers))?;
+        let [century, year, month, day, hour, minute, second, tens] = numbers.to_le_bytes();
+        let (0x10..=0xa0, 0) = (last & 0xf0, last & 0x0f) else {
+            return None;
+        };
+        let (zone, rest) = match (code, rest) {
+            (0x20, rest) => (Zone::Unspecified, rest),
+            (0x24, [b'Z', rest @ ..]) => (Zone::Utc, rest),
+            _ => return None,
+        };
+        self.rest = rest;
+        let fields = Fields {
+            year: u16::from(century) * 100 + u16::from(year),
+            month,
+            day,
+            hour,
+            minute,
+            second,
+            millisecond: u16::from(tens) * 10 + u16::from(last >> 4) - 1,
+        };
+        let base = Base::Absolute;
+        Some(Time { base, zone, fields })
+    }
+
+    /// A date and time after its code byte (FIPA00069 `BinDateTime`), which says what follows.
+    #[inline(always)]
+    pub(crate) fn date_time(&mut self, clause: &'static str) -> Result<Time> {
+        match self.short_date_time() {
+            Some(time) => Ok(time),
+            None => self.other_date_time(clause),
         }
     }
 
     #[inline(never)]
-    fn other_utf8(
-        &self,
-        bytes: &'a [u8],
-        behind: usize,
-        clause: &'static str,
-        what: &'static str,
-    ) -> Result<&'a str> {
-        std::str::from_utf8(bytes).map_err(|error| {
-            let offset = self.offset() - behind - bytes.len() + error.valid_up_to();
-            DecodeError::new(offset, clause, Problem::NotUtf8(what))
-        })
-    }
-
-    /// A date and time after its code byte (FIPA00069 `BinDateTime`), which says what follows.
-    pub(crate) fn date_time(&mut self, clause: &'static str) -> Result<Time> {
+    fn other_date_time(&mut self, clause: &'static str) -> Result<Time> {
         let code = self.byte(clause, "a date")?;
         let base = match code {
             0x20 | 0x24 => Base::Absolute,
@@ -362,8 +414,7 @@ impl<'a, N: Notes> Reader<'a, N> {
 
     /// Digits (FIPA00069 2.2): ends behind the first byte whose low nibble is 0.
     pub(crate) fn digits(&mut self, clause: &'static str) -> Result<&'a [u8]> {
-        let rest = self.bytes.get(self.position..).unwrap_or_default();
-        let last = rest.iter().position(|byte| byte & 0x0f == 0);
+        let last = self.rest.iter().position(|byte| byte & 0x0f == 0);
         let Some(last) = last else {
             return Err(self.error(clause, Problem::Truncated("a number")));
         };
@@ -397,6 +448,23 @@ pub(crate) fn string_form(bytes: &[u8]) -> (Form, &[u8]) {
     }
 }
 
+/// What stands between quotation marks: `\"` becomes `"`; a backslash before anything else is a
+/// backslash.
+pub(crate) fn unescaped(inner: &[u8]) -> Cow<'_, [u8]> {
+    let mut escapes = memchr::memmem::find_iter(inner, b"\\\"").peekable();
+    if escapes.peek().is_none() {
+        return Cow::Borrowed(inner);
+    }
+    let mut out = Vec::with_capacity(inner.len());
+    let mut done = 0;
+    for backslash in escapes {
+        out.extend_from_slice(inner.get(done..backslash).unwrap_or_default());
+        done = backslash + 1;
+    }
+    out.extend_from_slice(inner.get(done..).unwrap_or_default());
+    Cow::Owned(out)
+}
+
 /// The text behind `n"`, if it is of n bytes.
 fn counted(bytes: &[u8]) -> Option<&[u8]> {
     // A length has at most 10 digits; looking no further keeps hostile input cheap.
@@ -410,38 +478,6 @@ fn counted(bytes: &[u8]) -> Option<&[u8]> {
         len = len * 10 + usize::from(digit - b'0');
     }
     (!digits.is_empty() && len == text.len()).then_some(text)
-}
-
-const ONES: u64 = 0x0101_0101_0101_0101;
-const TOPS: u64 = ONES << 7;
-
-/// Words and names are a few bytes long: looking at those eight by eight is quicker than starting a
-/// vectorised search.
-#[inline]
-fn find_nul(bytes: &[u8]) -> Option<usize> {
-    near_nul(bytes).or_else(|| memchr::memchr(0, bytes))
-}
-
-/// The first NUL, if it is near and not among the last bytes.
-#[inline(always)]
-fn near_nul(bytes: &[u8]) -> Option<usize> {
-    const NEAR: usize = 5;
-    let mut before = 0;
-    for eight in bytes.as_chunks::<8>().0.iter().take(NEAR) {
-        let word = u64::from_le_bytes(*eight);
-        // Of the first byte that is zero, and perhaps of later ones, the top bit is set.
-        let zeros = word.wrapping_sub(ONES) & !word & TOPS;
-        if zeros != 0 {
-            return Some(before + zeros.trailing_zeros() as usize / 8);
-        }
-        before += 8;
-    }
-    None
-}
-
-#[inline(always)]
-fn ascii(bytes: &[u8]) -> Option<&str> {
-    AsciiStr::from_ascii(bytes).ok().map(AsciiStr::as_str)
 }
 
 /// The characters of digits that were read; `None` stands for a nibble without a meaning.
@@ -467,8 +503,8 @@ pub(crate) fn digit_chars(digits: &[u8]) -> impl Iterator<Item = Option<char>> +
 fn bin_date(digits: [u8; 9]) -> Option<Fields> {
     let [y1, y2, month, day, hour, minute, second, m1, m2] = digits;
     let first = [y1, y2, month, day, hour, minute, second, m1];
-    let [century, year, month, day, hour, minute, second, tens] = match all_digits(first) {
-        Some(numbers) => numbers,
+    let numbers = match all_digits(first) {
+        Some(numbers) => numbers.to_le_bytes(),
         None => {
             let padded = |byte: u8| match (byte >> 4, byte & 0x0f) {
                 (digit, 0) | (0, digit) => nibble(digit),
@@ -481,6 +517,7 @@ fn bin_date(digits: [u8; 9]) -> Option<Fields> {
             [two(y1)?, two(y2)?, a, b, c, d, e, two(m1)?]
         }
     };
+    let [century, year, month, day, hour, minute, second, tens] = numbers;
     let millisecond = if m2 & 0x0f == 0 {
         u16::from(tens) * 10 + u16::from(nibble(m2 >> 4)?)
     } else {
@@ -499,14 +536,14 @@ fn bin_date(digits: [u8; 9]) -> Option<Fields> {
 
 /// The numbers that eight times two digits are, if all of them are digits.
 #[inline]
-fn all_digits(bytes: [u8; 8]) -> Option<[u8; 8]> {
+fn all_digits(bytes: [u8; 8]) -> Option<u64> {
     let word = u64::from_le_bytes(bytes);
     let (high, low) = (word >> 4 & (ONES * 0x0f), word & (ONES * 0x0f));
     // In every byte: the top bit is set where there is a padding nibble or none of a digit.
     let padding = |nibbles: u64| !(nibbles + ONES * 0x7f);
     let beyond = |nibbles: u64| nibbles + ONES * (0x80 - 11);
     let wrong = padding(high) | padding(low) | beyond(high) | beyond(low);
-    (wrong & TOPS == 0).then(|| (high * 10 + low - ONES * 11).to_le_bytes())
+    (wrong & TOPS == 0).then(|| high * 10 + low - ONES * 11)
 }
 
 /// The number that two digits are.

@@ -2,14 +2,12 @@
 
 use bytes::Bytes;
 
-use crate::bitefficient::{Text, without_x};
-use crate::envelope::agent_id::AgentIdViews;
-use crate::envelope::read::{Event, Parameter, Part, ReceivedView, UserDefined, Walk};
-use crate::envelope::view::Age;
+use crate::envelope::parts::{Event, Events, Parameter, Part, ReceivedView, UserDefined};
+use crate::envelope::read::Walk;
+use crate::envelope::view::{Origin, is_xml};
 use crate::error::{DecodeError, Problem};
-use crate::{
-    AgentId, Envelope, EnvelopeParams, EnvelopeView, Letter, Received, Representation, xml,
-};
+use crate::view::AgentIds;
+use crate::{AgentId, Envelope, EnvelopeParams, EnvelopeView, Letter, Received, Text, xml};
 
 impl Envelope {
     /// Reads an encoded envelope with its extensions, behind which the payload may follow, and
@@ -23,39 +21,42 @@ impl Envelope {
     /// When the bytes do not begin with a whole envelope.
     pub fn decode(bytes: &[u8]) -> Result<(Self, usize), DecodeError> {
         if is_xml(bytes) {
-            return xml::decode_envelope(bytes);
+            decode(xml::Walk::new(bytes))
+        } else {
+            decode(Walk::new(bytes))
         }
-        let mut newest_first = Vec::new();
-        let mut oldest_first = Vec::new();
-        let mut age = Age::Base;
-        let mut current = EnvelopeParams::default();
-        let mut walk = Walk::new(bytes);
-        let mut begun = false;
-        while let Some(event) = walk.next()? {
-            match event {
-                Event::Part(part) => {
-                    if begun {
-                        let extensions = match age {
-                            Age::OldestFirst => &mut oldest_first,
-                            Age::NewestFirst | Age::Base => &mut newest_first,
-                        };
-                        extensions.push(std::mem::take(&mut current));
-                    }
-                    begun = true;
-                    age = Age::of(&part);
-                    begin(&mut current, part);
+    }
+}
+
+fn decode<'a>(mut walk: impl Events<'a>) -> Result<(Envelope, usize), DecodeError> {
+    let mut parts: Vec<(Origin, EnvelopeParams)> = Vec::new();
+    let mut current = 0;
+    while let Some(event) = walk.next()? {
+        match event {
+            Event::Part(part) => {
+                let origin = Origin::of(&part, parts.len() + 1);
+                current = origin.part.saturating_sub(1);
+                // In XML, one may go on that another was in.
+                if current == parts.len() {
+                    let mut params = EnvelopeParams::default();
+                    begin(&mut params, part);
+                    parts.push((origin, params));
                 }
-                Event::Parameter(parameter) => set(&mut current, parameter)?,
+            }
+            Event::Parameter(parameter) => {
+                if let Some((_, params)) = parts.get_mut(current) {
+                    set(params, parameter)?;
+                }
             }
         }
-        let mut extensions = oldest_first;
-        extensions.extend(newest_first.into_iter().rev());
-        let envelope = Self {
-            base: current,
-            extensions,
-        };
-        Ok((envelope, walk.position()))
     }
+    parts.sort_by_key(|(origin, _)| (origin.age, origin.part));
+    let mut parts = parts.into_iter().map(|(_, params)| params);
+    let envelope = Envelope {
+        base: parts.next().unwrap_or_default(),
+        extensions: parts.collect(),
+    };
+    Ok((envelope, walk.position()))
 }
 
 impl Letter {
@@ -64,11 +65,7 @@ impl Letter {
     /// # Errors
     /// When the bytes do not begin with a whole envelope. The message behind it is not looked at.
     pub fn split(mut bytes: Bytes) -> Result<Self, DecodeError> {
-        let envelope_len = if is_xml(&bytes) {
-            xml::decode_envelope(&bytes)?.1
-        } else {
-            EnvelopeView::parse(&bytes)?.len()
-        };
+        let envelope_len = EnvelopeView::parse(&bytes)?.len();
         let envelope = bytes.split_to(envelope_len);
         Ok(Self::new(envelope, bytes))
     }
@@ -103,10 +100,6 @@ impl Letter {
     }
 }
 
-fn is_xml(bytes: &[u8]) -> bool {
-    Representation::detect(bytes) == Some(Representation::Xml)
-}
-
 fn begin(params: &mut EnvelopeParams, part: Part<'_>) {
     match part {
         Part::Extension(view) => params.received = received(view),
@@ -114,22 +107,22 @@ fn begin(params: &mut EnvelopeParams, part: Part<'_>) {
             params.acl_representation = Some(representation.to_owned());
             params.date = Some(date);
         }
+        Part::Params { .. } => {}
     }
 }
 
 fn set(params: &mut EnvelopeParams, parameter: Parameter<'_>) -> Result<(), DecodeError> {
     match parameter {
-        // JADE writes a list that is empty where there is none.
-        Parameter::To([]) | Parameter::IntendedReceivers([]) => {}
-        Parameter::To(ids) => params.to = agents(ids)?,
-        Parameter::From(agent) => params.from = Some(agent.to_owned()?),
+        Parameter::To(ids) => add(&mut params.to, ids)?,
+        Parameter::From(agent) => params.from = Some(agent.to_agent_id()?),
+        Parameter::Date(date) => params.date = Some(date),
         Parameter::AclRepresentation(representation) => {
             params.acl_representation = Some(representation.to_owned());
         }
         Parameter::Comments(text) => params.comments = present(Some(text)),
         Parameter::PayloadLength(len) => params.payload_length = Some(len),
         Parameter::PayloadEncoding(text) => params.payload_encoding = present(Some(text)),
-        Parameter::IntendedReceivers(ids) => params.intended_receivers = agents(ids)?,
+        Parameter::IntendedReceivers(ids) => add(&mut params.intended_receivers, ids)?,
         // fipa_services repeats the stamp of an extension here, with more in it.
         Parameter::Received(view) => params.received = received(view).or(params.received.take()),
         Parameter::TransportBehaviour(text) => params.transport_behaviour = present(Some(text)),
@@ -138,10 +131,14 @@ fn set(params: &mut EnvelopeParams, parameter: Parameter<'_>) -> Result<(), Deco
     Ok(())
 }
 
-fn agents(ids: &[u8]) -> Result<Vec<AgentId>, DecodeError> {
-    AgentIdViews::new(ids)
-        .map(|agent| agent.to_owned())
-        .collect()
+/// The lists of one part add up in XML; a list that is empty is how JADE says that there is none.
+fn add(agents: &mut Vec<AgentId>, ids: AgentIds<'_>) -> Result<(), DecodeError> {
+    let more = ids.to_agent_ids()?;
+    if !ids.is_xml() && !more.is_empty() {
+        agents.clear();
+    }
+    agents.extend(more);
+    Ok(())
 }
 
 fn received(view: ReceivedView<'_>) -> Option<Received> {
@@ -162,14 +159,12 @@ fn present(text: Option<Text<'_>>) -> Option<String> {
 
 fn owned_pair(pair: UserDefined<'_>) -> (String, String) {
     match pair {
-        UserDefined::Pair(name, value) => (
-            without_x(&name.as_str()).to_owned(),
-            value.as_str().into_owned(),
-        ),
+        UserDefined::Pair(name, value) => (name.as_str().into_owned(), value.as_str().into_owned()),
         UserDefined::Joined(text) => {
             let text = text.as_str();
             let (name, value) = text.split_once(' ').unwrap_or((&text, ""));
-            (without_x(name).to_owned(), value.to_owned())
+            let name = Text::plain(name.as_bytes()).without_x();
+            (name.as_str().into_owned(), value.to_owned())
         }
     }
 }

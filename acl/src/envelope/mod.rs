@@ -1,7 +1,8 @@
 //! The envelope (FIPA00067): what message transport services need to know of a letter.
 
-mod agent_id;
+pub(crate) mod agent_id;
 mod decode;
+pub(crate) mod parts;
 mod read;
 mod view;
 mod write;

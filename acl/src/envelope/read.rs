@@ -4,76 +4,23 @@
 //! and structure says it all); the tag that JADE writes in front of a stamp; the tags that
 //! fipa_services writes in front of numbers; strings in every form.
 
-use crate::AgentId;
 use crate::bitefficient::notes::{self, Notes, Silent};
 use crate::bitefficient::reader::{Reader, digit_chars};
-use crate::bitefficient::{Text, without_x};
-use crate::envelope::agent_id::{AgentIdView, agent_id, agent_ids, user_defined_name};
+use crate::bitefficient::without_x;
+use crate::envelope::agent_id::{agent_id, agent_ids, user_defined_name};
+use crate::envelope::parts::{
+    AclRepresentationView, Event, Events, Parameter, Part, ReceivedView, Stamp, UserDefined,
+};
 use crate::error::{DecodeError, Problem};
+use crate::view::AgentIdView;
 use crate::word::is_token;
-use crate::{AclRepresentation, Representation, Time};
+use crate::{AclRepresentation, AgentId, Representation, Text};
 
 const CLAUSE: &str = "FIPA00088 MessageEnvelope";
 const DATE: &str = "FIPA00069 2.3 BinDateTime";
 
 /// Most extension envelopes that are accepted in front of a base.
 const MAX_EXTENSIONS: usize = 1024;
-
-/// One of the envelopes that an envelope consists of.
-#[derive(Debug, Clone, Copy)]
-pub(super) enum Part<'a> {
-    /// An extension, with the stamp it begins with.
-    Extension(ReceivedView<'a>),
-    /// The base, which is the last one.
-    Base(AclRepresentationView<'a>, Time),
-}
-
-#[derive(Debug, Clone, Copy)]
-pub(super) enum AclRepresentationView<'a> {
-    Standard(Representation),
-    Named(Text<'a>),
-}
-
-impl AclRepresentationView<'_> {
-    pub(super) fn to_owned(self) -> AclRepresentation {
-        match self {
-            Self::Standard(representation) => representation.into(),
-            Self::Named(name) => AclRepresentation::from(&*name.as_str()),
-        }
-    }
-}
-
-#[derive(Debug, Clone, Copy)]
-pub(super) struct ReceivedView<'a> {
-    pub(super) by: Text<'a>,
-    pub(super) date: Time,
-    pub(super) from: Option<Text<'a>>,
-    pub(super) id: Option<Text<'a>>,
-    pub(super) via: Option<Text<'a>>,
-    /// User-defined parameters, and what stands between them.
-    pub(super) rest: &'a [u8],
-}
-
-#[derive(Debug, Clone, Copy)]
-pub(super) enum Parameter<'a> {
-    To(&'a [u8]),
-    From(AgentIdView<'a>),
-    AclRepresentation(AclRepresentationView<'a>),
-    Comments(Text<'a>),
-    PayloadLength(u64),
-    PayloadEncoding(Text<'a>),
-    IntendedReceivers(&'a [u8]),
-    Received(ReceivedView<'a>),
-    TransportBehaviour(Text<'a>),
-    UserDefined(UserDefined<'a>),
-}
-
-#[derive(Debug, Clone, Copy)]
-pub(super) enum UserDefined<'a> {
-    Pair(Text<'a>, Text<'a>),
-    /// Name, a blank, value (JADE).
-    Joined(Text<'a>),
-}
 
 /// A walk through an envelope, part by part.
 #[derive(Debug, Clone)]
@@ -89,15 +36,6 @@ enum Place {
     InExtension,
     InBase,
     Behind,
-}
-
-/// What a [`Walk`] comes by.
-#[derive(Debug)]
-pub(super) enum Event<'a> {
-    /// A new part begins.
-    Part(Part<'a>),
-    /// A parameter of the part that began last.
-    Parameter(Parameter<'a>),
 }
 
 impl<'a> Walk<'a> {
@@ -116,14 +54,28 @@ impl<'a, N: Notes> Walk<'a, N> {
         }
     }
 
-    /// How many bytes were walked through: behind the base, the length of the envelope.
-    pub(super) fn position(&self) -> usize {
+    fn begin_part(&mut self) -> Result<Event<'a>, DecodeError> {
+        let part = part(&mut self.reader)?;
+        self.place = match part {
+            Part::Extension(_) => Place::InExtension,
+            Part::Base(..) | Part::Params { .. } => Place::InBase,
+        };
+        self.extensions += 1;
+        if self.extensions > MAX_EXTENSIONS + 1 {
+            let problem = Problem::TooDeep("extension envelopes");
+            return Err(self.reader.error(CLAUSE, problem));
+        }
+        Ok(Event::Part(part))
+    }
+}
+
+impl<'a, N: Notes> Events<'a> for Walk<'a, N> {
+    fn position(&self) -> usize {
         self.reader.position()
     }
 
-    /// The next thing, or `None` behind the base.
     #[inline]
-    pub(super) fn next(&mut self) -> Result<Option<Event<'a>>, DecodeError> {
+    fn next(&mut self) -> Result<Option<Event<'a>>, DecodeError> {
         loop {
             match self.place {
                 Place::BetweenParts => return self.begin_part().map(Some),
@@ -143,20 +95,6 @@ impl<'a, N: Notes> Walk<'a, N> {
                 Place::Behind => return Ok(None),
             }
         }
-    }
-
-    fn begin_part(&mut self) -> Result<Event<'a>, DecodeError> {
-        let part = part(&mut self.reader)?;
-        self.place = match part {
-            Part::Base(..) => Place::InBase,
-            Part::Extension(_) => Place::InExtension,
-        };
-        self.extensions += 1;
-        if self.extensions > MAX_EXTENSIONS + 1 {
-            let problem = Problem::TooDeep("extension envelopes");
-            return Err(self.reader.error(CLAUSE, problem));
-        }
-        Ok(Event::Part(part))
     }
 }
 
@@ -200,7 +138,7 @@ fn parameter<'a, N: Notes>(
     Ok(Some(match code {
         0x00 => Parameter::UserDefined(user_defined(reader)?),
         0x01 => return Ok(None),
-        0x02 => Parameter::To(agent_ids(reader, AgentId::MAX_DEPTH, "to")?),
+        0x02 => Parameter::To(agent_ids(reader, "to")?),
         0x03 => Parameter::From(from(reader)?),
         0x04 => Parameter::AclRepresentation(acl_representation(reader)?),
         0x05 => Parameter::Comments(text(reader, CLAUSE, "comments")?),
@@ -208,7 +146,7 @@ fn parameter<'a, N: Notes>(
         0x07 => Parameter::PayloadEncoding(text(reader, CLAUSE, "payload-encoding")?),
         0x09 => {
             let set = "intended-receiver";
-            Parameter::IntendedReceivers(agent_ids(reader, AgentId::MAX_DEPTH, set)?)
+            Parameter::IntendedReceivers(agent_ids(reader, set)?)
         }
         0x0a => Parameter::Received(received(reader)?),
         0x0b => {
@@ -300,7 +238,7 @@ fn received<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<ReceivedView<'a>
         from: None,
         id: None,
         via: None,
-        rest: &[],
+        rest: Stamp::BitEfficient(&[]),
     };
     let start = reader.position();
     loop {
@@ -313,21 +251,21 @@ fn received<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<ReceivedView<'a>
             None => {
                 reader.notes().shallower();
                 reader.note(|| "end of received".to_owned());
-                view.rest = rest;
+                view.rest = Stamp::BitEfficient(rest);
                 return Ok(view);
             }
         }
     }
 }
 
-enum ReceivedPart<'a> {
+pub(super) enum ReceivedPart<'a> {
     From(Text<'a>),
     Id(Text<'a>),
     Via(Text<'a>),
     UserDefined(UserDefined<'a>),
 }
 
-fn received_part<'a, N: Notes>(
+pub(super) fn received_part<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
 ) -> Result<Option<ReceivedPart<'a>>, DecodeError> {
     const CLAUSE: &str = "FIPA00088 ReceivedObject";
@@ -342,33 +280,20 @@ fn received_part<'a, N: Notes>(
     }))
 }
 
-impl<'a> ReceivedView<'a> {
-    /// The user-defined parameters of the stamp.
-    pub(super) fn user_defined(&self) -> impl Iterator<Item = UserDefined<'a>> + use<'a> {
-        let mut reader = Reader::new(self.rest);
-        // An error cannot occur in checked bytes, and would end the list.
-        std::iter::from_fn(move || {
-            while reader.remaining() > 0 {
-                if let ReceivedPart::UserDefined(found) = received_part(&mut reader).ok()?? {
-                    return Some(found);
-                }
-            }
-            None
-        })
-    }
-}
-
 fn user_defined<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<UserDefined<'a>, DecodeError> {
     const CLAUSE: &str = "FIPA00088 user-defined";
     let mut ahead = reader.ahead();
     let first = ahead.string(CLAUSE, "user-defined name")?;
     // A name has no blank: with one, it is name and value in one string, as JADE writes it.
-    if let Some((name, value)) = first.raw().split_once(' ')
-        && is_token(name)
+    if let Some(blank) = memchr::memchr(b' ', first.raw())
+        && first.raw().get(..blank).is_some_and(is_token)
     {
         reader.follow(&ahead);
         reader.note(|| {
-            let (name, value) = (notes::quoted(without_x(name)), notes::quoted(value));
+            let text = first.as_str();
+            let (name, value) = text.split_once(' ').unwrap_or_default();
+            let name = Text::plain(without_x(name.as_bytes()));
+            let (name, value) = (notes::quoted(&name.as_str()), notes::quoted(value));
             format!("user-defined parameter {name}: {value}, in one string as JADE writes it")
         });
         return Ok(UserDefined::Joined(first));
@@ -376,7 +301,7 @@ fn user_defined<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<UserDefined<
     let name = user_defined_name(reader, CLAUSE)?;
     let value = reader.string(CLAUSE, "user-defined value")?;
     reader.note(|| notes::user_defined(&name, &value));
-    Ok(UserDefined::Pair(name, value))
+    Ok(UserDefined::Pair(name.without_x(), value))
 }
 
 /// Reads an `Any`, which has to be text.

@@ -351,7 +351,7 @@ impl Writer {
     fn user_defined_name(&mut self, name: &str) -> Result<(), EncodeError> {
         let what = "user-defined name";
         // fipa_services keeps names without X- in its memory, and does not add it here.
-        if self.for_fipa_services() && without_x(name) == name {
+        if self.for_fipa_services() && without_x(name.as_bytes()) == name.as_bytes() {
             self.string(what, name)
         } else {
             self.string(what, &format!("X-{name}"))

@@ -5,8 +5,7 @@
 
 mod record;
 
-use crate::bitefficient::MessageView;
-use crate::bitefficient::notes;
+use crate::bitefficient::{notes, view_noting};
 use crate::explain::record::Record;
 use crate::{DecodeError, EnvelopeView, Representation};
 
@@ -80,7 +79,7 @@ pub fn explain(bytes: &[u8]) -> Explanation {
 }
 
 fn message(bytes: &[u8], base: usize, record: &mut Record) -> Result<(), DecodeError> {
-    MessageView::parse_noting(bytes, base, record).map(|_| ())
+    view_noting(bytes, base, record).map(|_| ())
 }
 
 fn letter(bytes: &[u8], record: &mut Record) -> Result<(), DecodeError> {

@@ -1,8 +1,8 @@
 //! Tokens of the string encoding: white space, words, strings, expressions.
 
-use std::borrow::Cow;
-
+use crate::Text;
 use crate::error::{DecodeError, Problem};
+use crate::scan::{self, TOPS};
 
 /// Deepest nesting of expressions that is accepted.
 pub(super) const MAX_EXPRESSION_DEPTH: usize = 64;
@@ -33,49 +33,72 @@ pub(super) type Keywords<T> = [(&'static str, Follows, T)];
 /// Goes over the bytes of a message once, from front to back.
 pub(super) struct Lexer<'a> {
     bytes: &'a [u8],
-    at: usize,
+    /// Those that were not read yet.
+    rest: &'a [u8],
 }
 
 impl<'a> Lexer<'a> {
     pub(super) fn new(bytes: &'a [u8]) -> Self {
-        Self { bytes, at: 0 }
+        Self { bytes, rest: bytes }
     }
 
     /// Bytes read so far.
     pub(super) fn offset(&self) -> usize {
-        self.at
+        self.bytes.len() - self.rest.len()
     }
 
     pub(super) fn rest(&self) -> &'a [u8] {
-        self.bytes.get(self.at..).unwrap_or_default()
+        self.rest
+    }
+
+    /// What was read since `start`, a former [`offset`](Self::offset).
+    pub(super) fn since(&self, start: usize) -> &'a [u8] {
+        self.bytes.get(start..self.offset()).unwrap_or_default()
     }
 
     pub(super) fn peek(&self) -> Option<u8> {
-        self.bytes.get(self.at).copied()
+        self.rest.first().copied()
     }
 
     /// Passes over as many bytes, which the caller has seen to be there.
     pub(super) fn skip(&mut self, bytes: usize) {
-        self.at = self.bytes.len().min(self.at.saturating_add(bytes));
+        self.rest = self.rest.get(bytes..).unwrap_or_default();
     }
 
     /// Passes over white space and says whether there was any.
+    #[inline]
     pub(super) fn skip_space(&mut self) -> bool {
-        let start = self.at;
-        while self.peek().is_some_and(is_space) {
-            self.at += 1;
+        match self.rest {
+            [b' ', rest @ ..] if rest.first().is_some_and(|byte| *byte > b' ') => {
+                self.rest = rest;
+                true
+            }
+            [..=b' ', ..] => self.skip_more_space(),
+            _ => false,
         }
-        self.at > start
+    }
+
+    #[inline(never)]
+    fn skip_more_space(&mut self) -> bool {
+        let before = self.rest.len();
+        while let Some((byte, rest)) = self.rest.split_first()
+            && is_space(*byte)
+        {
+            self.rest = rest;
+        }
+        self.rest.len() < before
     }
 
     /// Passes over white space and the byte, if it stands there.
     pub(super) fn accept(&mut self, byte: u8) -> bool {
         self.skip_space();
-        let there = self.peek() == Some(byte);
-        if there {
-            self.at += 1;
+        match self.rest.split_first() {
+            Some((next, rest)) if *next == byte => {
+                self.rest = rest;
+                true
+            }
+            _ => false,
         }
-        there
     }
 
     /// Passes over white space and the parenthesis that must stand there.
@@ -104,15 +127,36 @@ impl<'a> Lexer<'a> {
     }
 
     /// Passes over a colon and the keyword behind it, in any case.
+    #[inline]
     pub(super) fn keyword<T: Copy>(
         &mut self,
         keywords: &Keywords<T>,
+        of: impl Fn(&[u8]) -> Option<T>,
         clause: &'static str,
         expected: &'static str,
     ) -> Result<Keyword<T>, DecodeError> {
         let Some((b':', rest)) = self.rest().split_first() else {
             return Err(self.unexpected(clause, expected));
         };
+        // Nearly everybody writes small letters, and a blank or a parenthesis behind them.
+        if let Some(len) = scan::find(rest, scan::no_token, |byte| !is_token_byte(byte))
+            && let Some((name, behind)) = rest.split_at_checked(len)
+            && let Some(parameter) = of(name)
+        {
+            self.rest = behind;
+            return Ok(Keyword::Known(parameter));
+        }
+        self.other_keyword(keywords, clause, expected)
+    }
+
+    #[inline(never)]
+    fn other_keyword<T: Copy>(
+        &mut self,
+        keywords: &Keywords<T>,
+        clause: &'static str,
+        expected: &'static str,
+    ) -> Result<Keyword<T>, DecodeError> {
+        let rest = self.rest.get(1..).unwrap_or_default();
         if starts_with(rest, USER_DEFINED) {
             self.skip(1 + USER_DEFINED.len());
             return Ok(Keyword::UserDefined);
@@ -132,28 +176,26 @@ impl<'a> Lexer<'a> {
         &mut self,
         glued: Option<&Keywords<T>>,
         what: &'static str,
-    ) -> Result<&'a str, DecodeError> {
-        let rest = self.rest();
-        let ends = |(place, byte): (usize, &u8)| {
-            !is_token_byte(*byte)
-                || (*byte == b':'
-                    && place > 0
-                    && glued.is_some_and(|keywords| {
-                        let behind = rest.get(place + 1..).unwrap_or_default();
-                        is_glued_keyword(behind, keywords)
-                    }))
-        };
-        let len = rest.iter().enumerate().position(|at| ends((at.0, at.1)));
-        let word = rest.get(..len.unwrap_or(rest.len())).unwrap_or_default();
+    ) -> Result<Text<'a>, DecodeError> {
+        let ends = |byte: u8| !is_token_byte(byte);
+        let len = scan::find(self.rest, scan::no_token, ends).unwrap_or(self.rest.len());
+        let mut word = self.rest.get(..len).unwrap_or_default();
+        if let Some(keywords) = glued
+            && let Some(len) = glued_keyword(self.rest, len, keywords)
+        {
+            word = self.rest.get(..len).unwrap_or_default();
+        }
         if word.is_empty() {
             return Err(self.unexpected(WORD, what));
         }
-        let text = std::str::from_utf8(word).map_err(|error| {
-            let offset = self.at + error.valid_up_to();
-            DecodeError::new(offset, WORD, Problem::NotUtf8(what))
-        })?;
+        if !word.is_ascii()
+            && let Err(error) = std::str::from_utf8(word)
+        {
+            let offset = self.offset() + error.valid_up_to();
+            return Err(DecodeError::new(offset, WORD, Problem::NotUtf8(what)));
+        }
         self.skip(word.len());
-        Ok(text)
+        Ok(Text::plain(word))
     }
 
     /// An expression as text: words and numbers as they stand, strings without their quotation
@@ -162,13 +204,14 @@ impl<'a> Lexer<'a> {
         &mut self,
         glued: Option<&Keywords<T>>,
         what: &'static str,
-    ) -> Result<Cow<'a, str>, DecodeError> {
+    ) -> Result<Text<'a>, DecodeError> {
         if self.peek() != Some(b'(') {
             return self.text(glued, what);
         }
-        let start = self.at;
-        let bytes = self.parenthesised(what)?;
-        checked_text(Cow::Borrowed(bytes), start, what)
+        let start = self.offset();
+        let text = Text::plain(self.parenthesised(what)?);
+        check_text(&text, start, what)?;
+        Ok(text)
     }
 
     /// A word, a number or a string.
@@ -176,33 +219,28 @@ impl<'a> Lexer<'a> {
         &mut self,
         glued: Option<&Keywords<T>>,
         what: &'static str,
-    ) -> Result<Cow<'a, str>, DecodeError> {
-        let start = self.at;
-        if !matches!(self.peek(), Some(b'"' | b'#')) {
-            return self.word(glued, what).map(Cow::Borrowed);
-        }
-        let bytes = self.string(what)?;
-        checked_text(bytes, start, what)
-    }
-
-    /// A string of either form, which must stand here. Borrowed unless it has escapes.
-    pub(super) fn string(&mut self, what: &'static str) -> Result<Cow<'a, [u8]>, DecodeError> {
-        if self.peek() == Some(b'#') {
-            return self.counted(what).map(Cow::Borrowed);
-        }
-        let mut unescaped = Vec::new();
-        let last = self.quoted(what, |piece| unescaped.extend_from_slice(piece))?;
-        if unescaped.is_empty() {
-            return Ok(Cow::Borrowed(last));
-        }
-        unescaped.extend_from_slice(last);
-        Ok(Cow::Owned(unescaped))
+    ) -> Result<Text<'a>, DecodeError> {
+        let start = self.offset();
+        let text = match self.peek() {
+            Some(b'"') => {
+                let (inner, escaped) = self.quoted(what)?;
+                if escaped {
+                    Text::quoted(inner)
+                } else {
+                    Text::plain(inner)
+                }
+            }
+            Some(b'#') => Text::plain(self.counted(what)?),
+            _ => return self.word(glued, what),
+        };
+        check_text(&text, start, what)?;
+        Ok(text)
     }
 
     /// A parenthesised expression, which must stand here, as it stands. Only its nesting is
     /// checked.
     pub(super) fn parenthesised(&mut self, what: &'static str) -> Result<&'a [u8], DecodeError> {
-        let start = self.at;
+        let start = self.offset();
         let mut depth = 0_usize;
         while let Some(byte) = self.peek() {
             match byte {
@@ -217,11 +255,11 @@ impl<'a> Lexer<'a> {
                     depth = depth.saturating_sub(1);
                     self.skip(1);
                     if depth == 0 {
-                        return Ok(self.bytes.get(start..self.at).unwrap_or_default());
+                        return Ok(self.since(start));
                     }
                 }
                 b'"' => {
-                    self.quoted(what, |_| ())?;
+                    self.quoted(what)?;
                 }
                 b'#' => {
                     self.counted(what)?;
@@ -237,41 +275,39 @@ impl<'a> Lexer<'a> {
         Err(self.error(EXPRESSION, Problem::Truncated(what)))
     }
 
-    /// A `StringLiteral`: what is inside, behind the last escape; what is in front of that goes
-    /// piece by piece to `unescaped`. A quotation mark behind a backslash always is an escape.
-    fn quoted(
-        &mut self,
-        what: &'static str,
-        mut unescaped: impl FnMut(&'a [u8]),
-    ) -> Result<&'a [u8], DecodeError> {
-        let inner = self.rest().get(1..).unwrap_or_default();
-        let mut done = 0;
-        for mark in memchr::memchr_iter(b'"', inner) {
-            let before = inner.get(done..mark).unwrap_or_default();
-            match before.split_last() {
-                Some((b'\\', piece)) => {
-                    unescaped(piece);
-                    // The mark itself goes with the next piece, and is none that ends it.
-                    unescaped(b"\"");
-                    done = mark + 1;
-                }
-                _ => {
-                    self.skip(mark + 2);
-                    return Ok(before);
-                }
+    /// A `StringLiteral`, which must stand here: what is inside, and whether there are escapes in
+    /// it. A quotation mark behind a backslash always is one.
+    pub(super) fn quoted(&mut self, what: &'static str) -> Result<(&'a [u8], bool), DecodeError> {
+        let inside = self.rest.get(1..).unwrap_or_default();
+        let mut from = 0;
+        while let Some(found) = inside
+            .get(from..)
+            .and_then(|rest| scan::find_byte(rest, b'"'))
+        {
+            let mark = from + found;
+            let inner = inside.get(..mark).unwrap_or_default();
+            if found == 0 || inner.last() != Some(&b'\\') {
+                self.skip(mark + 2);
+                return Ok((inner, from > 0));
             }
+            from = mark + 1;
         }
         Err(self.error(STRING, Problem::Truncated(what)))
     }
 
     /// A `ByteLengthEncodedString`: `#n"` and as many bytes.
-    fn counted(&mut self, what: &'static str) -> Result<&'a [u8], DecodeError> {
+    pub(super) fn counted(&mut self, what: &'static str) -> Result<&'a [u8], DecodeError> {
         let rest = self.rest().get(1..).unwrap_or_default();
         let digits = rest.iter().take_while(|byte| byte.is_ascii_digit()).count();
-        let number = rest.get(..digits).unwrap_or_default();
-        let len = std::str::from_utf8(number)
-            .ok()
-            .and_then(|digits| digits.parse::<usize>().ok())
+        let number = rest.get(..digits).filter(|digits| !digits.is_empty());
+        let len = number
+            .and_then(|digits| {
+                digits.iter().try_fold(0_usize, |number, digit| {
+                    number
+                        .checked_mul(10)?
+                        .checked_add(usize::from(digit - b'0'))
+                })
+            })
             .ok_or_else(|| self.error(STRING, Problem::Number))?;
         match rest.get(digits) {
             Some(b'"') => {}
@@ -290,7 +326,7 @@ impl<'a> Lexer<'a> {
     }
 
     pub(super) fn error(&self, clause: &'static str, problem: Problem) -> DecodeError {
-        DecodeError::new(self.at, clause, problem)
+        DecodeError::new(self.offset(), clause, problem)
     }
 
     /// What stands here, or that nothing does, is not what should.
@@ -311,27 +347,29 @@ pub(super) enum Keyword<T> {
 
 const USER_DEFINED: &str = "X-";
 
-fn checked_text<'a>(
-    bytes: Cow<'a, [u8]>,
-    start: usize,
-    what: &'static str,
-) -> Result<Cow<'a, str>, DecodeError> {
-    let fails = |problem| DecodeError::new(start, STRING, problem);
-    if memchr::memchr(0, &bytes).is_some() {
-        return Err(fails(Problem::Nul(what)));
+fn check_text(text: &Text<'_>, start: usize, what: &'static str) -> Result<(), DecodeError> {
+    let bytes = text.raw();
+    let odd = |word| (scan::zero(word) | word) & TOPS;
+    if !scan::any(bytes, odd) {
+        return Ok(());
     }
-    match bytes {
-        Cow::Borrowed(bytes) => std::str::from_utf8(bytes).map(Cow::Borrowed).ok(),
-        Cow::Owned(bytes) => String::from_utf8(bytes).map(Cow::Owned).ok(),
+    let fails = |problem| Err(DecodeError::new(start, STRING, problem));
+    if memchr::memchr(0, bytes).is_some() {
+        return fails(Problem::Nul(what));
     }
-    .ok_or_else(|| fails(Problem::NotUtf8(what)))
+    match std::str::from_utf8(bytes) {
+        Ok(_) => Ok(()),
+        Err(_) => fails(Problem::NotUtf8(what)),
+    }
 }
 
 /// The text of a string in parentheses, as fipa_services wraps user-defined values: `(#n"…)`.
-pub(super) fn unwrapped(text: &str) -> Option<&str> {
-    let inner = text.strip_prefix("(#")?.strip_suffix(')')?;
-    let (digits, inner) = inner.split_once('"')?;
-    (digits.parse() == Ok(inner.len())).then_some(inner)
+pub(super) fn unwrapped<'a>(text: &Text<'a>) -> Option<Text<'a>> {
+    let inner = text.raw().strip_prefix(b"(")?.strip_suffix(b")")?;
+    let mut lexer = Lexer::new(inner);
+    (lexer.peek() == Some(b'#')).then_some(())?;
+    let counted = lexer.counted("").ok()?;
+    lexer.rest().is_empty().then_some(Text::plain(counted))
 }
 
 /// Whether a reader of fipa_services' text might find a keyword inside of a word.
@@ -341,6 +379,23 @@ pub(super) fn holds_keyword<T>(word: &str, keywords: &Keywords<T>) -> bool {
         starts_with(behind, USER_DEFINED)
             || keywords.iter().any(|(name, ..)| starts_with(behind, name))
     })
+}
+
+/// Where in a word of this length at the beginning of the bytes, but not in front, a keyword begins.
+fn glued_keyword<T>(bytes: &[u8], len: usize, keywords: &Keywords<T>) -> Option<usize> {
+    let colon = |from: usize| {
+        let word = bytes.get(from..len)?;
+        Some(from + scan::find_byte(word, b':')?)
+    };
+    let mut from = 1;
+    while let Some(at) = colon(from) {
+        let behind = bytes.get(at + 1..).unwrap_or_default();
+        if is_glued_keyword(behind, keywords) {
+            return Some(at);
+        }
+        from = at + 1;
+    }
+    None
 }
 
 fn is_glued_keyword<T>(behind_colon: &[u8], keywords: &Keywords<T>) -> bool {
@@ -402,7 +457,7 @@ mod tests {
     fn text(bytes: &[u8]) -> Result<String, Problem> {
         let mut lexer = Lexer::new(bytes);
         let text = lexer.expression(NONE, "test");
-        text.map(Cow::into_owned)
+        text.map(|text| text.to_string())
             .map_err(|error| error.problem().clone())
     }
 
@@ -465,15 +520,16 @@ mod tests {
             (":sender(", ":sender"),
         ] {
             let found = Lexer::new(bytes.as_bytes()).word(Some(keywords), "test");
-            assert_eq!(found, Ok(word), "{bytes}");
+            assert_eq!(found.unwrap(), word, "{bytes}");
         }
         assert!(holds_keyword("a:CONTENTS", keywords) && !holds_keyword("content", keywords));
     }
 
     #[test]
     fn user_defined_values_are_unwrapped() {
-        assert_eq!(unwrapped("(#3\"a\")"), None);
-        assert_eq!(unwrapped("(#2\"a\")"), Some("a\""));
-        assert_eq!(unwrapped("(a)"), None);
+        let inside = |text: &'static str| unwrapped(&Text::plain(text.as_bytes()));
+        assert_eq!(inside("(#3\"a\")"), None);
+        assert_eq!(inside("(#2\"a\")"), Some(Text::plain(b"a\"")));
+        assert_eq!(inside("(a)"), None);
     }
 }

@@ -5,16 +5,10 @@
 //! three. Here the grammar; [`crate::Message::decode`] and [`crate::Message::encode`] are the way
 //! in.
 
+pub(crate) mod agent_id;
 mod lex;
 mod read;
 mod write;
 
-use crate::dialect::{BASE64, JADE_ENCODING};
-
-pub(crate) use read::decode;
+pub(crate) use read::{next_user_defined, view};
 pub(crate) use write::encode;
-
-/// Whether the user-defined parameter makes readers take the content for Base64.
-fn announces_base64((name, value): &(String, String)) -> bool {
-    name.eq_ignore_ascii_case(JADE_ENCODING) && value.eq_ignore_ascii_case(BASE64)
-}

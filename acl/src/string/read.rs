@@ -1,72 +1,128 @@
 //! Reading string messages, leniently.
 
-use std::borrow::Cow;
-
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD as BASE64_ENGINE;
-use bytes::Bytes;
-
-use super::announces_base64;
+use super::agent_id::{agent, agent_set};
 use super::lex::{Follows, Keyword, Keywords, Lexer, unwrapped};
 use crate::error::{DecodeError, Problem};
-use crate::{AgentId, AgentIdError, Message, Payload, Performative, Time};
+use crate::view::{Content, PerformativeView, UserDefined};
+use crate::{AgentId, Message, MessageView, Text, Time};
 
-/// Reads a string message. The content of the result shares the memory it was given in, unless it
-/// was written with escapes or in Base64.
+/// Reads a string message.
 ///
 /// # Errors
-/// When the payload is not one whole string message.
-pub(crate) fn decode(payload: &Payload) -> Result<Message, DecodeError> {
-    let bytes = payload.to_bytes();
-    let mut lexer = Lexer::new(&bytes);
+/// When the bytes are not one whole string message.
+pub(crate) fn view(bytes: &[u8]) -> Result<MessageView<'_>, DecodeError> {
+    let mut lexer = Lexer::new(bytes);
     if lexer.rest().starts_with(BYTE_ORDER_MARK) {
         lexer.skip(BYTE_ORDER_MARK.len());
     }
     lexer.open(MESSAGE)?;
     lexer.skip_space();
-    let mut message = Message::empty(performative(&mut lexer)?);
+    let mut view = MessageView::empty(performative(&mut lexer)?);
+    let parameters = lexer.rest();
     // Where the content stood, to say so when it is found not to be Base64.
     let mut content_offset = 0;
     while !lexer.accept(b')') {
-        let keyword = lexer.keyword(PARAMETERS, MESSAGE, "a parameter of a message")?;
-        let Keyword::Known(parameter) = keyword else {
-            message.user_defined.push(user_defined(&mut lexer)?);
-            continue;
-        };
-        // Without white space in front, the value ends where the next keyword begins.
-        let glued = (!lexer.skip_space()).then_some(PARAMETERS);
-        let mut text = |what| {
-            let text = lexer.expression(glued, what)?;
-            Ok(Some(text.into_owned()))
-        };
-        match parameter {
-            Parameter::ReplyWith => message.reply_with = text("reply-with")?,
-            Parameter::InReplyTo => message.in_reply_to = text("in-reply-to")?,
-            Parameter::Language => message.language = text("language")?,
-            Parameter::Encoding => message.encoding = text("encoding")?,
-            Parameter::Ontology => message.ontology = text("ontology")?,
-            Parameter::ConversationId => message.conversation_id = text("conversation-id")?,
-            Parameter::Sender => message.sender = Some(agent(&mut lexer, 0)?),
-            Parameter::Receiver => message.receivers = agent_set(&mut lexer)?,
-            Parameter::ReplyTo => message.reply_to = agent_set(&mut lexer)?,
-            Parameter::Protocol => message.protocol = Some(protocol(&mut lexer, glued)?),
-            Parameter::ReplyBy => message.reply_by = Some(date_time(&mut lexer)?),
-            Parameter::Content => {
-                content_offset = lexer.offset();
-                message.content = Some(content(&mut lexer, &bytes, glued)?);
-            }
+        match view.parameter(&mut lexer, &mut None)? {
+            Step::Parameter => {}
+            Step::Content(offset) => content_offset = offset,
+            Step::UserDefined => view.user_defined = UserDefined::String(parameters),
         }
     }
     lexer.skip_space();
     match lexer.rest().len() {
-        0 => without_base64(message, content_offset),
-        behind => Err(lexer.error(MESSAGE, Problem::Trailing(behind))),
+        0 => view.settle_base64(content_offset, "JADE X-JADE-Encoding")?,
+        behind => return Err(lexer.error(MESSAGE, Problem::Trailing(behind))),
+    }
+    Ok(view)
+}
+
+/// The next user-defined parameter of those behind the performative of a checked message.
+pub(crate) fn next_user_defined<'a>(rest: &mut &'a [u8]) -> Option<(Text<'a>, Text<'a>)> {
+    // What is passed over on the way is read into this.
+    let mut passed = MessageView::empty(PerformativeView::Standard(0));
+    let mut lexer = Lexer::new(rest);
+    while !lexer.accept(b')') {
+        // An error cannot occur in checked bytes, and would end this.
+        let mut pair = None;
+        passed.parameter(&mut lexer, &mut pair).ok()?;
+        *rest = lexer.rest();
+        if pair.is_some() {
+            return pair;
+        }
+    }
+    None
+}
+
+/// What was read of a message.
+enum Step {
+    /// A parameter that is in the view now.
+    Parameter,
+    /// The content, which is there too, and where it stands.
+    Content(usize),
+    /// A user-defined parameter, which is not there.
+    UserDefined,
+}
+
+impl<'a> MessageView<'a> {
+    /// Reads one parameter of a string message. What is user-defined is given, not kept.
+    #[inline]
+    fn parameter(
+        &mut self,
+        lexer: &mut Lexer<'a>,
+        pair: &mut Option<(Text<'a>, Text<'a>)>,
+    ) -> Result<Step, DecodeError> {
+        let keyword = lexer.keyword(
+            PARAMETERS,
+            Parameter::of,
+            MESSAGE,
+            "a parameter of a message",
+        )?;
+        let Keyword::Known(parameter) = keyword else {
+            *pair = Some(user_defined(lexer)?);
+            return Ok(Step::UserDefined);
+        };
+        // Without white space in front, the value ends where the next keyword begins.
+        let glued = (!lexer.skip_space()).then_some(PARAMETERS);
+        let (text, what) = match parameter {
+            Parameter::ReplyWith => (&mut self.reply_with, "reply-with"),
+            Parameter::InReplyTo => (&mut self.in_reply_to, "in-reply-to"),
+            Parameter::Language => (&mut self.language, "language"),
+            Parameter::Encoding => (&mut self.encoding, "encoding"),
+            Parameter::Ontology => (&mut self.ontology, "ontology"),
+            Parameter::ConversationId => (&mut self.conversation_id, "conversation-id"),
+            Parameter::Sender => {
+                self.sender = Some(agent(lexer, AgentId::MAX_DEPTH)?);
+                return Ok(Step::Parameter);
+            }
+            Parameter::Receiver => {
+                self.receivers = agent_set(lexer)?;
+                return Ok(Step::Parameter);
+            }
+            Parameter::ReplyTo => {
+                self.reply_to = agent_set(lexer)?;
+                return Ok(Step::Parameter);
+            }
+            Parameter::Protocol => {
+                self.protocol = Some(protocol(lexer, glued)?);
+                return Ok(Step::Parameter);
+            }
+            Parameter::ReplyBy => {
+                self.reply_by = Some(date_time(lexer)?);
+                return Ok(Step::Parameter);
+            }
+            Parameter::Content => {
+                let offset = lexer.offset();
+                self.content = Some(content(lexer, glued)?);
+                return Ok(Step::Content(offset));
+            }
+        };
+        *text = Some(lexer.expression(glued, what)?);
+        Ok(Step::Parameter)
     }
 }
 
 const BYTE_ORDER_MARK: &[u8] = b"\xef\xbb\xbf";
 const MESSAGE: &str = "FIPA00070 Message";
-const AGENT_ID: &str = "FIPA00070 AgentIdentifier";
 
 #[derive(Clone, Copy)]
 pub(super) enum Parameter {
@@ -82,6 +138,32 @@ pub(super) enum Parameter {
     Ontology,
     Protocol,
     ConversationId,
+}
+
+impl Parameter {
+    /// The parameter of this name in small letters; by length first, so that few have to be
+    /// compared.
+    #[inline]
+    fn of(name: &[u8]) -> Option<Self> {
+        Some(match name.len() {
+            6 if name == b"sender" => Self::Sender,
+            7 if name == b"content" => Self::Content,
+            8 => match name {
+                b"receiver" => Self::Receiver,
+                b"reply-to" => Self::ReplyTo,
+                b"reply-by" => Self::ReplyBy,
+                b"language" => Self::Language,
+                b"encoding" => Self::Encoding,
+                b"ontology" => Self::Ontology,
+                b"protocol" => Self::Protocol,
+                _ => return None,
+            },
+            10 if name == b"reply-with" => Self::ReplyWith,
+            11 if name == b"in-reply-to" => Self::InReplyTo,
+            15 if name == b"conversation-id" => Self::ConversationId,
+            _ => return None,
+        })
+    }
 }
 
 pub(super) const PARAMETERS: &Keywords<Parameter> = &[
@@ -103,35 +185,22 @@ pub(super) const PARAMETERS: &Keywords<Parameter> = &[
     ),
 ];
 
-#[derive(Clone, Copy)]
-pub(super) enum Slot {
-    Name,
-    Addresses,
-    Resolvers,
-}
-
-pub(super) const SLOTS: &Keywords<Slot> = &[
-    ("name", Follows::Never, Slot::Name),
-    ("addresses", Follows::Parenthesis, Slot::Addresses),
-    ("resolvers", Follows::Parenthesis, Slot::Resolvers),
-];
-
-fn performative(lexer: &mut Lexer<'_>) -> Result<Performative, DecodeError> {
+fn performative<'a>(lexer: &mut Lexer<'a>) -> Result<PerformativeView<'a>, DecodeError> {
     let offset = lexer.offset();
-    let word = lexer.word(Some(PARAMETERS), "performative")?;
-    word.parse()
-        .map_err(|_| DecodeError::new(offset, MESSAGE, Problem::NotAWord("performative")))
+    let name = lexer.word(Some(PARAMETERS), "performative")?;
+    let problem = Problem::NotAWord("performative");
+    PerformativeView::of_name(name).ok_or_else(|| DecodeError::new(offset, MESSAGE, problem))
 }
 
 /// JADE may write it in quotation marks; a word it must be all the same.
-fn protocol(
-    lexer: &mut Lexer<'_>,
+fn protocol<'a>(
+    lexer: &mut Lexer<'a>,
     glued: Option<&Keywords<Parameter>>,
-) -> Result<String, DecodeError> {
+) -> Result<Text<'a>, DecodeError> {
     let offset = lexer.offset();
     let text = lexer.text(glued, "protocol")?;
-    if crate::word::is_token(&text) {
-        Ok(text.into_owned())
+    if text.is_token() {
+        Ok(text)
     } else {
         let problem = Problem::NotAWord("protocol");
         Err(DecodeError::new(offset, MESSAGE, problem))
@@ -142,155 +211,40 @@ fn date_time(lexer: &mut Lexer<'_>) -> Result<Time, DecodeError> {
     let offset = lexer.offset();
     let text = lexer.text(Some(PARAMETERS), "reply-by")?;
     let clause = "FIPA00070 DateTime";
-    text.parse()
+    text.as_str()
+        .parse()
         .map_err(|_| DecodeError::new(offset, clause, Problem::DateTime))
 }
 
 /// A string by the standard, a word from JADE, and an expression from before edition F.
 fn content<'a>(
     lexer: &mut Lexer<'a>,
-    whole: &'a Bytes,
     glued: Option<&Keywords<Parameter>>,
-) -> Result<Bytes, DecodeError> {
+) -> Result<Content<'a>, DecodeError> {
     let offset = lexer.offset();
-    let content = match lexer.peek() {
-        Some(b'"' | b'#') => lexer.string("content")?,
-        Some(b'(') => Cow::Borrowed(lexer.parenthesised("content")?),
-        _ => Cow::Borrowed(lexer.word(glued, "content")?.as_bytes()),
+    let (bytes, escaped) = match lexer.peek() {
+        Some(b'"') => lexer.quoted("content")?,
+        Some(b'#') => (lexer.counted("content")?, false),
+        Some(b'(') => (lexer.parenthesised("content")?, false),
+        _ => (lexer.word(glued, "content")?.raw(), false),
     };
-    if content.len() as u64 > Message::MAX_CONTENT {
+    if bytes.len() as u64 > Message::MAX_CONTENT {
         let problem = Problem::TooLong("content");
         return Err(DecodeError::new(offset, MESSAGE, problem));
     }
-    Ok(match content {
-        Cow::Borrowed(slice) => whole.slice_ref(slice),
-        Cow::Owned(unescaped) => unescaped.into(),
+    Ok(if escaped {
+        Content::Quoted(bytes)
+    } else {
+        Content::Bytes(bytes)
     })
 }
 
-/// Undoes what JADE does to content that is no text.
-fn without_base64(mut message: Message, content_offset: usize) -> Result<Message, DecodeError> {
-    let Some(content) = &message.content else {
-        return Ok(message);
-    };
-    if !message.user_defined.iter().any(announces_base64) {
-        return Ok(message);
-    }
-    let encoded: Vec<u8> = content
-        .iter()
-        .copied()
-        .filter(|byte| !byte.is_ascii_whitespace())
-        .collect();
-    let decoded = BASE64_ENGINE.decode(encoded);
-    let problem = |_| DecodeError::new(content_offset, "JADE X-JADE-Encoding", Problem::Base64);
-    message.content = Some(decoded.map_err(problem)?.into());
-    message.user_defined.retain(|pair| !announces_base64(pair));
-    Ok(message)
-}
-
 /// Name and value of a user-defined parameter, whose `:X-` was read.
-fn user_defined(lexer: &mut Lexer<'_>) -> Result<(String, String), DecodeError> {
+pub(super) fn user_defined<'a>(lexer: &mut Lexer<'a>) -> Result<(Text<'a>, Text<'a>), DecodeError> {
     let name = lexer.word::<()>(None, "name of a user-defined parameter")?;
     lexer.skip_space();
     let wrapped = lexer.peek() == Some(b'(');
     let text = lexer.expression::<()>(None, "user-defined parameter")?;
-    let text = match unwrapped(&text) {
-        Some(inner) if wrapped => inner.to_owned(),
-        _ => text.into_owned(),
-    };
-    Ok((name.to_owned(), text))
-}
-
-fn agent_set(lexer: &mut Lexer<'_>) -> Result<Vec<AgentId>, DecodeError> {
-    let clause = "FIPA00070 AgentIdentifierSet";
-    lexer.open(clause)?;
-    lexer.name("set", clause, "set")?;
-    agents(lexer, 0)
-}
-
-/// Agent identifiers up to the parenthesis that closes the list.
-fn agents(lexer: &mut Lexer<'_>, depth: usize) -> Result<Vec<AgentId>, DecodeError> {
-    let mut agents = Vec::new();
-    while !lexer.accept(b')') {
-        agents.push(agent(lexer, depth)?);
-    }
-    Ok(agents)
-}
-
-fn agent(lexer: &mut Lexer<'_>, depth: usize) -> Result<AgentId, DecodeError> {
-    if depth > AgentId::MAX_DEPTH {
-        return Err(lexer.error(AGENT_ID, Problem::TooDeep("resolvers")));
-    }
-    lexer.open(AGENT_ID)?;
-    let start = lexer.offset();
-    lexer.name("agent-identifier", AGENT_ID, "agent-identifier")?;
-    let mut name = None;
-    let (mut addresses, mut resolvers) = (Vec::new(), Vec::new());
-    let mut pairs = Vec::new();
-    while !lexer.accept(b')') {
-        let keyword = lexer.keyword(SLOTS, AGENT_ID, "a parameter of an agent identifier")?;
-        match keyword {
-            Keyword::UserDefined => pairs.push(user_defined(lexer)?),
-            Keyword::Known(Slot::Name) => {
-                let glued = (!lexer.skip_space()).then_some(SLOTS);
-                name = Some(lexer.text(glued, "name of an agent")?);
-            }
-            Keyword::Known(Slot::Addresses) => addresses = self::addresses(lexer)?,
-            Keyword::Known(Slot::Resolvers) => {
-                sequence(lexer)?;
-                resolvers = agents(lexer, depth + 1)?;
-            }
-        }
-    }
-    let Some(name) = name else {
-        let problem = Problem::Missing("name of an agent");
-        return Err(DecodeError::new(start, AGENT_ID, problem));
-    };
-    built(name.into_owned(), addresses, resolvers, pairs)
-        .map_err(|error| DecodeError::new(start, AGENT_ID, problem(&error)))
-}
-
-fn built(
-    name: String,
-    addresses: Vec<String>,
-    resolvers: Vec<AgentId>,
-    pairs: Vec<(String, String)>,
-) -> Result<AgentId, AgentIdError> {
-    let mut agent = AgentId::new(name)?;
-    for address in addresses {
-        agent = agent.with_address(address)?;
-    }
-    for resolver in resolvers {
-        agent = agent.with_resolver(resolver)?;
-    }
-    for (name, value) in pairs {
-        agent = agent.with_user_defined(name, value)?;
-    }
-    Ok(agent)
-}
-
-fn problem(error: &AgentIdError) -> Problem {
-    match error {
-        AgentIdError::EmptyName => Problem::Empty("name of an agent"),
-        AgentIdError::NameTooLong(_) => Problem::TooLong("name of an agent"),
-        AgentIdError::Nul(part) => Problem::Nul(part),
-        AgentIdError::EmptyAddress => Problem::Empty("address of an agent"),
-        AgentIdError::TooDeep => Problem::TooDeep("resolvers"),
-        AgentIdError::UserDefinedName(_) => Problem::NotAWord("name of a user-defined parameter"),
-    }
-}
-
-fn addresses(lexer: &mut Lexer<'_>) -> Result<Vec<String>, DecodeError> {
-    sequence(lexer)?;
-    let mut addresses = Vec::new();
-    while !lexer.accept(b')') {
-        let address = lexer.text::<()>(None, "address of an agent")?;
-        addresses.push(address.into_owned());
-    }
-    Ok(addresses)
-}
-
-fn sequence(lexer: &mut Lexer<'_>) -> Result<(), DecodeError> {
-    lexer.open(AGENT_ID)?;
-    lexer.name("sequence", AGENT_ID, "sequence")
+    let unwrapped = wrapped.then(|| unwrapped(&text)).flatten();
+    Ok((name, unwrapped.unwrap_or(text)))
 }

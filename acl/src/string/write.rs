@@ -4,14 +4,14 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64_ENGINE;
 use bytes::Bytes;
 
-use super::announces_base64;
+use super::agent_id::SLOTS;
 use super::lex::{Keywords, holds_keyword};
-use super::read::{PARAMETERS, SLOTS};
-use crate::dialect::{BASE64, JADE_ENCODING, check_word, local_time, not_a_word};
+use super::read::PARAMETERS;
+use crate::dialect::{BASE64, JADE_ENCODING, announces_base64, check_word, local_time, not_a_word};
 use crate::error::EncodeError;
 use crate::time::Time;
 use crate::word::{Piece, is_quotable, is_token, is_word, quoted, string_literal};
-use crate::{AgentId, Dialect, Message, Performative};
+use crate::{AgentId, Dialect, Message, Performative, Text};
 
 /// The string message: parameters in the order of the standard, but content last.
 pub(crate) fn encode(message: &Message, dialect: Dialect) -> Result<Bytes, EncodeError> {
@@ -31,7 +31,11 @@ struct Writer {
 
 impl Writer {
     fn message(&mut self, message: &Message) -> Result<(), EncodeError> {
-        if message.content.is_some() && message.user_defined.iter().any(announces_base64) {
+        let announced = |(name, value): &(String, String)| {
+            let (name, value) = (name.as_bytes(), value.as_bytes());
+            announces_base64(&Text::plain(name), &Text::plain(value))
+        };
+        if message.content.is_some() && message.user_defined.iter().any(announced) {
             return Err(EncodeError::Unrepresentable {
                 what: "user-defined parameter JADE-Encoding",
                 why: "readers would take the content for Base64",

@@ -6,6 +6,8 @@ mod text;
 
 use std::time::{Duration, SystemTime};
 
+use crate::scan::{ONES, TOPS};
+
 use self::calendar::{civil_from_days, days_from_civil, days_of_month};
 
 /// A FIPA date-time with milliseconds.
@@ -272,6 +274,20 @@ impl Time {
         days_from_civil(i64::from(year), month, day) * MS_PER_DAY
             + seconds * 1000
             + i64::from(millisecond)
+    }
+}
+
+impl Fields {
+    /// Whether the numbers from century to tens of milliseconds, the lowest byte first and none
+    /// above 99, are within the bounds of each, for February, too: as nearly all are.
+    #[inline]
+    pub(crate) fn are_usual(numbers: u64) -> bool {
+        const LEAST: u64 = u64::from_le_bytes([0, 0, 1, 1, 0, 0, 0, 0]);
+        const MOST: u64 = u64::from_le_bytes([99, 99, 12, 28, 23, 59, 59, 99]);
+        // None of these carries into the next.
+        let too_low = (numbers | TOPS) - LEAST;
+        let too_high = numbers + (ONES * 0x7f - MOST);
+        (!too_low | too_high) & TOPS == 0
     }
 }
 

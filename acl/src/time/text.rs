@@ -3,6 +3,8 @@
 use std::fmt;
 use std::str::FromStr;
 
+use crate::scan::{ONES, TOPS};
+
 use super::{Base, Fields, Time, TimeError, Zone};
 
 impl Time {
@@ -74,6 +76,9 @@ impl FromStr for Time {
 
     /// Reads the text form of FIPA00070; `Z` in place of the `T` is accepted too (JADE).
     fn from_str(text: &str) -> Result<Self, Self::Err> {
+        if let Some(time) = usual(text.as_bytes()) {
+            return Ok(time);
+        }
         let (base, rest) = match text.as_bytes() {
             [b'+', rest @ ..] => (Base::After, rest),
             [b'-', rest @ ..] => (Base::Before, rest),
@@ -87,6 +92,56 @@ impl FromStr for Time {
         };
         Self::new(base, zone, fields)
     }
+}
+
+/// A time of the kind that nearly all are: on the calendar, in UTC or without a zone, and within
+/// what every month and every minute has. All digits are looked at in one.
+#[inline]
+fn usual(text: &[u8]) -> Option<Time> {
+    let (date, [b'T' | b'Z', rest @ ..]) = text.split_first_chunk::<8>()? else {
+        return None;
+    };
+    let (time, [last @ b'0'..=b'9', designator @ ..]) = rest.split_first_chunk::<8>()? else {
+        return None;
+    };
+    let zone = match designator {
+        [] => Zone::Unspecified,
+        b"Z" => Zone::Utc,
+        _ => return None,
+    };
+    let (date, time) = (pairs(*date)?, pairs(*time)?);
+    let [century, year, month, day] = date;
+    let [hour, minute, second, tens] = time;
+    let numbers = [century, year, month, day, hour, minute, second, tens];
+    if !Fields::are_usual(u64::from_le_bytes(numbers)) {
+        return None;
+    }
+    let fields = Fields {
+        year: u16::from(century) * 100 + u16::from(year),
+        month,
+        day,
+        hour,
+        minute,
+        second,
+        millisecond: u16::from(tens) * 10 + u16::from(last - b'0'),
+    };
+    let base = Base::Absolute;
+    Some(Time { base, zone, fields })
+}
+
+/// The numbers that four times two digits are, if all of them are digits.
+#[inline]
+fn pairs(digits: [u8; 8]) -> Option<[u8; 4]> {
+    const ZEROS: u64 = ONES * b'0' as u64;
+    let word = u64::from_le_bytes(digits);
+    let numbers = word ^ ZEROS;
+    // In every byte: the top bit is set if it is no digit.
+    let wrong = numbers | (numbers & !TOPS) + ONES * (0x80 - 10);
+    if wrong & TOPS != 0 {
+        return None;
+    }
+    let [a, b, c, d, e, f, g, h] = numbers.to_le_bytes();
+    Some([a * 10 + b, c * 10 + d, e * 10 + f, g * 10 + h])
 }
 
 fn syntax(text: &str) -> TimeError {

@@ -1,111 +1,210 @@
 //! Agent identifiers, whose names and addresses are attributes in messages and text in envelopes.
 //! Either is read in both.
 
-use crate::bitefficient::without_x;
 use crate::error::{DecodeError, EncodeError, Problem};
+use crate::view::{AgentIdView, AgentIds, Encoding, List, Part, check_name};
 use crate::xml::out::Out;
-use crate::xml::reader::{Element, Elements};
-use crate::{AgentId, AgentIdError, Dialect};
+use crate::xml::reader::{Element, Elements, Event};
+use crate::xml::tag::Tag;
+use crate::xml::value::Space;
+use crate::{AgentId, Dialect, Text};
 
-/// Reads the agent identifiers in the element that was begun last, to its end.
-pub(super) fn read_all(
-    elements: &mut Elements<'_>,
-    agents: &mut Vec<AgentId>,
+/// The agents in all elements of one kind among the bytes of a document.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct AgentSet<'a> {
+    bytes: &'a [u8],
+    /// Where the next agent is looked for, and where there are no more.
+    at: usize,
+    end: usize,
+    tag: Tag,
+    /// One of the elements has begun.
+    inside: bool,
+    /// There are agents.
+    any: bool,
+}
+
+impl AgentSet<'_> {
+    /// Adds those of further elements of the same document.
+    pub(crate) fn add(&mut self, others: &Self) {
+        self.end = others.end;
+        self.any |= others.any;
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        !self.any
+    }
+}
+
+impl<'a> Iterator for AgentSet<'a> {
+    type Item = AgentIdView<'a>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let mut elements = Elements::inside(self.bytes.get(self.at..self.end)?);
+        // An error cannot occur in checked bytes, and would end this.
+        let agent = loop {
+            match elements.next().ok()?? {
+                Event::Text(_) => {}
+                Event::End => self.inside = false,
+                Event::Start(element) if !self.inside && element.tag == self.tag => {
+                    self.inside = true;
+                }
+                Event::Start(element) if self.inside && element.tag == Tag::AgentIdentifier => {
+                    break read(&mut elements, &element, AgentId::MAX_DEPTH).ok()?;
+                }
+                Event::Start(_) => elements.skip().ok()?,
+            }
+        };
+        self.at += elements.position();
+        Some(agent)
+    }
+}
+
+/// Reads the agent identifiers in the element that was begun last, to its end, and adds them to
+/// those of the same kind.
+pub(super) fn read_all<'a>(
+    elements: &mut Elements<'a>,
+    begin: &Element<'a>,
+    agents: &mut AgentIds<'a>,
 ) -> Result<(), DecodeError> {
+    let mut any = false;
     while let Some(child) = elements.child()? {
-        if child.is("agent-identifier") {
-            agents.push(read(elements, &child)?);
+        if child.tag == Tag::AgentIdentifier {
+            read(elements, &child, AgentId::MAX_DEPTH)?;
+            any = true;
         } else {
             elements.skip()?;
         }
     }
+    let these = AgentIds::xml(AgentSet {
+        bytes: elements.bytes(),
+        at: begin.offset,
+        end: elements.position(),
+        tag: begin.tag,
+        inside: false,
+        any,
+    });
+    if !agents.add(&these) {
+        *agents = these;
+    }
     Ok(())
 }
 
-/// The nesting of elements is bounded by the reader, and with it this recursion.
-fn read<'a>(elements: &mut Elements<'a>, begin: &Element<'a>) -> Result<AgentId, DecodeError> {
-    let mut name = None;
-    let mut addresses = Vec::new();
-    let mut resolvers = Vec::new();
-    let mut user_defined = Vec::new();
+/// Reads the first of the agent identifiers in the element that was begun last, to its end.
+pub(super) fn read_one<'a>(
+    elements: &mut Elements<'a>,
+) -> Result<Option<AgentIdView<'a>>, DecodeError> {
+    let mut agent = None;
     while let Some(child) = elements.child()? {
-        if child.is("name") {
-            let value = elements.value(&child, &["id", "refid"])?;
-            name = Some(value.trimmed("agent name")?);
-        } else if child.is("addresses") {
-            read_addresses(elements, &mut addresses)?;
-        } else if child.is("resolvers") {
-            read_all(elements, &mut resolvers)?;
-        } else if let Some(pair) = user_defined_pair(elements, &child)? {
-            user_defined.push(pair);
+        if child.tag == Tag::AgentIdentifier {
+            let read = read(elements, &child, AgentId::MAX_DEPTH)?;
+            agent = agent.or(Some(read));
+        } else {
+            elements.skip()?;
         }
-    }
-    let refused = |error| {
-        let problem = match error {
-            AgentIdError::EmptyName => Problem::Empty("agent name"),
-            AgentIdError::NameTooLong(_) => Problem::TooLong("agent name"),
-            AgentIdError::TooDeep => Problem::TooDeep("resolvers"),
-            AgentIdError::UserDefinedName(_) => {
-                Problem::NotAWord("name of a user-defined parameter")
-            }
-            _ => Problem::NotAWord("agent identifier"),
-        };
-        elements.error(begin.offset, problem)
-    };
-    let Some(name) = name else {
-        return Err(elements.error(begin.offset, Problem::Missing("name of the agent")));
-    };
-    let mut agent = AgentId::new(name).map_err(refused)?;
-    for address in addresses {
-        agent = agent.with_address(address).map_err(refused)?;
-    }
-    for resolver in resolvers {
-        agent = agent.with_resolver(resolver).map_err(refused)?;
-    }
-    for (name, value) in user_defined {
-        agent = agent.with_user_defined(name, value).map_err(refused)?;
     }
     Ok(agent)
 }
 
-fn read_addresses(
-    elements: &mut Elements<'_>,
-    addresses: &mut Vec<String>,
-) -> Result<(), DecodeError> {
-    while let Some(child) = elements.child()? {
-        if !child.is("url") {
-            elements.skip()?;
-            continue;
-        }
-        let address = elements.value(&child, &["href"])?.trimmed("address")?;
-        if !address.is_empty() {
-            addresses.push(address);
+/// Reads an identifier, whose resolvers may be nested `depth` deep.
+fn read<'a>(
+    elements: &mut Elements<'a>,
+    begin: &Element<'a>,
+    depth: usize,
+) -> Result<AgentIdView<'a>, DecodeError> {
+    let start = elements.position();
+    let (mut name, mut list) = (None, List::Outside);
+    while part(elements, &mut list, depth, &mut name)?.is_some() {}
+    let inside = elements.bytes().get(start..elements.begin());
+    let wrong = |problem| elements.error(begin.offset, problem);
+    let name = name.ok_or_else(|| wrong(Problem::Missing("name of the agent")))?;
+    check_name(&name, "agent name").map_err(wrong)?;
+    let inside = inside.unwrap_or_default();
+    Ok(AgentIdView::new(name, Encoding::Xml, inside))
+}
+
+/// The next part of a checked identifier.
+pub(crate) fn next_part<'a>(rest: &mut &'a [u8], list: &mut List) -> Option<Part<'a>> {
+    let mut elements = Elements::inside(rest);
+    let part = part(&mut elements, list, AgentId::MAX_DEPTH, &mut None);
+    *rest = elements.rest();
+    part.ok().flatten()
+}
+
+/// The next part of an identifier, or `None` at its end; a name on the way is told.
+fn part<'a>(
+    elements: &mut Elements<'a>,
+    list: &mut List,
+    depth: usize,
+    name: &mut Option<Text<'a>>,
+) -> Result<Option<Part<'a>>, DecodeError> {
+    loop {
+        let child = match elements.next()? {
+            Some(Event::Start(child)) => child,
+            Some(Event::Text(_)) => continue,
+            Some(Event::End) if *list != List::Outside => {
+                *list = List::Outside;
+                continue;
+            }
+            Some(Event::End) | None => return Ok(None),
+        };
+        match (*list, child.tag) {
+            (List::Outside, Tag::Name) => {
+                let value = elements.value(&child, &["id", "refid"])?;
+                *name = Some(value.trimmed("agent name")?);
+            }
+            (List::Outside, Tag::Addresses) => *list = List::Addresses,
+            (List::Outside, Tag::Resolvers) => *list = List::Resolvers,
+            (List::Outside, _) => {
+                if let Some((name, value)) = user_defined(elements, &child)? {
+                    return Ok(Some(Part::UserDefined(name, value)));
+                }
+            }
+            (List::Addresses, Tag::Url) => {
+                let address = elements.value(&child, &["href"])?.trimmed("address")?;
+                if !address.is_empty() {
+                    return Ok(Some(Part::Address(address)));
+                }
+            }
+            (List::Resolvers, Tag::AgentIdentifier) => {
+                let Some(depth) = depth.checked_sub(1) else {
+                    return Err(elements.error(child.offset, Problem::TooDeep("resolvers")));
+                };
+                return read(elements, &child, depth).map(|agent| Some(Part::Resolver(agent)));
+            }
+            _ => elements.skip()?,
         }
     }
-    Ok(())
 }
 
 /// Reads an element to its end: a user-defined parameter in either form, name without `X-`, or
 /// `None` for an element that is not known.
-pub(super) fn user_defined_pair<'a>(
+pub(super) fn user_defined<'a>(
     elements: &mut Elements<'a>,
     element: &Element<'a>,
-) -> Result<Option<(String, String)>, DecodeError> {
-    let name = if element.is("user-defined") {
-        let Some(name) = elements.attribute(element, "href")? else {
-            let problem = Problem::Missing("name of a user-defined parameter");
-            return Err(elements.error(element.offset, problem));
-        };
-        let name = name.trimmed("name of a user-defined parameter")?;
-        without_x(&name).to_owned()
+) -> Result<Option<(Text<'a>, Text<'a>)>, DecodeError> {
+    let what = "name of a user-defined parameter";
+    let wrong = |problem| elements.error(element.offset, problem);
+    let name = if element.tag == Tag::UserDefined {
+        let name = elements.attribute(element, "href")?;
+        let name = name.ok_or_else(|| wrong(Problem::Missing(what)))?;
+        name.trimmed(what)?.without_x()
     } else if let Some(name) = element.user_defined() {
-        name.to_owned()
+        if std::str::from_utf8(name).is_err() {
+            return Err(wrong(Problem::NotUtf8(what)));
+        }
+        Text::plain(name)
     } else {
         elements.skip()?;
         return Ok(None);
     };
+    if !name.is_token() {
+        return Err(wrong(Problem::NotAWord(what)));
+    }
     let value = elements.value(element, &[])?;
-    Ok(Some((name, value.text("user-defined value")?)))
+    Ok(Some((
+        name,
+        value.text(Space::Counts, "user-defined value")?,
+    )))
 }
 
 /// How identifiers are written.

@@ -1,198 +1,250 @@
 //! Reading envelopes (FIPA00085).
 
+use crate::Text;
+use crate::envelope::parts::{
+    AclRepresentationView, Event, Events, Parameter, Part, ReceivedView, Stamp, UserDefined,
+};
 use crate::error::{DecodeError, Problem};
-use crate::word::is_token;
+use crate::view::AgentIds;
 use crate::xml::agent_id;
 use crate::xml::reader::{Element, Elements};
-use crate::{AclRepresentation, Envelope, EnvelopeParams, Received};
+use crate::xml::tag::Tag;
+use crate::xml::value::Space;
 
 const CLAUSE: &str = "FIPA00085";
 
 /// Most elements with parameters: the same bound as for bit-efficient extensions.
 const MAX_PARTS: usize = 1025;
 
-/// Reads an envelope, directly behind which the payload may follow, and says how long it is in
-/// bytes.
-///
-/// # Errors
-/// When the bytes do not begin with a whole envelope in this encoding.
-pub(crate) fn decode(bytes: &[u8]) -> Result<(Envelope, usize), DecodeError> {
-    let mut elements = Elements::new(bytes, CLAUSE);
-    let root = elements.root("envelope", "the outermost element is not envelope")?;
-    let mut parts = Vec::new();
-    while let Some(child) = elements.child()? {
-        if child.is("params") {
-            read_params(&mut elements, &child, &mut parts)?;
-        } else {
-            elements.skip()?;
-        }
-    }
-    // The sort is stable: JADE gives every part the same index, or puts one inside another.
-    parts.sort_by_key(|part| part.index);
-    let mut parts = parts.into_iter().map(|part| part.params);
-    let Some(base) = parts.next() else {
-        return Err(elements.error(root.offset, Problem::Missing("params")));
-    };
-    let envelope = Envelope {
-        base,
-        extensions: parts.collect(),
-    };
-    Ok((envelope, elements.position()))
-}
+/// Deepest nesting of such elements, which only JADE nests; elements nest no deeper.
+const MAX_NESTING: usize = 64;
 
-struct Part {
+/// A walk through an envelope, directly behind which the payload may follow.
+#[derive(Debug, Clone)]
+pub(crate) struct Walk<'a> {
+    elements: Elements<'a>,
+    /// Where the outermost element begins, once it has.
+    root: Option<usize>,
+    /// The parts that are open, and how many there are.
+    open: [Opened; MAX_NESTING],
+    depth: usize,
+    /// How many parts have begun.
+    parts: usize,
+    /// The index of the part that began last.
     index: u64,
-    params: EnvelopeParams,
+    ended: bool,
 }
 
-/// The nesting of elements is bounded by the reader, and with it this recursion.
-fn read_params<'a>(
-    elements: &mut Elements<'a>,
-    begin: &Element<'a>,
-    parts: &mut Vec<Part>,
-) -> Result<(), DecodeError> {
-    if parts.len() >= MAX_PARTS {
-        return Err(elements.error(begin.offset, Problem::TooDeep("params")));
-    }
-    let place = parts.len();
-    let index = match elements.attribute(begin, "index")? {
-        Some(value) if !value.is_empty() => {
-            let number = value.trimmed("index")?.parse();
-            number.map_err(|_| elements.error(begin.offset, Problem::Number))?
-        }
-        // Where peers leave it out, the order counts.
-        _ => parts.last().map_or(1, |part| part.index),
-    };
-    let params = EnvelopeParams::default();
-    parts.push(Part { index, params });
-    let mut params = EnvelopeParams::default();
-    while let Some(child) = elements.child()? {
-        if child.is("params") {
-            read_params(elements, &child, parts)?;
-        } else {
-            set(&mut params, elements, &child)?;
-        }
-    }
-    if let Some(part) = parts.get_mut(place) {
-        part.params = params;
-    }
-    Ok(())
+#[derive(Debug, Clone, Copy, Default)]
+struct Opened {
+    part: usize,
+    index: u64,
 }
 
-fn set<'a>(
-    params: &mut EnvelopeParams,
+impl<'a> Walk<'a> {
+    pub(crate) fn new(bytes: &'a [u8]) -> Self {
+        Self {
+            elements: Elements::new(bytes, CLAUSE),
+            root: None,
+            open: [Opened::default(); MAX_NESTING],
+            depth: 0,
+            parts: 0,
+            index: 1,
+            ended: false,
+        }
+    }
+
+    fn begin_part(&mut self, begin: &Element<'a>) -> Result<Event<'a>, DecodeError> {
+        let wrong = |problem| DecodeError::new(begin.offset, CLAUSE, problem);
+        if self.parts >= MAX_PARTS {
+            return Err(wrong(Problem::TooDeep("params")));
+        }
+        match self.elements.attribute(begin, "index")? {
+            Some(value) if !value.is_empty() => {
+                let number = value.trimmed("index")?.as_str().parse();
+                self.index = number.map_err(|_| wrong(Problem::Number))?;
+            }
+            // Where peers leave it out, the order counts.
+            _ => {}
+        }
+        self.parts += 1;
+        let (part, index) = (self.parts, self.index);
+        match self.open.get_mut(self.depth) {
+            Some(open) => *open = Opened { part, index },
+            None => return Err(wrong(Problem::TooDeep("params"))),
+        }
+        self.depth += 1;
+        Ok(Event::Part(Part::Params { part, index }))
+    }
+}
+
+impl<'a> Events<'a> for Walk<'a> {
+    fn next(&mut self) -> Result<Option<Event<'a>>, DecodeError> {
+        if self.ended {
+            return Ok(None);
+        }
+        let root = match self.root {
+            Some(root) => root,
+            None => {
+                let problem = "the outermost element is not envelope";
+                let root = self.elements.root(Tag::Envelope, problem)?.offset;
+                *self.root.insert(root)
+            }
+        };
+        loop {
+            let Some(child) = self.elements.child()? else {
+                if self.depth == 0 {
+                    self.ended = true;
+                    if self.parts == 0 {
+                        return Err(self.elements.error(root, Problem::Missing("params")));
+                    }
+                    return Ok(None);
+                }
+                self.depth -= 1;
+                // What follows belongs to the part that this one was in.
+                let around = self.depth.checked_sub(1).and_then(|at| self.open.get(at));
+                match around {
+                    Some(Opened { part, index }) => {
+                        let (part, index) = (*part, *index);
+                        return Ok(Some(Event::Part(Part::Params { part, index })));
+                    }
+                    None => continue,
+                }
+            };
+            if child.tag == Tag::Params {
+                return self.begin_part(&child).map(Some);
+            }
+            if self.depth == 0 {
+                self.elements.skip()?;
+            } else if let Some(parameter) = parameter(&mut self.elements, &child)? {
+                return Ok(Some(Event::Parameter(parameter)));
+            }
+        }
+    }
+
+    fn position(&self) -> usize {
+        self.elements.position()
+    }
+}
+
+/// Reads what an element inside of a part says, to its end; `None` if it says nothing.
+fn parameter<'a>(
     elements: &mut Elements<'a>,
     child: &Element<'a>,
-) -> Result<(), DecodeError> {
-    if child.is("to") {
-        return agent_id::read_all(elements, &mut params.to);
-    }
-    if child.is("intended-receiver") {
-        return agent_id::read_all(elements, &mut params.intended_receivers);
-    }
-    if child.is("from") {
-        let mut agents = Vec::new();
-        agent_id::read_all(elements, &mut agents)?;
-        params.from = agents.into_iter().next().or(params.from.take());
-        return Ok(());
-    }
-    if child.is("received") {
-        let received = read_received(elements, child)?;
-        params.received = received.or(params.received.take());
-        return Ok(());
-    }
-    if child.is("date") {
-        params.date = Some(elements.value(child, &["value"])?.time()?);
-        return Ok(());
-    }
-    let texts = [
-        ("comments", &mut params.comments),
-        ("payload-encoding", &mut params.payload_encoding),
-        ("transport-behaviour", &mut params.transport_behaviour),
-    ];
-    for (name, text) in texts {
-        if child.is(name) {
-            let value = elements.value(child, &["value"])?.text(name)?;
-            *text = Some(value).filter(|value| !value.is_empty());
-            return Ok(());
+) -> Result<Option<Parameter<'a>>, DecodeError> {
+    let text = |elements: &mut Elements<'a>, what| {
+        let value = elements.value(child, &["value"])?;
+        value.text(Space::Counts, what)
+    };
+    Ok(Some(match child.tag {
+        Tag::To => Parameter::To(agents(elements, child)?),
+        Tag::IntendedReceiver => Parameter::IntendedReceivers(agents(elements, child)?),
+        Tag::From => match agent_id::read_one(elements)? {
+            Some(agent) => Parameter::From(agent),
+            None => return Ok(None),
+        },
+        Tag::Received => match received(elements, child)? {
+            Some(received) => Parameter::Received(received),
+            None => return Ok(None),
+        },
+        Tag::Date => Parameter::Date(elements.value(child, &["value"])?.time()?),
+        Tag::Comments => Parameter::Comments(text(elements, "comments")?),
+        Tag::PayloadEncoding => Parameter::PayloadEncoding(text(elements, "payload-encoding")?),
+        Tag::TransportBehaviour => {
+            Parameter::TransportBehaviour(text(elements, "transport-behaviour")?)
         }
-    }
-    if child.is("acl-representation") {
-        let name = elements.value(child, &["value"])?;
-        let name = name.trimmed("acl-representation")?;
-        params.acl_representation =
-            (!name.is_empty()).then(|| AclRepresentation::from(name.as_str()));
-        return Ok(());
-    }
-    if child.is("payload-length") {
-        let digits = elements.value(child, &["value"])?;
-        let digits = digits.trimmed("payload-length")?;
-        // JADE writes -1, and nothing, where it does not know.
-        params.payload_length = if digits.is_empty() || digits == "-1" {
-            None
-        } else {
+        Tag::AclRepresentation => {
+            let name = elements.value(child, &["value"])?;
+            let name = name.trimmed("acl-representation")?;
+            if name.is_empty() {
+                return Ok(None);
+            }
+            Parameter::AclRepresentation(AclRepresentationView::Named(name))
+        }
+        Tag::PayloadLength => {
+            let digits = elements.value(child, &["value"])?;
+            let digits = digits.trimmed("payload-length")?;
+            let digits = digits.as_str();
+            // JADE writes -1, and nothing, where it does not know.
+            if digits.is_empty() || digits == "-1" {
+                return Ok(None);
+            }
             let wrong = |_| elements.error(child.offset, Problem::Number);
-            Some(digits.parse().map_err(wrong)?)
-        };
-        return Ok(());
-    }
-    let pair = user_defined(elements, child)?;
-    params.user_defined.extend(pair);
-    Ok(())
+            Parameter::PayloadLength(digits.parse().map_err(wrong)?)
+        }
+        _ => match agent_id::user_defined(elements, child)? {
+            Some((name, value)) => Parameter::UserDefined(UserDefined::Pair(name, value)),
+            None => return Ok(None),
+        },
+    }))
+}
+
+fn agents<'a>(
+    elements: &mut Elements<'a>,
+    child: &Element<'a>,
+) -> Result<AgentIds<'a>, DecodeError> {
+    let mut agents = AgentIds::default();
+    agent_id::read_all(elements, child, &mut agents)?;
+    Ok(agents)
 }
 
 /// A stamp, its parts in any order; `None` if it does not say by whom.
-fn read_received<'a>(
+fn received<'a>(
     elements: &mut Elements<'a>,
     begin: &Element<'a>,
-) -> Result<Option<Received>, DecodeError> {
-    let mut by = None;
-    let mut from = None;
-    let mut date = None;
-    let mut id = None;
-    let mut via = None;
-    let mut pairs = Vec::new();
+) -> Result<Option<ReceivedView<'a>>, DecodeError> {
+    let (mut by, mut from, mut date, mut id, mut via) = (None, None, None, None, None);
+    let start = elements.position();
     while let Some(child) = elements.child()? {
-        if child.is("received-date") {
-            date = Some(elements.value(&child, &["value"])?.time()?);
-            continue;
-        }
-        let texts = [
-            ("received-by", &mut by),
-            ("received-from", &mut from),
-            ("received-id", &mut id),
-            ("received-via", &mut via),
-        ];
-        let known = texts.into_iter().find(|(name, _)| child.is(name));
-        if let Some((name, text)) = known {
-            let value = elements.value(&child, &["value"])?.trimmed(name)?;
-            *text = Some(value).filter(|value| !value.is_empty());
-        } else {
-            pairs.extend(user_defined(elements, &child)?);
-        }
+        let (text, what) = match child.tag {
+            Tag::ReceivedDate => {
+                date = Some(elements.value(&child, &["value"])?.time()?);
+                continue;
+            }
+            Tag::ReceivedBy => (&mut by, "received-by"),
+            Tag::ReceivedFrom => (&mut from, "received-from"),
+            Tag::ReceivedId => (&mut id, "received-id"),
+            Tag::ReceivedVia => (&mut via, "received-via"),
+            _ => {
+                agent_id::user_defined(elements, &child)?;
+                continue;
+            }
+        };
+        let value: Text<'a> = elements.value(&child, &["value"])?.trimmed(what)?;
+        *text = (!value.is_empty()).then_some(value);
     }
+    let inside = elements.bytes().get(start..elements.begin());
     let Some(by) = by else { return Ok(None) };
     let Some(date) = date else {
         return Err(elements.error(begin.offset, Problem::Missing("received-date")));
     };
-    Ok(Some(Received {
+    Ok(Some(ReceivedView {
         by,
-        from,
         date,
+        from,
         id,
         via,
-        user_defined: pairs,
+        rest: Stamp::Xml(inside.unwrap_or_default()),
     }))
 }
 
-fn user_defined<'a>(
-    elements: &mut Elements<'a>,
-    child: &Element<'a>,
-) -> Result<Option<(String, String)>, DecodeError> {
-    let pair = agent_id::user_defined_pair(elements, child)?;
-    if pair.as_ref().is_some_and(|(name, _)| !is_token(name)) {
-        let problem = Problem::NotAWord("name of a user-defined parameter");
-        return Err(elements.error(child.offset, problem));
+/// The next user-defined parameter of those in a checked stamp.
+pub(crate) fn next_received_user_defined<'a>(rest: &mut &'a [u8]) -> Option<UserDefined<'a>> {
+    let mut elements = Elements::inside(rest);
+    // An error cannot occur in checked bytes, and would end this.
+    while let Some(child) = elements.child().ok()? {
+        let pair = match child.tag {
+            Tag::ReceivedDate
+            | Tag::ReceivedBy
+            | Tag::ReceivedFrom
+            | Tag::ReceivedId
+            | Tag::ReceivedVia => elements.skip().ok().map(|()| None)?,
+            _ => agent_id::user_defined(&mut elements, &child).ok()?,
+        };
+        *rest = elements.rest();
+        if let Some((name, value)) = pair {
+            return Some(UserDefined::Pair(name, value));
+        }
     }
-    Ok(pair)
+    None
 }

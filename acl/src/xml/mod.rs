@@ -16,8 +16,12 @@ mod message_read;
 mod message_write;
 mod out;
 mod reader;
+mod tag;
+mod value;
 
-pub(crate) use envelope_read::decode as decode_envelope;
+pub(crate) use agent_id::{AgentSet, next_part};
+pub(crate) use envelope_read::{Walk, next_received_user_defined};
 pub(crate) use envelope_write::encode as encode_envelope;
-pub(crate) use message_read::decode;
+pub(crate) use message_read::{next_user_defined, view};
 pub(crate) use message_write::encode;
+pub(crate) use value::{Space, unescaped};

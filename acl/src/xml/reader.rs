@@ -1,39 +1,43 @@
-//! Walking over XML elements without trust: bounded depth, offsets in every error, linear time.
+//! Walking over XML elements without trust and without allocating: bounded depth, offsets in every
+//! error, linear time.
 //!
-//! quick-xml reads the tags. Text and CDATA sections are cut out here, because fipa_services puts
-//! any bytes there, which quick-xml would have to be UTF-8.
+//! Of XML 1.0 this knows tags, text, CDATA sections and references to characters, and passes over
+//! comments, instructions and the name of a document type. There are no entities but the five of
+//! XML itself. Text and CDATA sections need not be UTF-8 here, because fipa_services puts any bytes
+//! there.
 
-use std::borrow::Cow;
-use std::io::BufRead as _;
+use memchr::memmem;
 
-use memchr::{memchr, memmem};
-use quick_xml::errors::{Error, IllFormedError, SyntaxError};
-use quick_xml::events::Event as Markup;
-use quick_xml::events::attributes::Attributes;
-
-use crate::Time;
 use crate::error::{DecodeError, Problem};
+use crate::scan;
+use crate::xml::tag::Tag;
+use crate::xml::value::{Piece, Value};
 
 /// Deepest nesting of elements: more than resolvers nested as deep as they may be need.
 const MAX_DEPTH: usize = 64;
 
-/// Longest reference to a character, from `&` to `;`.
-const MAX_REFERENCE: usize = 12;
-
 const CDATA: &[u8] = b"<![CDATA[";
 
 /// The elements of a document, in their order.
+#[derive(Debug, Clone)]
 pub(super) struct Elements<'a> {
-    reader: quick_xml::Reader<&'a [u8]>,
-    len: usize,
-    clause: &'static str,
-    /// Elements that are open.
+    bytes: &'a [u8],
+    /// Those that were not read yet.
+    rest: &'a [u8],
+    pub(super) clause: &'static str,
+    /// The names of the elements that are open.
+    open: [&'a [u8]; MAX_DEPTH],
     depth: usize,
+    /// Where what was read last begins.
+    begin: usize,
     /// The element that began last was an empty one, and its end is still to be told.
     ends: bool,
+    /// Elements that began in front of the bytes may end in them.
+    inside: bool,
 }
 
-enum Event<'a> {
+/// What a document consists of.
+pub(super) enum Event<'a> {
     Start(Element<'a>),
     End,
     Text(Piece<'a>),
@@ -42,27 +46,39 @@ enum Event<'a> {
 impl<'a> Elements<'a> {
     /// The elements in bytes that begin with a document; errors will name the clause.
     pub(super) fn new(bytes: &'a [u8], clause: &'static str) -> Self {
-        let document = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
         Self {
-            reader: quick_xml::Reader::from_reader(document),
-            len: bytes.len(),
+            bytes,
+            rest: bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes),
             clause,
+            open: [&[]; MAX_DEPTH],
             depth: 0,
+            begin: 0,
             ends: false,
+            inside: false,
         }
     }
 
-    /// The outermost element, which must have this name.
+    /// What follows in checked bytes that lie somewhere inside of elements.
+    pub(super) fn inside(bytes: &'a [u8]) -> Self {
+        Self {
+            rest: bytes,
+            inside: true,
+            ..Self::new(bytes, "")
+        }
+    }
+
+    /// The outermost element, which must have this tag.
     pub(super) fn root(
         &mut self,
-        name: &str,
+        tag: Tag,
         problem: &'static str,
     ) -> Result<Element<'a>, DecodeError> {
         loop {
             let offset = self.position();
             match self.next()? {
-                Event::Start(element) if element.is(name) => return Ok(element),
-                Event::Text(text) if text.is_blank() => {}
+                Some(Event::Start(element)) if element.tag == tag => return Ok(element),
+                Some(Event::Text(text)) if text.is_blank() => {}
+                None => return Err(self.truncated()),
                 _ => return Err(self.error(offset, Problem::Xml(problem))),
             }
         }
@@ -73,9 +89,10 @@ impl<'a> Elements<'a> {
     pub(super) fn child(&mut self) -> Result<Option<Element<'a>>, DecodeError> {
         loop {
             match self.next()? {
-                Event::Start(element) => return Ok(Some(element)),
-                Event::End => return Ok(None),
-                Event::Text(_) => {}
+                Some(Event::Start(element)) => return Ok(Some(element)),
+                Some(Event::End) => return Ok(None),
+                Some(Event::Text(_)) => {}
+                None => return Err(self.truncated()),
             }
         }
     }
@@ -92,18 +109,26 @@ impl<'a> Elements<'a> {
             let value = self.attribute(element, name)?;
             attribute = attribute.or(value.filter(|value| !value.is_empty()));
         }
-        let mut text = Value::new(self.position(), self.clause);
+        let start = self.position();
+        let mut text = Value::new(start, self.clause);
+        if let Some(raw) = self.whole_text() {
+            text.all = raw;
+            text.add(Piece::text(raw, start));
+            return Ok(attribute.unwrap_or(text));
+        }
         let mut inner = None;
         loop {
             match self.next()? {
-                Event::Text(piece) => text.pieces.push(piece),
-                Event::Start(child) if child.is("url") => {
+                Some(Event::Text(piece)) => text.add(piece),
+                Some(Event::Start(child)) if child.tag == Tag::Url => {
                     inner = Some(self.value(&child, &["href"])?);
                 }
-                Event::Start(_) => self.skip()?,
-                Event::End => break,
+                Some(Event::Start(_)) => self.skip()?,
+                Some(Event::End) => break,
+                None => return Err(self.truncated()),
             }
         }
+        text.all = self.bytes.get(start..self.begin).unwrap_or_default();
         Ok(match (attribute, inner) {
             (Some(attribute), _) => attribute,
             (None, Some(inner)) if text.is_blank() => inner,
@@ -111,59 +136,99 @@ impl<'a> Elements<'a> {
         })
     }
 
+    /// Reads the element that was begun last to its end, if there is nothing but a text in it, as
+    /// in nearly all.
+    #[inline]
+    fn whole_text(&mut self) -> Option<&'a [u8]> {
+        if self.ends {
+            return None;
+        }
+        let depth = self.depth.checked_sub(1)?;
+        let len = scan::find_byte(self.rest, b'<')?;
+        let (text, tag) = self.rest.split_at_checked(len)?;
+        let behind = tag
+            .strip_prefix(b"</")?
+            .strip_prefix(*self.open.get(depth)?)?;
+        let rest = behind.strip_prefix(b">")?;
+        self.begin = self.position() + len;
+        self.rest = rest;
+        self.depth = depth;
+        Some(text)
+    }
+
     /// Reads the element that was begun last to its end.
     pub(super) fn skip(&mut self) -> Result<(), DecodeError> {
         let outside = self.depth.saturating_sub(1);
         while self.depth > outside {
-            self.next()?;
+            if self.next()?.is_none() {
+                return Err(self.truncated());
+            }
         }
         Ok(())
     }
 
-    /// The value of an attribute.
+    /// The value of an attribute, whose name may be in any case and with any prefix.
     pub(super) fn attribute(
         &self,
         element: &Element<'a>,
         name: &str,
     ) -> Result<Option<Value<'a>>, DecodeError> {
-        let mut attributes = Attributes::new(element.markup, element.name.len());
-        // Looking for duplicates takes quadratic time.
-        for attribute in attributes.with_checks(false) {
-            let problem = Problem::Xml("malformed attribute");
-            let attribute = attribute.map_err(|_| self.error(element.offset, problem))?;
-            if local(attribute.key.into_inner()).eq_ignore_ascii_case(name)
-                && let Cow::Borrowed(raw) = attribute.value
-            {
-                let mut value = Value::new(element.offset, self.clause);
-                value.pieces.push(Piece {
-                    raw: raw.as_bytes(),
-                    offset: element.offset,
-                    literal: false,
-                });
-                return Ok(Some(value));
+        let malformed = || self.error(element.offset, Problem::Xml("malformed attribute"));
+        let mut rest = element.attributes;
+        loop {
+            rest = rest.trim_ascii_start();
+            if rest.is_empty() {
+                return Ok(None);
+            }
+            let ends = |byte: &u8| *byte == b'=' || byte.is_ascii_whitespace();
+            let len = rest.iter().position(ends).ok_or_else(malformed)?;
+            let (key, behind) = rest.split_at(len);
+            let behind = behind.trim_ascii_start().strip_prefix(b"=");
+            let (quote, inside) = match behind.ok_or_else(malformed)?.trim_ascii_start() {
+                [quote @ (b'"' | b'\''), inside @ ..] => (*quote, inside),
+                _ => return Err(malformed()),
+            };
+            let len = scan::find_byte(inside, quote).ok_or_else(malformed)?;
+            let (value, behind) = inside.split_at(len);
+            rest = behind.get(1..).unwrap_or_default();
+            if local(key).eq_ignore_ascii_case(name.as_bytes()) {
+                return Ok(Some(Value::attribute(value, element.offset, self.clause)));
             }
         }
-        Ok(None)
     }
 
     /// How many bytes were read.
     pub(super) fn position(&self) -> usize {
-        self.len - self.reader.get_ref().len()
+        self.bytes.len() - self.rest.len()
+    }
+
+    /// What was not read yet.
+    pub(super) fn rest(&self) -> &'a [u8] {
+        self.rest
+    }
+
+    /// Where what was read last begins.
+    pub(super) fn begin(&self) -> usize {
+        self.begin
+    }
+
+    /// All the bytes.
+    pub(super) fn bytes(&self) -> &'a [u8] {
+        self.bytes
     }
 
     /// Checks that nothing but white space, comments and instructions follows.
     pub(super) fn finish(mut self) -> Result<(), DecodeError> {
         loop {
-            let rest = self.reader.get_ref().trim_ascii_start();
-            let blank = self.reader.get_ref().len() - rest.len();
-            self.reader.stream().consume(blank);
-            if rest.is_empty() {
+            self.rest = self.rest.trim_ascii_start();
+            if self.rest.is_empty() {
                 return Ok(());
             }
-            if !rest.starts_with(b"<!--") && !rest.starts_with(b"<?") {
-                return Err(self.error(self.position(), Problem::Trailing(rest.len())));
+            if !self.rest.starts_with(b"<!--") && !self.rest.starts_with(b"<?") {
+                let problem = Problem::Trailing(self.rest.len());
+                return Err(self.error(self.position(), problem));
             }
-            self.markup()?;
+            self.pass()?;
         }
     }
 
@@ -171,258 +236,198 @@ impl<'a> Elements<'a> {
         DecodeError::new(offset, self.clause, problem)
     }
 
-    fn next(&mut self) -> Result<Event<'a>, DecodeError> {
+    #[cold]
+    pub(super) fn truncated(&self) -> DecodeError {
+        self.error(self.position(), Problem::Truncated("an element"))
+    }
+
+    /// What comes next, or `None` where the bytes end.
+    pub(super) fn next(&mut self) -> Result<Option<Event<'a>>, DecodeError> {
+        self.begin = self.position();
         if self.ends {
             self.ends = false;
-            return Ok(self.end());
+            self.depth = self.depth.saturating_sub(1);
+            return Ok(Some(Event::End));
         }
         loop {
-            let rest: &'a [u8] = self.reader.get_ref();
-            let offset = self.position();
-            if rest.starts_with(CDATA) {
-                let Some(end) = memmem::find(rest, b"]]>") else {
-                    return Err(self.error(offset, Problem::Truncated("a CDATA section")));
-                };
-                self.reader.stream().consume(end + 3);
-                return Ok(Event::Text(Piece {
-                    raw: rest.get(CDATA.len()..end).unwrap_or_default(),
-                    offset: offset + CDATA.len(),
-                    literal: true,
-                }));
-            }
-            let until_markup = memchr(b'<', rest).unwrap_or(rest.len());
-            if let Some(raw @ [_, ..]) = rest.get(..until_markup) {
-                self.reader.stream().consume(until_markup);
-                return Ok(Event::Text(Piece {
-                    raw,
-                    offset,
-                    literal: false,
-                }));
-            }
-            let (begins, name_len) = match self.markup()? {
-                Markup::Start(tag) => (true, tag.name().into_inner().len()),
-                Markup::Empty(tag) => {
-                    self.ends = true;
-                    (true, tag.name().into_inner().len())
+            self.begin = self.position();
+            match self.rest {
+                [] => return Ok(None),
+                [b'<', b'/', behind @ ..] => return self.end_tag(behind).map(Some),
+                [b'<', b'!', ..] if self.rest.starts_with(CDATA) => {
+                    return self.cdata().map(Some);
                 }
-                Markup::End(_) => return Ok(self.end()),
-                Markup::Eof => {
-                    return Err(self.error(offset, Problem::Truncated("an element")));
+                [b'<', b'!' | b'?', ..] => self.pass()?,
+                [b'<', behind @ ..] => return self.start_tag(behind).map(Some),
+                _ => {
+                    let len = scan::find_byte(self.rest, b'<').unwrap_or(self.rest.len());
+                    let (raw, rest) = self.rest.split_at(len);
+                    self.rest = rest;
+                    let offset = self.begin;
+                    return Ok(Some(Event::Text(Piece::text(raw, offset))));
                 }
-                Markup::DocType(text) if text.contains('[') => {
-                    let problem = Problem::Xml("an internal document type is not accepted");
-                    return Err(self.error(offset, problem));
-                }
-                _ => (false, 0),
-            };
-            if begins {
-                self.depth += 1;
-                if self.depth > MAX_DEPTH {
-                    return Err(self.error(offset, Problem::TooDeep("elements")));
-                }
-                let tag = rest.get(1..self.position() - offset - 1);
-                return self.element(tag.unwrap_or_default(), name_len, offset);
             }
         }
     }
 
-    fn end(&mut self) -> Event<'a> {
-        self.depth = self.depth.saturating_sub(1);
-        Event::End
-    }
-
-    /// `tag`: what is between the angle brackets.
-    fn element(
-        &self,
-        tag: &'a [u8],
-        name_len: usize,
-        offset: usize,
-    ) -> Result<Event<'a>, DecodeError> {
-        let not_utf8 = |_| self.error(offset, Problem::NotUtf8("tag"));
-        let tag = std::str::from_utf8(tag).map_err(not_utf8)?;
-        let markup = tag.strip_suffix('/').unwrap_or(tag);
-        let name = markup.get(..name_len).unwrap_or(markup);
+    fn start_tag(&mut self, behind: &'a [u8]) -> Result<Event<'a>, DecodeError> {
+        let truncated = || self.error(self.begin, Problem::Truncated("markup"));
+        let ends = |word| scan::is(word, b'>') | scan::below(word, 0x21);
+        let len = scan::find(behind, ends, |byte| byte == b'>' || byte <= b' ');
+        let len = len.ok_or_else(truncated)?;
+        let (name, behind) = behind.split_at(len);
+        let (attributes, rest) = markup(behind).ok_or_else(truncated)?;
+        let (name, attributes, is_empty) = match (name, attributes) {
+            ([name @ .., b'/'], []) => (name, attributes, true),
+            (name, [attributes @ .., b'/']) => (name, attributes, true),
+            _ => (name, attributes, false),
+        };
+        let tag = match Tag::of(name) {
+            Tag::Other => Tag::of(local(name)),
+            tag => tag,
+        };
+        self.rest = rest;
+        self.ends = is_empty;
+        match self.open.get_mut(self.depth) {
+            Some(open) => *open = name,
+            None => return Err(self.error(self.begin, Problem::TooDeep("elements"))),
+        }
+        self.depth += 1;
         Ok(Event::Start(Element {
-            markup,
+            tag,
             name,
-            local: local(name),
-            offset,
+            attributes,
+            offset: self.begin,
         }))
     }
 
-    /// Lets quick-xml read one piece of markup.
-    fn markup(&mut self) -> Result<Markup<'a>, DecodeError> {
+    fn end_tag(&mut self, behind: &'a [u8]) -> Result<Event<'a>, DecodeError> {
+        let wrong = Problem::Xml("an end tag does not match its start tag");
+        let open = match self.depth.checked_sub(1) {
+            Some(depth) => {
+                self.depth = depth;
+                self.open.get(depth).copied().unwrap_or_default()
+            }
+            None if self.inside => {
+                // It was compared when the bytes were checked.
+                let end = scan::find_byte(behind, b'>').and_then(|end| behind.get(end + 1..));
+                self.rest = end.unwrap_or_default();
+                return Ok(Event::End);
+            }
+            None => return Err(self.error(self.begin, wrong)),
+        };
+        match behind.strip_prefix(open) {
+            Some([b'>', rest @ ..]) => self.rest = rest,
+            Some([b' ' | b'\t' | b'\n' | b'\r', rest @ ..]) => match rest.trim_ascii_start() {
+                [b'>', rest @ ..] => self.rest = rest,
+                [] => return Err(self.error(self.begin, Problem::Truncated("markup"))),
+                _ => return Err(self.error(self.begin, wrong)),
+            },
+            _ if scan::find_byte(behind, b'>').is_none() => {
+                return Err(self.error(self.begin, Problem::Truncated("markup")));
+            }
+            _ => return Err(self.error(self.begin, wrong)),
+        }
+        Ok(Event::End)
+    }
+
+    fn cdata(&mut self) -> Result<Event<'a>, DecodeError> {
+        let inside = self.rest.get(CDATA.len()..).unwrap_or_default();
+        let Some(len) = memmem::find(inside, b"]]>") else {
+            let problem = Problem::Truncated("a CDATA section");
+            return Err(self.error(self.begin, problem));
+        };
+        self.rest = inside.get(len + 3..).unwrap_or_default();
+        let raw = inside.get(..len).unwrap_or_default();
+        Ok(Event::Text(Piece::literal(raw, self.begin + CDATA.len())))
+    }
+
+    /// Passes over a comment, an instruction or a document type, which begins here.
+    fn pass(&mut self) -> Result<(), DecodeError> {
         let offset = self.position();
-        self.reader.read_event().map_err(|error| {
-            let problem = match error {
-                Error::Syntax(SyntaxError::InvalidBangMarkup) => Problem::Xml("malformed markup"),
-                Error::Syntax(_) => Problem::Truncated("markup"),
-                Error::IllFormed(
-                    IllFormedError::MismatchedEndTag { .. } | IllFormedError::UnmatchedEndTag(_),
-                ) => Problem::Xml("an end tag does not match its start tag"),
-                Error::Encoding(_) => Problem::NotUtf8("tag"),
-                _ => Problem::Xml("malformed markup"),
+        let (opening, end): (usize, &[u8]) = match self.rest {
+            [b'<', b'!', b'-', b'-', ..] => (4, b"-->"),
+            [b'<', b'?', ..] => (2, b"?>"),
+            [b'<', b'!', name @ ..]
+                if name
+                    .get(..7)
+                    .is_some_and(|name| name.eq_ignore_ascii_case(b"DOCTYPE")) =>
+            {
+                let Some((inside, rest)) = markup(name) else {
+                    return Err(self.error(offset, Problem::Truncated("markup")));
+                };
+                if inside.contains(&b'[') {
+                    let problem = Problem::Xml("an internal document type is not accepted");
+                    return Err(self.error(offset, problem));
+                }
+                self.rest = rest;
+                return Ok(());
+            }
+            _ => return Err(self.error(offset, Problem::Xml("malformed markup"))),
+        };
+        let inside = self.rest.get(opening..).unwrap_or_default();
+        let mut rest = inside;
+        loop {
+            let Some(found) = scan::find_byte(rest, b'>') else {
+                return Err(self.error(offset, Problem::Truncated("markup")));
             };
-            DecodeError::new(offset, self.clause, problem)
-        })
+            rest = rest.get(found + 1..).unwrap_or_default();
+            let read = inside.len() - rest.len();
+            if inside.get(..read).is_some_and(|read| read.ends_with(end)) {
+                self.rest = rest;
+                return Ok(());
+            }
+        }
+    }
+}
+
+/// The bytes up to the angle bracket that closes a tag, which may have others in the values of its
+/// attributes, and those behind it.
+#[inline]
+fn markup(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
+    if let [b'>', behind @ ..] = bytes {
+        return Some((&[], behind));
+    }
+    other_markup(bytes)
+}
+
+fn other_markup(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
+    let mut len = 0;
+    loop {
+        let rest = bytes.get(len..)?;
+        let marks = |word| scan::is(word, b'>') | scan::is(word, b'"') | scan::is(word, b'\'');
+        len += scan::find(rest, marks, |byte| matches!(byte, b'>' | b'"' | b'\''))?;
+        let (inside, behind) = bytes.split_at_checked(len)?;
+        let (mark, behind) = behind.split_first()?;
+        if *mark == b'>' {
+            return Some((inside, behind));
+        }
+        len += 1 + scan::find_byte(behind, *mark)? + 1;
     }
 }
 
 /// The beginning of an element.
 pub(super) struct Element<'a> {
-    /// Name and attributes.
-    markup: &'a str,
-    name: &'a str,
-    /// The name without its prefix.
-    local: &'a str,
+    pub(super) tag: Tag,
+    /// The name with its prefix.
+    name: &'a [u8],
+    attributes: &'a [u8],
     /// Where it begins.
     pub(super) offset: usize,
 }
 
 impl<'a> Element<'a> {
-    /// Whether it has this name, in any case and with any prefix.
-    pub(super) fn is(&self, name: &str) -> bool {
-        self.local.eq_ignore_ascii_case(name)
-    }
-
     /// The name of the user-defined parameter that it stands for: what follows `X-`.
-    pub(super) fn user_defined(&self) -> Option<&'a str> {
-        let prefix = self.name.get(..2)?.eq_ignore_ascii_case("x-");
-        self.name.get(2..).filter(|name| prefix && !name.is_empty())
+    pub(super) fn user_defined(&self) -> Option<&'a [u8]> {
+        match self.name {
+            [b'X' | b'x', b'-', name @ ..] if !name.is_empty() => Some(name),
+            _ => None,
+        }
     }
 }
 
-fn local(name: &str) -> &str {
+fn local(name: &[u8]) -> &[u8] {
     // Names are a few bytes long: a vectorised search takes longer.
-    let colon = name.bytes().rposition(|byte| byte == b':');
+    let colon = name.iter().rposition(|byte| *byte == b':');
     colon.map_or(name, |colon| name.get(colon + 1..).unwrap_or_default())
-}
-
-/// Text, or the value of an attribute, still escaped.
-pub(super) struct Value<'a> {
-    pieces: Vec<Piece<'a>>,
-    pub(super) offset: usize,
-    clause: &'static str,
-}
-
-#[derive(Clone, Copy)]
-struct Piece<'a> {
-    raw: &'a [u8],
-    offset: usize,
-    /// From a CDATA section, where nothing is escaped.
-    literal: bool,
-}
-
-impl Piece<'_> {
-    fn is_blank(&self) -> bool {
-        !self.literal && self.raw.trim_ascii().is_empty()
-    }
-}
-
-impl<'a> Value<'a> {
-    fn new(offset: usize, clause: &'static str) -> Self {
-        Self {
-            pieces: Vec::new(),
-            offset,
-            clause,
-        }
-    }
-
-    pub(super) fn is_empty(&self) -> bool {
-        self.pieces.iter().all(|piece| piece.raw.is_empty())
-    }
-
-    fn is_blank(&self) -> bool {
-        self.pieces.iter().all(Piece::is_blank)
-    }
-
-    /// The bytes as they are meant: copied only when they are in pieces or escaped.
-    pub(super) fn bytes(&self) -> Result<Cow<'a, [u8]>, DecodeError> {
-        match &self.pieces[..] {
-            [] => return Ok(Cow::Borrowed(&[])),
-            [one] if one.literal || memchr(b'&', one.raw).is_none() => {
-                return Ok(Cow::Borrowed(one.raw));
-            }
-            _ => {}
-        }
-        let mut out = Vec::with_capacity(self.pieces.iter().map(|piece| piece.raw.len()).sum());
-        for piece in &self.pieces {
-            if piece.literal {
-                out.extend_from_slice(piece.raw);
-            } else {
-                self.unescape(*piece, &mut out)?;
-            }
-        }
-        Ok(Cow::Owned(out))
-    }
-
-    /// The text, with its white space.
-    pub(super) fn text(&self, what: &'static str) -> Result<String, DecodeError> {
-        let wrong = |problem| DecodeError::new(self.offset, self.clause, problem);
-        let text = String::from_utf8(self.bytes()?.into_owned())
-            .map_err(|_| wrong(Problem::NotUtf8(what)))?;
-        if text.contains('\0') {
-            return Err(wrong(Problem::Nul(what)));
-        }
-        Ok(text)
-    }
-
-    /// The text without the white space around it, unless that is escaped.
-    pub(super) fn trimmed(mut self, what: &'static str) -> Result<String, DecodeError> {
-        if let Some(first) = self.pieces.first_mut().filter(|piece| !piece.literal) {
-            let trimmed = first.raw.trim_ascii_start();
-            first.offset += first.raw.len() - trimmed.len();
-            first.raw = trimmed;
-        }
-        if let Some(last) = self.pieces.last_mut().filter(|piece| !piece.literal) {
-            last.raw = last.raw.trim_ascii_end();
-        }
-        self.text(what)
-    }
-
-    /// The date and time that it says.
-    pub(super) fn time(self) -> Result<Time, DecodeError> {
-        let error = DecodeError::new(self.offset, self.clause, Problem::DateTime);
-        self.trimmed("date")?.parse().map_err(|_| error)
-    }
-
-    fn unescape(&self, piece: Piece<'_>, out: &mut Vec<u8>) -> Result<(), DecodeError> {
-        let mut rest = piece.raw;
-        while let Some(start) = memchr(b'&', rest) {
-            let (before, reference) = rest.split_at(start);
-            out.extend_from_slice(before);
-            let shown = reference.get(..MAX_REFERENCE).unwrap_or(reference);
-            let end = memchr(b';', shown).unwrap_or(0);
-            let Some(character) = reference.get(1..end).and_then(character) else {
-                let offset = piece.offset + (piece.raw.len() - reference.len());
-                let problem = Problem::Xml("no such entity or character");
-                return Err(DecodeError::new(offset, self.clause, problem));
-            };
-            out.extend_from_slice(character.encode_utf8(&mut [0; 4]).as_bytes());
-            rest = reference.get(end + 1..).unwrap_or_default();
-        }
-        out.extend_from_slice(rest);
-        Ok(())
-    }
-}
-
-/// The character that is meant by what stands between `&` and `;`.
-fn character(reference: &[u8]) -> Option<char> {
-    let number = match reference {
-        b"lt" => return Some('<'),
-        b"gt" => return Some('>'),
-        b"amp" => return Some('&'),
-        b"quot" => return Some('"'),
-        b"apos" => return Some('\''),
-        [b'#', b'x' | b'X', digits @ ..] => (digits, 16),
-        [b'#', digits @ ..] => (digits, 10),
-        _ => return None,
-    };
-    let (digits, radix) = number;
-    let digits = std::str::from_utf8(digits).ok()?;
-    if digits.starts_with('+') {
-        return None;
-    }
-    let code = u32::from_str_radix(digits, radix).ok()?;
-    char::from_u32(code).filter(|character| *character != '\0')
 }

@@ -1,115 +1,12 @@
-//! Text parameters: words, strings, numbers and expressions, borrowed from the message.
+//! Expressions: words, strings, numbers, and expressions of those in parentheses.
 
 use std::borrow::Cow;
-use std::fmt;
 
+use crate::Text;
 use crate::bitefficient::notes::{self, Notes};
-use crate::bitefficient::reader::{Form, Reader, digit_chars, string_form};
+use crate::bitefficient::reader::{Form, Reader, digit_chars, string_form, unescaped};
 use crate::error::{DecodeError, Problem};
 use crate::word::push_string_literal;
-
-/// A text parameter of an encoded message or envelope.
-///
-/// Most are there byte by byte; a string with escapes and an expression have to be written out,
-/// which [`as_str`](Self::as_str) does when it is called.
-#[derive(Clone, Copy)]
-pub struct Text<'a>(Repr<'a>);
-
-#[derive(Clone, Copy)]
-enum Repr<'a> {
-    /// As it stands.
-    Plain(&'a str),
-    /// As it stands, after a byte count: the hand of fipa_services.
-    Counted(&'a str),
-    /// The inside of quotation marks, `\"` standing for `"`.
-    Quoted(&'a str),
-    /// A number or an expression in its encoded form, checked.
-    Encoded(&'a [u8]),
-}
-
-impl<'a> Text<'a> {
-    /// The text; numbers and expressions as FIPA00070 writes them.
-    #[must_use]
-    pub fn as_str(&self) -> Cow<'a, str> {
-        match self.0 {
-            Repr::Plain(text) | Repr::Counted(text) => Cow::Borrowed(text),
-            Repr::Quoted(inner) => unescaped(inner),
-            Repr::Encoded(bytes) => Cow::Owned(render(bytes)),
-        }
-    }
-
-    /// Whether the text is empty.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        match self.0 {
-            Repr::Plain(text) | Repr::Counted(text) | Repr::Quoted(text) => text.is_empty(),
-            Repr::Encoded(_) => false,
-        }
-    }
-
-    /// The text as it stands in the bytes, escapes included; empty for numbers and expressions.
-    pub(crate) fn raw(&self) -> &'a str {
-        match self.0 {
-            Repr::Plain(text) | Repr::Counted(text) | Repr::Quoted(text) => text,
-            Repr::Encoded(_) => "",
-        }
-    }
-
-    pub(crate) fn plain(text: &'a str) -> Self {
-        Self(Repr::Plain(text))
-    }
-
-    pub(crate) fn quoted(inner: &'a str) -> Self {
-        Self(Repr::Quoted(inner))
-    }
-
-    pub(crate) fn counted(text: &'a str) -> Self {
-        Self(Repr::Counted(text))
-    }
-
-    /// Whether the text was written in quotation marks.
-    pub(crate) fn is_quoted(&self) -> bool {
-        matches!(self.0, Repr::Quoted(_))
-    }
-
-    /// Whether the text was written with a byte count, as only fipa_services does in envelopes.
-    pub(crate) fn is_counted(&self) -> bool {
-        matches!(self.0, Repr::Counted(_))
-    }
-}
-
-/// Compares the texts, however they are encoded.
-impl PartialEq for Text<'_> {
-    fn eq(&self, other: &Self) -> bool {
-        self.as_str() == other.as_str()
-    }
-}
-
-impl Eq for Text<'_> {}
-
-impl PartialEq<str> for Text<'_> {
-    fn eq(&self, other: &str) -> bool {
-        self.as_str() == other
-    }
-}
-
-impl PartialEq<&str> for Text<'_> {
-    fn eq(&self, other: &&str) -> bool {
-        self.as_str() == *other
-    }
-}
-
-impl fmt::Display for Text<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(&self.as_str())
-    }
-}
-
-impl fmt::Debug for Text<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{:?}", self.as_str())
-    }
-}
 
 /// Deepest nesting of expressions that is accepted.
 pub(crate) const MAX_EXPRESSION_DEPTH: usize = 64;
@@ -149,13 +46,13 @@ fn other_expression<'a, N: Notes>(
         0x16 | 0x17 | 0x19 => string_after(reader, code, what),
         0x12 | 0x13 => {
             reader.digits(CLAUSE)?;
-            Ok(Text(Repr::Encoded(reader.since(start))))
+            Ok(Text::encoded(reader.since(start)))
         }
         0x60 | 0x70..=0x79 => {
             reader.notes().deeper();
             check_levels(reader, code, what)?;
             reader.notes().shallower();
-            Ok(Text(Repr::Encoded(reader.since(start))))
+            Ok(Text::encoded(reader.since(start)))
         }
         0x11 | 0x15 | 0x18 => Err(reader.error(CLAUSE, Problem::CodeTable)),
         other => Err(reader.unexpected(CLAUSE, other, "an expression")),
@@ -308,7 +205,7 @@ fn note_token<N: Notes>(reader: &mut Reader<'_, N>, code: u8, start: usize) {
 }
 
 /// Writes a checked number or expression as FIPA00070 does.
-fn render(bytes: &[u8]) -> String {
+pub(crate) fn render(bytes: &[u8]) -> String {
     let mut out = String::new();
     let mut reader = Reader::new(bytes);
     while let Some(code) = reader.peek() {
@@ -334,7 +231,7 @@ fn render_token(reader: &mut Reader<'_>, code: u8, out: &mut String) -> Result<(
         None | Some(Token::None) => return Ok(()),
         Some(Token::Word) => {
             separate(out);
-            out.push_str(reader.plain(CLAUSE, "word")?);
+            out.push_str(&Text::plain(reader.plain(CLAUSE, "word")?).as_str());
             return Ok(());
         }
         Some(Token::Number) => {
@@ -358,30 +255,12 @@ fn separate(out: &mut String) {
     }
 }
 
-/// `\"` becomes `"`; a backslash before anything else is a backslash.
-fn unescaped(inner: &str) -> Cow<'_, str> {
-    if memchr::memmem::find(inner.as_bytes(), b"\\\"").is_some() {
-        Cow::Owned(inner.replace("\\\"", "\""))
-    } else {
-        Cow::Borrowed(inner)
-    }
-}
-
 /// The content of a `14 String 00`, which need not be UTF-8.
 pub(crate) fn string_content(bytes: &[u8]) -> Cow<'_, [u8]> {
-    let (form, inner) = string_form(bytes);
-    let mut escapes = memchr::memmem::find_iter(inner, b"\\\"").peekable();
-    if form != Form::Quoted || escapes.peek().is_none() {
-        return Cow::Borrowed(inner);
+    match string_form(bytes) {
+        (Form::Quoted, inner) => unescaped(inner),
+        (_, inner) => Cow::Borrowed(inner),
     }
-    let mut out = Vec::with_capacity(inner.len());
-    let mut done = 0;
-    for backslash in escapes {
-        out.extend_from_slice(inner.get(done..backslash).unwrap_or_default());
-        done = backslash + 1;
-    }
-    out.extend_from_slice(inner.get(done..).unwrap_or_default());
-    Cow::Owned(out)
 }
 
 #[cfg(test)]

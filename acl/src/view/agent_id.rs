@@ -1,0 +1,227 @@
+//! Agent identifiers, borrowed from the bytes they were read from.
+
+use crate::error::{DecodeError, Problem};
+use crate::{AgentId, AgentIdError, Text, bitefficient, envelope, string, xml};
+
+/// An agent identifier in an encoded message or envelope.
+#[derive(Debug, Clone, Copy)]
+pub struct AgentIdView<'a> {
+    name: Text<'a>,
+    parts: Parts<'a>,
+}
+
+impl<'a> AgentIdView<'a> {
+    /// An identifier that was checked: see [`check`].
+    #[inline]
+    pub(crate) fn new(name: Text<'a>, encoding: Encoding, parts: &'a [u8]) -> Self {
+        let parts = Parts {
+            encoding,
+            rest: parts,
+            list: List::Outside,
+        };
+        Self { name, parts }
+    }
+
+    /// The name.
+    #[must_use]
+    pub fn name(&self) -> Text<'a> {
+        self.name
+    }
+
+    /// Transport addresses, the preferred one first.
+    pub fn addresses(&self) -> impl Iterator<Item = Text<'a>> + use<'a> {
+        self.parts.filter_map(|part| match part {
+            Part::Address(address) => Some(address),
+            _ => None,
+        })
+    }
+
+    /// Agents that can resolve the name, the preferred one first.
+    pub fn resolvers(&self) -> impl Iterator<Item = AgentIdView<'a>> + use<'a> {
+        self.parts.filter_map(|part| match part {
+            Part::Resolver(agent) => Some(agent),
+            _ => None,
+        })
+    }
+
+    /// User-defined parameters, names without `X-`.
+    pub fn user_defined(&self) -> impl Iterator<Item = (Text<'a>, Text<'a>)> + use<'a> {
+        self.parts.filter_map(|part| match part {
+            Part::UserDefined(name, value) => Some((name, value)),
+            _ => None,
+        })
+    }
+
+    /// The identifier as an owned value.
+    pub(crate) fn to_agent_id(self) -> Result<AgentId, DecodeError> {
+        // What an identifier can be refused for was checked when it was read; should it be
+        // refused all the same, the error is told.
+        self.owned()
+            .map_err(|error| DecodeError::new(0, "FIPA00023 3.1", problem(&error)))
+    }
+
+    fn owned(self) -> Result<AgentId, AgentIdError> {
+        let mut agent = AgentId::new(self.name.as_str())?;
+        for part in self.parts {
+            agent = match part {
+                Part::Address(address) => agent.with_address(address.as_str())?,
+                Part::Resolver(resolver) => agent.with_resolver(resolver.owned()?)?,
+                Part::UserDefined(name, value) => {
+                    agent.with_user_defined(name.as_str(), value.as_str())?
+                }
+            };
+        }
+        Ok(agent)
+    }
+}
+
+/// The agent identifiers of a set or sequence in an encoded message or envelope.
+#[derive(Debug, Clone, Default)]
+pub struct AgentIds<'a>(Set<'a>);
+
+#[derive(Debug, Clone, Default)]
+enum Set<'a> {
+    #[default]
+    Empty,
+    BitEfficient(&'a [u8]),
+    Envelope(&'a [u8]),
+    String(&'a [u8]),
+    Xml(xml::AgentSet<'a>),
+}
+
+impl<'a> AgentIds<'a> {
+    /// The identifiers in checked bytes, one behind the other.
+    #[inline]
+    pub(crate) fn new(encoding: Encoding, bytes: &'a [u8]) -> Self {
+        Self(match encoding {
+            _ if bytes.is_empty() => Set::Empty,
+            Encoding::BitEfficient => Set::BitEfficient(bytes),
+            Encoding::Envelope => Set::Envelope(bytes),
+            Encoding::String => Set::String(bytes),
+            Encoding::Xml => Set::Empty,
+        })
+    }
+
+    /// The identifiers in checked elements.
+    pub(crate) fn xml(set: xml::AgentSet<'a>) -> Self {
+        Self(Set::Xml(set))
+    }
+
+    /// Whether they are in elements of XML.
+    pub(crate) fn is_xml(&self) -> bool {
+        matches!(self.0, Set::Xml(_))
+    }
+
+    /// Whether there are none.
+    pub(crate) fn is_empty(&self) -> bool {
+        match &self.0 {
+            Set::Empty => true,
+            Set::BitEfficient(rest) | Set::Envelope(rest) | Set::String(rest) => rest.is_empty(),
+            Set::Xml(set) => set.is_empty(),
+        }
+    }
+
+    /// Adds the agents that follow in the same bytes, if both are elements of XML.
+    pub(crate) fn add(&mut self, others: &Self) -> bool {
+        match (&mut self.0, &others.0) {
+            (Set::Xml(set), Set::Xml(others)) => {
+                set.add(others);
+                true
+            }
+            _ => false,
+        }
+    }
+
+    pub(crate) fn to_agent_ids(&self) -> Result<Vec<AgentId>, DecodeError> {
+        self.clone().map(AgentIdView::to_agent_id).collect()
+    }
+}
+
+impl<'a> Iterator for AgentIds<'a> {
+    type Item = AgentIdView<'a>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        // Checked when they were read: an error cannot occur, and would end the list.
+        match &mut self.0 {
+            Set::Empty => None,
+            Set::BitEfficient(rest) => bitefficient::agent_id::next(rest),
+            Set::Envelope(rest) => envelope::agent_id::next(rest),
+            Set::String(rest) => string::agent_id::next(rest),
+            Set::Xml(set) => set.next(),
+        }
+    }
+}
+
+/// In which encoding an identifier is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Encoding {
+    /// FIPA00069.
+    BitEfficient,
+    /// FIPA00088.
+    Envelope,
+    /// FIPA00070.
+    String,
+    /// FIPA00071 and FIPA00085.
+    Xml,
+}
+
+/// What a checked identifier has beside its name, up to its end.
+#[derive(Debug, Clone, Copy)]
+struct Parts<'a> {
+    encoding: Encoding,
+    rest: &'a [u8],
+    list: List,
+}
+
+/// One of these parts.
+pub(crate) enum Part<'a> {
+    Address(Text<'a>),
+    Resolver(AgentIdView<'a>),
+    UserDefined(Text<'a>, Text<'a>),
+}
+
+/// Which list whoever reads part by part is in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum List {
+    Outside,
+    Addresses,
+    Resolvers,
+}
+
+impl<'a> Iterator for Parts<'a> {
+    type Item = Part<'a>;
+
+    fn next(&mut self) -> Option<Part<'a>> {
+        let next = match self.encoding {
+            Encoding::BitEfficient => bitefficient::agent_id::next_part,
+            Encoding::Envelope => envelope::agent_id::next_part,
+            Encoding::String => string::agent_id::next_part,
+            Encoding::Xml => xml::next_part,
+        };
+        next(&mut self.rest, &mut self.list)
+    }
+}
+
+/// Checks a name as [`AgentId::new`] does.
+pub(crate) fn check_name(name: &Text<'_>, what: &'static str) -> Result<(), Problem> {
+    // Most are far from being too long, escaped or not.
+    let raw = name.raw();
+    if raw.len() > AgentId::MAX_NAME && name.as_str().len() > AgentId::MAX_NAME {
+        return Err(Problem::TooLong(what));
+    }
+    if name.is_empty() {
+        return Err(Problem::Empty(what));
+    }
+    Ok(())
+}
+
+fn problem(error: &AgentIdError) -> Problem {
+    match error {
+        AgentIdError::EmptyName => Problem::Empty("agent name"),
+        AgentIdError::NameTooLong(_) => Problem::TooLong("agent name"),
+        AgentIdError::Nul(part) => Problem::Nul(part),
+        AgentIdError::EmptyAddress => Problem::Empty("address"),
+        AgentIdError::TooDeep => Problem::TooDeep("resolvers"),
+        AgentIdError::UserDefinedName(_) => Problem::NotAWord("name of a user-defined parameter"),
+    }
+}
