@@ -3,7 +3,7 @@
 #![no_main]
 
 use fipa_acl::{Message, Representation};
-use fipa_fuzz::{message_survives, payload};
+use fipa_fuzz::{message_survives, message_view_agrees, payload};
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {
@@ -11,7 +11,9 @@ fuzz_target!(|bytes: &[u8]| {
     if Representation::detect(bytes) != Some(Representation::String) {
         return;
     }
-    match Message::decode(&payload(bytes)) {
+    let decoded = Message::decode(&payload(bytes));
+    message_view_agrees(bytes, &decoded);
+    match decoded {
         Ok(message) => message_survives(&message),
         Err(error) => assert!(error.offset() <= bytes.len()),
     }

@@ -5,7 +5,7 @@
 
 use bytes::Bytes;
 use fipa_acl::{Envelope, Letter, Representation};
-use fipa_fuzz::envelope_survives;
+use fipa_fuzz::{envelope_survives, envelope_view_agrees};
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {
@@ -16,6 +16,7 @@ fuzz_target!(|bytes: &[u8]| {
         Ok(read) => read,
         Err(error) => return assert!(error.offset() <= bytes.len()),
     };
+    envelope_view_agrees(bytes, &envelope, len);
     let letter = Letter::split(Bytes::copy_from_slice(bytes)).expect("an envelope is there");
     assert_eq!(letter.envelope_len(), len);
     envelope_survives(&envelope);

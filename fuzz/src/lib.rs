@@ -4,7 +4,10 @@ use std::fmt::Debug;
 
 use bytes::Bytes;
 use fipa_acl::json::{Document, document_from_json, envelope_to_json, message_to_json};
-use fipa_acl::{Dialect, Envelope, Message, Payload, Representation};
+use fipa_acl::{
+    AgentId, AgentIdView, DecodeError, Dialect, Envelope, EnvelopeView, Message, MessageView,
+    Payload, Representation,
+};
 use serde_json::json;
 
 const DIALECTS: [Dialect; 3] = [Dialect::Standard, Dialect::FipaServices, Dialect::Jade];
@@ -71,6 +74,47 @@ fn same<T: Debug + PartialEq>(one: &T, other: &T, dialect: Dialect) {
     } else {
         assert_eq!(one, other, "{dialect}");
     }
+}
+
+/// The view of a message says what the message says, or is refused for the same reason.
+pub fn message_view_agrees(bytes: &[u8], decoded: &Result<Message, DecodeError>) {
+    let view = MessageView::parse(bytes);
+    assert_eq!(decoded.as_ref().err(), view.as_ref().err());
+    let (Ok(message), Ok(view)) = (decoded, view) else {
+        return;
+    };
+    assert_eq!(
+        view.content().as_deref(),
+        message.content().map(|all| &**all)
+    );
+    let names = |agents: &mut dyn Iterator<Item = AgentIdView<'_>>| -> Vec<String> {
+        agents.map(|agent| agent.name().to_string()).collect()
+    };
+    let owned = |agents: &[AgentId]| -> Vec<String> {
+        agents.iter().map(|agent| agent.name().to_owned()).collect()
+    };
+    assert_eq!(names(&mut view.receivers()), owned(message.receivers()));
+    assert_eq!(names(&mut view.reply_to()), owned(message.reply_to()));
+    assert_eq!(view.user_defined().count(), message.user_defined().len());
+}
+
+/// The view of an envelope says what the envelope says.
+pub fn envelope_view_agrees(bytes: &[u8], envelope: &Envelope, len: usize) {
+    let view = EnvelopeView::parse(bytes).expect("the view is not stricter");
+    assert_eq!(view.len(), len);
+    let effective = envelope.effective();
+    let from = effective.from.as_ref().map(|agent| agent.name().to_owned());
+    assert_eq!(view.from_name().map(|name| name.to_string()), from);
+    assert_eq!(view.acl_representation(), effective.acl_representation);
+    let receivers: Vec<_> = view.receivers().map(|name| name.to_string()).collect();
+    let named = if effective.intended_receivers.is_empty() {
+        &effective.to
+    } else {
+        &effective.intended_receivers
+    };
+    let named: Vec<_> = named.iter().map(|agent| agent.name().to_owned()).collect();
+    assert_eq!(receivers, named);
+    let _ = view.stamps().count();
 }
 
 /// The bytes as a message that lies in one piece.

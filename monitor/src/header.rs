@@ -165,10 +165,13 @@ impl<'a> From<&'a Message> for Header<'a> {
 impl<'a> From<&MessageView<'a>> for Header<'a> {
     fn from(view: &MessageView<'a>) -> Self {
         Self {
-            sender: view.sender().map(|sender| sender.name().into()),
-            receivers: view.receivers().map(|agent| agent.name().into()).collect(),
-            reply_to: view.reply_to().map(|agent| agent.name().into()).collect(),
-            protocol: view.protocol().map(Cow::Borrowed),
+            sender: view.sender().map(|sender| sender.name().as_str()),
+            receivers: view
+                .receivers()
+                .map(|agent| agent.name().as_str())
+                .collect(),
+            reply_to: view.reply_to().map(|agent| agent.name().as_str()).collect(),
+            protocol: view.protocol().map(|name| name.as_str()),
             conversation_id: view.conversation_id().map(|text| text.as_str()),
             reply_with: view.reply_with().map(|text| text.as_str()),
             in_reply_to: view.in_reply_to().map(|text| text.as_str()),

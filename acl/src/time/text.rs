@@ -136,7 +136,7 @@ fn pairs(digits: [u8; 8]) -> Option<[u8; 4]> {
     let word = u64::from_le_bytes(digits);
     let numbers = word ^ ZEROS;
     // In every byte: the top bit is set if it is no digit.
-    let wrong = numbers | (numbers & !TOPS) + ONES * (0x80 - 10);
+    let wrong = numbers | ((numbers & !TOPS) + ONES * (0x80 - 10));
     if wrong & TOPS != 0 {
         return None;
     }
