@@ -5,7 +5,7 @@ use std::borrow::Cow;
 use crate::Text;
 use crate::bitefficient::notes::{Notes, Silent};
 use crate::error::{DecodeError, Problem};
-use crate::scan::{Kind, ONES, TOPS, near_text};
+use crate::scan::{Kind, ONES, TOPS, find_byte, near_text};
 use crate::time::{Base, Fields, Time, Zone};
 
 /// A place in bytes that came from outside.
@@ -300,7 +300,23 @@ impl<'a, N: Notes> Reader<'a, N> {
         })
     }
 
-    /// A set of such agent identifiers, up to its end, which is read too.
+    /// The same of an envelope, where a bare text stands for a word (`02 … 00 01`).
+    #[inline(always)]
+    pub(crate) fn short_bare_name(&mut self) -> Option<&'a [u8]> {
+        let [0x02, rest @ ..] = self.rest else {
+            return None;
+        };
+        let (name, [0x01, rest @ ..], kind) = near_text(rest)? else {
+            return None;
+        };
+        let bare = !matches!(name, [] | [b'"' | b'#', ..]);
+        (kind.is_ascii() && bare).then(|| {
+            self.rest = rest;
+            name
+        })
+    }
+
+    /// A set of agent identifiers of a message that are of this kind, up to its end, which is read too.
     #[inline(always)]
     pub(crate) fn short_agent_names(&mut self) -> Option<&'a [u8]> {
         let mut ahead = self.ahead();
@@ -331,7 +347,7 @@ impl<'a, N: Notes> Reader<'a, N> {
 
     /// Text up to the next NUL, by the rule for `String 00` that fits every peer: in quotation
     /// marks (standard, fipa_services), with its length in front (fipa_services), or bare (JADE).
-    #[inline]
+    #[inline(always)]
     pub(crate) fn string(&mut self, clause: &'static str, what: &'static str) -> Result<Text<'a>> {
         self.plain(clause, what).map(Text::string)
     }
@@ -451,7 +467,11 @@ pub(crate) fn string_form(bytes: &[u8]) -> (Form, &[u8]) {
 /// What stands between quotation marks: `\"` becomes `"`; a backslash before anything else is a
 /// backslash.
 pub(crate) fn unescaped(inner: &[u8]) -> Cow<'_, [u8]> {
-    let mut escapes = memchr::memmem::find_iter(inner, b"\\\"").peekable();
+    // Nearly none has quotation marks at all, which is quicker found out.
+    let mut escapes = match find_byte(inner, b'"') {
+        Some(_) => memchr::memmem::find_iter(inner, b"\\\"").peekable(),
+        None => return Cow::Borrowed(inner),
+    };
     if escapes.peek().is_none() {
         return Cow::Borrowed(inner);
     }
