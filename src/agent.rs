@@ -122,12 +122,13 @@ impl Agent {
         self.post(&message, letter, deadline)
     }
 
-    /// Memory for the content of a message to one agent of this host, in shared memory where
-    /// possible: the content is written once, by the application, and the receiver reads it in
+    /// Memory for the content of a message to agents of this host, in shared memory where
+    /// possible: the content is written once, by the application, and the receivers read it in
     /// place. A content of the message itself is ignored.
     ///
-    /// Where shared memory cannot be used (several receivers, another host, no room), the memory
-    /// is on the heap, and [`send_loan`](Self::send_loan) works all the same.
+    /// Where shared memory cannot be used (another host, no room), the memory is on the heap, and
+    /// so is short content for several receivers; [`send_loan`](Self::send_loan) works all the
+    /// same.
     ///
     /// # Errors
     /// When the message cannot be sent at all.
@@ -136,13 +137,11 @@ impl Agent {
         // The lengths of all that stands around the content do not depend on when it is sent.
         let empty = letter_around(&message, Bytes::new(), SystemTime::now())?;
         let (head, tail) = message.around_content(len).map_err(PostError::from)?;
-        let receiver = match message.receivers() {
-            [only] => only.name(),
-            _ => "",
-        };
-        let head_room = receiver.len() + longest_envelope(&empty) + head.len();
+        let receivers: Vec<&str> = message.receivers().iter().map(AgentId::name).collect();
+        let name = receivers.iter().map(|name| name.len()).max();
+        let head_room = name.unwrap_or(0) + longest_envelope(&empty) + head.len();
         let mts = &self.domain.inner.service.mts;
-        let content = mts.loan(receiver, head_room, len, tail.len());
+        let content = mts.loan(self.incarnation, &receivers, head_room, len, tail.len());
         Ok(Loan { message, content })
     }
 

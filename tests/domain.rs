@@ -313,14 +313,99 @@ async fn loaned_content_is_not_copied() {
         );
         assert!(is_shared_memory(content), "{len} bytes were copied");
     }
-    // To several receivers the heap serves, and everything else is the same.
+    // Short content for several receivers is copied for each, and everything else is the same.
     let other = there.register("arm_2").unwrap();
-    let mut loan = rover.loan(inform(&rover, "arm.*", []), 5000).unwrap();
+    for len in [5000, 1 << 20] {
+        let mut loan = rover.loan(inform(&rover, "arm.*", []), len).unwrap();
+        loan.content_mut().fill(7);
+        assert!(rover.send_loan(loan).await.unwrap().all_succeeded());
+        for receiver in [&arm, &other] {
+            let incoming = receiver.receive().await.unwrap();
+            assert_eq!(incoming.message.content().unwrap(), &vec![7; len]);
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn large_content_for_several_receivers_is_in_memory_once() {
+    let config = config(&[]);
+    let (here, there) = two(&config).await;
+    let rover = here.register("rover").unwrap();
+    let arms: Vec<Agent> = (0..4)
+        .map(|number| there.register(&format!("arm_{number}")).unwrap())
+        .collect();
+    let message = |to: &[&str]| {
+        let empty = rover.message(Performative::Inform);
+        let message = to.iter().fold(empty, |message, to| {
+            message.receiver(AgentId::new(*to).unwrap())
+        });
+        message.content(vec![7; 1 << 20]).build().unwrap()
+    };
+    let mut loan = rover.loan(message(&["arm.*"]), 1 << 20).unwrap();
     loan.content_mut().fill(7);
-    assert!(rover.send_loan(loan).await.unwrap().all_succeeded());
-    for receiver in [&arm, &other] {
-        let incoming = receiver.receive().await.unwrap();
-        assert_eq!(incoming.message.content().unwrap(), &vec![7; 5000]);
+    let content: *const u8 = loan.content_mut().as_ptr();
+    assert!(is_shared_memory(loan.content_mut()));
+    let sendings = [
+        rover.send_loan(loan).await,
+        rover.send(message(&["arm.*"])).await,
+        rover
+            .send(message(&["arm_0", "arm_1", "arm_2", "arm_3"]))
+            .await,
+    ];
+    for sent in sendings {
+        assert!(sent.unwrap().all_succeeded());
+        let mut places = HashSet::new();
+        for arm in &arms {
+            let incoming = arm.receive().await.unwrap();
+            let content = incoming.message.content().unwrap();
+            assert_eq!(content, &vec![7; 1 << 20]);
+            assert!(is_shared_memory(content));
+            places.insert(content.as_ptr());
+        }
+        // All of one process read the same bytes, which are not those of the sender's mapping.
+        assert_eq!(places.len(), 1);
+        assert!(!places.contains(&content));
+    }
+    // To one there is nothing to be saved, and who is not reached that way has a copy.
+    let sent = rover.send(message(&["arm_0", "nobody"])).await.unwrap();
+    assert_eq!(sent.0.len(), 2, "{sent}");
+    let incoming = arms[0].receive().await.unwrap();
+    assert_eq!(incoming.message.content().unwrap(), &vec![7; 1 << 20]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn large_content_for_several_receivers_goes_to_those_without_shared_memory_too() {
+    let config = config(&["mts.transports=shm,tcp"]);
+    let domain = format!("domain={}", config.domain);
+    let plain = Config::load(&Sources {
+        set: vec![
+            domain,
+            "discovery.mdns=false".into(),
+            "mts.transports=tcp".into(),
+        ],
+        ..Sources::default()
+    });
+    let plain = plain.unwrap();
+    let here = Domain::open(&config).await.unwrap();
+    let (there, beyond) = (
+        Domain::open(&config).await.unwrap(),
+        Domain::open(&plain).await.unwrap(),
+    );
+    let rover = here.register("rover").unwrap();
+    let arms = [
+        there.register("arm_0").unwrap(),
+        there.register("arm_1").unwrap(),
+        beyond.register("arm_2").unwrap(),
+    ];
+    let sent = rover
+        .send(inform(&rover, "arm.*", vec![9; 1 << 20]))
+        .await
+        .unwrap();
+    assert!(sent.all_succeeded(), "{sent}");
+    for (arm, via) in arms.iter().zip([Kind::Shm, Kind::Shm, Kind::Tcp]) {
+        let incoming = arm.receive().await.unwrap();
+        assert_eq!(incoming.via, Some(via));
+        assert_eq!(incoming.message.content().unwrap(), &vec![9; 1 << 20]);
     }
 }
 

@@ -8,6 +8,7 @@
 //! Whoever waits, for an outcome or a letter, first drives the transports for a short while on
 //! its own thread, and then sleeps until it is woken.
 
+mod loans;
 mod receiving;
 
 use std::future::Future;
@@ -15,11 +16,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
-use bytes::Bytes;
 use fipa_sds::{Change, Directory, Entry, Pattern};
 use fipa_transport::{
-    Conclusion, Incarnation, Introduction, Kind, ListenError, LoanedContent, Location, Outcome,
-    Transport,
+    Conclusion, Incarnation, Introduction, Kind, ListenError, Location, Outcome, Transport,
+    WayError, WayFault,
 };
 use parking_lot::{Mutex, MutexGuard};
 use tokio::runtime::Handle;
@@ -237,7 +237,13 @@ impl Mts {
 
     /// Sends a letter. The outcomes, one per receiver, come with the future; the letter is on its
     /// way when this returns, whether the future is awaited or not.
-    pub fn send(&self, submission: Submission) -> Sending {
+    ///
+    /// Large content for several receivers is first put where all of them can read it, if a
+    /// transport offers that ([`Transport::loan_for_many`]).
+    pub fn send(&self, mut submission: Submission) -> Sending {
+        if let Some(content) = self.content_for_many(&submission) {
+            submission.letter = loans::with_content(submission.letter, content);
+        }
         self.begin(|core| core.send(Now::read(), submission))
     }
 
@@ -348,39 +354,6 @@ impl Mts {
         let received = received?;
         self.shared.carry_out(state);
         Some(received)
-    }
-
-    /// Memory for the content of a letter to this receiver, to be filled in place: shared memory
-    /// when that is the way a letter would go now, else the heap. `head_room` and `tail_room` are
-    /// the lengths of what will stand in front of the content and behind it.
-    pub fn loan(
-        &self,
-        receiver: &str,
-        head_room: usize,
-        len: usize,
-        tail_room: usize,
-    ) -> Box<dyn LoanedContent> {
-        let way = self.first_way(receiver);
-        let loaned = way.and_then(|way| {
-            let transport = self.shared.transport(way.kind())?;
-            match transport.loan(&way, head_room, len, tail_room) {
-                Ok(loaned) => loaned,
-                Err(error) => {
-                    tracing::debug!(%error, %way, "no loan; the heap serves instead");
-                    None
-                }
-            }
-        });
-        loaned.unwrap_or_else(|| Box::new(OnTheHeap(vec![0; len])))
-    }
-
-    /// The way a letter to this receiver would take first, now.
-    fn first_way(&self, receiver: &str) -> Option<Location> {
-        self.shared
-            .state
-            .lock()
-            .core
-            .first_way(Now::read(), receiver)
     }
 
     /// Does what can be done now on the calling thread; see [`Transport::drive`].
@@ -561,9 +534,9 @@ impl State {
     }
 }
 
-fn no_such_transport(kind: Kind) -> fipa_transport::WayError {
+fn no_such_transport(kind: Kind) -> WayError {
     let text = format!("this process does not use {kind}");
-    fipa_transport::WayError::new(fipa_transport::WayFault::Closed, text)
+    WayError::new(WayFault::Closed, text)
 }
 
 /// The outcomes of one letter, to be awaited.
@@ -631,17 +604,5 @@ async fn watch_directory(shared: Weak<Shared>, directory: Arc<dyn Directory>) {
         }
         state.core.handle_directory_change(now);
         shared.carry_out(state);
-    }
-}
-
-struct OnTheHeap(Vec<u8>);
-
-impl LoanedContent for OnTheHeap {
-    fn content_mut(&mut self) -> &mut [u8] {
-        &mut self.0
-    }
-
-    fn freeze(self: Box<Self>) -> Bytes {
-        self.0.into()
     }
 }

@@ -1,9 +1,10 @@
 //! A process of the play: one agent that receives and sends as it is told, and writes a line for
 //! everything that happens to it.
 //!
-//! Lines out: `ready`; `sent ID TO` before a letter is sent, `out ID OUTCOME` when its outcome is
+//! Lines out: `ready`; `at ADDRESS` of a gateway; `sent ID TO` before a letter is sent, `out ID OUTCOME` when its outcome is
 //! known; `took ID` when a letter was received whole, `torn ID` when its content is not what was
 //! sent; `loaned` when memory is on loan; `done TOKEN` after a command; `bye`.
+//! A letter to several has as many IDs, in the order of its receivers; its content has the first.
 //! Lines in: `send TOKEN TO COUNT SIZE`, `drop`, `quit`. Ends when its input ends.
 
 use std::io::{BufRead, Write};
@@ -13,8 +14,8 @@ use std::time::Duration;
 
 use fipa::config::Sources;
 use fipa::{
-    Agent, AgentId, Config, Domain, Gateway, Incoming, Message, MessageBuilder, Outcome,
-    Performative,
+    Agent, AgentId, Config, Delivery, Domain, Gateway, Incoming, Kind, Message, MessageBuilder,
+    Outcome, Performative,
 };
 use tokio::sync::mpsc::{Receiver, channel};
 use tokio::task::JoinSet;
@@ -29,7 +30,10 @@ const UNDER_WAY: usize = 6;
 const HELD: usize = 40;
 
 /// The sizes of contents: copied, in place, and several pages.
-pub(crate) const SIZES: [usize; 4] = [40, 1500, 5000, 70_000];
+pub(crate) const SIZES: [usize; 4] = [40, 1500, 5000, LARGE];
+
+/// The size of a content that lies in memory once for several receivers.
+pub(crate) const LARGE: usize = 70_000;
 
 /// An actor's part. All words, so that it can be written into the environment.
 #[derive(Debug, Clone)]
@@ -39,7 +43,7 @@ pub(crate) struct Part {
     pub(crate) tag: u32,
     /// `take`, `hold`, `deaf`, or `gateway`.
     pub(crate) receives: String,
-    /// `nothing`, `stream` or `loan`.
+    /// `nothing`, `stream`, `many` (each letter to all) or `loan`.
     pub(crate) sends: String,
     /// To whom, separated by commas.
     pub(crate) to: String,
@@ -125,6 +129,9 @@ async fn gateway(part: &Part, mut queue: Receiver<String>) {
         opened = Gateway::open(&part.config()).await;
     }
     let gateway = opened.unwrap();
+    let mut ways = gateway.locations().iter();
+    let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
+    say!("at {}", way.address());
     say!("ready");
     while queue.recv().await.is_some_and(|line| line != "quit") {}
     gateway.close().await;
@@ -137,13 +144,14 @@ async fn agent(part: &Part, mut queue: Receiver<String>) {
     let (release, mut released) = channel::<()>(1);
     let receiving = tokio::spawn({
         let (agent, mode) = (agent.clone(), part.receives.clone());
+        let own = part.name.clone();
         async move {
             let mut held: Vec<Incoming> = Vec::new();
             loop {
                 tokio::select! {
                     incoming = agent.receive(), if mode != "deaf" => {
                         let Ok(incoming) = incoming else { return };
-                        take(&incoming);
+                        take(&incoming, &own);
                         if mode == "hold" && held.len() < HELD {
                             held.push(incoming);
                         }
@@ -165,7 +173,8 @@ async fn agent(part: &Part, mut queue: Receiver<String>) {
         match words.as_slice() {
             ["send", token, to, count, size] => {
                 let (count, size) = (count.parse().unwrap(), size.parse().unwrap());
-                sender.send_all(to, count, size).await;
+                let to: Vec<&str> = to.split(',').collect();
+                sender.send_all(&to, count, size).await;
                 say!("done {token}");
             }
             ["drop"] => release.send(()).await.unwrap(),
@@ -193,7 +202,7 @@ fn fill(id: u64, content: &mut [u8]) {
     }
 }
 
-fn take(incoming: &Incoming) {
+fn take(incoming: &Incoming, own: &str) {
     let content = incoming.message.content().cloned().unwrap_or_default();
     // A failure that this agent is told about.
     if incoming.message.performative() != &Performative::Inform {
@@ -203,10 +212,12 @@ fn take(incoming: &Incoming) {
         return say!("torn 0");
     };
     let id = u64::from_le_bytes(*head);
+    let mut receivers = incoming.message.receivers().iter();
+    let place = receivers.position(|receiver| receiver.name() == own);
     let mut expected = vec![0; content.len()];
     fill(id, &mut expected);
     if expected == content {
-        say!("took {id}");
+        say!("took {}", id + place.unwrap() as u64);
     } else {
         say!("torn {id}");
     }
@@ -227,7 +238,11 @@ impl Sender {
             "stream" => {
                 let mut sending = JoinSet::new();
                 loop {
-                    let to = to[random.usize(..to.len())].to_owned();
+                    let one = to[random.usize(..to.len())];
+                    let to = match random.u8(..4) {
+                        0 => owned(&to),
+                        _ => owned(&[one]),
+                    };
                     let size = SIZES[random.usize(..SIZES.len())];
                     let loans = random.bool();
                     let sender = self.clone();
@@ -237,11 +252,15 @@ impl Sender {
                     }
                 }
             }
+            "many" => loop {
+                self.send_all(&to, UNDER_WAY, LARGE).await;
+            },
             "loan" => {
                 let mut loans = Vec::new();
-                for to in to {
+                let each = to.iter().map(|to| owned(&[to]));
+                for to in each.chain([owned(&to)]) {
                     for size in SIZES {
-                        let mut loan = self.agent.loan(self.message(to), size).unwrap();
+                        let mut loan = self.agent.loan(self.message(&to), size).unwrap();
                         fill(0, loan.content_mut());
                         loans.push(loan);
                     }
@@ -253,44 +272,60 @@ impl Sender {
         }
     }
 
-    async fn send_all(&self, to: &str, count: usize, size: usize) {
+    /// Letters, each to all of these.
+    async fn send_all(&self, to: &[&str], count: usize, size: usize) {
         let mut sending = JoinSet::new();
         for number in 0..count {
-            let (sender, to) = (self.clone(), to.to_owned());
+            let (sender, to) = (self.clone(), owned(to));
             sending.spawn(async move { sender.send(&to, size, number % 2 == 0).await });
         }
         sending.join_all().await;
     }
 
-    async fn send(&self, to: &str, size: usize, loans: bool) {
-        let number = self.next.fetch_add(1, Ordering::Relaxed);
+    async fn send(&self, to: &[String], size: usize, loans: bool) {
+        let number = self.next.fetch_add(to.len() as u32, Ordering::Relaxed);
         let id = u64::from(self.tag) << 32 | u64::from(number);
+        let say_sent = || {
+            for (id, to) in (id..).zip(to) {
+                say!("sent {id} {to}");
+            }
+        };
         let deliveries = if loans {
             let mut loan = self.agent.loan(self.message(to), size).unwrap();
             fill(id, loan.content_mut());
-            say!("sent {id} {to}");
+            say_sent();
             self.agent.send_loan(loan).await
         } else {
             let mut content = vec![0; size];
             fill(id, &mut content);
             let message = self.builder(to).content(content).build().unwrap();
-            say!("sent {id} {to}");
+            say_sent();
             self.agent.send(message).await
         };
         let deliveries = deliveries.unwrap();
-        assert_eq!(deliveries.0.len(), 1, "{deliveries}");
-        match &deliveries.0[0].outcome {
-            Outcome::Failed { reason, .. } => say!("out {id} {reason:?}"),
-            _ => say!("out {id} Delivered"),
+        assert_eq!(deliveries.0.len(), to.len(), "{deliveries}");
+        for Delivery { receiver, outcome } in &deliveries.0 {
+            let place = to.iter().position(|to| **to == **receiver).unwrap();
+            let id = id + place as u64;
+            match outcome {
+                Outcome::Failed { reason, .. } => say!("out {id} {reason:?}"),
+                _ => say!("out {id} Delivered"),
+            }
         }
     }
 
-    fn message(&self, to: &str) -> Message {
+    fn message(&self, to: &[String]) -> Message {
         self.builder(to).build().unwrap()
     }
 
-    fn builder(&self, to: &str) -> MessageBuilder {
-        let to = AgentId::new(to).unwrap();
-        self.agent.message(Performative::Inform).receiver(to)
+    fn builder(&self, to: &[String]) -> MessageBuilder {
+        let message = self.agent.message(Performative::Inform);
+        to.iter().fold(message, |message, to| {
+            message.receiver(AgentId::new(to).unwrap())
+        })
     }
+}
+
+fn owned(names: &[&str]) -> Vec<String> {
+    names.iter().map(|name| (*name).to_owned()).collect()
 }

@@ -5,22 +5,26 @@ use std::time::Duration;
 use fastrand::Rng;
 use rustix::process::Signal;
 
+use crate::actor::LARGE;
 use crate::stage::{Actor, Stage, wait_for};
 
 /// A round. Afterwards only the survivors are there.
 pub(crate) type Cell = fn(&mut Stage, &mut Rng);
 
 /// All cells.
-pub(crate) const CELLS: [(&str, Cell); 10] = [
+pub(crate) const CELLS: [(&str, Cell); 13] = [
     ("receiver before it takes a letter", receiver_before_taking),
     ("receiver holding borrowed content", receiver_holding),
+    ("receivers holding content for many", receivers_of_many),
     ("receiver while idle", receiver_idle),
     ("receiver with a full mailbox", receiver_full),
     ("receiver at any moment", receiver_busy),
     ("sender after loaning", sender_loaning),
     ("sender before the acknowledgement", sender_unacknowledged),
     ("sender holding acknowledgements", sender_acknowledged),
+    ("sender of content for many", sender_of_many),
     ("gateway at any moment", gateway),
+    ("gateway with letters in custody", gateway_with_custody),
     ("all together, with newcomers", all_together),
 ];
 
@@ -62,6 +66,28 @@ fn receiver_holding(stage: &mut Stage, random: &mut Rng) {
     pause(random);
     stage.kill(receiver);
     stage.wait_for_pulse(&holding);
+    sender.wait_until("ready");
+    stage.dismiss(sender);
+}
+
+fn receivers_of_many(stage: &mut Stage, random: &mut Rng) {
+    let receivers = [(); 2].map(|()| stage.enter("hold", "nothing", ""));
+    for receiver in &receivers {
+        receiver.wait_until("ready");
+    }
+    let [first, second] = &receivers;
+    let all = format!("anchor,{},{}", first.name, second.name);
+    let sender = stage.enter("take", "many", &all);
+    let many = stage.pulse_sends(&all, 20, LARGE);
+    wait_for(
+        || stage.taken(first) > 4 && stage.taken(second) > 4,
+        || "nothing is held".to_owned(),
+    );
+    for receiver in receivers {
+        pause(random);
+        stage.kill(receiver);
+    }
+    stage.wait_for_pulse(&many);
     sender.wait_until("ready");
     stage.dismiss(sender);
 }
@@ -143,6 +169,22 @@ fn sender_acknowledged(stage: &mut Stage, random: &mut Rng) {
     stage.dismiss(receiver);
 }
 
+fn sender_of_many(stage: &mut Stage, random: &mut Rng) {
+    let receivers = ["take", "hold"].map(|receives| stage.enter(receives, "nothing", ""));
+    for receiver in &receivers {
+        receiver.wait_until("ready");
+    }
+    let [first, second] = &receivers;
+    let all = format!("anchor,{},{}", first.name, second.name);
+    let sender = stage.enter("take", "many", &all);
+    wait_for_sending(stage, &sender);
+    pause(random);
+    stage.kill(sender);
+    for receiver in receivers {
+        stage.dismiss(receiver);
+    }
+}
+
 fn gateway(stage: &mut Stage, random: &mut Rng) {
     let gateway = stage.enter("gateway", "nothing", "");
     if random.bool() {
@@ -152,6 +194,24 @@ fn gateway(stage: &mut Stage, random: &mut Rng) {
     pause(random);
     stage.kill(gateway);
     stage.wait_for_pulse(&meanwhile);
+}
+
+fn gateway_with_custody(stage: &mut Stage, random: &mut Rng) {
+    let far_gateway = stage.enter_afar("gateway");
+    far_gateway.wait_until("ready");
+    let receiver = stage.enter_afar("take");
+    let at = far_gateway.said_after("at");
+    let gateway = stage.enter_knowing(&at);
+    // Its end gives these letters their outcomes, whatever became of them.
+    stage.pulse_reaches(&receiver.name);
+    far_gateway.signal(Signal::STOP);
+    let custody = stage.pulse_sends(&receiver.name, 12, 5000);
+    pause(random);
+    stage.kill(gateway);
+    stage.wait_for_pulse(&custody);
+    far_gateway.signal(Signal::CONT);
+    stage.dismiss(receiver);
+    stage.dismiss(far_gateway);
 }
 
 fn all_together(stage: &mut Stage, random: &mut Rng) {

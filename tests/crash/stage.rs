@@ -98,6 +98,13 @@ impl Actor {
         self.said.lock().unwrap().iter().any(|said| said == line)
     }
 
+    /// What it has said after this word.
+    pub(crate) fn said_after(&self, word: &str) -> String {
+        let said = self.said.lock().unwrap();
+        let mut rest = said.iter().filter_map(|said| said.strip_prefix(word));
+        rest.next().unwrap().trim_start().to_owned()
+    }
+
     pub(crate) fn wait_until(&self, line: &str) {
         wait_for(
             || self.has_said(line),
@@ -140,6 +147,9 @@ impl Drop for Actor {
 /// written to before.
 const SLACK: u64 = 512;
 
+/// How many segments for many a process has at most.
+const SEGMENTS: usize = 8;
+
 /// What the survivors of a domain use.
 #[derive(Debug, PartialEq, Eq)]
 struct Uses {
@@ -157,6 +167,8 @@ pub(crate) struct Stage {
     anchor: Option<Actor>,
     pulse: Option<Actor>,
     start: Option<Uses>,
+    /// The pages of the survivors.
+    pages: BTreeSet<PathBuf>,
     memory: u64,
     told: u32,
     pub(crate) kills: usize,
@@ -182,6 +194,7 @@ impl Stage {
             anchor: None,
             pulse: None,
             start: None,
+            pages: BTreeSet::new(),
             memory: 0,
             told: 0,
             kills: 0,
@@ -199,6 +212,10 @@ impl Stage {
             anchor.tell(&format!("send back-{size} pulse 100 {size}"));
             anchor.wait_until(&format!("done back-{size}"));
         }
+        let pages = stage.files().into_iter();
+        let is_page = |file: &PathBuf| file.extension().is_some_and(|end| end == "page");
+        stage.pages = pages.filter(is_page).collect();
+        assert_eq!(stage.pages.len(), 2);
         stage.start = Some(stage.uses());
         stage.memory = stage.private_memory();
         stage
@@ -209,8 +226,33 @@ impl Stage {
         self.enter_as("", receives, sends, to)
     }
 
+    /// A new actor as if on another host: one that only gateways reach.
+    pub(crate) fn enter_afar(&self, receives: &str) -> Actor {
+        let own = format!("domain={}", self.domain);
+        let settings = self.settings.replacen(&own, &format!("{own}-far"), 1);
+        self.enter_with("", receives, "nothing", "", settings)
+    }
+
+    /// A gateway of this domain that knows the one at this address.
+    pub(crate) fn enter_knowing(&self, at: &str) -> Actor {
+        let known = format!("discovery.static={{far=[\"tcp://{at}\"]}}");
+        let settings = format!("{} {known}", self.settings);
+        self.enter_with("", "gateway", "nothing", "", settings)
+    }
+
     /// A new actor of a given name.
     pub(crate) fn enter_as(&self, name: &str, receives: &str, sends: &str, to: &str) -> Actor {
+        self.enter_with(name, receives, sends, to, self.settings.clone())
+    }
+
+    fn enter_with(
+        &self,
+        name: &str,
+        receives: &str,
+        sends: &str,
+        to: &str,
+        settings: String,
+    ) -> Actor {
         static NEXT: AtomicU32 = AtomicU32::new(1);
         let tag = NEXT.fetch_add(1, Ordering::Relaxed);
         let name = if name.is_empty() {
@@ -224,7 +266,7 @@ impl Stage {
             receives: receives.to_owned(),
             sends: sends.to_owned(),
             to: to.to_owned(),
-            settings: self.settings.clone(),
+            settings,
         };
         let mut child = Command::new(std::env::current_exe().unwrap())
             .args([
@@ -250,7 +292,7 @@ impl Stage {
                 let words = line.trim_end();
                 ledger.lock().unwrap().note(tag, words);
                 let first = words.split(' ').next().unwrap_or_default();
-                if matches!(first, "ready" | "loaned" | "done" | "bye") {
+                if matches!(first, "ready" | "at" | "loaned" | "done" | "bye") {
                     heard.lock().unwrap().push(words.to_owned());
                 }
                 line.clear();
@@ -295,6 +337,21 @@ impl Stage {
             .as_ref()
             .unwrap()
             .wait_until(&format!("done {token}"));
+    }
+
+    /// `pulse` sends to this one until one letter arrives.
+    pub(crate) fn pulse_reaches(&mut self, to: &str) {
+        let began = Instant::now();
+        let arrived = |ledger: &Ledger| {
+            let mut letters = ledger.letters.values();
+            letters.any(|letter| letter.to == to && letter.taken_by.is_some())
+        };
+        while !arrived(&self.ledger.lock().unwrap()) {
+            assert!(began.elapsed() < WATCHDOG, "{to} is not reached");
+            let one = self.pulse_sends(to, 1, 40);
+            self.wait_for_pulse(&one);
+            std::thread::sleep(Duration::from_millis(10));
+        }
     }
 
     /// How many letters of an actor were sent, and how many of those have outcomes.
@@ -373,13 +430,16 @@ impl Stage {
         newcomer.wait_until("ready");
         self.dismiss(newcomer);
         let start = self.start.as_ref().unwrap();
+        // Segments for many are kept, and those of the other survivor kept open.
+        let most = start.descriptors.iter().map(|count| count + 2 * SEGMENTS);
+        let most: Vec<usize> = most.collect();
         let mut now = self.uses();
         wait_for(
             || {
                 now = self.uses();
                 now.files == start.files
                     && now.blocks <= start.blocks + SLACK
-                    && now.descriptors <= start.descriptors
+                    && now.descriptors <= most
             },
             || {
                 let now = self.uses();
@@ -416,12 +476,25 @@ impl Stage {
         [&self.anchor, &self.pulse].into_iter().flatten()
     }
 
+    /// Whether this is a segment for many of a survivor, of which each has some.
+    fn is_kept(&self, file: &Path) -> bool {
+        let name = file.to_string_lossy();
+        let life = name.strip_suffix(".content");
+        let life = life.and_then(|name| name.rsplit_once('.'));
+        let page = life.map(|(life, _)| PathBuf::from(format!("{life}.page")));
+        page.is_some_and(|page| self.pages.contains(&page))
+    }
+
     fn uses(&self) -> Uses {
         let descriptors = |actor: &Actor| {
             let descriptors = std::fs::read_dir(format!("/proc/{}/fd", actor.pid()));
             descriptors.unwrap().count()
         };
-        let files = self.files();
+        let (kept, files): (BTreeSet<_>, BTreeSet<_>) = self
+            .files()
+            .into_iter()
+            .partition(|file| self.is_kept(file));
+        assert!(kept.len() <= 2 * SEGMENTS, "{kept:?}");
         Uses {
             blocks: files
                 .iter()

@@ -38,6 +38,9 @@ pub struct ShmConfig {
     pub max_borrowed: usize,
     /// Content shorter than this, in bytes, is always copied: cheaper than holding a slot.
     pub copy_below: usize,
+    /// Content of a letter to several receivers lies in memory once for all of them from this
+    /// length on, in bytes: shorter content is copied for each, which is cheaper.
+    pub share_from: usize,
 }
 
 impl ShmConfig {
@@ -63,6 +66,7 @@ impl ShmConfig {
             max_loans: 8,
             max_borrowed: 256,
             copy_below: 1024,
+            share_from: 64 << 10,
         }
     }
 
@@ -99,6 +103,7 @@ impl ShmConfig {
             ("max_peers", self.max_peers, 1, 4096),
             ("window", self.window, 2, 128),
             ("max_loans", self.max_loans, 1, self.window - 1),
+            ("share_from", self.share_from, 1, usize::MAX),
         ] {
             if !(least..=most).contains(&value) {
                 return Err(wrong(format!(

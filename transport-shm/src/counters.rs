@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 pub struct ShmCounters {
     /// Parcels that arrived.
     pub arrived: u64,
-    /// Contents handed out in place, without a copy.
+    /// Contents handed out in place, without a copy; those that lie there for many too.
     pub in_place: u64,
     /// Contents copied because they are small.
     pub copied_small: u64,
@@ -18,6 +18,8 @@ pub struct ShmCounters {
     pub borrowed: u64,
     /// Parcels sent.
     pub sent: u64,
+    /// Parcels sent that refer to content which lies in memory once for many.
+    pub referring: u64,
     /// Loaned contents sent without a copy.
     pub loans_sent: u64,
     /// Loaned contents that had to be copied (other receiver, sent before, front too long).
@@ -44,7 +46,7 @@ macro_rules! tally {
     };
 }
 
-tally!(arrived in_place copied_small copied_full borrowed sent loans_sent loans_copied rung refused peers_gone);
+tally!(arrived in_place copied_small copied_full borrowed sent referring loans_sent loans_copied rung refused peers_gone);
 
 /// Adds one.
 pub(crate) fn count(counter: &AtomicU64) {

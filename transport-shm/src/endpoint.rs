@@ -18,10 +18,12 @@ use crate::counters::{Tally, count};
 use crate::domain::{Domain, GRACE, file_error};
 use crate::inbox::{Inbox, mailbox_name};
 use crate::layout::Svc;
+use crate::library::Library;
 use crate::loan::ShmLoan;
 use crate::memory::Budget;
 use crate::outbox::{Opening, Outbox, Posted};
 use crate::peers::Peer;
+use crate::pool::Pool;
 use crate::presence::{Bell, GLANCE, Neighbour, Presence};
 use crate::shift::Shift;
 use crate::{ShmConfig, ShmError};
@@ -50,6 +52,9 @@ pub(crate) struct Endpoint {
     dirty: AtomicU64,
     cleaning: AtomicBool,
     budget: Arc<Budget>,
+    /// Content of this process for many, and that of others.
+    pool: Arc<Pool>,
+    library: Arc<Library>,
     tally: Arc<Tally>,
     // Last: ends with the process's last trace.
     domain: Arc<Domain>,
@@ -58,7 +63,7 @@ pub(crate) struct Endpoint {
 impl Endpoint {
     pub(crate) fn open(config: ShmConfig, runtime: Handle) -> Result<Arc<Self>, ShmError> {
         let domain = Domain::new(&config)?;
-        let budget = Arc::new(Budget::new(&config.prefix, config.capacity));
+        let budget = Arc::new(Budget::new(&config));
         budget.check_start()?;
         // Under the lock, so that nobody takes what is half made for the traces of the dead.
         let lock = domain.enter()?;
@@ -92,8 +97,15 @@ impl Endpoint {
             .create::<Svc>()
             .map_err(|e| failed("cannot make a node", format!("{e:?}")))?;
         domain.close_to_others()?;
-        let inbox = Inbox::create(&config, &node, bell.clone(), tally.clone(), domain.clone())
+        let library = Arc::new(Library::new(domain.clone()));
+        let inbox = Inbox::create(&config, &node, bell.clone(), tally.clone(), library.clone())
             .map_err(|reason| failed("cannot make the mailbox", reason))?;
+        let pool = Pool::new(
+            config.incarnation,
+            config.share_from,
+            budget.clone(),
+            domain.clone(),
+        );
         Ok(Arc::new(Self {
             config,
             runtime,
@@ -111,6 +123,8 @@ impl Endpoint {
             dirty: AtomicU64::new(0),
             cleaning: AtomicBool::new(false),
             budget,
+            pool: Arc::new(pool),
+            library,
             tally,
             domain,
         }))
@@ -126,6 +140,10 @@ impl Endpoint {
 
     pub(crate) fn bell(&self) -> &Arc<Bell> {
         &self.bell
+    }
+
+    pub(crate) fn pool(&self) -> &Arc<Pool> {
+        &self.pool
     }
 
     pub(crate) fn tally(&self) -> &Tally {
@@ -171,6 +189,7 @@ impl Endpoint {
             presence.heard();
             presence.is_looking()
         });
+        self.pool.trim_if_waiting();
         // Whoever is at it is not disturbed.
         if !looked_after {
             self.work();
@@ -319,6 +338,7 @@ impl Endpoint {
                 waiting: self.waiting.clone(),
                 max_loans: self.config.max_loans,
                 budget: self.budget.clone(),
+                pool: self.pool.clone(),
                 tally: self.tally.clone(),
                 domain: self.domain.clone(),
             })
@@ -411,6 +431,7 @@ impl Endpoint {
         // Its last letters are taken, and its answers.
         self.work();
         self.wake_answered();
+        self.library.forget(incarnation);
         self.clean_soon();
     }
 
@@ -464,6 +485,8 @@ impl Endpoint {
         if self.closed.swap(true, Ordering::SeqCst) {
             return;
         }
+        // While others still know that this process is there.
+        self.pool.close();
         let mut concluded = Vec::new();
         let peers = {
             let mut inbox = self.inbox.lock();

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use bytes::Bytes;
+use fipa_transport::wire::ParcelHeader;
 use fipa_transport::{
     Answer, Arrival, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Sink, Ticket, Verdict,
 };
@@ -14,10 +15,11 @@ use parking_lot::Mutex;
 
 use crate::ShmConfig;
 use crate::counters::{Tally, count};
-use crate::domain::Domain;
 use crate::layout::{Ack, Active, BlankAck, Header, MailServer, Places, Svc};
+use crate::library::{Borrowed, Library, NotRead};
 use crate::memory::populate;
 use crate::presence::Bell;
+use crate::segment::Reference;
 
 /// How many parcels are taken before anything else is looked at.
 const BATCH: usize = 64;
@@ -58,7 +60,7 @@ impl Inbox {
         node: &Node<Svc>,
         bell: Arc<Bell>,
         tally: Arc<Tally>,
-        domain: Arc<Domain>,
+        library: Arc<Library>,
     ) -> Result<Self, String> {
         let name = ServiceName::new(&mailbox_name(config.incarnation)).map_err(debug)?;
         let service = node
@@ -98,7 +100,7 @@ impl Inbox {
                 waiting: AtomicBool::new(false),
                 bell,
                 tally: tally.clone(),
-                _domain: domain,
+                library,
             }),
             tally,
             max_letter: config.max_letter,
@@ -235,7 +237,7 @@ impl Inbox {
             return refused(active, FailureReason::Refused, "malformed header");
         };
         let payload = active.payload();
-        let Some(places) = Places::announced(header.start(), &parcel, payload.len()) else {
+        let Some(places) = Places::announced(header, &parcel, payload.len()) else {
             let detail = "the lengths do not add up";
             return refused(active, FailureReason::Refused, detail);
         };
@@ -243,6 +245,18 @@ impl Inbox {
         if parcel.body_len() > most {
             let detail = format!("{} bytes are the most here", self.max_letter);
             return refused(active, FailureReason::TooLarge, &detail);
+        }
+        if let Some(reference) = header.reference() {
+            let around = &payload[places.start..places.end];
+            let mut front = Bytes::copy_from_slice(around);
+            let tail = front.split_off(places.content - places.start);
+            let content = match self.content_for_many(header.sender(), reference, &parcel) {
+                Ok(content) => content,
+                Err(answer) => return (Err(answer), Owner::Unshared(active)),
+            };
+            let parcel = parcel.parcel_of_pieces(front, content, tail);
+            let parcel = parcel.map_err(|e| Answer::failed(FailureReason::Refused, e.to_string()));
+            return (parcel, Owner::Unshared(active));
         }
         let content = &payload[places.content..places.tail];
         let (parcel, owner) = if self.may_lend(content.len(), &active) {
@@ -262,6 +276,33 @@ impl Inbox {
         };
         let parcel = parcel.map_err(|e| Answer::failed(FailureReason::Refused, e.to_string()));
         (parcel, owner)
+    }
+
+    /// Content that lies in a segment of its sender, read there unless too much is.
+    fn content_for_many(
+        &self,
+        sender: Incarnation,
+        reference: Reference,
+        parcel: &ParcelHeader,
+    ) -> Result<Bytes, Answer> {
+        let len = usize::try_from(parcel.content_len()).unwrap_or(usize::MAX);
+        let library = &self.lending.library;
+        let content = library.read(sender, reference, len).map_err(|e| match e {
+            NotRead::Gone => {
+                let detail = "its content is not there any more";
+                Answer::failed(FailureReason::Refused, detail)
+            }
+            NotRead::NoRoom => Answer::Busy,
+        })?;
+        if !self.lending.begin_one() {
+            count(&self.tally.copied_full);
+            return Ok(Bytes::copy_from_slice(content.as_ref()));
+        }
+        count(&self.tally.in_place);
+        Ok(Bytes::from_owner(ForMany {
+            content,
+            lending: self.lending.clone(),
+        }))
     }
 
     /// Whether content is handed out in place. If so, it is counted as handed out.
@@ -343,6 +384,25 @@ impl AsRef<[u8]> for Content {
     }
 }
 
+/// Content in a sender's segment.
+struct ForMany {
+    content: Borrowed,
+    lending: Arc<Lending>,
+}
+
+impl AsRef<[u8]> for ForMany {
+    fn as_ref(&self) -> &[u8] {
+        self.content.as_ref()
+    }
+}
+
+impl Drop for ForMany {
+    fn drop(&mut self) {
+        let _held = self.lending.held.lock();
+        self.lending.tally.borrowed.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
 /// How much content is read in place.
 struct Lending {
     per_sender: usize,
@@ -353,11 +413,21 @@ struct Lending {
     waiting: AtomicBool,
     bell: Arc<Bell>,
     tally: Arc<Tally>,
-    // Last: whoever held content longest removes the domain's traces.
-    _domain: Arc<Domain>,
+    // Last: whoever held content longest removes the domain's traces, which the library does.
+    library: Arc<Library>,
 }
 
 impl Lending {
+    /// One more content in a segment, which takes no slot of its sender.
+    fn begin_one(&self) -> bool {
+        let _held = self.held.lock();
+        let few = self.tally.borrowed.load(Ordering::Relaxed) < self.total as u64;
+        if few {
+            self.tally.borrowed.fetch_add(1, Ordering::Relaxed);
+        }
+        few
+    }
+
     /// One more content of this sender, if that leaves a slot free for its next letter.
     fn begin(&self, sender: u128) -> bool {
         let mut held = self.held.lock();

@@ -44,7 +44,7 @@ pub fn inspect(config: &ShmConfig) -> Result<Inspection, ShmError> {
     Ok(Inspection {
         alive,
         dead,
-        used: Budget::new(&config.prefix, config.capacity).used(),
+        used: Budget::new(config).used(),
         free: shm.f_bavail.saturating_mul(shm.f_frsize),
         total: shm.f_blocks.saturating_mul(shm.f_frsize),
         exposed: exposed.take(MAX_EXPOSED).collect(),

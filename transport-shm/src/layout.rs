@@ -14,6 +14,8 @@ use iceoryx2::request_mut_uninit::RequestMutUninit;
 use iceoryx2::response_mut_uninit::ResponseMutUninit;
 use zerocopy::{FromBytes, IntoBytes};
 
+use crate::segment::Reference;
+
 pub(crate) type Svc = ipc_threadsafe::Service;
 pub(crate) type MailClient = Client<Svc, [u8], Header, Ack, ()>;
 pub(crate) type MailServer = Server<Svc, [u8], Header, Ack, ()>;
@@ -27,20 +29,23 @@ pub(crate) type BlankAck = ResponseMutUninit<Svc, MaybeUninit<Ack>, ()>;
 pub(crate) const ALIGNMENT: usize = 8;
 
 /// The version of this layout. Another one is another type to iceoryx2, and refused there.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 
 /// What stands in front of every parcel.
 ///
 /// The payload behind it is: `start` bytes of nothing, so that the content is aligned; then the
-/// parcel's body.
+/// parcel's body, without its content when that lies in a segment.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, ZeroCopySend)]
-#[type_name("fipa-mail-header-1")]
+#[type_name("fipa-mail-header-2")]
 pub(crate) struct Header {
     version: u32,
     start: u32,
     sender: u64,
     token: u64,
+    /// Where the content lies; 0 when it is in the payload.
+    segment: u64,
+    generation: u64,
     parcel: [u8; HEADER_LEN],
 }
 
@@ -51,6 +56,8 @@ impl Default for Header {
             start: 0,
             sender: 0,
             token: 0,
+            segment: 0,
+            generation: 0,
             parcel: [0; HEADER_LEN],
         }
     }
@@ -66,8 +73,30 @@ impl Header {
             start,
             sender: sender.as_u64(),
             token,
+            segment: 0,
+            generation: 0,
             parcel: bytes,
         }
+    }
+
+    /// The same, of a parcel whose content lies in a segment.
+    pub(crate) fn referring(self, to: Option<Reference>) -> Self {
+        match to {
+            Some(to) => Self {
+                segment: to.segment,
+                generation: to.generation,
+                ..self
+            },
+            None => self,
+        }
+    }
+
+    /// Where the content lies, if not in the payload.
+    pub(crate) fn reference(&self) -> Option<Reference> {
+        (self.segment != 0).then_some(Reference {
+            segment: self.segment,
+            generation: self.generation,
+        })
     }
 
     pub(crate) fn sender(&self) -> Incarnation {
@@ -78,7 +107,7 @@ impl Header {
         self.token
     }
 
-    pub(crate) fn start(&self) -> usize {
+    fn start(&self) -> usize {
         self.start as usize
     }
 
@@ -190,13 +219,22 @@ impl Places {
     }
 
     /// The places that a received header announces, when they fit a payload of this length.
-    pub(crate) fn announced(start: usize, parcel: &ParcelHeader, payload: usize) -> Option<Self> {
+    pub(crate) fn announced(
+        header: &Header,
+        parcel: &ParcelHeader,
+        payload: usize,
+    ) -> Option<Self> {
+        let start = header.start();
         let front = usize::try_from(parcel.front_len()).ok()?;
         let content_len = usize::try_from(parcel.content_len()).ok()?;
         let body = usize::try_from(parcel.body_len()).ok()?;
+        let elsewhere = match header.reference() {
+            Some(_) => content_len,
+            None => 0,
+        };
         let content = start.checked_add(front)?;
-        let tail = content.checked_add(content_len)?;
-        let end = start.checked_add(body)?;
+        let tail = content.checked_add(content_len - elsewhere)?;
+        let end = start.checked_add(body.checked_sub(elsewhere)?)?;
         (tail <= end && end <= payload).then_some(Self {
             start,
             content,

@@ -10,10 +10,12 @@
 //! * [`ShmCounters`] says what happened: what was copied, and why.
 //!
 //! Inside: `layout` is what lies in shared memory, `inbox` the receiving and `outbox` the sending
-//! side of mailboxes, `loan` memory handed out before it is sent, `presence` how processes wake
-//! each other and notice each other's end, `memory` where room comes from, `domain` the traces in
-//! the file system, `peers` the other processes known, `endpoint` what ties all together. `raw`
-//! (feature `raw`) is the bare iceoryx2 that benches compare with.
+//! side of mailboxes, `loan` memory handed out before it is sent, `segment` content that lies in
+//! memory once for many receivers (`pool` where it is sent, `library` where it is read),
+//! `presence` how processes wake each other and notice each other's end, `memory` where room comes
+//! from, `domain` the traces in the file system, `peers` the other processes known, `shift` who of
+//! several threads works, `fault` what the sender is told when a way fails, `endpoint` what ties
+//! all together. `raw` (feature `raw`) is the bare iceoryx2 that benches compare with.
 //!
 //! What must not live here: routes, retries, names of agents, deduplication. And no `unsafe` that
 //! does not say why it is sound; no other crate of this project has any.
@@ -28,16 +30,20 @@ mod config;
 mod counters;
 mod domain;
 mod endpoint;
+mod fault;
 mod inbox;
 mod inspect;
 mod layout;
+mod library;
 mod loan;
 mod memory;
 mod outbox;
 mod peers;
+mod pool;
 mod presence;
 #[cfg(feature = "raw")]
 pub mod raw;
+mod segment;
 mod shift;
 mod transport;
 

@@ -5,13 +5,19 @@
 //! SIGBUS, which ends the process. So pages are asked for with `MADV_POPULATE_WRITE` first, which
 //! reports an error instead.
 
+use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::fs::MetadataExt;
+use std::path::PathBuf;
+use std::ptr::NonNull;
+use std::time::{Duration, Instant};
 
 use fipa_transport::{WayError, WayFault};
+use rustix::fs::{FlockOperation, Mode, OFlags, flock, open};
 use rustix::io::Errno;
-use rustix::mm::{Advice, madvise};
+use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mmap, munmap};
 
-use crate::ShmError;
+use crate::presence::Names;
+use crate::{ShmConfig, ShmError};
 
 /// Where POSIX shared memory lies on Linux.
 pub(crate) const SHM: &str = "/dev/shm";
@@ -22,21 +28,34 @@ const MARGIN: u64 = 256 << 10;
 /// What an endpoint needs to begin with.
 const START: u64 = 1 << 20;
 
-const PAGE: usize = 4096;
+/// Length of a page of memory, in bytes.
+pub(crate) const PAGE: usize = 4096;
+
+/// How long to wait for others who are taking memory.
+const PATIENCE: Duration = Duration::from_millis(200);
 
 /// The share of one domain in this host's shared memory.
 #[derive(Debug)]
 pub(crate) struct Budget {
     prefix: String,
     capacity: u64,
+    /// Locked by whoever takes memory.
+    directory: PathBuf,
 }
 
 impl Budget {
-    pub(crate) fn new(prefix: &str, capacity: u64) -> Self {
+    pub(crate) fn new(config: &ShmConfig) -> Self {
         Self {
-            prefix: format!("{prefix}_"),
-            capacity,
+            prefix: format!("{}_", config.prefix),
+            capacity: config.capacity,
+            directory: Names::new(&config.root, &config.prefix)
+                .directory()
+                .to_owned(),
         }
+    }
+
+    pub(crate) fn capacity(&self) -> u64 {
+        self.capacity
     }
 
     /// Whether an endpoint can be opened at all.
@@ -52,7 +71,43 @@ impl Budget {
         Ok(())
     }
 
-    /// Whether `need` more bytes can be taken now.
+    /// Whether `need` more bytes can be taken now, and excludes others of the domain from taking
+    /// any until the result is dropped: then the pages must be there ([`populate`]).
+    ///
+    /// Who has the domain's lock may ask for this one, but not the other way round.
+    pub(crate) fn reserve(&self, need: u64) -> Result<OwnedFd, WayError> {
+        let turn = self.turn().map_err(|e| {
+            WayError::new(
+                WayFault::Congested,
+                format_args!(
+                    "cannot lock {} to take memory: {e}",
+                    self.directory.display()
+                ),
+            )
+        })?;
+        self.check(need)?;
+        Ok(turn)
+    }
+
+    /// The lock, on the directory itself: no file is left behind by it. Somebody who has it and
+    /// was stopped must not stop everybody else.
+    fn turn(&self) -> rustix::io::Result<OwnedFd> {
+        let flags = OFlags::DIRECTORY | OFlags::RDONLY | OFlags::CLOEXEC;
+        let directory = open(&self.directory, flags, Mode::empty())?;
+        let began = Instant::now();
+        loop {
+            match flock(&directory, FlockOperation::NonBlockingLockExclusive) {
+                Ok(()) => return Ok(directory),
+                Err(Errno::INTR) => {}
+                Err(Errno::WOULDBLOCK) if began.elapsed() < PATIENCE => {
+                    std::thread::sleep(Duration::from_micros(500));
+                }
+                Err(e) => return Err(e),
+            }
+        }
+    }
+
+    /// Whether `need` more bytes could be taken now.
     pub(crate) fn check(&self, need: u64) -> Result<(), WayError> {
         if need > self.capacity {
             return Err(WayError::new(
@@ -132,5 +187,52 @@ pub(crate) fn populate(start: *const u8, len: usize) -> Result<(), WayError> {
             },
             Err(e) => Err(no_room(len as u64, &format!("is full ({e})"))),
         };
+    }
+}
+
+/// A file of shared memory that this process has mapped, from its beginning.
+#[derive(Debug)]
+pub(crate) struct Mapping {
+    start: NonNull<u8>,
+    len: usize,
+}
+
+// SAFETY: a mapping is memory of this process's address space, not of a thread. Whoever makes a
+// reference into it answers for what else happens there.
+unsafe impl Send for Mapping {}
+// SAFETY: as above; a shared `Mapping` only tells where it is.
+unsafe impl Sync for Mapping {}
+
+impl Mapping {
+    pub(crate) fn new(file: impl AsFd, len: usize, protection: ProtFlags) -> std::io::Result<Self> {
+        // SAFETY: the kernel chooses where to map, so no memory in use is touched.
+        let start = unsafe {
+            mmap(
+                std::ptr::null_mut(),
+                len,
+                protection,
+                MapFlags::SHARED,
+                file,
+                0,
+            )
+        }?;
+        let start = NonNull::new(start.cast()).ok_or(std::io::ErrorKind::OutOfMemory)?;
+        Ok(Self { start, len })
+    }
+
+    pub(crate) fn start(&self) -> NonNull<u8> {
+        self.start
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.len
+    }
+}
+
+impl Drop for Mapping {
+    fn drop(&mut self) {
+        // SAFETY: mapped by `new` with this length, and nothing refers to it any more: whoever
+        // lends a part of it lends for no longer than it keeps the mapping.
+        let _ = unsafe { munmap(self.start.as_ptr().cast(), self.len) };
     }
 }

@@ -6,21 +6,22 @@ use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Weak};
 
 use bytes::Bytes;
-use fipa_transport::wire::{ParcelHeader, Pieces, WireError};
+use fipa_transport::wire::{ParcelHeader, Pieces};
 use fipa_transport::{AttemptId, Body, Conclusion, Incarnation, Parcel, WayError, WayFault};
 use iceoryx2::pending_response::PendingResponse;
-use iceoryx2::port::client::RequestSendError;
-use iceoryx2::port::{DegradationAction, LoanError};
+use iceoryx2::port::DegradationAction;
 use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, PortFactory, ServiceName};
-use iceoryx2::service::builder::request_response::RequestResponseOpenError;
-use iceoryx2::service::port_factory::client::ClientCreateError;
 use parking_lot::Mutex;
 
 use crate::counters::{Tally, count};
 use crate::domain::Domain;
+use crate::fault::{
+    create_error, loan_error, open_error, retired, send_error, too_large, window_full, wire_error,
+};
 use crate::layout::{ALIGNMENT, Ack, Blank, Filled, Header, MailClient, Pending, Places, Svc};
 use crate::loan::{Loan, ShmLoan};
 use crate::memory::{Budget, populate};
+use crate::pool::Pool;
 
 /// Bytes of the first, small memory segment's chunks, headers included.
 const FIRST_CHUNK: usize = 4096;
@@ -57,6 +58,7 @@ pub(crate) struct Outbox {
     retired: AtomicBool,
     token: AtomicU64,
     budget: Arc<Budget>,
+    pool: Arc<Pool>,
     tally: Arc<Tally>,
     // After the client: the last of the process to go removes the domain's traces.
     _domain: Arc<Domain>,
@@ -95,6 +97,11 @@ struct Sent {
 enum Memory {
     Own(Pending),
     Loaned(Arc<Loan>),
+    Referring {
+        pending: Pending,
+        /// The content for many that it refers to.
+        _content: Bytes,
+    },
 }
 
 /// What became of a dispatch.
@@ -114,6 +121,7 @@ pub(crate) struct Opening<'a> {
     pub(crate) waiting: Arc<AtomicUsize>,
     pub(crate) max_loans: usize,
     pub(crate) budget: Arc<Budget>,
+    pub(crate) pool: Arc<Pool>,
     pub(crate) tally: Arc<Tally>,
     pub(crate) domain: Arc<Domain>,
 }
@@ -165,6 +173,7 @@ impl Outbox {
             retired: AtomicBool::new(false),
             token: AtomicU64::new(start),
             budget: opening.budget,
+            pool: opening.pool,
             tally: opening.tally,
             _domain: opening.domain,
         };
@@ -201,8 +210,13 @@ impl Outbox {
             Body::Letter(letter) => (&letter.payload().content, letter.payload().tail.len()),
             _ => (&NO_CONTENT, 0),
         };
+        let reference = self.pool.find(content);
+        let content_here = match reference {
+            Some(_) => 0,
+            None => content.len(),
+        };
         let front = usize::try_from(header.front_len()).unwrap_or(usize::MAX);
-        let places = Places::for_lengths(front, content.len(), tail).ok_or_else(too_large)?;
+        let places = Places::for_lengths(front, content_here, tail).ok_or_else(too_large)?;
         let token = self.token.fetch_add(1, Ordering::Relaxed);
 
         let mut state = self.state.lock();
@@ -233,12 +247,17 @@ impl Outbox {
             }
         }
         let mut blank = self.take(&mut state, places.end)?;
-        *blank.user_header_mut() = Header::new(&header, offset(places.start)?, self.own, token);
+        let header = Header::new(&header, offset(places.start)?, self.own, token);
+        *blank.user_header_mut() = header.referring(reference);
         let payload = NonNull::from(blank.payload_mut()).cast();
+        let written = match reference {
+            Some(_) => Content::Elsewhere(content),
+            None => Content::Here,
+        };
         // SAFETY: the pieces are as long as `places.end - places.start` says (they are what the
         // header and the places were computed from), and the payload has `places.end` bytes.
         // Nothing refers to the payload of a request just taken.
-        unsafe { write(payload, places.start, &pieces, None) };
+        unsafe { write(payload, places.start, &pieces, written) };
         // SAFETY: all bytes from `start` on were just written, and those before are memory of a
         // shared mapping, filled by the kernel or by earlier requests.
         let filled = unsafe { blank.assume_init() };
@@ -246,7 +265,17 @@ impl Outbox {
         if pending.number_of_server_connections() == 0 {
             return Err(self.nobody_reached(&pending));
         }
-        self.queue(&mut state, attempt, token, Memory::Own(pending), expected);
+        let memory = match reference {
+            Some(_) => {
+                count(&self.tally.referring);
+                Memory::Referring {
+                    pending,
+                    _content: content.clone(),
+                }
+            }
+            None => Memory::Own(pending),
+        };
+        self.queue(&mut state, attempt, token, memory, expected);
         Ok(Posted::Yes)
     }
 
@@ -320,7 +349,7 @@ impl Outbox {
         // content begins, and for the tail, as the caller has checked. The content, which is all
         // that anybody else refers to, is not written, and whoever has taken the request is the
         // only one to write to the rest.
-        unsafe { write(loan.payload(), start, pieces, Some(content)) };
+        unsafe { write(loan.payload(), start, pieces, Content::InPlace(content)) };
         // SAFETY: front, content and tail are written; the rest is memory of a shared mapping.
         let filled: Filled = unsafe { blank.assume_init() };
         match filled.send() {
@@ -389,9 +418,12 @@ impl Outbox {
     fn take(&self, state: &mut State, len: usize) -> Result<Blank, WayError> {
         let segment = &mut state.segment;
         let grows = len > segment.room;
+        // Until the pages are there, nobody else takes any.
+        let mut _turn = None;
         if grows {
             let headers = self.chunks.saturating_mul(FIRST_CHUNK) as u64;
-            self.budget.check((len as u64).saturating_add(headers))?;
+            let need = (len as u64).saturating_add(headers);
+            _turn = Some(self.budget.reserve(need)?);
         }
         let mut blank = self.client.loan_slice_uninit(len).map_err(loan_error)?;
         let chunk = std::ptr::from_ref(blank.header()) as usize;
@@ -418,7 +450,7 @@ impl Outbox {
         if *ready < len {
             let missing = len - *ready;
             if missing > 2 * FIRST_CHUNK && !grows {
-                self.budget.check(missing as u64)?;
+                _turn = Some(self.budget.reserve(missing as u64)?);
             }
             populate(payload.wrapping_add(*ready), missing)?;
             *ready = len;
@@ -515,7 +547,7 @@ impl Sent {
     fn has_answer(&self) -> bool {
         let look = PendingResponse::has_response;
         match &self.memory {
-            Memory::Own(pending) => look(pending),
+            Memory::Own(pending) | Memory::Referring { pending, .. } => look(pending),
             Memory::Loaned(loan) => loan.with_pending(look).unwrap_or(false),
         }
     }
@@ -523,7 +555,7 @@ impl Sent {
     fn conclusion(&self, ended: bool) -> Option<Conclusion> {
         let look = |pending: &Pending| self.conclusion_of(pending, ended);
         match &self.memory {
-            Memory::Own(pending) => look(pending),
+            Memory::Own(pending) | Memory::Referring { pending, .. } => look(pending),
             Memory::Loaned(loan) => loan.with_pending(look).flatten(),
         }
     }
@@ -563,16 +595,31 @@ impl Sent {
     }
 }
 
-/// Writes pieces behind each other, `at` bytes behind `start`; all but `there`, which is in its
-/// place already.
+/// What of the content is written.
+enum Content<'a> {
+    /// It is written like the rest.
+    Here,
+    /// It is in its place already.
+    InPlace(&'a Bytes),
+    /// It lies somewhere else.
+    Elsewhere(&'a Bytes),
+}
+
+/// Writes pieces behind each other, `at` bytes behind `start`.
 ///
 /// # Safety
 /// There must be room, and nothing else may refer to what is written.
-unsafe fn write(start: NonNull<u8>, at: usize, pieces: &Pieces<'_>, there: Option<&Bytes>) {
+unsafe fn write(start: NonNull<u8>, at: usize, pieces: &Pieces<'_>, content: Content<'_>) {
     let mut at = at;
     for piece in pieces.iter() {
         let place = start.as_ptr().wrapping_add(at);
-        if !there.is_some_and(|there| std::ptr::eq(&there[..], piece)) {
+        let is = |content: &Bytes| std::ptr::eq(&content[..], piece);
+        let is_written = match content {
+            Content::Elsewhere(content) if is(content) => continue,
+            Content::InPlace(content) => !is(content),
+            Content::Here | Content::Elsewhere(_) => true,
+        };
+        if is_written {
             // SAFETY: the caller vouches for the room; a piece is not in it, because nothing else
             // refers to it.
             unsafe { place.copy_from_nonoverlapping(piece.as_ptr(), piece.len()) };
@@ -589,74 +636,4 @@ fn header_len() -> usize {
 
 fn offset(start: usize) -> Result<u32, WayError> {
     u32::try_from(start).map_err(|_| too_large())
-}
-
-fn too_large() -> WayError {
-    WayError::new(WayFault::TooLarge, "")
-}
-
-fn retired() -> WayError {
-    WayError::new(WayFault::Congested, "the connection is being renewed")
-}
-
-fn window_full(window: usize) -> WayError {
-    WayError::new(
-        WayFault::Congested,
-        format_args!("{window} letters to this process are without an answer"),
-    )
-}
-
-fn wire_error(error: WireError) -> WayError {
-    let fault = match error {
-        WireError::BodyLength { .. } => WayFault::TooLarge,
-        _ => WayFault::Refused,
-    };
-    WayError::new(fault, error)
-}
-
-fn open_error(error: RequestResponseOpenError) -> WayError {
-    use RequestResponseOpenError as E;
-    let fault = match error {
-        E::DoesNotExist | E::IsMarkedForDestruction => WayFault::Unreachable,
-        E::ExceedsMaxNumberOfNodes => WayFault::Congested,
-        E::IncompatibleRequestOrResponseType
-        | E::IncompatibleAttributes
-        | E::IncompatibleMessagingPattern => WayFault::Incompatible,
-        _ => WayFault::Unreachable,
-    };
-    WayError::new(
-        fault,
-        format_args!("the mailbox cannot be opened: {error:?}"),
-    )
-}
-
-fn create_error(error: ClientCreateError) -> WayError {
-    let hint = match error {
-        ClientCreateError::ExceedsMaxSupportedClients => {
-            ": too many processes have it open (max_clients of the other process)"
-        }
-        _ => ": often the limit of open files is too low, or shared memory is full",
-    };
-    WayError::new(
-        WayFault::Congested,
-        format_args!("the mailbox cannot be connected to ({error:?}){hint}"),
-    )
-}
-
-fn loan_error(error: LoanError) -> WayError {
-    let hint = match error {
-        LoanError::ExceedsMaxLoans => "too many letters are with this process",
-        _ => "no shared memory could be had: enlarge /dev/shm, or raise the limit of open files",
-    };
-    WayError::new(WayFault::Congested, format_args!("{hint} ({error:?})"))
-}
-
-fn send_error(error: RequestSendError) -> WayError {
-    let hint = match error {
-        RequestSendError::ExceedsMaxActiveRequests => {
-            "too many letters to this process are without an answer"
-        }
-        _ => "the mailbox does not take it",
-    };
-    WayError::new(WayFault::Congested, format_args!("{hint} ({error:?})"))
 }

@@ -7,6 +7,8 @@
 //! * a page of shared memory that says whether it is looking already, so that nobody needs to
 //!   ring, and how often it has heard its bell. The page and the bell work together as described
 //!   at [`Presence::looking`] and [`Neighbour::is_awake`].
+//!
+//! Besides, while it multicasts, its segments (see `segment`).
 
 use std::fs::File;
 use std::io::{self, ErrorKind, Read, Write};
@@ -19,16 +21,19 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::Incarnation;
 use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
-use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
+use rustix::mm::ProtFlags;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
-use crate::memory::SHM;
-
-const PAGE_LEN: usize = 4096;
+use crate::domain::files_in;
+use crate::memory::{Mapping, PAGE, SHM};
+use crate::segment;
 
 /// Nobody but the owner.
 const PRIVATE: Mode = Mode::RUSR.union(Mode::WUSR);
+
+/// How the names of segments end.
+const CONTENT: &str = "content";
 
 /// Names of the files of processes.
 #[derive(Debug, Clone)]
@@ -61,7 +66,20 @@ impl Names {
         Path::new(SHM).join(format!("{}{of}.page", self.prefix))
     }
 
+    /// A segment of content for many.
+    pub(crate) fn content(&self, of: Incarnation, number: u64) -> PathBuf {
+        Path::new(SHM).join(format!("{}{of}.{number}.{CONTENT}", self.prefix))
+    }
+
     pub(crate) fn remove(&self, of: Incarnation) {
+        let contents = format!("{}{of}.", self.prefix);
+        for file in files_in(Path::new(SHM)) {
+            let name = file.file_name();
+            let name = name.to_string_lossy();
+            if name.starts_with(&contents) && name.ends_with(CONTENT) {
+                segment::remove(&file.path());
+            }
+        }
         // What is not there need not be removed, and `live` goes last: as long as it is there,
         // whoever cleans up comes back for the others.
         for path in [self.page(of), self.bell(of), self.live(of)] {
@@ -84,7 +102,9 @@ impl Names {
                     .to_str()
                     .and_then(|name| name.strip_prefix(&self.prefix))
                     .and_then(|name| name.split_once('.'))
-                    .filter(|(_, kind)| matches!(*kind, "live" | "bell" | "page"))
+                    .filter(|(_, kind)| {
+                        matches!(*kind, "live" | "bell" | "page") || kind.ends_with(CONTENT)
+                    })
                     .and_then(|(digits, _)| digits.parse().ok());
                 found.extend(incarnation);
             }
@@ -144,7 +164,7 @@ impl Presence {
             .open(names.page(own))?;
         // Written, not just made longer: a full file system is an error here, and not a signal
         // later.
-        page.write_all(&[0; PAGE_LEN])?;
+        page.write_all(&[0; PAGE])?;
         Ok(Self {
             names: names.clone(),
             own,
@@ -279,7 +299,7 @@ impl Neighbour {
             return Err(ErrorKind::NotFound.into());
         }
         let page = File::open(names.page(of))?;
-        if page.metadata()?.len() < PAGE_LEN as u64 {
+        if page.metadata()?.len() < PAGE as u64 {
             return Err(io::Error::new(
                 ErrorKind::InvalidData,
                 "the page is too short",
@@ -382,42 +402,18 @@ struct Words {
 
 /// A mapped page.
 #[derive(Debug)]
-struct Page(*mut Words);
-
-// SAFETY: the page is memory of this process's address space, not of a thread, and is only
-// accessed atomically.
-unsafe impl Send for Page {}
-// SAFETY: as above.
-unsafe impl Sync for Page {}
+struct Page(Mapping);
 
 impl Page {
     fn map(file: &File, protection: ProtFlags) -> io::Result<Self> {
-        // SAFETY: the kernel chooses where to map, so no memory in use is touched.
-        let start = unsafe {
-            mmap(
-                std::ptr::null_mut(),
-                PAGE_LEN,
-                protection,
-                MapFlags::SHARED,
-                file,
-                0,
-            )
-        }?;
-        Ok(Self(start.cast()))
+        Mapping::new(file, PAGE, protection).map(Self)
     }
 
     fn words(&self) -> &Words {
         // SAFETY: the mapping lives as long as self, is aligned to a page and longer than `Words`,
         // whose every value is valid, and every process accesses these words atomically only.
-        // Neighbours map it for reading and only load.
-        unsafe { &*self.0 }
-    }
-}
-
-impl Drop for Page {
-    fn drop(&mut self) {
-        // SAFETY: mapped by `map` with this length, and nothing refers to it any more: `words`
-        // lends for the life of self only.
-        let _ = unsafe { munmap(self.0.cast(), PAGE_LEN) };
+        // Neighbours map it for reading and only load. The file is never shortened: its process
+        // does not, and who opens it has looked at its length.
+        unsafe { self.0.start().cast::<Words>().as_ref() }
     }
 }

@@ -21,12 +21,12 @@ use iceoryx2::prelude::{
 };
 use iceoryx2::request_mut::RequestMut;
 
-use crate::layout::{Ack, Svc};
+use crate::layout::{self, Ack, Svc};
 use crate::memory::Budget;
 use crate::{ShmConfig, ShmError};
 
 /// As large as the transport's header.
-type Header = [u64; 11];
+type Header = [u64; size_of::<layout::Header>() / 8];
 type Answer = [u8; size_of::<Ack>()];
 
 /// How many requests of one client may always be without an answer.
@@ -86,7 +86,7 @@ impl RawNode {
             })?;
         Ok(Self {
             node,
-            budget: Budget::new(&config.prefix, config.capacity),
+            budget: Budget::new(config),
         })
     }
 

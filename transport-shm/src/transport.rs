@@ -3,6 +3,7 @@
 use std::fmt;
 use std::sync::{Arc, Weak};
 
+use bytes::Bytes;
 use fipa_transport::{
     Answer, AttemptId, Body, Kind, ListenError, LoanedContent, Location, Parcel, Sink, Ticket,
     Transport, WayError, WayFault,
@@ -145,6 +146,16 @@ impl Transport for ShmTransport {
         self.check_len(len)?;
         let loan = self.endpoint.loan(to, head_room, len, tail_room)?;
         Ok(Some(Box::new(loan)))
+    }
+
+    fn loan_for_many(&self, len: usize) -> Result<Option<Box<dyn LoanedContent>>, WayError> {
+        self.check_len(len)?;
+        let loan = self.endpoint.pool().loan(len)?;
+        Ok(loan.map(|loan| Box::new(loan) as Box<dyn LoanedContent>))
+    }
+
+    fn copies_for_each(&self, content: &Bytes) -> bool {
+        self.endpoint.pool().copies(content)
     }
 
     /// Must not be called by the sink while it is told something.

@@ -1,9 +1,14 @@
 //! Several processes, some of which are killed. Every test starts its own from this binary.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on says so")]
+#![allow(
+    clippy::print_stdout,
+    reason = "processes tell each other what they see"
+)]
 
 mod common;
 
+use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 
@@ -21,11 +26,13 @@ struct Process {
 }
 
 impl Process {
-    /// Roles: `receive` what comes and keep it; `send` to a process without end.
+    /// Roles: `receive` what comes and keep it; `tell` where its content lies, besides; `send` to
+    /// a process without end, or `many`, which is content for many.
     fn start(place: &Place, role: &str, to: Incarnation) -> Self {
         let config = place.config();
         let child = Command::new(std::env::current_exe().unwrap())
-            .args(["--ignored", "--exact", "a_process_of_its_own"])
+            .args(["--ignored", "--exact", "--nocapture"])
+            .arg("a_process_of_its_own")
             .env(
                 ROLE,
                 format!(
@@ -35,7 +42,10 @@ impl Process {
                     config.incarnation
                 ),
             )
-            .stdout(Stdio::null())
+            .stdout(match role {
+                "tell" => Stdio::piped(),
+                _ => Stdio::null(),
+            })
             .spawn()
             .unwrap();
         Self {
@@ -89,11 +99,30 @@ fn a_process_of_its_own() {
         .unwrap();
     let endpoint = ShmTransport::new(config, runtime.handle().clone()).unwrap();
     let told = Arc::new(common::Told::default());
-    endpoint.listen(told).unwrap();
+    endpoint.listen(told.clone()).unwrap();
     let content = Bytes::from(vec![7; 5000]);
+    let mut seen = 0;
     loop {
         match role {
             "receive" => std::thread::park(),
+            "tell" => {
+                wait_for_ever(|| told.arrivals() > seen);
+                let content = told.content(seen);
+                seen += 1;
+                if !content.is_empty() {
+                    let sum: u64 = content.iter().map(|byte| u64::from(*byte)).sum();
+                    println!("\nLIES {} {} {sum}", lies(&content), content.len());
+                }
+            }
+            "many" => {
+                // All are held or read already.
+                let Ok(Some(mut loan)) = endpoint.loan_for_many(100_000) else {
+                    std::thread::yield_now();
+                    continue;
+                };
+                loan.content_mut().fill(7);
+                let _ = endpoint.dispatch(attempt(), &to, parcel(loan.freeze()));
+            }
             _ => {
                 // Full, or gone.
                 if endpoint
@@ -105,6 +134,91 @@ fn a_process_of_its_own() {
             }
         }
     }
+}
+
+fn wait_for_ever(condition: impl Fn() -> bool) {
+    while !condition() {
+        std::thread::sleep(std::time::Duration::from_millis(1));
+    }
+}
+
+/// Where content lies: device and number of the file, and the place in it.
+fn lies(content: &[u8]) -> String {
+    let address = content.as_ptr() as usize;
+    let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
+    let place = maps.lines().find_map(|line| {
+        let mut fields = line.split_whitespace();
+        let (start, end) = fields.next()?.split_once('-')?;
+        let start = usize::from_str_radix(start, 16).ok()?;
+        let end = usize::from_str_radix(end, 16).ok()?;
+        let offset = usize::from_str_radix(fields.nth(1)?, 16).ok()?;
+        let (device, inode) = (fields.next()?, fields.next()?);
+        let here = (start..end).contains(&address) && address + content.len() <= end;
+        here.then(|| format!("{device} {inode} {}", address - start + offset))
+    });
+    place.unwrap()
+}
+
+#[test]
+fn receivers_in_two_processes_read_the_same_memory() {
+    let place = Place::new();
+    let (sender, sent) = place.listening();
+    let nobody = Incarnation::from_u64(1);
+    let mut receivers = [(); 2].map(|()| Process::start(&place, "tell", nobody));
+    for receiver in &receivers {
+        receiver.wait_until_up(&sender);
+    }
+    let mut loan = sender.loan_for_many(1 << 20).unwrap().unwrap();
+    let bytes = loan.content_mut().iter_mut();
+    bytes
+        .enumerate()
+        .for_each(|(at, byte)| *byte = (at % 251) as u8);
+    let content = loan.freeze();
+    let sum: u64 = content.iter().map(|byte| u64::from(*byte)).sum();
+    let expected = format!("LIES {} {} {sum}", lies(&content), content.len());
+    for receiver in &mut receivers {
+        let to = location_of(receiver.incarnation);
+        let one = attempt();
+        sender.dispatch(one, &to, parcel(content.clone())).unwrap();
+        wait_for("answer", || sent.conclusion_of(one).is_some());
+        let lines = BufReader::new(receiver.child.stdout.take().unwrap()).lines();
+        let mut lines = lines.map_while(Result::ok);
+        let told = lines.find(|line| line.starts_with("LIES"));
+        assert_eq!(told, Some(expected.clone()));
+    }
+    assert_eq!(sender.counters().referring, 2);
+    // Killed while they hold it, they do not keep it from being used again.
+    for receiver in &mut receivers {
+        receiver.kill();
+    }
+    let before = lies(&content);
+    drop(content);
+    let again = sender.loan_for_many(1 << 20).unwrap().unwrap().freeze();
+    assert_eq!(lies(&again), before);
+}
+
+#[test]
+fn content_for_many_of_a_killed_sender_stays_as_long_as_it_is_read() {
+    let place = Place::new();
+    let (receiver, got) = place.listening();
+    let own = receiver.location().incarnation();
+    let mut sender = Process::start(&place, "many", own);
+    wait_for("letters", || got.arrivals() >= 8);
+    sender.kill();
+    wait_for("notice", || receiver.counters().peers_gone == 1);
+    let dead = sender.incarnation.to_string();
+    wait_for("removal", || {
+        !place.traces().iter().any(|file| file.contains(&dead))
+    });
+    for number in 0..got.arrivals() {
+        assert!(got.content(number).iter().all(|byte| *byte == 7));
+    }
+    got.arrived.lock().unwrap().clear();
+    assert_eq!(receiver.counters().borrowed, 0);
+    let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
+    assert!(!maps.contains(&format!("{dead}.")), "still mapped");
+    receiver.close();
+    assert_eq!(place.traces(), Vec::<String>::new());
 }
 
 #[test]

@@ -5,6 +5,7 @@ use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use bytes::Bytes;
 use fipa_acl::Letter;
 use parking_lot::Mutex;
 
@@ -188,6 +189,14 @@ impl Transport for Faulty {
         tail_room: usize,
     ) -> Result<Option<Box<dyn LoanedContent>>, WayError> {
         self.inner.loan(to, head_room, len, tail_room)
+    }
+
+    fn loan_for_many(&self, len: usize) -> Result<Option<Box<dyn LoanedContent>>, WayError> {
+        self.inner.loan_for_many(len)
+    }
+
+    fn copies_for_each(&self, content: &Bytes) -> bool {
+        self.inner.copies_for_each(content)
     }
 
     fn close(&self) {

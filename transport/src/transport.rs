@@ -4,6 +4,7 @@ use std::fmt;
 use std::net::IpAddr;
 use std::sync::Arc;
 
+use bytes::Bytes;
 use fipa_acl::Letter;
 use serde::Serialize;
 
@@ -88,19 +89,37 @@ pub trait Transport: Send + Sync + 'static {
         Ok(None)
     }
 
+    /// Loans `len` bytes for the content of a letter to several locations, when this transport can
+    /// carry them to any number of locations without a copy for each. The content is in memory
+    /// once, as long as anybody reads it; what is dispatched elsewhere is copied as usual.
+    ///
+    /// # Errors
+    /// When there is no room or the content is too large.
+    fn loan_for_many(&self, len: usize) -> Result<Option<Box<dyn LoanedContent>>, WayError> {
+        let _ = len;
+        Ok(None)
+    }
+
+    /// Whether dispatching letters with this content to several locations makes a copy for each
+    /// that is worth avoiding by [`loan_for_many`](Self::loan_for_many).
+    fn copies_for_each(&self, content: &Bytes) -> bool {
+        let _ = content;
+        false
+    }
+
     /// Stops listening, gives every outstanding attempt its conclusion and frees everything.
     /// Later dispatches fail. Calling it twice is allowed.
     fn close(&self);
 }
 
-/// Memory for the content of one letter, to be filled in place.
+/// Memory for the content of a letter, to be filled in place.
 pub trait LoanedContent: Send {
     /// The bytes, to be written. They start out as zeros or as anything else.
     fn content_mut(&mut self) -> &mut [u8];
 
     /// The bytes as content of a letter. The transport that loaned them recognises them when the
-    /// letter is dispatched to the location they were loaned for, and copies nothing.
-    fn freeze(self: Box<Self>) -> bytes::Bytes;
+    /// letter is dispatched to a location they were loaned for, and copies nothing.
+    fn freeze(self: Box<Self>) -> Bytes;
 }
 
 /// Who is told what arrives and what became of attempts: the delivery core.

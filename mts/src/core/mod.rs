@@ -385,6 +385,35 @@ impl Core {
         self.desk.choose(now.instant, &entry, &[])
     }
 
+    /// The kind of transport by which a letter to these receivers would go first to two of them at
+    /// least, now; of several kinds, the one that most of them would be reached by.
+    #[must_use]
+    pub fn kind_for_many<'a>(
+        &self,
+        now: Now,
+        sender: Incarnation,
+        receivers: impl IntoIterator<Item = &'a str>,
+    ) -> Option<Kind> {
+        let directory = &*self.desk.directory;
+        let own = self.agents.get(&sender).map(|inbox| &*inbox.name);
+        let mut reached = Map::default();
+        for receiver in receivers {
+            let entries = match fipa_sds::resolve(directory, receiver, own.unwrap_or_default()) {
+                Ok(Resolution::Exact(entry)) => vec![entry],
+                Ok(Resolution::Multicast(entries)) => entries,
+                Ok(Resolution::None) | Err(_) => Vec::new(),
+            };
+            for entry in entries {
+                if let Some(way) = self.desk.choose(now.instant, &entry, &[]) {
+                    reached.insert(desk::life_of(&entry), way.kind());
+                }
+            }
+        }
+        let by = |kind: Kind| reached.values().filter(|other| **other == kind).count();
+        let most = Kind::ALL.into_iter().max_by_key(|kind| by(*kind))?;
+        (by(most) > 1).then_some(most)
+    }
+
     /// Whether somebody watches: then [`Action::Notice`] tells of every letter, before what is to
     /// be done about it.
     pub fn watch(&mut self, watched: bool) {

@@ -150,6 +150,71 @@ pub fn loaned_content_arrives(fixture: &dyn Fixture) {
     }
 }
 
+/// Memory loaned for many arrives at all of them as the content it was filled with, and stays so
+/// for whoever holds it while further contents follow; what is held and what is given back leaves
+/// room for more.
+pub fn content_for_many_arrives_everywhere(fixture: &dyn Fixture) {
+    let (a, b, c) = (
+        Party::new(fixture),
+        Party::new(fixture),
+        Party::new(fixture),
+    );
+    let len = 100_000.min(a.transport.max_letter() / 2);
+    let filled = |round: u64| Bytes::from(vec![round as u8; len]);
+    let mut kept = Vec::new();
+    for round in 0..40 {
+        let loan = a.transport.loan_for_many(len);
+        let content = match loan {
+            Ok(Some(mut loan)) => {
+                assert_eq!(loan.content_mut().len(), len);
+                loan.content_mut().copy_from_slice(&filled(round));
+                let content = loan.freeze();
+                assert!(!a.transport.copies_for_each(&content));
+                content
+            }
+            Ok(None) if round == 0 => return,
+            // What is held takes up the room there is, and letters go on without it.
+            Err(error) if round > 0 => {
+                assert_eq!(error.fault, WayFault::Congested, "{error}");
+                filled(round)
+            }
+            other => panic!("round {round}: {:?}", other.map(|loan| loan.is_some())),
+        };
+        let sent = parcel(round, letter(content.clone()));
+        for (index, to) in [(2 * round, &b), (2 * round + 1, &c)] {
+            a.send(index, to, sent.clone());
+        }
+        for (index, to) in [(2 * round, &b), (2 * round + 1, &c)] {
+            assert_eq!(concluded(&[&a, &b, &c], &a, index), accepted());
+            assert_same(&to.arrived(to.arrivals() - 1), &sent);
+        }
+        if round < 20 {
+            kept.push(content);
+            continue;
+        }
+        for receiver in [&b, &c] {
+            for (arrived, ..) in &receiver.sink.record.lock().arrivals {
+                let sent = parcel(arrived.sequence, letter(filled(arrived.sequence)));
+                assert_same(arrived, &sent);
+            }
+        }
+        let own = kept.iter().enumerate();
+        own.for_each(|(round, kept)| assert!(*kept == filled(round as u64), "changed"));
+        // The sender gives back what it kept, and one receiver after the other.
+        kept.clear();
+        let receiver = if round % 2 == 0 { &b } else { &c };
+        receiver.sink.record.lock().arrivals.clear();
+    }
+    b.sink.record.lock().arrivals.clear();
+    c.sink.record.lock().arrivals.clear();
+    assert!(
+        a.transport
+            .loan_for_many(len)
+            .is_ok_and(|loan| loan.is_some()),
+        "room comes back"
+    );
+}
+
 /// Whatever is dispatched without waiting is either refused at once or concluded; what was
 /// accepted arrived once.
 pub fn a_flood_is_bounded_and_every_attempt_concluded(fixture: &dyn Fixture) {

@@ -51,6 +51,7 @@ macro_rules! conformance_tests {
             a_closing_sender_leaves_no_attempt_open
             a_closed_transport_takes_nothing
             loaned_content_arrives
+            content_for_many_arrives_everywhere
             a_flood_is_bounded_and_every_attempt_concluded
             many_talk_to_one_and_one_to_many
             a_sink_may_use_its_transport

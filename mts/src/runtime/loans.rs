@@ -1,0 +1,114 @@
+//! Memory for contents, from the transport that will carry them.
+
+use bytes::Bytes;
+use fipa_acl::{Letter, Payload};
+use fipa_transport::{Incarnation, Kind, LoanedContent, Location, Transport, WayError};
+
+use super::{Mts, Shared};
+use crate::core::{Now, Submission};
+
+type Loaned = Option<Box<dyn LoanedContent>>;
+
+impl Mts {
+    /// Memory for the content of a letter from this agent to these receivers, names or patterns,
+    /// to be filled in place: shared memory when that is the way a letter would go now, else the
+    /// heap. `head_room` and `tail_room` are the lengths of what will stand in front of the
+    /// content and behind it.
+    pub fn loan(
+        &self,
+        sender: Incarnation,
+        receivers: &[&str],
+        head_room: usize,
+        len: usize,
+        tail_room: usize,
+    ) -> Box<dyn LoanedContent> {
+        let loaned = match self.way_to_one(receivers) {
+            Some(way) => self.shared.loan_from(way.kind(), |transport| {
+                transport.loan(&way, head_room, len, tail_room)
+            }),
+            None => self.loan_for_many(sender, receivers.iter().copied(), len),
+        };
+        loaned.unwrap_or_else(|| Box::new(OnTheHeap(vec![0; len])))
+    }
+
+    /// The way a letter to the only receiver would take first, now.
+    fn way_to_one(&self, receivers: &[&str]) -> Option<Location> {
+        let [receiver] = receivers else {
+            return None;
+        };
+        let state = self.shared.state.lock();
+        state.core.first_way(Now::read(), receiver)
+    }
+
+    fn loan_for_many<'a>(
+        &self,
+        sender: Incarnation,
+        receivers: impl IntoIterator<Item = &'a str>,
+        len: usize,
+    ) -> Loaned {
+        let kind = {
+            let state = self.shared.state.lock();
+            state.core.kind_for_many(Now::read(), sender, receivers)?
+        };
+        self.shared
+            .loan_from(kind, |transport| transport.loan_for_many(len))
+    }
+
+    /// The content of a letter in memory that all its receivers can read, if it should be moved
+    /// there.
+    pub(super) fn content_for_many(&self, submission: &Submission) -> Option<Bytes> {
+        let receivers = &submission.receivers;
+        let content = &submission.letter.payload().content;
+        let many = match &receivers[..] {
+            [receiver] => fipa_sds::is_pattern(receiver),
+            _ => true,
+        };
+        let mut transports = self.shared.transports.iter();
+        if !many || !transports.any(|transport| transport.copies_for_each(content)) {
+            return None;
+        }
+        let names = receivers.iter().map(|receiver| &**receiver);
+        let mut loan = self.loan_for_many(submission.sender, names, content.len())?;
+        loan.content_mut().copy_from_slice(content);
+        Some(loan.freeze())
+    }
+}
+
+impl Shared {
+    /// A loan, if this transport gives one.
+    fn loan_from(
+        &self,
+        kind: Kind,
+        loan: impl FnOnce(&dyn Transport) -> Result<Option<Box<dyn LoanedContent>>, WayError>,
+    ) -> Option<Box<dyn LoanedContent>> {
+        match loan(&**self.transport(kind)?) {
+            Ok(loaned) => loaned,
+            Err(error) => {
+                tracing::debug!(%error, %kind, "no loan; the heap serves instead");
+                None
+            }
+        }
+    }
+}
+
+/// The same letter with this content. Nothing is copied.
+pub(super) fn with_content(letter: Letter, content: Bytes) -> Letter {
+    let envelope = letter.envelope();
+    let payload = Payload {
+        content,
+        ..letter.into_payload()
+    };
+    Letter::new(envelope, payload)
+}
+
+struct OnTheHeap(Vec<u8>);
+
+impl LoanedContent for OnTheHeap {
+    fn content_mut(&mut self) -> &mut [u8] {
+        &mut self.0
+    }
+
+    fn freeze(self: Box<Self>) -> Bytes {
+        self.0.into()
+    }
+}
