@@ -192,19 +192,15 @@ fn nobody_is_told_where_somebody_elses_letter_says_it_is() {
 fn failure_messages_that_nobody_takes_are_bounded() {
     let mut core = core(true, &[]);
     let most = core.config().lane;
+    // All at one moment, however long it takes: nothing may time out.
+    let (then, deadline) = (now(), Duration::from_secs(5));
     for _ in 0..2 * most {
-        core.handle_unframed(
-            now(),
-            Duration::from_secs(5),
-            recorded(LETTER),
-            Kind::Tcp,
-            HERE,
-        );
+        core.handle_unframed(then, deadline, recorded(LETTER), Kind::Tcp, HERE);
     }
     let mut told = 0;
     while let Some((attempt, _, _)) = dispatched(&mut core) {
         told += 1;
-        core.handle_conclusion(now(), attempt, Conclusion::Handed);
+        core.handle_conclusion(then, attempt, Conclusion::Handed);
     }
     assert_eq!(told, most);
 }

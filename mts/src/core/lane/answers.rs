@@ -151,8 +151,7 @@ impl Lane {
         }
     }
 
-    /// The other side said finally that it does not take the letter. If an earlier attempt may
-    /// have delivered it, that is what the sender has to know.
+    /// The other side said finally that it does not take the letter.
     fn refused(
         &mut self,
         index: usize,
@@ -161,20 +160,13 @@ impl Lane {
         detail: String,
         desk: &mut Desk,
     ) {
-        let delivery = &mut self.letters[index];
-        let unconfirmed = delivery.progress.unconfirmed;
-        delivery.failed_at(
+        self.letters[index].failed_at(
             location,
             WayError {
                 fault: WayFault::Refused,
                 detail,
             },
         );
-        let reason = if unconfirmed {
-            FailureReason::Unconfirmed
-        } else {
-            reason
-        };
         self.fail(index, reason, desk);
     }
 
@@ -271,8 +263,6 @@ impl Lane {
                 delivery.progress.attempts = attempts;
                 if reason == FailureReason::NoSuchAgent && !here {
                     self.receiver_left(index, desk, moved);
-                } else if delivery.progress.unconfirmed {
-                    self.fail(index, FailureReason::Unconfirmed, desk);
                 } else {
                     self.fail(index, reason, desk);
                 }

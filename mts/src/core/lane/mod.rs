@@ -60,6 +60,8 @@ pub(crate) struct Lane {
     recovering: bool,
     paused_until: Option<Instant>,
     pauses: u32,
+    /// The last letter that has got there.
+    delivered: u64,
     /// Letters that failed here, and what they came after: who came after them comes after that.
     skipped: VecDeque<(u64, u64)>,
     /// When something is due by the clock at the earliest.
@@ -94,6 +96,7 @@ impl Lane {
             recovering: false,
             paused_until: None,
             pauses: 0,
+            delivered: 0,
             skipped: VecDeque::new(),
             due: None,
             scheduled: None,
@@ -153,8 +156,12 @@ impl Lane {
     }
 
     /// Puts a letter in, at its place in the order.
-    pub(crate) fn push(&mut self, delivery: Delivery, desk: &mut Desk) {
+    pub(crate) fn push(&mut self, mut delivery: Delivery, desk: &mut Desk) {
         desk.held += delivery.letter.len();
+        // A copy that strayed, most likely: the letter itself has got there, and this one's fate must
+        // not tell otherwise.
+        let forwarded = matches!(delivery.origin, Origin::Forwarded { .. });
+        delivery.progress.unconfirmed |= forwarded && delivery.sequence <= self.delivered;
         let place = self
             .letters
             .partition_point(|other| other.sequence < delivery.sequence);
@@ -363,12 +370,7 @@ impl Lane {
                 true
             }
             None => {
-                let reason = if progress.unconfirmed {
-                    FailureReason::Unconfirmed
-                } else {
-                    FailureReason::NoSuchAgent
-                };
-                self.fail(index, reason, desk);
+                self.fail(index, FailureReason::NoSuchAgent, desk);
                 true
             }
         }
@@ -400,8 +402,13 @@ impl Lane {
         }
     }
 
+    /// Gives a letter up. If it may have been delivered, that is what its sender has to know.
     fn fail(&mut self, index: usize, reason: FailureReason, desk: &mut Desk) {
         let delivery = &mut self.letters[index];
+        let reason = match delivery.progress.unconfirmed {
+            true => FailureReason::Unconfirmed,
+            false => reason,
+        };
         let attempts = std::mem::take(&mut delivery.progress.attempts);
         let sender = match delivery.origin {
             Origin::Local { .. } => Some(Author::Ours(self.stream.sender)),
@@ -439,6 +446,9 @@ impl Lane {
             return;
         };
         desk.held -= delivery.letter.len();
+        if !matches!(outcome, Outcome::Failed { .. }) {
+            self.delivered = self.delivered.max(delivery.sequence);
+        }
         if self.letters.is_empty() {
             self.way = None;
         }
