@@ -109,7 +109,14 @@ impl Checks {
                 tracing::debug!(?event, "conversation");
             }
         }
-        match monitor.check(&Header::from(message), now) {
+        let verdict = monitor.check(&Header::from(message), now);
+        tracing::trace!(
+            performative = %message.performative(),
+            conversation = message.conversation_id(),
+            accepted = verdict.is_accepted(),
+            "checked"
+        );
+        match verdict {
             Verdict::Violation(violation) => Some(violation),
             _ => None,
         }

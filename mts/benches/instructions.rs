@@ -32,6 +32,14 @@ const PATHS: &[Path] = &[
         round();
         measured(round);
     }),
+    ("core/letter/watched/1000", |crowd, names| {
+        let mut round = || {
+            let names = names.iter();
+            names.for_each(|name| crowd.send_watched(black_box(name)));
+        };
+        round();
+        measured(round);
+    }),
     ("core/arrival/1000", |crowd, names| {
         let mut round = || (0..names.len()).for_each(|from| crowd.receive(black_box(from)));
         round();

@@ -9,6 +9,7 @@
 mod blocking;
 mod proxies;
 mod selling;
+mod verdicts;
 
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;

@@ -109,6 +109,17 @@ impl Stage {
     /// Starts a process with an agent of this name, or with a gateway, and waits until it is
     /// there.
     pub(super) async fn start(&mut self, host: &str, name: &str, role: &str) -> Result<(), String> {
+        self.start_with(host, name, role, "monitor.check=off").await
+    }
+
+    /// The same with something else in its configuration.
+    pub(super) async fn start_with(
+        &mut self,
+        host: &str,
+        name: &str,
+        role: &str,
+        set: &str,
+    ) -> Result<(), String> {
         let mut child = Command::new(&self.program)
             .args(["demo", "--part", role, "--name", name])
             .args(["--set", &format!("domain={}", Self::domain(host))])
@@ -117,6 +128,7 @@ impl Stage {
             .args(["--set", "discovery.interfaces=lo"])
             .args(["--set", "transport.tcp.listen=127.0.0.1:0"])
             .args(["--set", "mts.transports=shm,tcp"])
+            .args(["--set", set])
             .env("FIPA_RUNTIME_DIR", &self.place)
             .env_remove("FIPA_CONFIG")
             .current_dir("/")

@@ -463,7 +463,47 @@ impl Play {
         );
         ensure!(kept == 3, "{kept} letters kept to the protocol, not 3");
         self.say(&format!("  who watches sees: {text}"));
-        found!("sender": sender, "performative": performative, "violation": text, "kept": kept)
+        let caught_itself = self.stopped_by_itself().await?;
+        found!(
+            "sender": sender, "performative": performative, "violation": text, "kept": kept,
+            "caught_itself": caught_itself
+        )
+    }
+
+    /// The same again by an agent that checks itself: what would break the protocol does not leave,
+    /// and it can still do what is right.
+    async fn stopped_by_itself(&mut self) -> Result<String, String> {
+        let set = "monitor.check=enforce";
+        self.stage
+            .start_with("rover", "arm_6", "agent", set)
+            .await?;
+        let converse = |performative: &str, to: &str| Order::Converse {
+            performative: performative.into(),
+            to: to.into(),
+            conversation: "auction-2".into(),
+        };
+        one_delivery(&self.send("rover", converse("cfp", "arm_6")).await?)?;
+        self.received_by("arm_6").await?;
+        self.say("  rover says cfp to arm_6, which checks itself");
+        let broken = converse("inform", "rover");
+        let what = match self.stage.part("arm_6")?.tell(&broken).await {
+            Err(what) => what,
+            Ok(other) => return Err(format!("arm_6 was not stopped: {other:?}")),
+        };
+        ensure!(
+            what.contains("not sent: inform from arm_6") && what.contains("expected"),
+            "arm_6 was told: {what}"
+        );
+        self.say(&format!("  stopped by itself, {what}"));
+        one_delivery(&self.send("arm_6", converse("propose", "rover")).await?)?;
+        // The next thing that comes from it: the inform has not left.
+        let seen = self.received_by("rover").await?;
+        ensure!(
+            seen.performative == "propose" && seen.sender == "arm_6",
+            "rover saw {seen:?}"
+        );
+        self.say("  arm_6 says propose to rover instead");
+        Ok(what)
     }
 
     async fn measurement(&mut self) -> Found {

@@ -1,0 +1,120 @@
+//! Any bytes from a process are a record or an error; whatever is told, the watcher tells no letter
+//! twice and keeps to its bounds. What this project writes of a letter is a record.
+
+#![no_main]
+
+use std::collections::HashSet;
+use std::time::{Duration, Instant, SystemTime};
+
+use bytes::Bytes;
+use fipa_acl::{Envelope, Letter};
+use fipa_mts::core::{News, Notice, SendId};
+use fipa_mts::watch::record::{MAX_CONTENT, MAX_LEN, RecordBody, Wish, of};
+use fipa_mts::watch::{Event, Joiner, Record, Source};
+use fipa_transport::{Incarnation, Stream};
+use libfuzzer_sys::fuzz_target;
+
+/// Where the header has the lengths of its five parts, and where it ends.
+const LENGTHS: usize = 72;
+const HEADER: usize = 96;
+
+fuzz_target!(|bytes: &[u8]| {
+    let _ = Wish::parse(bytes);
+    let whole = Bytes::copy_from_slice(bytes);
+    // Also of what is no letter: whoever sends it is watched, too.
+    let envelope_len = Envelope::decode(&whole).map_or(bytes.len() / 2, |(_, len)| len);
+    let (envelope, payload) = (whole.slice(..envelope_len), whole.slice(envelope_len..));
+    what_is_written_is_read(&Letter::new(envelope, payload));
+    let mut joiner = Joiner::new();
+    joiner.handle_begin(Source(0), "somebody");
+    let mut now = Instant::now();
+    let mut told = HashSet::new();
+    let mut rest = bytes;
+    let mut number = 0_u64;
+    while let Some(([kind, wait, low, high], after)) = rest.split_first_chunk::<4>() {
+        let len = usize::from(u16::from_le_bytes([*low, *high])).min(after.len());
+        let (record, after) = after.split_at(len);
+        rest = after;
+        number += 1;
+        let source = Source(number % 3);
+        // What says that it is no record needs no help; the rest is made to look like one.
+        let record = match kind {
+            0 => record.to_vec(),
+            kind => repaired(*kind, record),
+        };
+        match Record::parse(&record.into()) {
+            Ok(record) => {
+                if let RecordBody::Letter { letter, .. } = &record.body {
+                    let given = letter.content.len();
+                    assert!(given <= MAX_CONTENT);
+                    assert!(given as u64 <= letter.content_len.unwrap_or(0));
+                }
+                joiner.handle(now, source, record);
+            }
+            Err(error) => {
+                assert!(!error.to_string().is_empty());
+                joiner.handle_malformed(source, error);
+            }
+        }
+        now += Duration::from_millis(u64::from(*wait));
+        while let Some(event) = joiner.poll_event(now) {
+            note(&event, &mut told);
+        }
+    }
+    while let Some(event) = joiner.finish() {
+        note(&event, &mut told);
+    }
+});
+
+fn note(event: &Event, told: &mut HashSet<(Incarnation, u64)>) {
+    if let Event::Letter(passage) = event {
+        let letter = (passage.stream.sender, passage.sequence);
+        assert!(told.insert(letter), "told twice");
+    }
+}
+
+/// With magic number, version and a kind, and with lengths that add up, so that what lies behind
+/// is looked at.
+fn repaired(kind: u8, record: &[u8]) -> Vec<u8> {
+    let mut record = record.to_vec();
+    record.resize(record.len().max(HEADER), 0);
+    record[..6].copy_from_slice(&[b'f', b'i', b'p', b'w', 1, kind % 8]);
+    let mut left = u32::try_from(record.len() - HEADER).expect("inputs are short");
+    for part in 0..5 {
+        let at = LENGTHS + part * 4;
+        let said: [u8; 4] = record[at..at + 4].try_into().expect("four bytes");
+        let len = match part {
+            4 => left,
+            _ => (u32::from_le_bytes(said) % 256).min(left),
+        };
+        left -= len;
+        record[at..at + 4].copy_from_slice(&len.to_le_bytes());
+    }
+    record
+}
+
+fn what_is_written_is_read(letter: &Letter) {
+    let notice = Notice {
+        stream: Stream {
+            sender: Incarnation::from_u64(7),
+            receiver: Incarnation::from_u64(8),
+        },
+        sequence: 3,
+        receiver: "arm_1".into(),
+        news: News::Sent {
+            send: Some(SendId(9)),
+            letter: letter.clone(),
+        },
+    };
+    for content in [0, 10, u32::MAX] {
+        let at = SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000);
+        let written = of(&notice, Wish { content }, at);
+        assert!(written.len() <= MAX_LEN);
+        let record = Record::parse(&written.into()).expect("what was written is read");
+        let RecordBody::Letter { letter: seen, .. } = record.body else {
+            panic!("another kind");
+        };
+        assert_eq!(seen.size, letter.len() as u64);
+        assert!(seen.content.len() as u64 <= u64::from(content));
+    }
+}
