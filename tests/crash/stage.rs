@@ -143,10 +143,6 @@ impl Drop for Actor {
     }
 }
 
-/// How many blocks of 512 bytes the survivors' own memory may grow by: pages that they have not
-/// written to before.
-const SLACK: u64 = 512;
-
 /// How many segments for many a process has at most.
 const SEGMENTS: usize = 8;
 
@@ -154,7 +150,9 @@ const SEGMENTS: usize = 8;
 #[derive(Debug, PartialEq, Eq)]
 struct Uses {
     files: BTreeSet<PathBuf>,
-    blocks: u64,
+    /// How long the files in shared memory are together: what they can come to take at most. What
+    /// they take grows until every part of them has been used once.
+    length: u64,
     descriptors: Vec<usize>,
 }
 
@@ -437,18 +435,16 @@ impl Stage {
         wait_for(
             || {
                 now = self.uses();
-                now.files == start.files
-                    && now.blocks <= start.blocks + SLACK
-                    && now.descriptors <= most
+                now.files == start.files && now.length <= start.length && now.descriptors <= most
             },
             || {
                 let now = self.uses();
                 format!(
-                    "left over: {:?}; missing: {:?}; blocks {} (from {}); descriptors {:?} (from {:?})",
+                    "left over: {:?}; missing: {:?}; length {} (from {}); descriptors {:?} (from {:?})",
                     now.files.difference(&start.files).collect::<Vec<_>>(),
                     start.files.difference(&now.files).collect::<Vec<_>>(),
-                    now.blocks,
-                    start.blocks,
+                    now.length,
+                    start.length,
                     now.descriptors,
                     start.descriptors
                 )
@@ -496,10 +492,11 @@ impl Stage {
             .partition(|file| self.is_kept(file));
         assert!(kept.len() <= 2 * SEGMENTS, "{kept:?}");
         Uses {
-            blocks: files
+            length: files
                 .iter()
+                .filter(|file| file.starts_with("/dev/shm"))
                 .filter_map(|file| std::fs::metadata(file).ok())
-                .map(|metadata| std::os::unix::fs::MetadataExt::blocks(&metadata))
+                .map(|metadata| metadata.len())
                 .sum(),
             files,
             descriptors: self.survivors().map(descriptors).collect(),

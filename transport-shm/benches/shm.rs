@@ -6,6 +6,10 @@
 //! memory that was loaned; `raw` is a bare iceoryx2 request of the same size and its response.
 //! `window` keeps eight rounds under way.
 //!
+//! A round of what is sent to 32 receivers ends when all have answered: `letters`, short ones; `one
+//! content`, that lies in memory once, filled and referred to by each letter; `copies`, the same as
+//! letters of their own. `fill` is that memory alone, filled and given back.
+//!
 //! Blocks of rounds of all kinds take turns, so that whatever else the machine does strikes all
 //! alike: compare the percentiles with each other, and never times of different runs.
 
@@ -45,7 +49,7 @@ const TAIL: usize = 1;
 
 /// An answer of iceoryx2's as long as the transport's.
 type RawAck = [u8; 184];
-type RawHeader = [u64; 11];
+type RawHeader = [u64; 13];
 type RawClient = Client<ipc_threadsafe::Service, [u8], RawHeader, RawAck, ()>;
 type RawPending = PendingResponse<ipc_threadsafe::Service, [u8], RawHeader, RawAck, ()>;
 type RawServer = Server<ipc_threadsafe::Service, [u8], RawHeader, RawAck, ()>;
@@ -56,7 +60,9 @@ fn main() {
     let blocks: usize = blocks.next_back().unwrap_or(40);
     let directory = tempfile::tempdir().expect("a directory");
     let (raw, ours) = (Raw::new(directory.path()), Ours::new(directory.path()));
-    let (raw, ours) = (&raw, &ours);
+    let crowd = Crowd::new(directory.path());
+    let (raw, ours, crowd) = (&raw, &ours, &crowd);
+    let large = Bytes::from(vec![7; 1 << 20]);
     let mut kinds = Vec::new();
     for size in [100, 1 << 10, 64 << 10, 1 << 20] {
         let payload = vec![7; FRONT + size + TAIL];
@@ -78,6 +84,17 @@ fn main() {
     let round = move || ours.many(&letter, BLOCK);
     kinds.push(Measured::new("window", size, OURS, BLOCK, round));
 
+    let size = large.len();
+    let fill = || drop(crowd.filled(&large));
+    kinds.push(Measured::new("fill", size, CROWD, 1, fill));
+    let short = parcel(Bytes::from(vec![7; 100]));
+    let letters = move || crowd.round(&short);
+    kinds.push(Measured::new("32 letters", 100, CROWD, 1, letters));
+    let once = || crowd.round(&parcel(crowd.filled(&large)));
+    kinds.push(Measured::new("32, one content", size, CROWD, 1, once));
+    let copies = || crowd.round(&parcel(large.clone()));
+    kinds.push(Measured::new("32 copies", size, CROWD, 1, copies));
+
     let turn = AtomicUsize::new(RAW);
     std::thread::scope(|scope| {
         scope.spawn(|| {
@@ -85,6 +102,7 @@ fn main() {
                 match turn.load(Ordering::Acquire) {
                     RAW => raw.serve(),
                     OURS => ours.serve(),
+                    CROWD => crowd.serve(),
                     _ => return,
                 }
             }
@@ -104,7 +122,8 @@ fn main() {
 /// Whom the receiving thread serves.
 const RAW: usize = 0;
 const OURS: usize = 1;
-const END: usize = 2;
+const CROWD: usize = 2;
+const END: usize = 3;
 
 /// A kind of round, and how long each took.
 struct Measured<'a> {
@@ -215,35 +234,102 @@ struct Ours {
     receiver: ShmTransport,
     to: Location,
     // After the endpoints, which have tasks here.
-    _runtime: tokio::runtime::Runtime,
+    _domain: Domain,
+}
+
+/// A domain of its own, for endpoints.
+struct Domain {
+    root: std::path::PathBuf,
+    prefix: String,
+    runtime: tokio::runtime::Runtime,
+}
+
+impl Domain {
+    fn new(directory: &std::path::Path) -> Self {
+        let prefix = format!("fipabench-{}", Incarnation::random());
+        Self {
+            root: directory.join(&prefix),
+            prefix,
+            runtime: tokio::runtime::Builder::new_multi_thread()
+                .worker_threads(1)
+                .enable_all()
+                .build()
+                .expect("a runtime"),
+        }
+    }
+
+    fn endpoint(&self) -> (ShmTransport, Arc<Count>) {
+        let config = ShmConfig::new(&self.root, &self.prefix, Incarnation::random());
+        let handle = self.runtime.handle().clone();
+        let endpoint = ShmTransport::new(config, handle).expect("an endpoint");
+        let sink = Arc::new(Count::default());
+        endpoint.listen(sink.clone()).expect("listening");
+        (endpoint, sink)
+    }
+}
+
+/// A sender, and many who receive the same.
+struct Crowd {
+    sender: ShmTransport,
+    sent: Arc<Count>,
+    receivers: Vec<ShmTransport>,
+    locations: Vec<Location>,
+    // After the endpoints, which have tasks here.
+    _domain: Domain,
+}
+
+impl Crowd {
+    fn new(directory: &std::path::Path) -> Self {
+        let domain = Domain::new(directory);
+        let (sender, sent) = domain.endpoint();
+        let receivers: Vec<_> = (0..32).map(|_| domain.endpoint().0).collect();
+        Self {
+            sender,
+            sent,
+            locations: receivers.iter().map(ShmTransport::location).collect(),
+            receivers,
+            _domain: domain,
+        }
+    }
+
+    fn serve(&self) {
+        for receiver in &self.receivers {
+            receiver.drive();
+        }
+    }
+
+    /// Content for many, written as an application writes it.
+    fn filled(&self, content: &[u8]) -> Bytes {
+        let loan = self.sender.loan_for_many(content.len()).expect("room");
+        let mut loan = loan.expect("long enough");
+        loan.content_mut().copy_from_slice(content);
+        loan.freeze()
+    }
+
+    fn round(&self, parcel: &Parcel) {
+        let before = self.sent.0.load(Ordering::Acquire);
+        for to in &self.locations {
+            let dispatched = self.sender.dispatch(AttemptId(1), to, parcel.clone());
+            dispatched.expect("room");
+        }
+        while self.sent.0.load(Ordering::Acquire) - before < self.locations.len() as u64 {
+            self.sender.drive();
+        }
+    }
 }
 
 impl Ours {
     fn new(directory: &std::path::Path) -> Self {
-        let runtime = tokio::runtime::Builder::new_multi_thread()
-            .worker_threads(1)
-            .enable_all()
-            .build()
-            .expect("a runtime");
-        let prefix = format!("fipabench-{}", Incarnation::random());
-        let endpoint = || {
-            let root = directory.join("domain");
-            let config = ShmConfig::new(root, &prefix, Incarnation::random());
-            let endpoint =
-                ShmTransport::new(config, runtime.handle().clone()).expect("an endpoint");
-            let sink = Arc::new(Count::default());
-            endpoint.listen(sink.clone()).expect("listening");
-            (endpoint, sink)
-        };
-        let (sender, sent) = endpoint();
-        let (receiver, _) = endpoint();
+        let domain = Domain::new(directory);
+        let (sender, sent) = domain.endpoint();
+        let (receiver, _) = domain.endpoint();
         let to = receiver.location();
         Self {
             sender,
             sent,
             receiver,
             to,
-            _runtime: runtime,
+            _domain: domain,
         }
     }
 

@@ -3,14 +3,14 @@
 //! When a process is killed, somebody has to remove its mailbox and its side of every connection.
 //! That must wait until its last letters have been taken by those who are alive: iceoryx2 0.10
 //! never lets go of memory for requests that it finds in the mailbox after their sender has been
-//! cleaned up. So whoever cleans up first rings all bells, then waits for [`GRACE`].
+//! cleaned up. So whoever cleans up first rings all bells, and waits until everybody has looked.
 
 use std::collections::HashSet;
 use std::os::fd::OwnedFd;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use fipa_transport::Incarnation;
 use iceoryx2::node::{Node, NodeState, NodeView};
@@ -20,11 +20,18 @@ use rustix::fs::{FlockOperation, Mode, OFlags, fchmod, flock, fstat, open, stat}
 
 use crate::layout::Svc;
 use crate::memory::SHM;
-use crate::presence::Names;
+use crate::presence::{Names, Neighbour, has_ended};
 use crate::{ShmConfig, ShmError};
 
-/// How long the living have to take the letters of the dead.
-pub(crate) const GRACE: Duration = Duration::from_millis(100);
+/// How long the living have to take the letters of the dead, who may be stopped, or have too
+/// little of the processor.
+const PATIENCE_TO_LOOK: Duration = Duration::from_secs(1);
+
+/// How long those have who do not listen yet, and may never.
+const GRACE: Duration = Duration::from_millis(100);
+
+/// How long to wait before asking again who has looked.
+const STEP: Duration = Duration::from_millis(5);
 
 /// What [`cleanup_dead`] did.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -41,8 +48,8 @@ pub struct Cleaned {
 /// Removes what killed processes of a domain left behind. For tools: an endpoint does this by
 /// itself when it starts, when it closes, and when it notices that a process it talks to is gone.
 ///
-/// Blocks for about a tenth of a second when processes are alive. The configuration's
-/// incarnation is not used; it must only be a known one.
+/// Blocks until all living processes have looked into their mailboxes, at most a second. The
+/// configuration's incarnation is not used; it must only be a known one.
 ///
 /// # Errors
 /// When the configuration makes no sense, or files cannot be listed.
@@ -51,9 +58,7 @@ pub fn cleanup_dead(config: &ShmConfig) -> Result<Cleaned, ShmError> {
     if !config.root.exists() {
         return Ok(Cleaned::default());
     }
-    if domain.ring_all()? > 0 {
-        std::thread::sleep(GRACE);
-    }
+    domain.settle()?;
     domain.clean(false)
 }
 
@@ -179,6 +184,36 @@ impl Domain {
             closed.map_err(|e| file_error("cannot close to other users", &path, e))?;
         }
         Ok(())
+    }
+
+    /// Waits until the living have taken what the dead have sent, and says how many there are.
+    ///
+    /// A look that was going on may have passed the letters by; the one after it, begun when the
+    /// dead were dead, has not.
+    pub(crate) fn settle(&self) -> Result<usize, ShmError> {
+        let all = self.all()?.into_iter();
+        let living = all.filter_map(|one| Neighbour::open(&self.names, one).ok());
+        let mut waited_for: Vec<_> = living.map(|one| (one.looks(), one)).collect();
+        let alive = waited_for.len();
+        let began = Instant::now();
+        loop {
+            let waited = began.elapsed();
+            waited_for.retain(|(before, one)| {
+                let patience = match before {
+                    0 => GRACE,
+                    _ => PATIENCE_TO_LOOK,
+                };
+                let has_looked = one.looks().wrapping_sub(*before) >= 2;
+                !has_looked && waited < patience && !has_ended(one.live().as_ref())
+            });
+            if waited_for.is_empty() || self.closing.load(Ordering::SeqCst) {
+                return Ok(alive);
+            }
+            for (_, one) in &waited_for {
+                one.ring();
+            }
+            std::thread::sleep(STEP);
+        }
     }
 
     /// Rings at every process, and says how many are there.

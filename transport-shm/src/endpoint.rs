@@ -15,7 +15,7 @@ use parking_lot::{Mutex, RwLock};
 use tokio::runtime::Handle;
 
 use crate::counters::{Tally, count};
-use crate::domain::{Domain, GRACE, file_error};
+use crate::domain::{Domain, file_error};
 use crate::inbox::{Inbox, mailbox_name};
 use crate::layout::Svc;
 use crate::library::Library;
@@ -98,7 +98,8 @@ impl Endpoint {
             .map_err(|e| failed("cannot make a node", format!("{e:?}")))?;
         domain.close_to_others()?;
         let library = Arc::new(Library::new(domain.clone()));
-        let inbox = Inbox::create(&config, &node, bell.clone(), tally.clone(), library.clone())
+        let told = (bell.clone(), presence.looks());
+        let inbox = Inbox::create(&config, &node, told, tally.clone(), library.clone())
             .map_err(|reason| failed("cannot make the mailbox", reason))?;
         let pool = Pool::new(
             config.incarnation,
@@ -456,14 +457,13 @@ impl Endpoint {
                 let Some(now) = endpoint.upgrade().filter(|now| !now.is_closed()) else {
                     return;
                 };
-                let alive = match now.domain.has_dead() {
-                    true => now.domain.ring_all().unwrap_or(0),
+                let domain = now.domain.clone();
+                drop(now);
+                let alive = match domain.has_dead() {
+                    true => domain.settle().unwrap_or(0),
                     false => 0,
                 };
-                drop(now);
-                if alive > 0 {
-                    std::thread::sleep(GRACE);
-                }
+                drop(domain);
                 let Some(now) = endpoint.upgrade().filter(|now| !now.is_closed()) else {
                     return;
                 };

@@ -18,7 +18,7 @@ use crate::counters::{Tally, count};
 use crate::layout::{Ack, Active, BlankAck, Header, MailServer, Places, Svc};
 use crate::library::{Borrowed, Library, NotRead};
 use crate::memory::populate;
-use crate::presence::Bell;
+use crate::presence::{Bell, Looks};
 use crate::segment::Reference;
 
 /// How many parcels are taken before anything else is looked at.
@@ -45,6 +45,7 @@ pub(crate) fn location_of(of: Incarnation) -> Location {
 pub(crate) struct Inbox {
     server: MailServer,
     lending: Arc<Lending>,
+    looks: Looks,
     tally: Arc<Tally>,
     max_letter: usize,
     copy_below: usize,
@@ -58,7 +59,7 @@ impl Inbox {
     pub(crate) fn create(
         config: &ShmConfig,
         node: &Node<Svc>,
-        bell: Arc<Bell>,
+        (bell, looks): (Arc<Bell>, Looks),
         tally: Arc<Tally>,
         library: Arc<Library>,
     ) -> Result<Self, String> {
@@ -102,6 +103,7 @@ impl Inbox {
                 tally: tally.clone(),
                 library,
             }),
+            looks,
             tally,
             max_letter: config.max_letter,
             copy_below: config.copy_below,
@@ -124,7 +126,10 @@ impl Inbox {
                         }
                     }
                 }
-                Ok(None) => return done > 0,
+                Ok(None) => {
+                    self.looks.one_more();
+                    return done > 0;
+                }
                 Err(ReceiveError::ExceedsMaxBorrows) => {
                     // Cannot happen as long as iceoryx2 counts as `Lending` does. Nothing is
                     // lost: the next content given back rings the bell.

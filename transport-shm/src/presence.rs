@@ -134,7 +134,7 @@ pub(crate) struct Presence {
     names: Names,
     own: Incarnation,
     bell: Arc<Bell>,
-    page: Page,
+    page: Arc<Page>,
     // Last: the other files are there as long as this one is open.
     _live: File,
 }
@@ -169,13 +169,18 @@ impl Presence {
             names: names.clone(),
             own,
             bell: Arc::new(Bell(bell)),
-            page: Page::map(&page, ProtFlags::READ | ProtFlags::WRITE)?,
+            page: Arc::new(Page::map(&page, ProtFlags::READ | ProtFlags::WRITE)?),
             _live,
         })
     }
 
     pub(crate) fn bell(&self) -> &Arc<Bell> {
         &self.bell
+    }
+
+    /// Where the process counts its looks.
+    pub(crate) fn looks(&self) -> Looks {
+        Looks(self.page.clone())
     }
 
     /// Says to others, until the result is dropped, that they need not ring.
@@ -200,6 +205,20 @@ impl Presence {
         self.page.words().heard.fetch_add(1, Ordering::SeqCst);
         // Whoever has read the count from before has put in what is found now.
         fence(Ordering::SeqCst);
+    }
+}
+
+/// How often a process has looked into its mailbox, told to others. Counted by one thread at a
+/// time.
+#[derive(Debug)]
+pub(crate) struct Looks(Arc<Page>);
+
+impl Looks {
+    /// The mailbox is empty, as far as this look goes.
+    pub(crate) fn one_more(&self) {
+        let looks = &self.0.words().looks;
+        let before = looks.load(Ordering::Relaxed);
+        looks.store(before.wrapping_add(1), Ordering::Release);
     }
 }
 
@@ -314,6 +333,17 @@ impl Neighbour {
         })
     }
 
+    /// How often the process has looked into its mailbox to the end; 0 when it does not listen
+    /// yet.
+    pub(crate) fn looks(&self) -> u64 {
+        self.page.words().looks.load(Ordering::Acquire)
+    }
+
+    /// Makes the process look, whether it is awake or not.
+    pub(crate) fn ring(&self) {
+        ring(&self.bell);
+    }
+
     /// What becomes readable when the process ends.
     pub(crate) fn live(&self) -> &Arc<OwnedFd> {
         &self.live
@@ -398,6 +428,10 @@ struct Words {
     lookers: AtomicU32,
     /// How often the process has silenced its bell before it looked.
     heard: AtomicU64,
+    /// What is written often does not disturb those who read the others.
+    _apart: [u64; 6],
+    /// How often the process has found its mailbox empty, or emptied it.
+    looks: AtomicU64,
 }
 
 /// A mapped page.

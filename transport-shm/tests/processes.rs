@@ -26,7 +26,7 @@ struct Process {
 }
 
 impl Process {
-    /// Roles: `receive` what comes and keep it; `tell` where its content lies, besides; `send` to
+    /// Roles: `receive` what comes and keep it, or `drop` it; `tell` where its content lies, besides; `send` to
     /// a process without end, or `many`, which is content for many.
     fn start(place: &Place, role: &str, to: Incarnation) -> Self {
         let config = place.config();
@@ -105,6 +105,10 @@ fn a_process_of_its_own() {
     loop {
         match role {
             "receive" => std::thread::park(),
+            "drop" => {
+                told.arrived.lock().unwrap().clear();
+                std::thread::sleep(std::time::Duration::from_millis(1));
+            }
             "tell" => {
                 wait_for_ever(|| told.arrivals() > seen);
                 let content = told.content(seen);
@@ -265,7 +269,8 @@ fn content_of_a_killed_sender_stays() {
     let (receiver, got) = place.listening();
     let own = receiver.location().incarnation();
     let mut sender = Process::start(&place, "send", own);
-    wait_for("letter", || got.arrivals() > 0);
+    // More than are taken at a time, so that it is known.
+    wait_for("letters", || got.arrivals() > 64);
     sender.kill();
     wait_for("notice", || receiver.counters().peers_gone == 1);
     let dead = sender.incarnation.to_string();
@@ -314,6 +319,31 @@ fn a_receiver_survives_more_killed_senders_than_it_has_connections() {
     drop((sender, receiver));
     cleanup_dead(&place.config()).unwrap();
     assert_eq!(place.traces(), Vec::<String>::new());
+}
+
+#[test]
+fn the_dead_are_cleaned_up_after_when_their_last_letters_have_been_taken() {
+    let place = Place::new();
+    let (receiver, connected) = (
+        Process::start(&place, "drop", Incarnation::from_u64(1)),
+        |file: &String| file.ends_with(".connection"),
+    );
+    let connections = || place.traces().iter().filter(|file| connected(file)).count();
+    let mut sender = Process::start(&place, "send", receiver.incarnation);
+    wait_for("connection", || connections() >= 2);
+    // Too busy to look for longer than anybody might think it takes.
+    receiver.signal("-STOP");
+    std::thread::sleep(std::time::Duration::from_millis(50));
+    sender.kill();
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            std::thread::sleep(std::time::Duration::from_millis(300));
+            receiver.signal("-CONT");
+        });
+        let cleaned = cleanup_dead(&place.config()).unwrap();
+        assert_eq!((cleaned.alive, cleaned.failed), (1, 0));
+    });
+    wait_for("end of the connection", || connections() == 0);
 }
 
 #[test]
