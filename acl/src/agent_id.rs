@@ -121,6 +121,11 @@ impl AgentId {
         self.name == other.name
     }
 
+    /// Whether there is nothing but the name.
+    pub(crate) fn is_plain(&self) -> bool {
+        self.addresses.is_empty() && self.resolvers.is_empty() && self.user_defined.is_empty()
+    }
+
     fn depth(&self) -> usize {
         let below = self.resolvers.iter().map(|resolver| resolver.depth() + 1);
         below.max().unwrap_or(0)

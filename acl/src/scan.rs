@@ -131,24 +131,29 @@ pub(crate) fn find_byte(bytes: &[u8], byte: u8) -> Option<usize> {
 #[inline]
 pub(crate) fn any(bytes: &[u8], found: impl Fn(u64) -> u64) -> bool {
     let mut marks = 0;
+    each(bytes, |word| marks |= found(word));
+    marks & TOPS != 0
+}
+
+/// Looks at all bytes, at some twice, and at letters besides.
+#[inline(always)]
+pub(crate) fn each(bytes: &[u8], mut look: impl FnMut(u64)) {
     match (bytes.as_chunks::<8>(), bytes.last_chunk()) {
         // The last eight overlap those in front of them.
         ((eights, _), Some(last)) => {
             for eight in eights {
-                marks |= found(u64::from_le_bytes(*eight));
+                look(u64::from_le_bytes(*eight));
             }
-            marks |= found(u64::from_le_bytes(*last));
+            look(u64::from_le_bytes(*last));
         }
         ((_, rest), None) => {
-            // Letters, which nobody looks for.
             let mut eight = [b'a'; 8];
             for (filled, byte) in eight.iter_mut().zip(rest) {
                 *filled = *byte;
             }
-            marks |= found(u64::from_le_bytes(eight));
+            look(u64::from_le_bytes(eight));
         }
     }
-    marks & TOPS != 0
 }
 
 #[cfg(test)]

@@ -29,15 +29,41 @@ pub(crate) enum Shape {
 }
 
 impl Shape {
-    #[inline]
+    #[inline(always)]
     pub(crate) fn of(text: impl AsRef<[u8]>) -> Self {
         let bytes = text.as_ref();
-        let (no_token, care) = classes(bytes);
-        let starts_well = match bytes.first() {
-            None | Some(b'0'..=b'9' | b'#' | b'-' | b'@' | b'"') => false,
-            Some(_) => true,
+        // Most texts have none of the characters up to the parentheses but blanks, and no
+        // backslashes.
+        let (low, odd) = match (bytes.first_chunk(), bytes.last_chunk(), bytes.len()) {
+            (Some(first), Some(last), ..=16) => odds::<8>(first, last),
+            (Some(_), Some(_), 17..=32) => match (bytes.first_chunk(), bytes.last_chunk()) {
+                (Some(first), Some(last)) => odds::<16>(first, last),
+                _ => return Self::of_any(bytes),
+            },
+            _ => return Self::of_any(bytes),
         };
-        if starts_well && no_token == 0 {
+        if odd {
+            Self::of_any(bytes)
+        } else if low || Self::is_excluded(bytes) {
+            Self::Quotable
+        } else {
+            Self::Word
+        }
+    }
+
+    /// Whether the first character is none of a word.
+    #[inline]
+    fn is_excluded(bytes: &[u8]) -> bool {
+        matches!(
+            bytes.first(),
+            None | Some(b'0'..=b'9' | b'#' | b'-' | b'@' | b'"')
+        )
+    }
+
+    #[inline(never)]
+    fn of_any(bytes: &[u8]) -> Self {
+        let (no_token, care) = classes(bytes);
+        if !Self::is_excluded(bytes) && no_token == 0 {
             Self::Word
         } else if care == 0 {
             Self::Quotable
@@ -47,32 +73,32 @@ impl Shape {
     }
 }
 
+/// Whether there are bytes up to the parentheses in a text that begins and ends so, and whether there
+/// are others than blanks among them, or backslashes. Written so that the compiler makes a few
+/// instructions of it that look at all bytes at once.
+#[inline(always)]
+fn odds<const N: usize>(first: &[u8; N], last: &[u8; N]) -> (bool, bool) {
+    let (mut low, mut odd) = (0, 0);
+    for (one, other) in first.iter().zip(last) {
+        for byte in [*one, *other] {
+            let is_low = u8::from(byte < b'*');
+            low |= is_low;
+            odd |= is_low & u8::from(byte != b' ') | u8::from(byte == b'\\');
+        }
+    }
+    (low != 0, odd != 0)
+}
+
 /// Two numbers, neither of which is zero if there are bytes that no token has (blanks, parentheses
 /// and control characters), or bytes that need care in quotation marks (those and backslashes).
 #[inline]
 fn classes(bytes: &[u8]) -> (u64, u64) {
     let (mut no_token, mut care) = (0, 0);
-    let mut look = |eight: [u8; 8]| {
-        let word = u64::from_le_bytes(eight);
-        // Exact as to whether there is one.
+    // Exact as to whether there is one.
+    scan::each(bytes, |word| {
         no_token |= scan::no_token(word) & TOPS;
         care |= (scan::is(word, b'"') | scan::is(word, b'\\')) & TOPS;
-    };
-    match (bytes.as_chunks::<8>(), bytes.last_chunk()) {
-        // The last eight overlap those in front of them.
-        ((eights, _), Some(last)) => {
-            eights.iter().for_each(|eight| look(*eight));
-            look(*last);
-        }
-        ((_, rest), None) => {
-            // Letters, which are neither.
-            let mut eight = [b'a'; 8];
-            for (filled, byte) in eight.iter_mut().zip(rest) {
-                *filled = *byte;
-            }
-            look(eight);
-        }
-    }
+    });
     (no_token, care)
 }
 

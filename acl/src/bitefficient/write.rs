@@ -24,11 +24,9 @@ pub fn encode(message: &Message, out: &mut impl BufMut) {
     let content_len = message.content.as_ref().map(Bytes::len);
     let mut sink = Sink::new(out);
     write_head(message, content_len, &mut sink);
+    sink.slice(message.content.as_deref().unwrap_or_default());
+    sink.slice(TAIL);
     sink.flush();
-    if let Some(content) = &message.content {
-        out.put_slice(content);
-    }
-    out.put_slice(TAIL);
 }
 
 impl Message {
@@ -126,6 +124,11 @@ impl<'a, B: BufMut> Sink<'a, B> {
         }
     }
 
+    #[inline(never)]
+    fn slices(&mut self, slices: [&[u8]; 3]) {
+        slices.into_iter().for_each(|slice| self.slice(slice));
+    }
+
     /// Hands on what was collected; to be called in the end.
     fn flush(&mut self) {
         let collected = self.collected.get(..self.len).unwrap_or_default();
@@ -156,7 +159,7 @@ impl<B: BufMut> Out for Sink<'_, B> {
     }
 
     /// All at once, where there is room.
-    #[inline]
+    #[inline(always)]
     fn framed<const N: usize, const M: usize>(
         &mut self,
         before: [u8; N],
@@ -169,14 +172,30 @@ impl<B: BufMut> Out for Sink<'_, B> {
             && let Some((last, _)) = room.split_first_chunk_mut::<M>()
         {
             *first = before;
-            middle.copy_from_slice(bytes);
+            copy_short(middle, bytes);
             *last = behind;
             self.len += N + bytes.len() + M;
         } else {
-            self.slice(&before);
-            self.slice(bytes);
-            self.slice(&behind);
+            self.slices([&before, bytes, &behind]);
         }
+    }
+}
+
+/// Copies a few bytes: in two that overlap, which is quicker than to call the function for many.
+#[inline(always)]
+fn copy_short(to: &mut [u8], from: &[u8]) {
+    if from.len() <= 16
+        && let (Some(first), Some(last)) = (from.first_chunk::<8>(), from.last_chunk::<8>())
+    {
+        to.first_chunk_mut().into_iter().for_each(|to| *to = *first);
+        to.last_chunk_mut().into_iter().for_each(|to| *to = *last);
+    } else if from.len() <= 32
+        && let (Some(first), Some(last)) = (from.first_chunk::<16>(), from.last_chunk::<16>())
+    {
+        to.first_chunk_mut().into_iter().for_each(|to| *to = *first);
+        to.last_chunk_mut().into_iter().for_each(|to| *to = *last);
+    } else {
+        to.copy_from_slice(from);
     }
 }
 
@@ -200,9 +219,15 @@ fn write_head(message: &Message, content_len: Option<usize>, out: &mut impl Out)
             write_word(message.performative.as_str(), out);
         }
     }
-    if let Some(sender) = &message.sender {
-        out.byte(0x02);
-        write_agent_id(sender, out);
+    match &message.sender {
+        Some(sender) if sender.is_plain() => {
+            out.framed(*b"\x02\x02\x10", sender.name().as_bytes(), *b"\x00\x01");
+        }
+        Some(sender) => {
+            out.byte(0x02);
+            write_agent_id(sender, out);
+        }
+        None => {}
     }
     write_set(0x03, &message.receivers, out);
     write_text(0x05, message.reply_with.as_deref(), out);
@@ -244,9 +269,19 @@ fn write_text(code: u8, text: Option<&str>, out: &mut impl Out) {
 }
 
 fn write_set(code: u8, agents: &[AgentId], out: &mut impl Out) {
-    if !agents.is_empty() {
-        out.byte(code);
-        write_agent_ids(agents, out);
+    match agents {
+        [] => {}
+        [agent] if agent.is_plain() => {
+            out.framed(
+                [code, 0x02, 0x10],
+                agent.name().as_bytes(),
+                *b"\x00\x01\x01",
+            );
+        }
+        _ => {
+            out.byte(code);
+            write_agent_ids(agents, out);
+        }
     }
 }
 
@@ -371,8 +406,17 @@ fn write_seconds(time: Time, out: &mut impl Out) {
 /// A number below 100.
 #[inline]
 fn two_digits(number: u16) -> u8 {
-    let (tens, ones) = (number / 10, number % 10);
-    ((tens + 1) << 4 | (ones + 1)) as u8
+    const DIGITS: [u8; 100] = {
+        let mut digits = [0; 100];
+        let mut number = 0;
+        while number < digits.len() {
+            digits[number] = ((number / 10 + 1) << 4 | (number % 10 + 1)) as u8;
+            number += 1;
+        }
+        digits
+    };
+    // No field of a time is above that.
+    DIGITS.get(usize::from(number)).copied().unwrap_or(0x11)
 }
 
 /// Digits (FIPA00069 2.2) of a number.
