@@ -1,11 +1,14 @@
 //! Messages to bytes and back, whatever the encoding: the way into the modules that know one each.
 
-use bytes::Bytes;
+use bytes::{BufMut, Bytes};
 
 use crate::bitefficient::dialects::{self, Peer};
+use crate::bitefficient::write::{Counter, Out, Sink};
 use crate::envelope::encode as encode_envelope;
 use crate::error::{DecodeError, EncodeError};
-use crate::{Dialect, Envelope, Message, MessageView, Payload, Representation, string, xml};
+use crate::{
+    Dialect, Envelope, Message, MessageView, Payload, Representation, bitefficient, string, xml,
+};
 
 impl Message {
     /// Reads an encoded message, whichever encoding and dialect it is in: its first bytes tell.
@@ -37,14 +40,76 @@ impl Message {
         representation: Representation,
         dialect: Dialect,
     ) -> Result<Bytes, EncodeError> {
-        match representation {
-            Representation::BitEfficient => match dialect {
-                Dialect::Standard => Ok(self.to_payload().to_bytes()),
-                Dialect::FipaServices => dialects::encode(self, Peer::FipaServices),
-                Dialect::Jade => dialects::encode(self, Peer::Jade),
-            },
-            Representation::String => string::encode(self, dialect),
-            Representation::Xml => xml::encode(self, dialect),
+        if (representation, dialect) == (Representation::BitEfficient, Dialect::Standard) {
+            return Ok(self.to_payload().to_bytes());
+        }
+        let content_len = self.content().map_or(0, Bytes::len);
+        let mut out = Vec::with_capacity(content_len.saturating_add(512));
+        self.write(representation, dialect, &mut out)?;
+        Ok(out.into())
+    }
+
+    /// How many bytes [`encode_into`](Self::encode_into) writes.
+    ///
+    /// # Errors
+    /// Like [`encode`](Self::encode).
+    pub fn encoded_len(
+        &self,
+        representation: Representation,
+        dialect: Dialect,
+    ) -> Result<usize, EncodeError> {
+        if (representation, dialect) == (Representation::BitEfficient, Dialect::Standard) {
+            return Ok(bitefficient::encoded_len(self));
+        }
+        let mut counter = Counter(0);
+        self.write(representation, dialect, &mut counter)?;
+        Ok(counter.0)
+    }
+
+    /// Writes the encoded message into memory that is there: [`encoded_len`](Self::encoded_len)
+    /// bytes. Of a message that cannot be encoded, a part may have been written.
+    ///
+    /// # Errors
+    /// Like [`encode`](Self::encode).
+    ///
+    /// # Panics
+    /// When the buffer has a limit and less room than that.
+    pub fn encode_into(
+        &self,
+        representation: Representation,
+        dialect: Dialect,
+        out: &mut impl BufMut,
+    ) -> Result<(), EncodeError> {
+        if (representation, dialect) == (Representation::BitEfficient, Dialect::Standard) {
+            bitefficient::encode(self, out);
+            return Ok(());
+        }
+        let mut sink = Sink::new(out);
+        let written = self.write(representation, dialect, &mut sink);
+        sink.flush();
+        written
+    }
+
+    /// Writes other representations and dialects than the bit-efficient one of the standard.
+    fn write(
+        &self,
+        representation: Representation,
+        dialect: Dialect,
+        out: &mut dyn Out,
+    ) -> Result<(), EncodeError> {
+        match (representation, dialect) {
+            (Representation::BitEfficient, Dialect::Standard) => {
+                out.slice(&self.to_payload().to_bytes());
+                Ok(())
+            }
+            (Representation::BitEfficient, Dialect::FipaServices) => {
+                dialects::encode(self, Peer::FipaServices, out)
+            }
+            (Representation::BitEfficient, Dialect::Jade) => {
+                dialects::encode(self, Peer::Jade, out)
+            }
+            (Representation::String, _) => string::encode(self, dialect, out),
+            (Representation::Xml, _) => xml::encode(self, dialect, out),
         }
     }
 }
@@ -67,7 +132,11 @@ impl Envelope {
     ) -> Result<Bytes, EncodeError> {
         match representation {
             Representation::BitEfficient => encode_envelope(self, dialect),
-            Representation::Xml => xml::encode_envelope(self, dialect),
+            Representation::Xml => {
+                let mut out = Vec::with_capacity(1024);
+                xml::encode_envelope(self, dialect, &mut out)?;
+                Ok(out.into())
+            }
             other @ Representation::String => Err(EncodeError::UnsupportedRepresentation(other)),
         }
     }

@@ -6,8 +6,8 @@ mod arbitrary;
 
 use bytes::{Bytes, BytesMut};
 use fipa_acl::{
-    AgentId, DecodeError, Envelope, EnvelopeView, Explanation, Letter, Message, MessageView,
-    Payload, Performative, Representation, bitefficient, explain,
+    AgentId, DecodeError, Dialect, Envelope, EnvelopeView, Explanation, Letter, Message,
+    MessageView, Payload, Performative, Representation, bitefficient, explain,
 };
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -111,6 +111,28 @@ fn never_panics(bytes: &[u8]) {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(192))]
+
+    #[test]
+    fn every_length_is_known_before(message in message().boxed()) {
+        for representation in [
+            Representation::BitEfficient,
+            Representation::String,
+            Representation::Xml,
+        ] {
+            for dialect in [Dialect::Standard, Dialect::FipaServices, Dialect::Jade] {
+                let len = message.encoded_len(representation, dialect);
+                let written = message.encode(representation, dialect);
+                prop_assert_eq!(len.clone(), written.as_ref().map(Bytes::len).map_err(Clone::clone));
+                let Ok(written) = written else { continue };
+                // As much room as there has to be, and no more.
+                let mut room = vec![0; written.len()];
+                let mut out = &mut room[..];
+                message.encode_into(representation, dialect, &mut out).unwrap();
+                prop_assert_eq!(out.len(), 0);
+                prop_assert_eq!(&room[..], &written[..]);
+            }
+        }
+    }
 
     #[test]
     fn a_message_survives(message in message().boxed()) {

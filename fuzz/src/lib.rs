@@ -25,9 +25,15 @@ pub fn message_survives(message: &Message) {
         Representation::Xml,
     ] {
         for dialect in DIALECTS {
+            let len = message.encoded_len(representation, dialect);
             let Ok(written) = message.encode(representation, dialect) else {
+                assert!(len.is_err());
                 continue;
             };
+            assert_eq!(len, Ok(written.len()));
+            let mut into = Vec::new();
+            let again = message.encode_into(representation, dialect, &mut into);
+            assert_eq!((again, &into[..]), (Ok(()), &written[..]));
             assert_eq!(Representation::detect(&written), Some(representation));
             let again = Message::decode(&written.into());
             let again = again.unwrap_or_else(|error| {

@@ -18,26 +18,20 @@ pub(crate) enum Peer {
     Jade,
 }
 
-/// The encoded message.
+/// Writes the encoded message.
 ///
 /// # Errors
 /// When the peer could not read what the message says.
-pub(crate) fn encode(message: &Message, peer: Peer) -> Result<Bytes, EncodeError> {
-    let content_len = message.content.as_ref().map_or(0, Bytes::len);
-    let mut writer = Writer {
-        out: Vec::with_capacity(content_len.saturating_add(512)),
-        peer,
-    };
-    writer.message(message)?;
-    Ok(writer.out.into())
+pub(crate) fn encode(message: &Message, peer: Peer, out: &mut dyn Out) -> Result<(), EncodeError> {
+    Writer { out, peer }.message(message)
 }
 
-struct Writer {
-    out: Vec<u8>,
+struct Writer<'a> {
+    out: &'a mut dyn Out,
     peer: Peer,
 }
 
-impl Writer {
+impl Writer<'_> {
     fn message(&mut self, message: &Message) -> Result<(), EncodeError> {
         self.out.slice(&[0xfa, 0x10]);
         self.performative(&message.performative)?;
@@ -225,37 +219,33 @@ impl Writer {
             let why = "JADE would misread a text in quotation marks of this length";
             return Err(EncodeError::Unrepresentable { what, why });
         }
-        write_len(text.len(), &mut self.out);
+        write_len(text.len(), self.out);
         self.out.slice(text.as_bytes());
         Ok(())
     }
 
     /// As a string where it can stand there as one, else with its length in front.
     fn content(&mut self, content: &Bytes) {
-        let before = self.out.len();
-        self.out.byte(0x14);
-        if self.peer == Peer::FipaServices {
-            self.out.slice(format!("#{}\"", content.len()).as_bytes());
-        }
-        let start = self.out.len();
-        self.out.slice(content);
-        // The copy is looked at, because nobody vouches that shared memory stays as it is.
-        let copy = self.out.get(start..).unwrap_or_default();
-        let is_string = memchr::memchr(0, copy).is_none()
+        // A copy, because nobody vouches that shared memory stays as it is.
+        let content = content.to_vec();
+        let is_string = memchr::memchr(0, &content).is_none()
             && match self.peer {
                 Peer::FipaServices => true,
                 Peer::Jade => {
-                    string_form(copy).0 == Form::Bare && std::str::from_utf8(copy).is_ok()
+                    string_form(&content).0 == Form::Bare && std::str::from_utf8(&content).is_ok()
                 }
             };
-        if is_string {
-            self.out.byte(0x00);
+        if !is_string {
+            write_len(content.len(), self.out);
+            self.out.slice(&content);
             return;
         }
-        let copy = self.out.split_off(start);
-        self.out.truncate(before);
-        write_len(copy.len(), &mut self.out);
-        self.out.slice(&copy);
+        self.out.byte(0x14);
+        match self.peer {
+            Peer::FipaServices => self.counted(&content),
+            Peer::Jade => self.out.slice(&content),
+        }
+        self.out.byte(0x00);
     }
 
     fn counted(&mut self, bytes: &[u8]) {
@@ -265,9 +255,9 @@ impl Writer {
 
     fn time(&mut self, time: Time) -> Result<(), EncodeError> {
         match self.peer {
-            Peer::Jade => write_date_time(time, &mut self.out),
+            Peer::Jade => write_date_time(time, self.out),
             Peer::FipaServices => {
-                write_local_date_time(local_time("reply-by", time)?, &mut self.out);
+                write_local_date_time(local_time("reply-by", time)?, self.out);
             }
         }
         Ok(())

@@ -86,14 +86,16 @@ pub(crate) trait Out {
         before: [u8; N],
         bytes: &[u8],
         behind: [u8; M],
-    ) {
+    ) where
+        Self: Sized,
+    {
         self.slice(&before);
         self.slice(bytes);
         self.slice(&behind);
     }
 }
 
-struct Counter(usize);
+pub(crate) struct Counter(pub(crate) usize);
 
 impl Out for Counter {
     #[inline]
@@ -109,14 +111,14 @@ impl Out for Counter {
 
 /// Collects the many small pieces of a head, because every one of them costs a growing buffer a
 /// check of its room.
-struct Sink<'a, B: BufMut> {
+pub(crate) struct Sink<'a, B: BufMut> {
     out: &'a mut B,
     collected: [u8; 256],
     len: usize,
 }
 
 impl<'a, B: BufMut> Sink<'a, B> {
-    fn new(out: &'a mut B) -> Self {
+    pub(crate) fn new(out: &'a mut B) -> Self {
         Self {
             out,
             collected: [0; 256],
@@ -130,7 +132,7 @@ impl<'a, B: BufMut> Sink<'a, B> {
     }
 
     /// Hands on what was collected; to be called in the end.
-    fn flush(&mut self) {
+    pub(crate) fn flush(&mut self) {
         let collected = self.collected.get(..self.len).unwrap_or_default();
         self.out.put_slice(collected);
         self.len = 0;
@@ -341,7 +343,7 @@ fn write_expression(text: &str, out: &mut impl Out) {
 }
 
 /// Code and length of a `BinString` that is given with its length.
-pub(crate) fn write_len(len: usize, out: &mut impl Out) {
+pub(crate) fn write_len(len: usize, out: &mut (impl Out + ?Sized)) {
     if let Ok(len) = u8::try_from(len) {
         out.slice(&[0x16, len]);
     } else if let Ok(len) = u16::try_from(len) {
@@ -356,7 +358,7 @@ pub(crate) fn write_len(len: usize, out: &mut impl Out) {
 }
 
 /// A `BinDateTime` (FIPA00069 2.3), three digits of milliseconds and padding.
-pub(crate) fn write_date_time(time: Time, out: &mut impl Out) {
+pub(crate) fn write_date_time(time: Time, out: &mut (impl Out + ?Sized)) {
     let base = match time.base {
         Base::Absolute => 0x20,
         Base::After => 0x21,
@@ -380,7 +382,7 @@ pub(crate) fn write_date_time(time: Time, out: &mut impl Out) {
 }
 
 /// The same as fipa_services writes it, whatever the zone: four digits of milliseconds.
-pub(crate) fn write_local_date_time(time: Time, out: &mut impl Out) {
+pub(crate) fn write_local_date_time(time: Time, out: &mut (impl Out + ?Sized)) {
     out.byte(0x20);
     write_seconds(time, out);
     let millisecond = time.fields.millisecond;
@@ -388,7 +390,7 @@ pub(crate) fn write_local_date_time(time: Time, out: &mut impl Out) {
 }
 
 /// Year to seconds.
-fn write_seconds(time: Time, out: &mut impl Out) {
+fn write_seconds(time: Time, out: &mut (impl Out + ?Sized)) {
     let Fields {
         year,
         month,

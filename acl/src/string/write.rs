@@ -7,29 +7,28 @@ use bytes::Bytes;
 use super::agent_id::SLOTS;
 use super::lex::{Keywords, holds_keyword};
 use super::read::PARAMETERS;
+use crate::bitefficient::write::Out;
 use crate::dialect::{BASE64, JADE_ENCODING, announces_base64, check_word, local_time, not_a_word};
 use crate::error::EncodeError;
 use crate::time::Time;
 use crate::word::{Piece, is_quotable, is_token, is_word, quoted, string_literal};
 use crate::{AgentId, Dialect, Message, Performative, Text};
 
-/// The string message: parameters in the order of the standard, but content last.
-pub(crate) fn encode(message: &Message, dialect: Dialect) -> Result<Bytes, EncodeError> {
-    let content_len = message.content.as_ref().map_or(0, Bytes::len);
-    let mut writer = Writer {
-        out: Vec::with_capacity(content_len.saturating_add(512)),
-        dialect,
-    };
-    writer.message(message)?;
-    Ok(writer.out.into())
+/// Writes the string message: parameters in the order of the standard, but content last.
+pub(crate) fn encode(
+    message: &Message,
+    dialect: Dialect,
+    out: &mut dyn Out,
+) -> Result<(), EncodeError> {
+    Writer { out, dialect }.message(message)
 }
 
-struct Writer {
-    out: Vec<u8>,
+struct Writer<'a> {
+    out: &'a mut dyn Out,
     dialect: Dialect,
 }
 
-impl Writer {
+impl Writer<'_> {
     fn message(&mut self, message: &Message) -> Result<(), EncodeError> {
         let announced = |(name, value): &(String, String)| {
             let (name, value) = (name.as_bytes(), value.as_bytes());
@@ -257,36 +256,24 @@ impl Writer {
 
     /// In quotation marks if it is text that can stand there, else in Base64.
     fn content_for_jade(&mut self, content: &Bytes) {
-        let before = self.out.len();
-        self.key("content");
-        self.push("\"");
-        let start = self.out.len();
-        self.out.extend_from_slice(content);
-        // The copy is looked at, because nobody vouches that shared memory stays as it is.
-        let copy = self.out.get(start..).unwrap_or_default();
-        let is_text = !copy.contains(&0) && std::str::from_utf8(copy).is_ok();
-        if is_text && memchr::memchr(b'"', copy).is_none() && copy.last() != Some(&b'\\') {
+        // A copy, because nobody vouches that shared memory stays as it is.
+        let content = content.to_vec();
+        let text = std::str::from_utf8(&content)
+            .ok()
+            .filter(|text| memchr::memchr(0, text.as_bytes()).is_none() && is_quotable(text));
+        let Some(text) = text else {
+            self.colon("X-");
+            self.push(JADE_ENCODING);
+            self.space();
+            self.push(BASE64);
+            self.key("content");
+            self.push("\"");
+            self.push(&BASE64_ENGINE.encode(&content));
             self.push("\"");
             return;
-        }
-        let copy = self.out.split_off(start);
-        self.out.truncate(before);
-        if is_text
-            && let Ok(text) = std::str::from_utf8(&copy)
-            && is_quotable(text)
-        {
-            self.key("content");
-            quoted(text, |piece| self.push(piece));
-            return;
-        }
-        self.colon("X-");
-        self.push(JADE_ENCODING);
-        self.space();
-        self.push(BASE64);
+        };
         self.key("content");
-        self.push("\"");
-        self.push(&BASE64_ENGINE.encode(&copy));
-        self.push("\"");
+        quoted(text, |piece| self.push(piece));
     }
 
     fn time(&mut self, time: Time) -> Result<(), EncodeError> {
@@ -315,7 +302,7 @@ impl Writer {
         self.push("#");
         self.push(&bytes.len().to_string());
         self.push("\"");
-        self.out.extend_from_slice(bytes);
+        self.out.slice(bytes);
     }
 
     fn space(&mut self) {
@@ -325,7 +312,7 @@ impl Writer {
     }
 
     fn push(&mut self, text: &str) {
-        self.out.extend_from_slice(text.as_bytes());
+        self.out.slice(text.as_bytes());
     }
 }
 

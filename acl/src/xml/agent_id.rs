@@ -218,7 +218,7 @@ pub(super) enum Form {
 
 /// Writes elements with agent identifiers in them, all in one where the dialect's reader takes it.
 pub(super) fn write_all(
-    out: &mut Out,
+    out: &mut Out<'_>,
     element: &str,
     agents: &[AgentId],
     form: Form,
@@ -242,7 +242,7 @@ pub(super) fn write_all(
 }
 
 pub(super) fn write(
-    out: &mut Out,
+    out: &mut Out<'_>,
     agent: &AgentId,
     form: Form,
     dialect: Dialect,
@@ -290,7 +290,7 @@ pub(super) fn write(
 }
 
 fn write_value(
-    out: &mut Out,
+    out: &mut Out<'_>,
     (element, attribute): (&str, &str),
     what: &'static str,
     value: &str,

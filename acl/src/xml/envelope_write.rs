@@ -1,22 +1,25 @@
 //! Writing envelopes (FIPA00085).
 
-use bytes::Bytes;
-
+use crate::bitefficient::write;
 use crate::dialect::local_time;
 use crate::error::EncodeError;
 use crate::xml::agent_id::{self, Form};
 use crate::xml::out::Out;
 use crate::{Dialect, Envelope, EnvelopeParams, Received, Time};
 
-/// The encoded envelope, all extensions included.
+/// Writes the encoded envelope, all extensions included.
 ///
 /// JADE reads one part only and gets the parameters that count; older stamps are not among them.
 /// fipa_services reads times without a zone only; it gets them without.
 ///
 /// # Errors
 /// When XML cannot carry it, or the reader that the dialect is for cannot read what it says.
-pub(crate) fn encode(envelope: &Envelope, dialect: Dialect) -> Result<Bytes, EncodeError> {
-    let mut out = Out::new(dialect);
+pub(crate) fn encode(
+    envelope: &Envelope,
+    dialect: Dialect,
+    out: &mut dyn write::Out,
+) -> Result<(), EncodeError> {
+    let mut out = Out::new(out, dialect);
     out.raw(match dialect {
         Dialect::Standard => "<?xml version=\"1.0\"?>",
         Dialect::FipaServices => "<?xml version=\"1.0\" ?>",
@@ -32,11 +35,11 @@ pub(crate) fn encode(envelope: &Envelope, dialect: Dialect) -> Result<Bytes, Enc
         }
     }
     out.close("envelope");
-    Ok(out.into_bytes())
+    Ok(())
 }
 
 fn write_part(
-    out: &mut Out,
+    out: &mut Out<'_>,
     index: usize,
     params: &EnvelopeParams,
     dialect: Dialect,
@@ -91,7 +94,11 @@ fn write_part(
     Ok(())
 }
 
-fn write_received(out: &mut Out, received: &Received, dialect: Dialect) -> Result<(), EncodeError> {
+fn write_received(
+    out: &mut Out<'_>,
+    received: &Received,
+    dialect: Dialect,
+) -> Result<(), EncodeError> {
     let date = time_text("received-date", received.date, dialect)?;
     let by = ("received-by", Some(received.by.as_str()));
     let from = ("received-from", received.from.as_deref());
@@ -114,7 +121,11 @@ fn write_received(out: &mut Out, received: &Received, dialect: Dialect) -> Resul
     Ok(())
 }
 
-fn write_text(out: &mut Out, element: &'static str, text: Option<&str>) -> Result<(), EncodeError> {
+fn write_text(
+    out: &mut Out<'_>,
+    element: &'static str,
+    text: Option<&str>,
+) -> Result<(), EncodeError> {
     match text {
         None => Ok(()),
         Some(text) => out.element(element, element, present(element, text)?),
@@ -122,7 +133,7 @@ fn write_text(out: &mut Out, element: &'static str, text: Option<&str>) -> Resul
 }
 
 fn write_user_defined(
-    out: &mut Out,
+    out: &mut Out<'_>,
     pairs: &[(String, String)],
     dialect: Dialect,
 ) -> Result<(), EncodeError> {

@@ -1,21 +1,24 @@
 //! Writing messages (FIPA00071).
 
-use bytes::Bytes;
-
+use crate::bitefficient::write;
 use crate::dialect::{JADE_ENCODING, local_time};
 use crate::error::EncodeError;
 use crate::xml::agent_id::{self, Form};
 use crate::xml::out::Out;
 use crate::{Dialect, Message, Performative, Time};
 
-/// The encoded message.
+/// Writes the encoded message.
 ///
 /// # Errors
 /// When XML cannot carry it (bytes that are no text, control characters), or the reader that the
 /// dialect is for cannot read what it says. fipa_services reads times without a zone only; it
 /// gets them without, and takes them as its local time.
-pub(crate) fn encode(message: &Message, dialect: Dialect) -> Result<Bytes, EncodeError> {
-    let mut out = Out::new(dialect);
+pub(crate) fn encode(
+    message: &Message,
+    dialect: Dialect,
+    out: &mut dyn write::Out,
+) -> Result<(), EncodeError> {
+    let mut out = Out::new(out, dialect);
     let jade = dialect == Dialect::Jade;
     match dialect {
         Dialect::Standard => out.raw("<?xml version=\"1.0\"?>"),
@@ -89,7 +92,7 @@ pub(crate) fn encode(message: &Message, dialect: Dialect) -> Result<Bytes, Encod
         }
     }
     out.close("fipa-message");
-    Ok(out.into_bytes())
+    Ok(())
 }
 
 fn act(message: &Message, jade: bool) -> Result<String, EncodeError> {
@@ -103,7 +106,11 @@ fn act(message: &Message, jade: bool) -> Result<String, EncodeError> {
     }
 }
 
-fn write_content(out: &mut Out, message: &Message, dialect: Dialect) -> Result<(), EncodeError> {
+fn write_content(
+    out: &mut Out<'_>,
+    message: &Message,
+    dialect: Dialect,
+) -> Result<(), EncodeError> {
     let Some(content) = message.content() else {
         return Ok(());
     };
@@ -123,7 +130,7 @@ fn write_content(out: &mut Out, message: &Message, dialect: Dialect) -> Result<(
 }
 
 fn write_text(
-    out: &mut Out,
+    out: &mut Out<'_>,
     element: &'static str,
     text: Option<&str>,
     dialect: Dialect,

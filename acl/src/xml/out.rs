@@ -1,46 +1,40 @@
 //! Writing XML 1.0: escaped text, nothing that a reader would change.
 
-use bytes::Bytes;
-
 use crate::Dialect;
 use crate::error::EncodeError;
 use crate::word::is_token;
 
 /// A document in the making.
-pub(super) struct Out {
-    text: String,
+pub(super) struct Out<'a> {
+    out: &'a mut dyn crate::bitefficient::write::Out,
     /// White space is escaped wherever a reader that condenses it would change it. fipa_services
     /// itself writes content in CDATA sections only, so outside of them nothing is promised.
     guards_space: bool,
 }
 
-impl Out {
-    pub(super) fn new(dialect: Dialect) -> Self {
+impl<'a> Out<'a> {
+    pub(super) fn new(out: &'a mut dyn crate::bitefficient::write::Out, dialect: Dialect) -> Self {
         Self {
-            text: String::new(),
+            out,
             guards_space: dialect == Dialect::FipaServices,
         }
     }
 
-    pub(super) fn into_bytes(self) -> Bytes {
-        self.text.into_bytes().into()
-    }
-
     /// Something that needs no escaping.
     pub(super) fn raw(&mut self, text: &str) {
-        self.text.push_str(text);
+        self.out.slice(text.as_bytes());
     }
 
     pub(super) fn open(&mut self, element: &str) {
-        self.text.push('<');
-        self.text.push_str(element);
-        self.text.push('>');
+        self.raw("<");
+        self.raw(element);
+        self.raw(">");
     }
 
     pub(super) fn close(&mut self, element: &str) {
-        self.text.push_str("</");
-        self.text.push_str(element);
-        self.text.push('>');
+        self.raw("</");
+        self.raw(element);
+        self.raw(">");
     }
 
     /// A value in an attribute of an element that is otherwise empty.
@@ -51,10 +45,10 @@ impl Out {
         what: &'static str,
         value: &str,
     ) -> Result<(), EncodeError> {
-        self.text.push('<');
-        self.text.push_str(element);
+        self.raw("<");
+        self.raw(element);
         self.attribute(attribute, what, value)?;
-        self.text.push_str(" />");
+        self.raw(" />");
         Ok(())
     }
 
@@ -64,11 +58,11 @@ impl Out {
         what: &'static str,
         value: &str,
     ) -> Result<(), EncodeError> {
-        self.text.push(' ');
-        self.text.push_str(attribute);
-        self.text.push_str("=\"");
+        self.raw(" ");
+        self.raw(attribute);
+        self.raw("=\"");
         self.text_trimmed(what, value)?;
-        self.text.push('"');
+        self.raw("\"");
         Ok(())
     }
 
@@ -110,7 +104,7 @@ impl Out {
 
     fn spaces(&mut self, count: usize) {
         for _ in 0..count {
-            self.text.push_str("&#x20;");
+            self.raw("&#x20;");
         }
     }
 
@@ -155,10 +149,7 @@ impl Out {
         let bytes = text.as_bytes();
         let mut plain = 0;
         let mut from = 0;
-        while let Some(found) = bytes.get(from..).and_then(|rest| {
-            let class = |byte: u8| CLASS.get(usize::from(byte)).copied().unwrap_or_default();
-            rest.iter().position(|byte| class(*byte) & looked_for != 0)
-        }) {
+        while let Some(found) = bytes.get(from..).and_then(|rest| marked(rest, looked_for)) {
             let at = from + found;
             from = at + 1;
             // In front of the text there might as well be a space.
@@ -185,13 +176,41 @@ impl Out {
                 }
                 _ => continue,
             };
-            self.text.push_str(text.get(plain..at).unwrap_or_default());
-            self.text.push_str(escape);
+            self.raw(text.get(plain..at).unwrap_or_default());
+            self.raw(escape);
             plain = from;
         }
-        self.text.push_str(text.get(plain..).unwrap_or_default());
+        self.raw(text.get(plain..).unwrap_or_default());
         Ok(())
     }
+}
+
+/// Where the first byte is that is looked for.
+fn marked(bytes: &[u8], looked_for: u8) -> Option<usize> {
+    let mut before = 0;
+    // Content may be long. Written so that the compiler looks at many bytes at once.
+    for chunk in bytes.as_chunks::<32>().0 {
+        let mut found = 0;
+        for byte in chunk {
+            let mark = u8::from(*byte < b' ')
+                | u8::from(*byte == b'"')
+                | u8::from(*byte == b'&')
+                | u8::from(*byte == b'<')
+                | u8::from(*byte == b'>')
+                | u8::from(*byte == 0xef);
+            found |= (mark * MARK) | (u8::from(*byte == b' ') * SPACE);
+        }
+        if found & looked_for != 0 {
+            break;
+        }
+        before += chunk.len();
+    }
+    let class = |byte: u8| CLASS.get(usize::from(byte)).copied().unwrap_or_default();
+    let rest = bytes.get(before..)?.iter();
+    let found = rest
+        .copied()
+        .position(|byte| class(byte) & looked_for != 0)?;
+    Some(before + found)
 }
 
 /// Bytes that are escaped or refused, or might be.
