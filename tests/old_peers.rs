@@ -1,0 +1,184 @@
+//! Conversations with peers that know nothing of us, over real sockets: what fipa_services and
+//! JADE's proxy were recorded to write comes to an agent, and the agent's answer comes to them in
+//! their own hand. The peers are small: a port on which each connection is one letter.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
+
+use fipa::config::Sources;
+use fipa::{
+    Agent, AgentId, Config, Domain, Envelope, Gateway, Kind, Letter, Message, Outcome, Performative,
+};
+use fipa_acl::{Dialect, Representation};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::time::timeout;
+
+/// Ends a test that hangs.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+macro_rules! recorded {
+    ($($file:literal),* $(,)?) => {
+        [$(($file, include_bytes!(concat!("../acl/tests/vectors/", $file)).as_slice())),*]
+    };
+}
+
+/// Agents on a host with a gateway, which knows one old peer.
+struct Host {
+    gateway: Gateway,
+    domain: Domain,
+    peer: TcpListener,
+}
+
+impl Host {
+    /// `understands` is what the configuration says of the peer, whose agent has this name.
+    async fn new(name: &str, understands: &str) -> Self {
+        static NEXT: AtomicU32 = AtomicU32::new(0);
+        let number = NEXT.fetch_add(1, Ordering::Relaxed);
+        let mark = format!("{}-{number}", std::process::id());
+        let peer = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let at = peer.local_addr().unwrap();
+        let set = [
+            format!("domain=old-{mark}"),
+            format!("mts.name=gateway-{mark}"),
+            "discovery.mdns=false".to_owned(),
+            format!("discovery.static={{ \"{name}\" = [\"tcp://{at};{understands}\"] }}"),
+        ];
+        let config = Config::load(&Sources {
+            set: set.into(),
+            ..Sources::default()
+        })
+        .unwrap();
+        let gateway = Gateway::open(&config).await.unwrap();
+        let domain = Domain::open(&config).await.unwrap();
+        let known = async {
+            let mut changes = domain.directory().watch();
+            while domain.directory().lookup(name).is_none() {
+                changes.next().await.unwrap();
+            }
+        };
+        timeout(PATIENCE, known).await.unwrap();
+        Self {
+            gateway,
+            domain,
+            peer,
+        }
+    }
+
+    fn address(&self) -> String {
+        let mut ways = self.gateway.locations().iter();
+        let tcp = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
+        tcp.address().to_owned()
+    }
+
+    /// The next letter that the peer gets, to the end of its connection.
+    async fn read_by_peer(&self) -> Vec<u8> {
+        let read = async {
+            let (mut stream, _) = self.peer.accept().await.unwrap();
+            let mut letter = Vec::new();
+            stream.read_to_end(&mut letter).await.unwrap();
+            letter
+        };
+        timeout(PATIENCE, read).await.unwrap()
+    }
+}
+
+/// A letter as an old peer sends it: all of it, and the end.
+async fn throw(letter: &[u8], at: &str) {
+    let mut stream = TcpStream::connect(at).await.unwrap();
+    stream.write_all(letter).await.unwrap();
+    stream.shutdown().await.unwrap();
+}
+
+async fn receive(agent: &Agent) -> Message {
+    let received = timeout(PATIENCE, agent.receive()).await;
+    received.unwrap().unwrap().message
+}
+
+fn read(letter: &[u8]) -> (Envelope, Letter, Message) {
+    let (envelope, letter) = Letter::decode(letter.to_vec().into()).unwrap();
+    let message = Message::decode(letter.payload()).unwrap();
+    (envelope, letter, message)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_fipa_services_wrote_is_taken_and_answered_in_its_hand() {
+    let host = Host::new("alice", "fipa-services").await;
+    let [bob, carol, dave] = ["bob", "carol", "dave"].map(|it| host.domain.register(it).unwrap());
+    let letters = recorded![
+        "e01_simple.be",
+        "e01_simple.xml",
+        "e02_payload_string.be",
+        "e02_payload_string.xml",
+        "e04_one_stamp.be",
+        "e04_one_stamp.xml",
+        "e06_received_full.be",
+        "e06_received_full.xml",
+        "e07_intended.be",
+        "e09_comments_encoding.be",
+        "e10_transport_behaviour.be",
+        "e12_extra_override.be",
+        "e12_extra_override.xml",
+        "e14_payload_70k_bin.be",
+        "e19_base_over_64k.be",
+    ];
+    for (file, bytes) in letters {
+        throw(bytes, &host.address()).await;
+        let (envelope, _, sent) = read(bytes);
+        for to in envelope.effective().intended_receivers {
+            let agent = [&bob, &carol, &dave].into_iter();
+            let agent = agent.clone().find(|it| it.name() == to.name()).unwrap();
+            let message = receive(agent).await;
+            assert_eq!(message, sent, "{file} as {} got it", agent.name());
+            let answer = agent.reply(&message, Performative::Agree).content(file);
+            let (delivered, answer) = tokio::join!(
+                agent.send(answer.build().unwrap()),
+                timeout(PATIENCE, host.read_by_peer())
+            );
+            let delivered = delivered.unwrap();
+            let outcome = &delivered.0[0].outcome;
+            let handed = matches!(outcome, Outcome::Sent { via: Kind::Tcp, .. });
+            assert!(handed, "{file}: {delivered}");
+            let (envelope, letter, message) = read(&answer.unwrap());
+            assert_eq!(envelope.effective().intended_receivers[0].name(), "alice");
+            assert_eq!(message.content().unwrap(), file);
+            let theirs = message.encode(Representation::BitEfficient, Dialect::FipaServices);
+            assert_eq!(letter.payload().to_bytes(), theirs.unwrap(), "{file}");
+            let theirs = envelope.encode(Representation::BitEfficient, Dialect::FipaServices);
+            assert_eq!(letter.envelope(), theirs.unwrap(), "{file}");
+        }
+    }
+    host.gateway.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn jades_proxy_is_asked_and_answers_where_the_letter_says() {
+    let host = Host::new("echo@jadetest", "jade").await;
+    let rusty = host.domain.register("rusty@rustap").unwrap();
+    let question = rusty
+        .message(Performative::Request)
+        .receiver(AgentId::new("echo@jadetest").unwrap())
+        .content("(hello)")
+        .build()
+        .unwrap();
+    let (delivered, asked) = tokio::join!(rusty.send(question), host.read_by_peer());
+    let delivered = delivered.unwrap();
+    let outcome = &delivered.0[0].outcome;
+    let handed = matches!(outcome, Outcome::Sent { via: Kind::Tcp, .. });
+    assert!(handed, "{delivered}");
+    assert!(asked.starts_with(b"<?xml"), "{asked:?}");
+    let (_, letter, message) = read(&asked);
+    let representation = Representation::detect(&letter.payload().head);
+    assert_eq!(representation, Some(Representation::String));
+    assert_eq!(message.content().unwrap(), "(hello)");
+    // It answers as it was recorded to, where its letter says.
+    let back = message.sender().unwrap().addresses()[0].clone();
+    let [(_, recorded)] = recorded!["jade_tcp_reply.xml"];
+    throw(recorded, back.strip_prefix("tcp://").unwrap()).await;
+    let answer = receive(&rusty).await;
+    assert_eq!(answer, read(recorded).2);
+    assert_eq!(answer.sender().unwrap().name(), "echo@jadetest");
+    host.gateway.close().await;
+}
