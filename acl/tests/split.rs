@@ -3,7 +3,10 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
 use bytes::Bytes;
-use fipa_acl::{Message, Payload, Performative, Problem, explain};
+use fipa_acl::{
+    BuildError, Dialect, EncodeError, Message, MessageBuilder, Payload, Performative, Problem,
+    Representation, explain,
+};
 
 fn message() -> Message {
     Message::builder(Performative::Inform)
@@ -119,4 +122,43 @@ fn other_encodings_and_code_tables_are_named() {
     }
     assert_eq!(of(b"hello"), Problem::UnknownRepresentation);
     assert_eq!(of(b"\xfa\x10\x08\x01\n"), Problem::Trailing(1));
+}
+
+/// FIPA00069: a length has 32 bits. Nobody touches the content, so the memory is never taken.
+#[test]
+fn the_longest_content_there_can_be() {
+    let longest = u32::MAX as usize;
+    let (head, tail) = message().around_content(longest).unwrap();
+    assert!(head.ends_with(b"\x04\x19\xff\xff\xff\xff"));
+    assert_eq!(&tail[..], b"\x01");
+    let too_long = message().around_content(longest + 1);
+    assert_eq!(too_long, Err(EncodeError::ContentTooLong(longest + 1)));
+
+    // The kernel gives addresses for more than there is room for, but not for very much more.
+    let memory = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
+    let free = memory.lines().find_map(|line| {
+        let kilobytes = line.strip_prefix("MemAvailable:")?.strip_suffix("kB")?;
+        kilobytes.trim().parse::<u64>().ok()
+    });
+    if free.is_none_or(|kilobytes| kilobytes < 5 << 20) {
+        println!("skipped: less than 5 GiB of memory are available");
+        assert_ne!(std::env::var("CI").as_deref(), Ok("true"));
+        return;
+    }
+    let sent = MessageBuilder::from(message())
+        .content(Bytes::from(vec![0; longest]))
+        .build()
+        .unwrap();
+    let payload = sent.to_payload();
+    assert_eq!(payload.len(), head.len() + longest + 1);
+    for dialect in [Dialect::Standard, Dialect::FipaServices] {
+        let len = sent.encoded_len(Representation::String, dialect).unwrap();
+        assert!(len > longest);
+    }
+    let read = Message::decode(&payload).unwrap();
+    let content = read.content().unwrap();
+    assert_eq!(content.len(), longest);
+    assert_eq!(content.as_ptr(), payload.content.as_ptr());
+    let beyond = MessageBuilder::from(message()).content(Bytes::from(vec![0; longest + 1]));
+    assert_eq!(beyond.build(), Err(BuildError::ContentTooLong(longest + 1)));
 }

@@ -12,7 +12,7 @@ use fipa_acl::{
 };
 use proptest::prelude::*;
 
-use arbitrary::{message, message_of, pairs};
+use arbitrary::{Kinds, message, message_of, pairs};
 
 const DIALECTS: [Dialect; 3] = [Dialect::Standard, Dialect::FipaServices, Dialect::Jade];
 
@@ -325,7 +325,11 @@ fn sayable() -> impl Strategy<Value = Message> {
         }
         agent
     });
-    message_of(agent.boxed(), word)
+    message_of(Kinds {
+        agent: agent.boxed(),
+        protocol: word,
+        ..Kinds::default()
+    })
 }
 
 /// fipa_services takes times as local.

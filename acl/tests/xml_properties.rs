@@ -15,7 +15,7 @@ use proptest::collection::vec;
 use proptest::option;
 use proptest::prelude::*;
 
-use arbitrary::agent_of;
+use arbitrary::{Kinds, agent_of, message_of};
 
 const XML: Representation = Representation::Xml;
 
@@ -63,35 +63,20 @@ fn time() -> impl Strategy<Value = Time> {
     ]
 }
 
-prop_compose! {
-    fn message()(
-        performative in prop_oneof![
+fn message() -> impl Strategy<Value = Message> {
+    message_of(Kinds {
+        performative: prop_oneof![
             prop::sample::select(&Performative::STANDARD[..]),
             "[a-z][a-z<&-]{0,9}".prop_map(|name| name.parse().unwrap()),
-        ],
-        sender in option::of(agent()),
-        receivers in vec(agent(), 0..3),
-        reply_to in vec(agent(), 0..3),
-        texts in vec(option::of(text()), 7),
-        protocol in option::of("[!-'*-~]{1,9}"),
-        reply_by in option::of(time()),
-        user_defined in pairs(),
-    ) -> Message {
-        let mut builder = Message::builder(performative).receivers(receivers);
-        if let Some(sender) = sender { builder = builder.sender(sender); }
-        for agent in reply_to { builder = builder.reply_to(agent); }
-        if let Some(text) = &texts[0] { builder = builder.language(text); }
-        if let Some(text) = &texts[1] { builder = builder.encoding(text); }
-        if let Some(text) = &texts[2] { builder = builder.ontology(text); }
-        if let Some(text) = &texts[3] { builder = builder.conversation_id(text); }
-        if let Some(text) = &texts[4] { builder = builder.reply_with(text); }
-        if let Some(text) = &texts[5] { builder = builder.in_reply_to(text); }
-        if let Some(text) = &texts[6] { builder = builder.content(text.clone()); }
-        if let Some(protocol) = protocol { builder = builder.protocol(protocol); }
-        if let Some(reply_by) = reply_by { builder = builder.reply_by(reply_by); }
-        for (name, value) in user_defined { builder = builder.user_defined(name, value); }
-        builder.build().unwrap()
-    }
+        ]
+        .boxed(),
+        agent: agent(),
+        content: option::of(text().prop_map(String::into_bytes)).boxed(),
+        text: text(),
+        protocol: "[!-'*-~]{1,9}".boxed(),
+        time: time().boxed(),
+        pairs: pairs().boxed(),
+    })
 }
 
 prop_compose! {

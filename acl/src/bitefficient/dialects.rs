@@ -5,11 +5,14 @@ use bytes::Bytes;
 use crate::bitefficient::reader::{Form, string_form};
 use crate::bitefficient::view::UNDEFINED_AGENT;
 use crate::bitefficient::without_x;
-use crate::bitefficient::write::{Out, write_date_time, write_len, write_local_date_time};
+use crate::bitefficient::write::{
+    Hand, Out, write_agent_id_by, write_agent_set_by, write_date_time, write_len,
+    write_local_date_time,
+};
 use crate::dialect::{check_word, local_time};
 use crate::error::EncodeError;
 use crate::word::is_token;
-use crate::{AgentId, Message, Performative, Time};
+use crate::{Message, Performative, Time};
 
 /// Whose hand to write in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -40,7 +43,9 @@ impl Writer<'_> {
             Peer::FipaServices => self.as_fipa_services(message)?,
             Peer::Jade => self.as_jade(message)?,
         }
-        self.user_defined(0x00, &message.user_defined)?;
+        for (name, value) in &message.user_defined {
+            self.user_defined(0x00, (name, value))?;
+        }
         if let Some(content) = &message.content {
             self.out.byte(0x04);
             self.content(content);
@@ -57,11 +62,11 @@ impl Writer<'_> {
             self.out.slice(b"\0\x01");
         }
         self.sender(message)?;
-        self.agent_set(0x03, &message.receivers)?;
+        write_agent_set_by(self, 0x03, &message.receivers)?;
         self.text(0x05, "reply-with", message.reply_with())?;
         self.reply_by(message)?;
         self.text(0x07, "in-reply-to", message.in_reply_to())?;
-        self.agent_set(0x08, &message.reply_to)?;
+        write_agent_set_by(self, 0x08, &message.reply_to)?;
         self.text(0x09, "language", message.language())?;
         self.text(0x0a, "encoding", message.encoding())?;
         self.text(0x0b, "ontology", message.ontology())?;
@@ -73,8 +78,8 @@ impl Writer<'_> {
     fn as_jade(&mut self, message: &Message) -> Result<(), EncodeError> {
         self.text(0x0b, "ontology", message.ontology())?;
         self.sender(message)?;
-        self.agent_set(0x03, &message.receivers)?;
-        self.agent_set(0x08, &message.reply_to)?;
+        write_agent_set_by(self, 0x03, &message.receivers)?;
+        write_agent_set_by(self, 0x08, &message.reply_to)?;
         self.text(0x0d, "conversation-id", message.conversation_id())?;
         self.text(0x07, "in-reply-to", message.in_reply_to())?;
         self.text(0x05, "reply-with", message.reply_with())?;
@@ -89,7 +94,7 @@ impl Writer<'_> {
             return Ok(());
         };
         self.out.byte(0x02);
-        self.agent(sender)
+        write_agent_id_by(self, sender)
     }
 
     fn reply_by(&mut self, message: &Message) -> Result<(), EncodeError> {
@@ -124,48 +129,16 @@ impl Writer<'_> {
         Ok(())
     }
 
-    fn agent_set(&mut self, code: u8, agents: &[AgentId]) -> Result<(), EncodeError> {
-        if agents.is_empty() {
-            return Ok(());
-        }
+    fn user_defined(&mut self, code: u8, (name, value): (&str, &str)) -> Result<(), EncodeError> {
         self.out.byte(code);
-        for agent in agents {
-            self.agent(agent)?;
+        let what = "name of a user-defined parameter";
+        // fipa_services keeps names without X- in its memory, and does not add it here.
+        if self.peer == Peer::FipaServices && without_x(name.as_bytes()) == name.as_bytes() {
+            self.word(what, name)?;
+        } else {
+            self.word(what, &format!("X-{name}"))?;
         }
-        self.out.byte(0x01);
-        Ok(())
-    }
-
-    /// The parts in the only order that fipa_services reads.
-    fn agent(&mut self, agent: &AgentId) -> Result<(), EncodeError> {
-        self.out.byte(0x02);
-        self.word("name of an agent", agent.name())?;
-        if !agent.addresses().is_empty() {
-            self.out.byte(0x02);
-            for address in agent.addresses() {
-                self.word("address of an agent", address)?;
-            }
-            self.out.byte(0x01);
-        }
-        self.agent_set(0x03, agent.resolvers())?;
-        self.user_defined(0x04, agent.user_defined())?;
-        self.out.byte(0x01);
-        Ok(())
-    }
-
-    fn user_defined(&mut self, code: u8, pairs: &[(String, String)]) -> Result<(), EncodeError> {
-        for (name, value) in pairs {
-            self.out.byte(code);
-            let what = "name of a user-defined parameter";
-            // fipa_services keeps names without X- in its memory, and does not add it here.
-            if self.peer == Peer::FipaServices && without_x(name.as_bytes()) == name.as_bytes() {
-                self.word(what, name)?;
-            } else {
-                self.word(what, &format!("X-{name}"))?;
-            }
-            self.expression("user-defined parameter", value)?;
-        }
-        Ok(())
+        self.expression("user-defined parameter", value)
     }
 
     fn text(
@@ -261,5 +234,19 @@ impl Writer<'_> {
             }
         }
         Ok(())
+    }
+}
+
+impl Hand for Writer<'_> {
+    fn byte(&mut self, byte: u8) {
+        self.out.byte(byte);
+    }
+
+    fn name(&mut self, what: &'static str, text: &str) -> Result<(), EncodeError> {
+        self.word(what, text)
+    }
+
+    fn user_defined_of_agent(&mut self, name: &str, value: &str) -> Result<(), EncodeError> {
+        self.user_defined(0x04, (name, value))
     }
 }

@@ -314,6 +314,53 @@ fn write_agent_id(agent: &AgentId, out: &mut impl Out) {
     out.byte(0x01);
 }
 
+/// How texts are written in one of the bit-efficient formats for one of the readers.
+pub(crate) trait Hand {
+    fn byte(&mut self, byte: u8);
+
+    /// A name or an address.
+    fn name(&mut self, what: &'static str, text: &str) -> Result<(), EncodeError>;
+
+    /// A user-defined parameter of an agent identifier, with its code.
+    fn user_defined_of_agent(&mut self, name: &str, value: &str) -> Result<(), EncodeError>;
+}
+
+/// An agent identifier, the parts in the only order that fipa_services reads.
+pub(crate) fn write_agent_id_by(hand: &mut impl Hand, agent: &AgentId) -> Result<(), EncodeError> {
+    hand.byte(0x02);
+    hand.name("name of an agent", agent.name())?;
+    if !agent.addresses().is_empty() {
+        hand.byte(0x02);
+        for address in agent.addresses() {
+            hand.name("address of an agent", address)?;
+        }
+        hand.byte(0x01);
+    }
+    write_agent_set_by(hand, 0x03, agent.resolvers())?;
+    for (name, value) in agent.user_defined() {
+        hand.user_defined_of_agent(name, value)?;
+    }
+    hand.byte(0x01);
+    Ok(())
+}
+
+/// A set of agent identifiers with its code, unless it is empty.
+pub(crate) fn write_agent_set_by(
+    hand: &mut impl Hand,
+    code: u8,
+    agents: &[AgentId],
+) -> Result<(), EncodeError> {
+    if agents.is_empty() {
+        return Ok(());
+    }
+    hand.byte(code);
+    for agent in agents {
+        write_agent_id_by(hand, agent)?;
+    }
+    hand.byte(0x01);
+    Ok(())
+}
+
 fn write_user_defined(name: &str, value: &str, out: &mut impl Out) {
     out.framed(*b"\x10X-", name.as_bytes(), [0x00]);
     write_expression(value, out);

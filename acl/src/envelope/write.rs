@@ -9,7 +9,10 @@ use bytes::Bytes;
 
 use crate::bitefficient::reader::{Form, string_form};
 use crate::bitefficient::without_x;
-use crate::bitefficient::write::{Out, write_date_time, write_digits, write_local_date_time};
+use crate::bitefficient::write::{
+    Hand, Out, write_agent_id_by, write_agent_set_by, write_date_time, write_digits,
+    write_local_date_time,
+};
 use crate::dialect::local_time;
 use crate::error::EncodeError;
 use crate::word::{self, is_token};
@@ -67,11 +70,11 @@ impl Envelope {
         writer.acl_representation(representation)?;
         writer.time("date", date)?;
         let to = writer.out.len();
-        writer.agent_ids(0x02, receivers)?;
+        write_agent_set_by(&mut writer, 0x02, receivers)?;
         let list = to..writer.out.len();
         if let Some(from) = from {
             writer.out.byte(0x03);
-            writer.agent_id(from)?;
+            write_agent_id_by(&mut writer, from)?;
         }
         writer.out.byte(0x06);
         writer.payload_length(payload_length)?;
@@ -184,10 +187,10 @@ impl Writer {
     /// is that of fipa_services too.
     fn parameters(&mut self, params: &EnvelopeParams) -> Result<(), EncodeError> {
         let base = params.date.is_some();
-        self.agent_ids(0x02, &params.to)?;
+        write_agent_set_by(self, 0x02, &params.to)?;
         if let Some(from) = &params.from {
             self.out.byte(0x03);
-            self.agent_id(from)?;
+            write_agent_id_by(self, from)?;
         }
         // In a base envelope it stands in front already. fipa_services says it twice.
         if let Some(representation) = &params.acl_representation
@@ -219,7 +222,7 @@ impl Writer {
             }
             encoding => self.text(0x07, "payload-encoding", encoding)?,
         }
-        self.agent_ids(0x09, &params.intended_receivers)?;
+        write_agent_set_by(self, 0x09, &params.intended_receivers)?;
         if let Some(received) = &params.received
             && (base || self.for_fipa_services())
         {
@@ -293,45 +296,6 @@ impl Writer {
                 self.string("acl-representation", present("acl-representation", &name)?)?;
             }
         }
-        Ok(())
-    }
-
-    fn agent_ids(&mut self, code: u8, agents: &[AgentId]) -> Result<(), EncodeError> {
-        if agents.is_empty() {
-            return Ok(());
-        }
-        self.out.byte(code);
-        for agent in agents {
-            self.agent_id(agent)?;
-        }
-        self.out.byte(0x01);
-        Ok(())
-    }
-
-    fn agent_id(&mut self, agent: &AgentId) -> Result<(), EncodeError> {
-        self.out.byte(0x02);
-        self.string("agent name", agent.name())?;
-        if !agent.addresses().is_empty() {
-            self.out.byte(0x02);
-            for address in agent.addresses() {
-                self.string("address", address)?;
-            }
-            self.out.byte(0x01);
-        }
-        self.agent_ids(0x03, agent.resolvers())?;
-        for (name, value) in agent.user_defined() {
-            // JADE keeps to the code of messages, and to plain strings.
-            if self.dialect == Dialect::Jade {
-                self.out.byte(0x04);
-                self.user_defined_name(name)?;
-                self.string("user-defined value", value)?;
-            } else {
-                self.out.byte(0x05);
-                self.user_defined_name(name)?;
-                self.any(value)?;
-            }
-        }
-        self.out.byte(0x01);
         Ok(())
     }
 
@@ -410,6 +374,28 @@ impl Writer {
             write_date_time(time, &mut self.out);
         }
         Ok(())
+    }
+}
+
+impl Hand for Writer {
+    fn byte(&mut self, byte: u8) {
+        self.out.byte(byte);
+    }
+
+    fn name(&mut self, what: &'static str, text: &str) -> Result<(), EncodeError> {
+        self.string(what, text)
+    }
+
+    fn user_defined_of_agent(&mut self, name: &str, value: &str) -> Result<(), EncodeError> {
+        // JADE keeps to the code of messages, and to plain strings.
+        if self.dialect == Dialect::Jade {
+            self.out.byte(0x04);
+            self.user_defined_name(name)?;
+            return self.string("user-defined value", value);
+        }
+        self.out.byte(0x05);
+        self.user_defined_name(name)?;
+        self.any(value)
     }
 }
 

@@ -112,21 +112,47 @@ fn content() -> impl Strategy<Value = Option<Vec<u8>>> {
 }
 
 pub(crate) fn message() -> impl Strategy<Value = Message> {
-    message_of(agent(), token())
+    message_of(Kinds::default())
+}
+
+/// What messages are made of.
+pub(crate) struct Kinds {
+    pub(crate) performative: BoxedStrategy<Performative>,
+    pub(crate) agent: BoxedStrategy<AgentId>,
+    pub(crate) content: BoxedStrategy<Option<Vec<u8>>>,
+    pub(crate) text: BoxedStrategy<String>,
+    pub(crate) protocol: BoxedStrategy<String>,
+    pub(crate) time: BoxedStrategy<Time>,
+    pub(crate) pairs: BoxedStrategy<Vec<(String, String)>>,
+}
+
+/// All kinds that there are.
+impl Default for Kinds {
+    fn default() -> Self {
+        Self {
+            performative: performative().boxed(),
+            agent: agent(),
+            content: content().boxed(),
+            text: text(),
+            protocol: token(),
+            time: time(),
+            pairs: pairs().boxed(),
+        }
+    }
 }
 
 prop_compose! {
-    /// A message with these agents and protocols.
-    pub(crate) fn message_of(agent: BoxedStrategy<AgentId>, word: BoxedStrategy<String>)(
-        performative in performative(),
-        sender in option::of(agent.clone()),
-        receivers in vec(agent.clone(), 0..3),
-        reply_to in vec(agent, 0..2),
-        content in content(),
-        texts in vec(option::of(text()), 6),
-        protocol in option::of(word),
-        reply_by in option::of(time()),
-        user_defined in pairs(),
+    /// A message of these kinds.
+    pub(crate) fn message_of(kinds: Kinds)(
+        performative in kinds.performative,
+        sender in option::of(kinds.agent.clone()),
+        receivers in vec(kinds.agent.clone(), 0..3),
+        reply_to in vec(kinds.agent, 0..3),
+        content in kinds.content,
+        texts in vec(option::of(kinds.text), 6),
+        protocol in option::of(kinds.protocol),
+        reply_by in option::of(kinds.time),
+        user_defined in kinds.pairs,
     ) -> Message {
         let mut builder = Message::builder(performative).receivers(receivers);
         if let Some(sender) = sender { builder = builder.sender(sender); }
