@@ -10,7 +10,9 @@ use std::time::Duration;
 
 use fipa::config::Sources;
 use fipa::watch::{Event, Fate, Passage, WatchOptions, Watcher};
-use fipa::{Agent, AgentId, Config, Domain, FailureReason, Kind, Message, Outcome, Performative};
+use fipa::{
+    Agent, AgentId, Config, Domain, FailureReason, Gateway, Kind, Message, Outcome, Performative,
+};
 use rustix::net::{AddressFamily, SendFlags, SocketAddrUnix, SocketType};
 
 /// Ends a test that hangs.
@@ -18,13 +20,20 @@ const WATCHDOG: Duration = Duration::from_secs(60);
 
 /// A configuration for a domain that no other test has.
 fn config() -> Config {
+    config_with(&[])
+}
+
+fn config_with(set: &[String]) -> Config {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     let number = NEXT.fetch_add(1, Ordering::Relaxed);
+    let mark = format!("watch-{}-{number}", std::process::id());
+    let own = [
+        format!("domain={mark}"),
+        format!("mts.name=mts-{mark}"),
+        "discovery.mdns=false".to_owned(),
+    ];
     Config::load(&Sources {
-        set: vec![
-            format!("domain=watch-{}-{number}", std::process::id()),
-            "discovery.mdns=false".to_owned(),
-        ],
+        set: own.iter().chain(set).cloned().collect(),
         ..Sources::default()
     })
     .unwrap()
@@ -315,4 +324,142 @@ async fn nonsense_is_refused_and_nobody_else_notices() {
         .await
         .unwrap();
     assert_eq!(letter(&mut watcher).await.content_len, Some(11));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_becomes_of_the_only_letter_of_a_process_is_seen() {
+    let config = config();
+    let there = Domain::open(&config).await.unwrap();
+    let arm = there.register("arm").unwrap();
+    let mut watcher = Watcher::open(&config, WatchOptions::default())
+        .await
+        .unwrap();
+    let own = there.register("own").unwrap();
+    until_seen(&mut watcher, &own, "own").await;
+    // The arm's queue is filled.
+    let moment = Duration::from_millis(200);
+    let mut filling = true;
+    while filling {
+        let one = own.send_within(request(&own, "arm", "one"), moment);
+        filling = one.await.unwrap().all_succeeded();
+    }
+    for number in 0..5 {
+        let here = Domain::open(&config).await.unwrap();
+        let name = format!("rover_{number}");
+        let rover = here.register(&name).unwrap();
+        let only = request(&rover, "arm", "only");
+        let deliveries = rover.send_within(only, moment).await.unwrap();
+        let Outcome::Failed { reason: told, .. } = deliveries.0[0].outcome else {
+            panic!("{deliveries}");
+        };
+        drop(rover);
+        here.close().await;
+        let seen = loop {
+            let seen = letter(&mut watcher).await;
+            // What the service tells the sender of the failure is a letter, too.
+            if seen.sender() == Some(&name) {
+                break seen;
+            }
+        };
+        let Fate::Settled(Outcome::Failed { reason, .. }) = &seen.fate else {
+            panic!("{seen:?}");
+        };
+        assert_eq!((&*seen.receiver, *reason), ("arm", told));
+    }
+    drop(arm);
+}
+
+/// A host with a gateway, which knows the one at this address, and somebody who watches it.
+async fn watched(peer: Option<&str>) -> (Gateway, Domain, Watcher) {
+    let known = peer.map(|address| format!("discovery.static={{ far = [\"tcp://{address}\"] }}"));
+    let config = config_with(known.as_slice());
+    let gateway = Gateway::open(&config).await.unwrap();
+    let domain = Domain::open(&config).await.unwrap();
+    let watcher = Watcher::open(&config, WatchOptions::default()).await;
+    (gateway, domain, watcher.unwrap())
+}
+
+async fn known(domain: &Domain, name: &str) {
+    let mut changes = domain.directory().watch();
+    while domain.directory().lookup(name).is_none() {
+        let change = tokio::time::timeout(WATCHDOG, changes.next()).await;
+        assert!(change.unwrap().is_some());
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn between_hosts_each_watcher_sees_a_letter_once_with_its_gateway() {
+    let (far, abroad, mut watching_far) = watched(None).await;
+    let mut ways = far.locations().iter();
+    let at = ways.find(|way| way.kind() == Kind::Tcp).unwrap().address();
+    let (near, at_home, mut watching_near) = watched(Some(at)).await;
+    let rover = at_home.register("rover").unwrap();
+    let arm = abroad.register("arm").unwrap();
+    known(&at_home, "arm").await;
+    known(&abroad, "rover").await;
+    // Both processes, and both gateways, know that they are watched.
+    for (watcher, from) in [(&mut watching_near, &rover), (&mut watching_far, &arm)] {
+        until_seen(watcher, from, from.name()).await;
+    }
+    let ends = async |watcher: &mut Watcher, content: u64| loop {
+        let seen = letter(watcher).await;
+        if seen.content_len == Some(content) && seen.sender() != Some(&*seen.receiver) {
+            return seen;
+        }
+    };
+    // Until the gateways, too, are told: they learn of watchers in their own time.
+    loop {
+        let sent = rover.send(request(&rover, "arm", "known?")).await.unwrap();
+        assert!(sent.all_succeeded(), "{sent}");
+        let near = ends(&mut watching_near, 6).await;
+        let far = ends(&mut watching_far, 6).await;
+        if near.gateway.is_some() && far.gateway.is_some() {
+            break;
+        }
+    }
+    for (from, to, content) in [(&rover, "arm", "there"), (&arm, "rover", "and back")] {
+        let sent = from.send(request(from, to, content)).await.unwrap();
+        assert!(sent.all_succeeded(), "{sent}");
+        let leaves_near = to == "arm";
+        let content = content.len() as u64;
+        let at_near = ends(&mut watching_near, content).await;
+        let at_far = ends(&mut watching_far, content).await;
+        assert_eq!(at_near.gateway.as_deref(), Some(near.name()));
+        assert_eq!(at_far.gateway.as_deref(), Some(far.name()));
+        assert_eq!(at_near.from_elsewhere, !leaves_near);
+        assert_eq!(at_far.from_elsewhere, leaves_near);
+        assert_eq!(
+            (at_near.via, at_far.via),
+            (Some(Kind::Tcp), Some(Kind::Tcp))
+        );
+        // Its sender was told on its own host; on the other it was taken.
+        let (own, other) = if leaves_near {
+            (&at_near.fate, &at_far.fate)
+        } else {
+            (&at_far.fate, &at_near.fate)
+        };
+        assert!(
+            matches!(own, Fate::Settled(outcome) if outcome.is_success()),
+            "{own:?}"
+        );
+        assert!(
+            matches!(other, Fate::Taken | Fate::Passed(Outcome::Delivered { .. })),
+            "{other:?}"
+        );
+        assert_eq!(at_near.sequence, at_far.sequence);
+        assert_eq!(at_near.stream, at_far.stream);
+    }
+    // Nothing in between: each was told once. The gateways' own letters are between gateways.
+    let mut others = Vec::new();
+    while let Ok(Event::Letter(seen)) =
+        tokio::time::timeout(Duration::from_millis(500), watching_near.next()).await
+    {
+        others.push(seen);
+    }
+    assert!(
+        others
+            .iter()
+            .all(|seen| seen.message.as_ref().unwrap().conversation_id() != Some("c1")),
+        "{others:?}"
+    );
 }

@@ -333,7 +333,6 @@ fn by_default(machine: &Machine, party: &Party, state: u16, said: &Said<'_>) -> 
     let has_ended = here.is_final;
     // Who has been told the last thing may not have understood it; who said it has no reason.
     let answers_last = party.last != said.side;
-    let group = machine.scope == Scope::Conversation;
     match said.act {
         NOT_UNDERSTOOD => (!has_ended || answers_last).then(|| Lead::to(AFTER_NOT_UNDERSTOOD)),
         CANCEL => {
@@ -349,7 +348,7 @@ fn by_default(machine: &Machine, party: &Party, state: u16, said: &Said<'_>) -> 
                 ..Lead::to(CANCELLING)
             })
         }
-        FAILURE if machine.failure_by_parties && group => (!has_ended).then_some(Lead {
+        FAILURE if machine.failure_by_parties => (!has_ended).then_some(Lead {
             resume: state,
             ..Lead::to(FAILED)
         }),

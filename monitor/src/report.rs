@@ -1,6 +1,6 @@
 //! Violations in words: what came, where the conversation is, what would have been right.
 
-use crate::conversation::{CANCELLING, Conversation, FAILED, state_name};
+use crate::conversation::{CANCELLING, Conversation, FAILED, Party, state_name};
 use crate::judge::Fault;
 use crate::machine::{Machine, Roles, Scope, State};
 use crate::monitor::Denied;
@@ -66,7 +66,8 @@ pub(crate) fn violation(
         let person = participant.as_deref();
         let resume = || {
             let mut parties = conversation.parties.iter();
-            let party = parties.find(|party| party.state == state);
+            let meant = |party: &&Party| person.is_none_or(|name| names.is(party.peer, name));
+            let party = parties.find(meant);
             party.and_then(|party| machine.state(party.resume))
         };
         let own = match state {

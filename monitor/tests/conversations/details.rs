@@ -1,0 +1,165 @@
+//! Small print: what a violation says was expected, and bounds that are met exactly.
+
+use super::*;
+
+fn stage_of(text: &str) -> Stage {
+    let mut library = Library::standard();
+    library.add(Machine::read("own", text).unwrap()).unwrap();
+    Stage::new(Monitor::observer(Arc::new(library)))
+}
+
+fn own(words: &'static str) -> Header<'static> {
+    say_in("own", words)
+}
+
+fn expected(violation: &Violation) -> Vec<String> {
+    let all = violation.expected.iter();
+    let shown = all.map(|one| format!("{} {}>{}", one.performative, one.from, one.to));
+    shown.collect()
+}
+
+#[test]
+fn what_is_expected_is_told_of_the_participant_concerned() {
+    let mut stage = Stage::observer();
+    stage.right(say("cfp ann>ben,cid"));
+    stage.right(say("propose ben>ann"));
+    // Of both a message was not delivered, in different states.
+    stage.right(say("failure ams>ben"));
+    stage.right(say("refuse cid>ann"));
+    stage.right(say("failure ams>cid"));
+    let violation = stage.wrong(say("confirm ben>ann"));
+    assert_eq!(violation.state.as_deref(), Some("undelivered"));
+    assert_eq!(
+        expected(&violation),
+        ["accept-proposal, reject-proposal ann>ben"]
+    );
+    let violation = stage.wrong(say("confirm cid>ann"));
+    assert_eq!(expected(&violation), Vec::<String>::new(), "it had refused");
+}
+
+#[test]
+fn while_cancelling_its_answer_is_expected() {
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben"));
+    stage.right(request("cancel ann>ben"));
+    let violation = stage.wrong(request("propose ben>ann"));
+    let [answer] = &violation.expected[..] else {
+        panic!("{violation:?}");
+    };
+    assert_eq!(answer.performative, "inform, failure");
+    // Only then.
+    stage.right(request("inform ben>ann"));
+    let violation = stage.wrong(request("agree ben>ann"));
+    assert_eq!(expected(&violation), Vec::<String>::new());
+}
+
+#[test]
+fn what_is_expected_is_listed_by_who_says_it_to_whom() {
+    let mut stage = stage_of(
+        r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2">
+            <transition performative="agree" from="b" to="a" target="3"/>
+            <transition performative="inform" from="b" to="c" target="3"/>
+            <transition performative="refuse" from="b" to="a" target="3"/>
+            <transition performative="propose" from="c" to="a" target="3"/>
+        </state>
+        <state id="3" final="yes"/></scxml>"#,
+    );
+    stage.right(own("request ann>ben"));
+    let violation = stage.wrong(own("subscribe ben>ann"));
+    assert_eq!(
+        expected(&violation),
+        ["agree, refuse ben>ann", "inform ben>c", "propose c>ann"]
+    );
+}
+
+#[test]
+fn the_initiator_need_not_be_the_first_role_of_the_file() {
+    let mut stage = stage_of(
+        r#"<scxml initial="start" xmlns:fipa="urn:fipa-rs:protocol" fipa:scope="participant">
+        <state id="asked">
+            <transition performative="inform" from="arm" to="rover" target="done"/>
+        </state>
+        <state id="start">
+            <transition performative="request" from="rover" to="arm" target="asked"/>
+        </state>
+        <state id="done" final="yes"/></scxml>"#,
+    );
+    stage.right(own("request ann>ben,cid"));
+    assert_eq!(stage.wrong(own("inform ann>ben")).kind, Kind::WrongSender);
+    stage.right(own("inform ben>ann"));
+    assert_eq!(stage.right(own("inform cid>ann")), "done");
+}
+
+#[test]
+fn a_failure_ends_only_what_is_written_in_the_form_of_fipa_acl() {
+    let text = r#"<scxml initial="1" NAMESPACE>
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from="b" to="a" target="3"/></state>
+        <state id="3" final="yes"/></scxml>"#;
+    let plain = text.replace("NAMESPACE", "");
+    let mut stage = stage_of(&plain);
+    stage.right(own("request ann>ben"));
+    assert_eq!(stage.right(own("failure ben>ann")), "undelivered");
+    let ours = r#"xmlns:fipa="urn:fipa-rs:protocol" fipa:scope="conversation""#;
+    let mut stage = stage_of(&text.replace("NAMESPACE", ours));
+    stage.right(own("request ann>ben"));
+    assert_eq!(stage.wrong(own("failure ben>ann")).kind, Kind::Unexpected);
+}
+
+#[test]
+fn as_many_participants_as_may_be() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="agree" from="b" to="a" target="3"/></state>
+        <state id="3" final="yes"/></scxml>"#;
+    let mut library = Library::standard();
+    library.add(Machine::read("own", text).unwrap()).unwrap();
+    let mut limits = Limits::default();
+    limits.participants = 2;
+    let monitor = Monitor::observer(Arc::new(library)).with_limits(limits);
+    assert!(monitor.library().find("own").is_some());
+    let mut stage = Stage::new(monitor);
+    stage.right(own("request ann>ben"));
+    stage.right(own("agree ben>ann"));
+}
+
+#[test]
+fn an_answer_that_crossed_the_cancel_may_come_after_it_was_not_delivered() {
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben"));
+    stage.right(request("agree ben>ann"));
+    stage.right(request("cancel ann>ben"));
+    // This may be the result as well as the answer to the cancel.
+    assert_eq!(stage.right(request("inform ben>ann")), "cancelled");
+    stage.right(request("failure ams>ben"));
+    assert_eq!(stage.right(request("inform ben>ann")), "cancelled");
+    assert_eq!(stage.wrong(request("inform ben>ann")).kind, Kind::Ended);
+}
+
+#[test]
+fn of_many_deadlines_those_that_count_are_kept() {
+    let mut stage = Stage::observer();
+    let due = Time::from_system_time(stage.now + Duration::from_secs(50)).unwrap();
+    stage.right(say("cfp ann>ben").reply_by(due));
+    // Deadlines that were met, far more than there are conversations.
+    for number in 0..3_000 {
+        let id = format!("s{number}");
+        let subscribe = say_in("fipa-contract-net", "cfp ann>ben").conversation_id(id.clone());
+        stage.right(subscribe.reply_by(due));
+        let refuse = say_in("fipa-contract-net", "refuse ben>ann").conversation_id(id);
+        stage.right(refuse);
+    }
+    let overdue = stage.pass(51);
+    let ids: Vec<&str> = overdue
+        .iter()
+        .filter_map(|event| match event {
+            Event::Overdue {
+                conversation_id, ..
+            } => Some(conversation_id.as_str()),
+            _ => None,
+        })
+        .collect();
+    assert_eq!(ids, ["c"]);
+}
