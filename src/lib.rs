@@ -23,7 +23,8 @@
 //! # }
 //! ```
 //!
-//! * [`Domain`] is this process's membership, [`Agent`] one name in it.
+//! * [`Domain`] is this process's membership, [`Agent`] one name in it, [`Coalition`] a name for
+//!   several.
 //! * [`watch`] sees the letters of all processes of a domain on this host pass.
 //! * [`config`] is what the owner of a robot chooses, in one TOML file.
 //! * [`blocking`] is for processes without an async runtime.
@@ -40,6 +41,7 @@ mod agent;
 pub mod blocking;
 #[cfg(feature = "monitor")]
 mod checks;
+mod coalition;
 pub mod config;
 pub mod doctor;
 mod domain;
@@ -55,6 +57,7 @@ pub mod watch;
 pub use agent::{Agent, Deliveries, Delivery, Incoming, Loan, ReceiveError, SendError, Unread};
 #[cfg(feature = "monitor")]
 pub use checks::ProtocolError;
+pub use coalition::{Coalition, CoalitionError};
 pub use config::Config;
 pub use domain::{Domain, OpenError, RegisterOptions};
 pub use fipa_acl::{
@@ -64,8 +67,8 @@ pub use fipa_acl::{
 #[cfg(feature = "monitor")]
 pub use fipa_monitor as monitor;
 pub use fipa_sds::{
-    Change, Directory, Entry, Matcher, Pattern, PatternError, Query, Reach, RegisterError, Role,
-    Source, Watch, is_pattern,
+    Change, Directory, Entry, Matcher, Members, MembersError, Pattern, PatternError, Query, Reach,
+    RegisterError, Role, Source, Watch, is_pattern,
 };
 pub use fipa_transport::{
     Attempt, FailureReason, Incarnation, Kind, ListenError, Location, Outcome, Signature, WayError,

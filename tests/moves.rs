@@ -93,7 +93,10 @@ struct Taken {
 
 impl Taken {
     fn take(&self, incoming: &Incoming) {
-        // What a message transport service tells of failures has another sender.
+        // Gateways may have something to say, too.
+        if *incoming.message.performative() != Performative::Inform {
+            return;
+        }
         let text = String::from_utf8(incoming.message.content().unwrap().to_vec()).unwrap();
         self.numbers.lock().push(text.parse().unwrap());
         self.in_this_life.fetch_add(1, Ordering::Relaxed);

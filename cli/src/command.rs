@@ -2,6 +2,7 @@
 
 mod agents;
 mod bench;
+mod coalition;
 mod config;
 mod decode;
 mod demo;
@@ -26,6 +27,7 @@ pub(crate) enum Command {
     Agents(agents::Arguments),
     Send(Box<send::Arguments>),
     Echo(echo::Arguments),
+    Coalition(coalition::Arguments),
     Routes(routes::Arguments),
     Watch(Box<watch::Arguments>),
     Demo(demo::Arguments),
@@ -44,6 +46,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Agents(arguments) => agents::run(arguments, global),
         Command::Send(arguments) => send::run(*arguments, global),
         Command::Echo(arguments) => echo::run(arguments, global),
+        Command::Coalition(arguments) => coalition::run(arguments, global),
         Command::Routes(arguments) => routes::run(arguments, global),
         Command::Watch(arguments) => watch::run(*arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),

@@ -147,7 +147,8 @@ pub(crate) fn register(
     registered.map_err(|error| not_registered(error, name, config))
 }
 
-fn not_registered(error: RegisterError, name: &str, config: &Config) -> Failure {
+/// Why a name could not be registered.
+pub(crate) fn not_registered(error: RegisterError, name: &str, config: &Config) -> Failure {
     let domain = format!("domain {:?}", config.domain);
     match error {
         RegisterError::AlreadyRegistered { holder } => Failure::failed(

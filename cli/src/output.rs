@@ -3,8 +3,11 @@
 use std::io::{self, Write};
 
 use fipa::{Deliveries, Outcome};
+use rustix::event::{PollFd, PollFlags, poll};
+use rustix::io::Errno;
 use serde::Serialize;
 use serde_json::{Value, json};
+use tokio::sync::oneshot;
 
 use crate::report::Failure;
 
@@ -22,6 +25,35 @@ pub(crate) fn bytes(bytes: &[u8]) -> Result<(), Failure> {
 /// for as long as somebody does ends with the reader.
 pub(crate) fn text_if_read(text: &str) -> Result<bool, Failure> {
     bytes_if_read(text.as_bytes())
+}
+
+/// Says when nobody will read what is printed any more, as after `| head`; never where that cannot
+/// be known.
+pub(crate) struct Reader(oneshot::Receiver<()>);
+
+impl Reader {
+    /// From now on.
+    pub(crate) fn of_output() -> Self {
+        let (gone, reader) = oneshot::channel();
+        // It ends with the process: nothing but the reader's end ends the wait.
+        std::thread::spawn(move || {
+            let stdout = io::stdout();
+            let mut watched = [PollFd::new(&stdout, PollFlags::empty())];
+            while let Err(Errno::INTR) = poll(&mut watched, None) {}
+            if watched[0].revents().contains(PollFlags::ERR) {
+                // Who waited may have ended.
+                let _ = gone.send(());
+            }
+        });
+        Self(reader)
+    }
+
+    /// Returns then. Cancelling the future loses nothing.
+    pub(crate) async fn gone(&mut self) {
+        if (&mut self.0).await.is_err() {
+            std::future::pending().await
+        }
+    }
 }
 
 fn bytes_if_read(bytes: &[u8]) -> Result<bool, Failure> {

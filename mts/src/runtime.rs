@@ -595,12 +595,14 @@ async fn watch_directory(shared: Weak<Shared>, directory: Arc<dyn Directory>) {
         };
         let now = Now::read();
         let mut state = shared.state.lock();
-        match &change {
-            Change::Left(entry) => state.core.handle_departure(now, entry),
-            Change::Changed { before, after } if before.incarnation != after.incarnation => {
-                state.core.handle_departure(now, before);
+        for change in change.single() {
+            match change {
+                Change::Left(entry) => state.core.handle_departure(now, entry),
+                Change::Changed { before, after } if before.incarnation != after.incarnation => {
+                    state.core.handle_departure(now, before);
+                }
+                _ => {}
             }
-            _ => {}
         }
         state.core.handle_directory_change(now);
         shared.carry_out(state);

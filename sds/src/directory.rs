@@ -101,6 +101,9 @@ pub enum RegisterError {
     /// The registration is not valid.
     #[error("cannot register: {0}")]
     Invalid(#[from] EntryError),
+    /// What was to be removed in the same go was not registered here.
+    #[error("nothing named {0:?} of this incarnation is registered here")]
+    NotOurs(Arc<str>),
     /// There are too many registrations, or they are too large.
     #[error("the directory is full: {0}")]
     Full(String),

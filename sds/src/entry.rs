@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use fipa_transport::{Incarnation, Location};
 use serde::{Deserialize, Serialize};
 
-use crate::{NameError, check_name};
+use crate::{Members, NameError, check_name};
 
 /// What the directory knows about one registration.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -31,7 +31,7 @@ pub struct Entry {
     pub source: Source,
     /// Whether it lives on this host.
     pub reach: Reach,
-    /// Whether it is an agent or a gateway.
+    /// Whether it is an agent, a gateway or a coalition.
     pub role: Role,
 }
 
@@ -142,7 +142,7 @@ pub enum Reach {
 }
 
 /// Who stands behind an entry.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
 pub enum Role {
@@ -151,6 +151,9 @@ pub enum Role {
     Agent,
     /// A message transport service that forwards for others. Patterns do not match it.
     Gateway,
+    /// A name that stands for these agents, or for their leader. Patterns do not match it: they
+    /// match its members.
+    Coalition(Members),
 }
 
 /// What the owner of an agent says when registering it.

@@ -8,6 +8,7 @@
 //!   [`MergedDirectory`] makes one view of several.
 //! * [`Exchange`] decides what gateways tell each other of their agents.
 //! * [`Query`] and [`Pattern`] search; [`resolve`] turns the name of a receiver into entries.
+//! * A coalition is an entry, too: its role names its [`Members`].
 //!
 //! The crate depends on `fipa-transport`, sideways, for two words only: an entry lists
 //! [`Location`](fipa_transport::Location)s, and a registration is told from an earlier one of the
@@ -20,6 +21,7 @@
 #[macro_use]
 mod table;
 
+mod coalition;
 mod contacts;
 mod directory;
 mod entry;
@@ -34,13 +36,14 @@ mod query;
 mod resolve;
 mod watch;
 
+pub use coalition::{Members, MembersError};
 pub use contacts::ContactDirectory;
 pub use directory::{DeregisterError, Directory, RegisterError};
 pub use entry::{Entry, EntryError, Mts, Reach, Registration, Role, Source};
 pub use exchange::{EXCHANGE_ONTOLOGY, Exchange, ExchangeDirectory, ExchangeError};
 pub use host::{Departures, HostConfig, HostDirectory, HostError, SocketId};
 #[cfg(feature = "mdns")]
-pub use mdns::{MdnsConfig, MdnsDirectory, MdnsError, MdnsStatus, Withdrawal};
+pub use mdns::{MdnsConfig, MdnsDirectory, MdnsError, MdnsStatus, Multicast, Withdrawal, probe};
 pub use memory::{MemoryDirectory, StaticDirectory};
 pub use merged::MergedDirectory;
 pub use name::{MAX_NAME, NameError, check_name};

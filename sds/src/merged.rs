@@ -166,10 +166,24 @@ impl MergedView {
 
     /// What a change in one of the directories means for the merged view, if anything.
     pub(crate) fn told(&mut self, raw: Change) -> Option<Change> {
-        let Some(name) = raw.name() else {
-            self.reread();
-            return Some(Change::Lagged);
-        };
+        match &raw {
+            Change::Together(raws) => {
+                let names = raws.iter().filter_map(Change::name);
+                let changes = names.filter_map(|name| self.now(name)).collect();
+                Change::together(changes)
+            }
+            one => match one.name() {
+                Some(name) => self.now(name),
+                None => {
+                    self.reread();
+                    Some(Change::Lagged)
+                }
+            },
+        }
+    }
+
+    /// What has changed about that name since it was told of.
+    fn now(&mut self, name: &Arc<str>) -> Option<Change> {
         let after = holder(&self.back_ends, name);
         let before = match &after {
             Some(entry) => self.told.insert(name.clone(), Arc::clone(entry)),

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::{Directory, Entry, Matcher, Pattern, PatternError, Query, Role, is_pattern};
+use crate::{Directory, Entry, Matcher, Pattern, PatternError, Query, Role, coalition, is_pattern};
 
 /// Whom the name of a receiver means.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -11,13 +11,21 @@ pub enum Resolution {
     Exact(Arc<Entry>),
     /// The entries that match a pattern, by name; at least one.
     Multicast(Vec<Arc<Entry>>),
-    /// Nobody: an unknown name, or a pattern that matches nobody but the sender.
+    /// The members of a coalition, coalitions among them followed, or its leader.
+    Coalition {
+        /// Those that are there.
+        agents: Vec<Arc<Entry>>,
+        /// Members whom nobody knows, or beyond the bounds of what one name can mean.
+        missing: Vec<Arc<str>>,
+    },
+    /// Nobody: an unknown name, or a pattern or coalition that has nobody but the sender.
     None,
 }
 
 /// Whom `receiver` means in a letter from `sender`.
 ///
-/// An exact name comes first, whatever characters it has. Otherwise, what
+/// An exact name comes first, whatever characters it has; that of a coalition means its members,
+/// without the sender, or its leader. Otherwise, what
 /// [is a pattern](is_pattern) means every agent whose whole name matches, except the sender
 /// itself and gateways, which nobody means who writes to `.*`.
 ///
@@ -29,7 +37,13 @@ pub fn resolve(
     sender: &str,
 ) -> Result<Resolution, PatternError> {
     if let Some(entry) = directory.lookup(receiver) {
-        return Ok(Resolution::Exact(entry));
+        return Ok(match &entry.role {
+            Role::Coalition(_) => match coalition::agents_of(directory, &entry, sender) {
+                (agents, missing) if agents.is_empty() && missing.is_empty() => Resolution::None,
+                (agents, missing) => Resolution::Coalition { agents, missing },
+            },
+            _ => Resolution::Exact(entry),
+        });
     }
     if !is_pattern(receiver) {
         return Ok(Resolution::None);
@@ -68,7 +82,7 @@ mod tests {
         match resolution {
             Resolution::Exact(entry) => vec![&*entry.name],
             Resolution::Multicast(entries) => entries.iter().map(|entry| &*entry.name).collect(),
-            Resolution::None => Vec::new(),
+            Resolution::Coalition { .. } | Resolution::None => Vec::new(),
         }
     }
 

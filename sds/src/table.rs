@@ -197,18 +197,24 @@ impl<O: Clone + Eq + Hash> Table<O> {
         updates: impl IntoIterator<Item = (O, Arc<str>, Option<Arc<Entry>>)>,
     ) {
         let mut index = self.index.write();
+        // Coalitions that change together are told together: a merger has no state in between.
+        let mut together = Vec::new();
         for (origin, name, entry) in updates {
-            self.apply(&mut index, origin, name, entry);
+            match index.change(origin, name, entry) {
+                Some(change) if change.of_coalition() => together.push(change),
+                change => self.tell(change),
+            }
         }
+        self.tell(Change::together(together));
     }
 
     /// Watchers are told under the lock, so that they are told in the order in which it happened.
     fn apply(&self, index: &mut Index<O>, origin: O, name: Arc<str>, entry: Option<Arc<Entry>>) {
-        let before = index.holder(&name).cloned();
-        index.set(origin, &name, entry);
-        let after = index.holder(&name).cloned();
-        index.reindex(before.as_ref(), after.as_ref());
-        if let Some(change) = Change::between(before, after) {
+        self.tell(index.change(origin, name, entry));
+    }
+
+    fn tell(&self, change: Option<Change>) {
+        if let Some(change) = change {
             self.generation.fetch_add(1, Ordering::Release);
             self.hub.tell(&change);
         }
@@ -219,6 +225,15 @@ impl<O: Eq> Index<O> {
     fn holder(&self, name: &str) -> Option<&Arc<Entry>> {
         let claims = self.claims.get(name)?;
         claims.first().map(|(_, entry)| entry)
+    }
+
+    /// Puts in or takes out what the origin claims by that name.
+    fn change(&mut self, origin: O, name: Arc<str>, entry: Option<Arc<Entry>>) -> Option<Change> {
+        let before = self.holder(&name).cloned();
+        self.set(origin, &name, entry);
+        let after = self.holder(&name).cloned();
+        self.reindex(before.as_ref(), after.as_ref());
+        Change::between(before, after)
     }
 
     fn set(&mut self, origin: O, name: &Arc<str>, entry: Option<Arc<Entry>>) {

@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use parking_lot::Mutex;
 use tokio::sync::mpsc;
 
-use crate::Entry;
 use crate::merged::MergedView;
+use crate::{Entry, Role};
 
 /// One change of a directory.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -23,6 +23,9 @@ pub enum Change {
     },
     /// An entry that is gone.
     Left(Arc<Entry>),
+    /// Several that are one: nobody saw a state in between. At least two, none of them of this
+    /// kind; all of them are of coalitions.
+    Together(Vec<Change>),
     /// The watcher was too slow and has missed changes: it should read all entries again.
     Lagged,
 }
@@ -38,13 +41,40 @@ impl Change {
         }
     }
 
-    /// The name it is about.
+    /// Several changes as one, if there are any.
+    pub(crate) fn together(mut changes: Vec<Self>) -> Option<Self> {
+        if changes.len() < 2 {
+            return changes.pop();
+        }
+        Some(Self::Together(changes))
+    }
+
+    /// The changes it is made of: itself, when it is one.
+    #[must_use]
+    pub fn single(&self) -> &[Self] {
+        match self {
+            Self::Together(changes) => changes,
+            one => std::slice::from_ref(one),
+        }
+    }
+
+    /// Whether it is about a coalition, now or before.
+    pub(crate) fn of_coalition(&self) -> bool {
+        let is = |entry: &Entry| matches!(entry.role, Role::Coalition(_));
+        match self {
+            Self::Joined(entry) | Self::Left(entry) => is(entry),
+            Self::Changed { before, after } => is(before) || is(after),
+            Self::Together(_) | Self::Lagged => false,
+        }
+    }
+
+    /// The name it is about, if it is one.
     pub(crate) fn name(&self) -> Option<&Arc<str>> {
         match self {
             Self::Joined(entry) | Self::Left(entry) | Self::Changed { after: entry, .. } => {
                 Some(&entry.name)
             }
-            Self::Lagged => None,
+            Self::Together(_) | Self::Lagged => None,
         }
     }
 }

@@ -1,8 +1,11 @@
 //! What a machine needs for all this to work, and what is wrong with it.
 //!
 //! Each area has a file with one function that examines it and adds its [`Check`]s; a new area is
-//! a file here and a line in [`examine`]. Examining changes nothing.
+//! a file here and a line in [`examine`]. Examining changes nothing; the
+//! network is asked who is there.
 
+#[cfg(feature = "mdns")]
+mod network;
 #[cfg(feature = "shm")]
 mod shm;
 
@@ -40,11 +43,12 @@ pub enum Verdict {
     Bad,
 }
 
-/// Examines everything that the configuration makes use of. Blocks for some milliseconds.
+/// Examines everything that the configuration makes use of. Blocks for some milliseconds; for three
+/// seconds when `discovery.mdns` is on, while it listens to the network.
 #[must_use]
 pub fn examine(config: &Config) -> Vec<Check> {
     #[cfg_attr(
-        not(feature = "shm"),
+        not(any(feature = "shm", feature = "mdns")),
         expect(unused_mut, reason = "nothing is examined")
     )]
     let mut checks = Vec::new();
@@ -52,16 +56,20 @@ pub fn examine(config: &Config) -> Vec<Check> {
     if config.mts.transports.contains(&crate::Kind::Shm) {
         shm::examine(config, &mut checks);
     }
-    #[cfg(not(feature = "shm"))]
+    #[cfg(feature = "mdns")]
+    if config.discovery.mdns {
+        network::examine(config, &mut checks);
+    }
+    #[cfg(not(any(feature = "shm", feature = "mdns")))]
     let _ = config;
     checks
 }
 
 /// Makes the checks of one area.
-#[cfg(feature = "shm")]
+#[cfg(any(feature = "shm", feature = "mdns"))]
 pub(crate) struct Area(pub(crate) &'static str);
 
-#[cfg(feature = "shm")]
+#[cfg(any(feature = "shm", feature = "mdns"))]
 impl Area {
     pub(crate) fn fine(&self, check: &'static str, found: impl Into<String>) -> Check {
         Check {

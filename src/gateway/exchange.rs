@@ -3,7 +3,7 @@
 //! Its letters are those of the gateway itself, to the neighbour itself, so they go by whatever
 //! transport leads there, in order and acknowledged. The clerk hands over what comes in.
 
-use std::collections::HashSet;
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -77,17 +77,22 @@ impl Exchanging {
     /// Tells and is told, until the service ends.
     pub(super) async fn run(self: Arc<Self>, means: Means, known: Arc<MergedDirectory>) {
         let (mut host, mut there) = (means.service.host.watch(), known.watch());
-        let mut told = HashSet::new();
+        let mut contests = Contests::default();
         let mut sent: JoinSet<(Incarnation, bool)> = JoinSet::new();
         let mut own_changed = true;
         loop {
-            if std::mem::take(&mut own_changed) {
+            let told_now = contests.due().is_some_and(|due| due <= Instant::now());
+            if std::mem::take(&mut own_changed) || told_now {
                 let (own, contested) = own_agents(&means.service.host, &*known);
                 self.core.lock().handle_own(Instant::now(), &own);
-                tell_contested(&means, &contested, &mut told);
+                contests.tell(&means, &contested);
             }
-            let due = self.work(&means, &mut sent);
-            let until = due.map(tokio::time::Instant::from_std);
+            let due = [self.work(&means, &mut sent), contests.due()];
+            let until = due
+                .into_iter()
+                .flatten()
+                .min()
+                .map(tokio::time::Instant::from_std);
             tokio::select! {
                 change = host.next() => {
                     if change.is_none() {
@@ -169,13 +174,40 @@ impl Exchanging {
     }
 }
 
-/// Tells agents of this host, once, that others reach somebody else by their name.
-fn tell_contested(means: &Means, contested: &[Contested], told: &mut HashSet<Incarnation>) {
-    told.retain(|agent| contested.iter().any(|one| one.entry.incarnation == *agent));
-    for Contested { entry, holder } in contested {
-        if !told.insert(entry.incarnation) {
-            continue;
+/// How long somebody else has to have a name before its later owner is told: news of an agent that
+/// moves may overtake each other.
+const CONTESTED: Duration = Duration::from_secs(1);
+
+/// The agents of this host whose name somebody else has: since when, and whether they were told.
+#[derive(Default)]
+struct Contests(HashMap<Incarnation, (Instant, bool)>);
+
+impl Contests {
+    /// When somebody is to be told next.
+    fn due(&self) -> Option<Instant> {
+        let untold = self.0.values().filter(|(_, told)| !told);
+        untold.map(|(since, _)| *since + CONTESTED).min()
+    }
+
+    /// Tells agents of this host, once, that others reach somebody else by their name.
+    fn tell(&mut self, means: &Means, contested: &[Contested]) {
+        let now = Instant::now();
+        self.0
+            .retain(|agent, _| contested.iter().any(|one| one.entry.incarnation == *agent));
+        for one in contested {
+            let contest = self.0.entry(one.entry.incarnation);
+            let (since, told) = contest.or_insert((now, false));
+            if !*told && now >= *since + CONTESTED {
+                *told = true;
+                one.tell(means);
+            }
         }
+    }
+}
+
+impl Contested {
+    fn tell(&self, means: &Means) {
+        let Self { entry, holder } = self;
         let (name, mts) = (&entry.name, &holder.mts.name);
         tracing::warn!(%name, holder = %mts, "an earlier registration on another host has the name");
         let content = format!(

@@ -28,7 +28,7 @@ impl Publisher {
         // The later of one name counts: what is known, before what was heard.
         let all = heard.iter().chain(known.iter());
         let through_here = all
-            .filter(|entry| entry.role == Role::Agent)
+            .filter(|entry| entry.role != Role::Gateway)
             .map(|entry| Entry {
                 locations: self.locations.clone(),
                 ..Entry::clone(entry)
@@ -39,7 +39,7 @@ impl Publisher {
     }
 }
 
-/// The agents of this host, as far as others are to know of them: first those that are, then those
+/// The agents and coalitions of this host, as far as others are to know of them: first those that are, then those
 /// whose name somebody on another host has had for longer, each with that holder.
 pub(super) fn own_agents(
     host: &HostDirectory,
@@ -49,7 +49,7 @@ pub(super) fn own_agents(
     let entries = host.entries();
     let agents = entries
         .iter()
-        .filter(|entry| entry.reach == Reach::Local && entry.role == Role::Agent);
+        .filter(|entry| entry.reach == Reach::Local && entry.role != Role::Gateway);
     let age = |entry: &Entry| (entry.registered, entry.incarnation);
     for entry in agents {
         match known.known(&entry.name) {
@@ -142,6 +142,7 @@ impl Keeper {
                 agent_type: entry.agent_type.clone(),
                 description: entry.description.clone(),
                 registered: entry.registered,
+                role: entry.role.clone(),
                 ..Registration::new(Arc::clone(name), entry.incarnation, locations.clone())
             };
             match network.register(registration) {

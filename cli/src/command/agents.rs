@@ -2,6 +2,7 @@
 
 mod watch;
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
@@ -16,7 +17,7 @@ use crate::report::Failure;
 
 /// Show who is there, and where
 ///
-/// Lists the agents of the domain on this host and, when a gateway is running (`fipa up`), those
+/// Lists the agents and coalitions of the domain on this host and, when a gateway is running (`fipa up`), those
 /// that it knows on other hosts; the gateway itself too. Needs no gateway.
 ///
 /// A pattern is a regular expression for the whole text, such as `arm_.*`. What has none of
@@ -32,7 +33,7 @@ Examples:
 
 Columns:
   REACH      this host, or the gateway that letters go through
-  LOCATIONS  where it takes letters, in order of preference
+  LOCATIONS  where it takes letters, in order of preference; of a coalition, its members
   MTS        the message transport service that delivers to it
   LEARNT     how: host (a process of this host), mdns (announced on the network), exchange (told by
              its gateway), static (the configuration), contact (it has written)
@@ -40,7 +41,8 @@ Columns:
 
 JSON:
   { \"domain\": text, \"gateway\": the name of this host's gateway, or null,
-    \"agents\": [ { \"name\", \"type\", \"description\", \"role\": \"agent\" or \"gateway\",
+    \"agents\": [ { \"name\", \"type\", \"description\", \"role\": \"agent\", \"gateway\" or \"coalition\",
+                  \"members\": [ name ] and \"leader\": name or null, of a coalition,
                   \"reach\": \"local\" or \"remote\", \"gateway\": name, when it is remote,
                   \"locations\": [ text ], \"mts\": { \"name\", \"incarnation\" },
                   \"incarnation\", \"registered\": time, \"source\": how it was learnt } ] }
@@ -179,7 +181,7 @@ impl Row {
             "name": entry.name,
             "type": entry.agent_type,
             "description": entry.description,
-            "role": entry.role,
+            "role": role(&entry.role),
             "reach": if through.is_none() { "local" } else { "remote" },
             "locations": locations,
             "mts": entry.mts,
@@ -190,6 +192,20 @@ impl Row {
         if let Some(gateway) = &through {
             json["gateway"] = gateway.as_str().into();
         }
+        let places = match &entry.role {
+            Role::Coalition(members) => {
+                json["members"] = json!(members.names());
+                json["leader"] = json!(members.leader());
+                let leads = |name: &Arc<str>| members.leader().is_some_and(|leader| leader == name);
+                let names = members.names().iter();
+                let line = |name: &Arc<str>| match leads(name) {
+                    true => format!("{name} (leads)"),
+                    false => name.to_string(),
+                };
+                names.map(line).collect()
+            }
+            _ => locations,
+        };
         let reach = match through {
             None => "this host".to_owned(),
             Some(gateway) => format!("via {gateway}"),
@@ -198,7 +214,7 @@ impl Row {
             entry.name.to_string(),
             entry.agent_type.clone(),
             reach,
-            locations.join("\n"),
+            places.join("\n"),
             entry.mts.name.to_string(),
             learnt(entry.source).to_owned(),
             age(entry),
@@ -207,12 +223,21 @@ impl Row {
     }
 }
 
-fn gateway(directory: &dyn Directory) -> Option<std::sync::Arc<Entry>> {
+fn gateway(directory: &dyn Directory) -> Option<Arc<Entry>> {
     let entries = directory.entries();
     let mut gateways = entries
         .iter()
         .filter(|entry| entry.role == Role::Gateway && entry.reach == Reach::Local);
     gateways.next().cloned()
+}
+
+fn role(role: &Role) -> &'static str {
+    match role {
+        Role::Agent => "agent",
+        Role::Gateway => "gateway",
+        Role::Coalition(_) => "coalition",
+        _ => "?",
+    }
 }
 
 fn learnt(source: Source) -> &'static str {

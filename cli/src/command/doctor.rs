@@ -12,12 +12,14 @@ use crate::report::Failure;
 /// Examine what is wrong with this machine
 ///
 /// Looks at what the configured transports need: the size of /dev/shm, limits, permissions, what
-/// dead processes have left. Changes nothing.
+/// dead processes have left; and, where discovery.mdns is on, at what the network does with
+/// multicast on each interface, which takes three seconds. Changes nothing.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   fipa doctor
   fipa doctor --set transport.shm.capacity=1GiB
+  fipa doctor --set 'discovery.interfaces=[\"wlan0\"]'
   fipa doctor --json | jq -r '.checks[] | select(.verdict != \"fine\") | .advice'
 
 Verdicts:

@@ -144,6 +144,7 @@ fn ready_json(config: &Config, gateway: &Gateway, problem: Option<&str>) -> Valu
 
 fn log(change: &Change) {
     match change {
+        Change::Together(changes) => changes.iter().for_each(log),
         Change::Joined(entry) => tell("joined", entry),
         Change::Changed { after, .. } => tell("changed", after),
         Change::Left(entry) => tell("left", entry),

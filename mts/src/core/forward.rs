@@ -186,17 +186,27 @@ impl Core {
         let sender = stamp::sender(&letter).unwrap_or_default();
         let stream_sender = self.desk.config.incarnation;
         for receiver in receivers {
-            let entries = match fipa_sds::resolve(&*directory, &receiver, &sender) {
-                Ok(Resolution::Exact(entry)) => vec![entry],
-                Ok(Resolution::Multicast(entries)) => entries,
-                Ok(Resolution::None) | Err(_) => Vec::new(),
+            let (entries, missing) = match fipa_sds::resolve(&*directory, &receiver, &sender) {
+                Ok(Resolution::Exact(entry)) => (vec![entry], Vec::new()),
+                Ok(Resolution::Multicast(entries)) => (entries, Vec::new()),
+                Ok(Resolution::Coalition {
+                    agents,
+                    mut missing,
+                }) => {
+                    // Its members elsewhere are not reached from here, and the sender is told.
+                    let away = agents.iter().filter(|entry| entry.reach != Reach::Local);
+                    missing.extend(away.map(|entry| Arc::clone(&entry.name)));
+                    (agents, missing)
+                }
+                Ok(Resolution::None) | Err(_) => (Vec::new(), Vec::new()),
             };
-            let here = entries
-                .into_iter()
-                .filter(|entry| entry.reach == Reach::Local);
-            let mut found = false;
+            let here = entries.iter().filter(|entry| entry.reach == Reach::Local);
+            let nobody = here.clone().next().is_none() && missing.is_empty();
+            let receiver: Arc<str> = receiver.as_str().into();
+            for name in missing.into_iter().chain(nobody.then_some(receiver)) {
+                self.unframed_to_nobody(&name, &letter, via, from);
+            }
             for entry in here {
-                found = true;
                 let stream = Stream {
                     sender: stream_sender,
                     receiver: entry.incarnation,
@@ -241,33 +251,43 @@ impl Core {
                 delivery.hops = 1;
                 self.put(now, stream, Arc::clone(&entry.name), delivery);
             }
-            if !found {
-                tracing::info!(%receiver, %sender, "an unframed letter names nobody of this host");
-                let stream = Stream {
-                    sender: stream_sender,
-                    receiver: Incarnation::UNKNOWN,
-                };
-                let name: Arc<str> = receiver.as_str().into();
-                let sequence = self.sequence_of(stream_sender);
-                self.desk.notice(stream, sequence, &name, || News::Passed {
-                    via,
-                    remote: true,
-                    letter: letter.clone(),
-                });
-                self.desk.notice(stream, sequence, &name, || News::Settled {
-                    outcome: failed(FailureReason::NoSuchAgent),
-                    sender: true,
-                });
-                self.desk.undelivered.push_back(Undelivered {
-                    sender: Author::OldPeer { from },
-                    receiver: name,
-                    letter: letter.clone(),
-                    reason: FailureReason::NoSuchAgent,
-                    detail: String::new(),
-                });
-            }
         }
         self.tell_failures(now);
+    }
+
+    /// An old peer's letter is for somebody who is not on this host.
+    fn unframed_to_nobody(
+        &mut self,
+        receiver: &Arc<str>,
+        letter: &Letter,
+        via: Kind,
+        from: IpAddr,
+    ) {
+        tracing::info!(%receiver, %from, "an unframed letter names nobody of this host");
+        let own = self.desk.config.incarnation;
+        let stream = Stream {
+            sender: own,
+            receiver: Incarnation::UNKNOWN,
+        };
+        let sequence = self.sequence_of(own);
+        self.desk
+            .notice(stream, sequence, receiver, || News::Passed {
+                via,
+                remote: true,
+                letter: letter.clone(),
+            });
+        self.desk
+            .notice(stream, sequence, receiver, || News::Settled {
+                outcome: failed(FailureReason::NoSuchAgent),
+                sender: true,
+            });
+        self.desk.undelivered.push_back(Undelivered {
+            sender: Author::OldPeer { from },
+            receiver: Arc::clone(receiver),
+            letter: letter.clone(),
+            reason: FailureReason::NoSuchAgent,
+            detail: String::new(),
+        });
     }
 
     /// Tells senders of what failed, in the form of FIPA `failure` messages.

@@ -34,7 +34,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::Letter;
-use fipa_sds::{Directory, Entry, Pattern, Resolution};
+use fipa_sds::{Directory, Entry, Pattern, Resolution, Role};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind, Location,
     Outcome, Parcel, Report, Stream, Verdict,
@@ -85,7 +85,7 @@ pub struct Submission {
     pub sender: Incarnation,
     /// The letter, for all receivers.
     pub letter: Letter,
-    /// Names or patterns of the receivers.
+    /// Names of the receivers, of coalitions too, or patterns.
     pub receivers: Vec<Arc<str>>,
     /// How long delivery may take, at most [`MAX_DEADLINE`].
     pub deadline: Duration,
@@ -217,6 +217,17 @@ impl Core {
                 }
                 Ok(Resolution::Exact(entry)) => vec![entry],
                 Ok(Resolution::Multicast(entries)) => entries,
+                Ok(Resolution::Coalition { agents, missing }) => {
+                    count += missing.len();
+                    for member in missing {
+                        let reason = FailureReason::NoSuchAgent;
+                        self.undeliverable(send, sender, member, letter.clone(), reason);
+                    }
+                    if agents.is_empty() {
+                        continue;
+                    }
+                    agents
+                }
                 Ok(Resolution::None) | Err(_) => Vec::new(),
             };
             if entries.is_empty() {
@@ -378,10 +389,13 @@ impl Core {
         self.desk.way_states(now.instant)
     }
 
-    /// The first way that a letter from here to this receiver would take now.
+    /// The first way that a letter from here to this receiver would take now; none to several.
     #[must_use]
     pub fn first_way(&self, now: Now, receiver: &str) -> Option<Location> {
         let entry = self.desk.directory.lookup(receiver)?;
+        if matches!(entry.role, Role::Coalition(_)) {
+            return None;
+        }
         self.desk.choose(now.instant, &entry, &[])
     }
 
@@ -401,6 +415,7 @@ impl Core {
             let entries = match fipa_sds::resolve(directory, receiver, own.unwrap_or_default()) {
                 Ok(Resolution::Exact(entry)) => vec![entry],
                 Ok(Resolution::Multicast(entries)) => entries,
+                Ok(Resolution::Coalition { agents, .. }) => agents,
                 Ok(Resolution::None) | Err(_) => Vec::new(),
             };
             for entry in entries {

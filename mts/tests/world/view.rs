@@ -74,7 +74,7 @@ impl View {
             registered: SystemTime::UNIX_EPOCH,
             source: Source::Host,
             reach,
-            role: registered.role,
+            role: registered.role.clone(),
         }))
     }
 

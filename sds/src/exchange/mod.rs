@@ -54,8 +54,16 @@ struct Own {
     agents: Agents,
     /// Counts the changes of `agents`.
     version: u64,
-    /// The names that changed, the latest last; that of `version` is the last one.
-    log: VecDeque<Arc<str>>,
+    /// The names that changed, the latest last; that of `version` is the last one. Coalitions that
+    /// changed together stand together.
+    log: VecDeque<Logged>,
+}
+
+#[derive(Debug, Clone)]
+struct Logged {
+    name: Arc<str>,
+    /// It changed together with the one before it: they are told in one letter.
+    together: bool,
 }
 
 /// A gateway that can be written to, or could a moment ago.
@@ -147,7 +155,8 @@ impl Exchange {
         Arc::clone(&self.directory)
     }
 
-    /// These are the agents to be told of now: those of this host, gateways left out.
+    /// These are the agents and coalitions to be told of now: those of this host, gateways left
+    /// out.
     pub fn handle_own<'a>(
         &mut self,
         now: Instant,
@@ -155,7 +164,7 @@ impl Exchange {
     ) {
         let agents = agents.into_iter();
         let agents: Agents = agents
-            .filter(|entry| entry.role == Role::Agent)
+            .filter(|entry| entry.role != Role::Gateway)
             .take(Self::MAX_AGENTS)
             .map(|entry| (Arc::clone(&entry.name), Arc::clone(entry)))
             .collect();
@@ -354,10 +363,21 @@ impl Own {
             .filter(|name| !self.agents.contains_key(*name));
         let differs = |(name, entry): &(&Arc<str>, &Arc<Entry>)| before.get(*name) != Some(*entry);
         let other = self.agents.iter().filter(differs).map(|(name, _)| name);
-        let changed: Vec<Arc<str>> = left.chain(other).cloned().collect();
-        self.version += changed.len() as u64;
-        let any = !changed.is_empty();
-        self.log.extend(changed);
+        let is_coalition = |name: &&Arc<str>| {
+            let entry = self.agents.get(*name).or_else(|| before.get(*name));
+            entry.is_some_and(|entry| matches!(entry.role, Role::Coalition(_)))
+        };
+        let (coalitions, agents): (Vec<_>, Vec<_>) = left.chain(other).partition(is_coalition);
+        let any = !coalitions.is_empty() || !agents.is_empty();
+        self.version += (coalitions.len() + agents.len()) as u64;
+        let logged = |name: &Arc<str>, together| Logged {
+            name: Arc::clone(name),
+            together,
+        };
+        let agents = agents.into_iter().map(|name| logged(name, false));
+        let coalitions = coalitions.into_iter().enumerate();
+        let coalitions = coalitions.map(|(number, name)| logged(name, number > 0));
+        self.log.extend(agents.chain(coalitions));
         let surplus = self.log.len().saturating_sub(Exchange::LOG);
         self.log.drain(..surplus);
         any
@@ -417,8 +437,10 @@ impl Own {
         let start = self.log.len().saturating_sub(behind);
         let mut names = BTreeSet::new();
         let (mut bytes, mut taken) = (0, 0);
-        for name in self.log.range(start..) {
-            if names.len() >= Exchange::BATCH || bytes > Exchange::BATCH_BYTES {
+        for Logged { name, together } in self.log.range(start..) {
+            let full = names.len() >= Exchange::BATCH || bytes > Exchange::BATCH_BYTES;
+            // Coalitions that changed together are not torn apart, as long as they fit a letter.
+            if full && !(*together && bytes <= Exchange::MAX_CONTENT / 2) {
                 break;
             }
             if names.insert(Arc::clone(name)) {
@@ -460,7 +482,11 @@ fn batch<'a>(entries: impl Iterator<Item = &'a Arc<Entry>>) -> Vec<&'a Arc<Entry
 }
 
 fn weight(entry: &Entry) -> usize {
-    entry.name.len() + entry.agent_type.len() + entry.description.len() + 100
+    let members = match &entry.role {
+        Role::Coalition(members) => members.names().iter().map(|name| name.len() + 10).sum(),
+        _ => 0,
+    };
+    entry.name.len() + entry.agent_type.len() + entry.description.len() + members + 100
 }
 
 impl Telling {
@@ -572,7 +598,7 @@ impl Neighbour {
             reach: Reach::Remote {
                 gateway: self.mts.incarnation,
             },
-            role: Role::Agent,
+            role: agent.coalition.map_or(Role::Agent, Role::Coalition),
         };
         if let Err(error) = entry.check() {
             tracing::debug!(gateway = %self.mts.name, %error, "agent not used");

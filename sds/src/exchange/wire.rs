@@ -5,7 +5,8 @@
 //! { "version": 1, "tell": "goodbye" }
 //! { "version": 1, "tell": { "full": { "version": 7, "first": true, "last": false, "agents": [agent] } } }
 //! { "version": 1, "tell": { "changes": { "from": 7, "to": 9, "agents": [agent], "left": [name] } } }
-//! agent = { "name", "type", "id", "description", "registered": milliseconds since 1970, UTC }
+//! agent = { "name", "type", "id", "description", "registered": milliseconds since 1970, UTC,
+//!           "coalition": { "members": [name], "leader": name }, for a coalition }
 //! ```
 //!
 //! Where the agents are is not said: with the gateway whose letter it is. Unknown keys are passed
@@ -17,8 +18,8 @@ use fipa_transport::Incarnation;
 use serde::de::Error as _;
 use serde::{Deserialize, Serialize};
 
-use crate::Entry;
 use crate::entry::millis_of_time;
+use crate::{Entry, Members, Role};
 
 const VERSION: u32 = 1;
 
@@ -71,6 +72,8 @@ pub(super) struct Agent {
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub(super) description: String,
     pub(super) registered: u64,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) coalition: Option<Members>,
 }
 
 impl Agent {
@@ -81,6 +84,10 @@ impl Agent {
             agent_type: entry.agent_type.clone(),
             description: entry.description.clone(),
             registered: millis_of_time(entry.registered),
+            coalition: match &entry.role {
+                Role::Coalition(members) => Some(members.clone()),
+                _ => None,
+            },
         }
     }
 }

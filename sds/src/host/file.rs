@@ -120,7 +120,7 @@ impl WrittenEntry {
             locations: entry.locations.clone(),
             description: entry.description.clone(),
             registered: millis_of_time(entry.registered),
-            role: entry.role,
+            role: entry.role.clone(),
             source: remote.is_some().then_some(entry.source),
             remote,
         }

@@ -116,6 +116,24 @@ impl HostDirectory {
         self.shared.publish(published.into_values().collect())
     }
 
+    /// Registers or changes all of these and removes those, by name and incarnation, or does
+    /// nothing at all. Those who watch see coalitions among them change in one go
+    /// ([`Change::Together`](crate::Change::Together)).
+    ///
+    /// # Errors
+    /// When somebody else has one of the names, a registration is not valid, one to be removed was
+    /// not made here, or the directory cannot be written.
+    pub fn replace(
+        &self,
+        registrations: Vec<Registration>,
+        leaving: &[(&str, Incarnation)],
+    ) -> Result<(), RegisterError> {
+        let entries = registrations.into_iter();
+        let entries = entries.map(|one| one.into_entry(&self.config.mts, Source::Host));
+        self.shared
+            .replace(entries.collect::<Result<_, _>>()?, leaving)
+    }
+
     /// Tells from now on when processes of this host have ended, in order or not.
     #[must_use]
     pub fn departures(&self) -> Departures {

@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use fipa_transport::Incarnation;
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
@@ -227,13 +228,44 @@ impl Shared {
                 Some(before) => own.agents.insert(before.name.clone(), before),
                 None => own.agents.remove(&entry.name),
             };
-            return Err(match error {
-                WriteError::Full(why) => RegisterError::Full(why),
-                WriteError::Host(error) => failed(error),
-            });
+            return Err(error.into());
         }
         self.table.put(self.place.id(), Arc::clone(&entry));
         Ok(entry)
+    }
+
+    pub(super) fn replace(
+        &self,
+        entries: Vec<Entry>,
+        leaving: &[(&str, Incarnation)],
+    ) -> Result<(), RegisterError> {
+        let guard = self.place.lock().map_err(failed)?;
+        for entry in &entries {
+            self.free(&guard, entry)?;
+        }
+        let mut own = self.own.lock();
+        if own.closed {
+            return Err(RegisterError::Closed);
+        }
+        let before = own.agents.clone();
+        for (name, incarnation) in leaving {
+            let ours = own.agents.get(*name);
+            if ours.is_none_or(|entry| entry.incarnation != *incarnation) {
+                own.agents = before;
+                return Err(RegisterError::NotOurs((*name).into()));
+            }
+            own.agents.remove(*name);
+        }
+        let entries = entries
+            .into_iter()
+            .map(|entry| (entry.name.clone(), Arc::new(entry)));
+        own.agents.extend(entries);
+        if let Err(error) = self.write(&guard, &own) {
+            own.agents = before;
+            return Err(error.into());
+        }
+        self.tell(self.place.id(), &before, &own.agents);
+        Ok(())
     }
 
     /// Sees to it that nobody who lives has the name.
@@ -346,6 +378,15 @@ enum WriteError {
     Full(String),
     #[error(transparent)]
     Host(#[from] HostError),
+}
+
+impl From<WriteError> for RegisterError {
+    fn from(error: WriteError) -> Self {
+        match error {
+            WriteError::Full(why) => Self::Full(why),
+            WriteError::Host(error) => failed(error),
+        }
+    }
 }
 
 fn failed(error: HostError) -> RegisterError {

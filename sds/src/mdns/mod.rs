@@ -13,6 +13,7 @@
 mod beacon;
 mod ear;
 mod held;
+mod probe;
 mod record;
 mod task;
 mod whole;
@@ -28,6 +29,7 @@ use tokio::sync::{Notify, broadcast};
 
 use self::beacon::Digest;
 use self::held::Holdings;
+pub use self::probe::{Multicast, probe};
 use crate::table::Table;
 use crate::{
     DeregisterError, Directory, Entry, Mts, RegisterError, Registration, Source, Subscriber,

@@ -13,7 +13,9 @@
 //! | `fipa-name` | the exact name |
 //! | `fipa-id` | the incarnation |
 //! | `fipa-mts`, `fipa-mts-id` | name and incarnation of the gateway that announces it |
-//! | `fipa-role` | `gateway`, or absent for an agent |
+//! | `fipa-role` | `gateway` or `coalition`, absent for an agent |
+//! | `fipa-members` | names of the members of a coalition, with a line feed between two |
+//! | `fipa-leader` | the name of its leader, if it has one |
 //! | `fipa-time` | when it was registered, in milliseconds since 1970, UTC |
 //! | `fipa-locations` | all locations, in order, with a space between two |
 //! | `fipa-type`, `fipa-description` | in full, when the peers' key has only the beginning |
@@ -34,7 +36,7 @@ use std::time::SystemTime;
 use fipa_transport::{Incarnation, Kind, Location, LocationError, Signature};
 
 use crate::entry::{millis_of_time, time_of_millis};
-use crate::{Entry, EntryError, Mts, Reach, Role, Source};
+use crate::{Entry, EntryError, Members, Mts, Reach, Role, Source};
 
 /// Longest value that the peers write, and that we write into one string.
 const MAX_VALUE: usize = 200;
@@ -75,8 +77,17 @@ pub(super) fn encode(entry: &Entry) -> Properties {
     own("fipa-id", &entry.incarnation.to_string());
     own("fipa-mts", &entry.mts.name);
     own("fipa-mts-id", &entry.mts.incarnation.to_string());
-    if entry.role == Role::Gateway {
-        own("fipa-role", "gateway");
+    match &entry.role {
+        Role::Agent => {}
+        Role::Gateway => own("fipa-role", "gateway"),
+        Role::Coalition(members) => {
+            own("fipa-role", "coalition");
+            // No name has control characters.
+            own("fipa-members", &members.names().join("\n"));
+            if let Some(leader) = members.leader() {
+                own("fipa-leader", leader);
+            }
+        }
     }
     own("fipa-time", &time.to_string());
     let locations: Vec<String> = entry.locations.iter().map(Location::to_string).collect();
@@ -217,6 +228,7 @@ fn ours(record: &Record<'_>) -> Result<Entry, RecordError> {
     let role = match record.text("fipa-role")?.as_deref() {
         None => Role::Agent,
         Some("gateway") => Role::Gateway,
+        Some("coalition") => Role::Coalition(members(record)?),
         Some(_) => return Err(RecordError::Value("fipa-role")),
     };
     let whole = |ours: &'static str, theirs: &'static str| {
@@ -239,6 +251,13 @@ fn ours(record: &Record<'_>) -> Result<Entry, RecordError> {
         reach: Reach::Remote { gateway: mts },
         role,
     })
+}
+
+fn members(record: &Record<'_>) -> Result<Members, RecordError> {
+    let key = "fipa-members";
+    let names = record.text(key)?.ok_or(RecordError::Missing(key))?;
+    let leader = record.text("fipa-leader")?.map(Into::into);
+    Members::new(names.split('\n'), leader).map_err(|_| RecordError::Value(key))
 }
 
 fn theirs(label: &str, record: &Record<'_>, whole: bool, now: SystemTime) -> Entry {
@@ -563,6 +582,8 @@ mod tests {
             description in any_text(Entry::MAX_DESCRIPTION),
             millis: u64,
             gateway: bool,
+            members in prop::collection::vec(any_text(200), 0..5),
+            led: bool,
         ) -> Entry {
             let mts = Mts::new(mts_name, Incarnation::from_u64(mts));
             Entry {
@@ -575,7 +596,14 @@ mod tests {
                 description,
                 registered: time_of_millis(millis),
                 source: Source::Mdns,
-                role: if gateway { Role::Gateway } else { Role::Agent },
+                role: match Members::new(
+                    members.iter().map(String::as_str),
+                    members.first().filter(|_| led).map(|name| name.as_str().into()),
+                ) {
+                    Ok(members) => Role::Coalition(members),
+                    Err(_) if gateway => Role::Gateway,
+                    Err(_) => Role::Agent,
+                },
             }
         }
     }

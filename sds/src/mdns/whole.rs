@@ -18,6 +18,7 @@ use std::sync::Arc;
 use std::task::Poll;
 use std::time::{Duration, Instant};
 
+use if_addrs::Interface;
 use simple_dns::rdata::RData;
 use simple_dns::{CLASS, Label, Name, Packet, QCLASS, QTYPE, Question, TYPE};
 use socket2::{Domain, Protocol, SockRef, Socket, Type};
@@ -28,7 +29,7 @@ use super::record::Properties;
 use super::{MdnsConfig, SERVICE_TYPE};
 
 /// Largest packet of multicast DNS (RFC 6762 clause 17).
-const MAX_PACKET: usize = 9000;
+pub(super) const MAX_PACKET: usize = 9000;
 /// Most records asked for at one time.
 const MAX_WANTED: usize = 4096;
 /// Most questions in one packet: they fit the smallest packet every network carries.
@@ -187,7 +188,7 @@ pub(super) fn is_plausible(packet: &[u8]) -> bool {
 pub(super) struct Sockets {
     open: Vec<(UdpSocket, SocketAddr)>,
     /// Those they are for.
-    interfaces: Vec<if_addrs::Interface>,
+    interfaces: Vec<Interface>,
     buffer: Vec<u8>,
 }
 
@@ -204,16 +205,7 @@ impl Sockets {
     /// Opens what can be opened of the interfaces that the configuration names, if they are not
     /// the same as before.
     pub(super) fn refresh(&mut self, config: &MdnsConfig) -> io::Result<()> {
-        let mut interfaces = if_addrs::get_if_addrs()?;
-        interfaces.retain(|interface| {
-            let chosen = |one: &String| match one.parse::<IpAddr>() {
-                Ok(address) => address == interface.ip(),
-                Err(_) => *one == interface.name,
-            };
-            let all = config.interfaces.is_empty();
-            interface.is_oper_up() && (all || config.interfaces.iter().any(chosen))
-        });
-        interfaces.truncate(MAX_INTERFACES);
+        let interfaces = interfaces(config)?;
         if interfaces == self.interfaces {
             return Ok(());
         }
@@ -233,6 +225,7 @@ impl Sockets {
                     group_v6(index, config.port)
                 }
             };
+            let opened = opened.and_then(|(socket, to)| Ok((UdpSocket::from_std(socket)?, to)));
             match opened {
                 Ok(socket) => self.open.push(socket),
                 Err(error) => last_error = Some(error),
@@ -277,7 +270,25 @@ impl Sockets {
     }
 }
 
-fn group_v4(interface: Ipv4Addr, port: u16) -> io::Result<(UdpSocket, SocketAddr)> {
+/// The addresses of those that are up and that the configuration names.
+pub(super) fn interfaces(config: &MdnsConfig) -> io::Result<Vec<Interface>> {
+    let mut interfaces = if_addrs::get_if_addrs()?;
+    interfaces.retain(|interface| {
+        let chosen = |one: &String| match one.parse::<IpAddr>() {
+            Ok(address) => address == interface.ip(),
+            Err(_) => *one == interface.name,
+        };
+        let all = config.interfaces.is_empty();
+        interface.is_oper_up() && (all || config.interfaces.iter().any(chosen))
+    });
+    interfaces.truncate(MAX_INTERFACES);
+    Ok(interfaces)
+}
+
+/// A socket in the group of an interface, which is not waited for, and the group.
+pub(super) type Grouped = (std::net::UdpSocket, SocketAddr);
+
+pub(super) fn group_v4(interface: Ipv4Addr, port: u16) -> io::Result<Grouped> {
     let group = Ipv4Addr::new(224, 0, 0, 251);
     let address = SocketAddr::V4(SocketAddrV4::new(group, port));
     let socket = socket(Domain::IPV4, address)?;
@@ -289,7 +300,7 @@ fn group_v4(interface: Ipv4Addr, port: u16) -> io::Result<(UdpSocket, SocketAddr
     Ok((socket, address))
 }
 
-fn group_v6(interface: u32, port: u16) -> io::Result<(UdpSocket, SocketAddr)> {
+pub(super) fn group_v6(interface: u32, port: u16) -> io::Result<Grouped> {
     let group = Ipv6Addr::new(0xff02, 0, 0, 0, 0, 0, 0, 0xfb);
     let address = SocketAddr::V6(SocketAddrV6::new(group, port, 0, interface));
     let socket = socket(Domain::IPV6, address)?;
@@ -301,7 +312,7 @@ fn group_v6(interface: u32, port: u16) -> io::Result<(UdpSocket, SocketAddr)> {
     Ok((socket, address))
 }
 
-fn socket(domain: Domain, address: SocketAddr) -> io::Result<UdpSocket> {
+fn socket(domain: Domain, address: SocketAddr) -> io::Result<std::net::UdpSocket> {
     let socket = Socket::new(domain, Type::DGRAM, Some(Protocol::UDP))?;
     if domain == Domain::IPV6 {
         socket.set_only_v6(true)?;
@@ -310,7 +321,7 @@ fn socket(domain: Domain, address: SocketAddr) -> io::Result<UdpSocket> {
     socket.set_reuse_port(true)?;
     socket.set_nonblocking(true)?;
     socket.bind(&address.into())?;
-    UdpSocket::from_std(socket.into())
+    Ok(socket.into())
 }
 
 #[cfg(test)]

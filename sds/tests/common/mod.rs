@@ -62,7 +62,7 @@ fn said(entry: &Entry) -> Registration {
         locations: entry.locations.clone(),
         description: entry.description.clone(),
         registered: entry.registered,
-        role: entry.role,
+        role: entry.role.clone(),
     }
 }
 

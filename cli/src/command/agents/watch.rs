@@ -17,6 +17,7 @@ use crate::report::Failure;
 pub(super) fn run(filter: &Filter, config: &Config, json: bool) -> Result<(), Failure> {
     options::runtime()?.block_on(async {
         let mut stop = Stop::listen()?;
+        let mut reader = output::Reader::of_output();
         let domain = membership::join(config).await?;
         let directory = domain.directory();
         // Watching begins before reading: what joins in between is told by one of them.
@@ -30,20 +31,14 @@ pub(super) fn run(filter: &Filter, config: &Config, json: bool) -> Result<(), Fa
             }
             tokio::select! {
                 () = stop.requested() => break,
+                () = reader.gone() => break,
                 change = changes.next() => match change {
                     None => break,
-                    Some(Change::Joined(entry)) => {
-                        told = shown.now(&entry.name, Some(&entry), directory, filter, json);
-                    }
-                    Some(Change::Changed { after, .. }) => {
-                        told = shown.now(&after.name, Some(&after), directory, filter, json);
-                    }
-                    Some(Change::Left(entry)) => {
-                        told = shown.now(&entry.name, None, directory, filter, json);
-                    }
-                    // So many at once that some were missed: what is there is compared.
-                    Some(Change::Lagged) => {
-                        told = shown.all(directory, filter, What::Joined, json);
+                    Some(change) => {
+                        let mut changes = change.single().iter();
+                        told = changes.try_for_each(|change| {
+                            shown.change(change, directory, filter, json)
+                        });
                     }
                 },
             }
@@ -104,6 +99,23 @@ impl Shown {
             }
         }
         Ok(())
+    }
+
+    fn change(
+        &mut self,
+        change: &Change,
+        directory: &dyn Directory,
+        filter: &Filter,
+        json: bool,
+    ) -> Result<(), Failure> {
+        match change {
+            Change::Joined(entry) | Change::Changed { after: entry, .. } => {
+                self.now(&entry.name, Some(entry), directory, filter, json)
+            }
+            Change::Left(entry) => self.now(&entry.name, None, directory, filter, json),
+            // So many at once that some were missed: what is there is compared.
+            Change::Together(_) | Change::Lagged => self.all(directory, filter, What::Joined, json),
+        }
     }
 
     /// Tells what that name means now, if it is different from what was shown.

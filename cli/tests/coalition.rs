@@ -1,0 +1,61 @@
+//! `fipa coalition`, and who watches agents, as a shell runs them.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+
+mod common;
+
+use std::io::{BufRead, BufReader};
+use std::process::Stdio;
+
+use common::Host;
+
+#[test]
+fn a_coalition_is_shown_and_written_to() {
+    let host = Host::new();
+    let (parrot, owl) = (host.echo("parrot"), host.echo("owl"));
+    let members = ["coalition", "birds", "parrot", "owl", "--leader", "owl"];
+    let birds = host.start(&members);
+    assert!(
+        birds.ready.starts_with("birds of the domain"),
+        "{}",
+        birds.ready
+    );
+    let listed = host.run(&["agents", "birds", "--json"]).done_json();
+    let listed = &listed["agents"][0];
+    assert_eq!(listed["role"], "coalition");
+    assert_eq!(listed["members"], serde_json::json!(["parrot", "owl"]));
+    assert_eq!(listed["leader"], "owl");
+    let table = host.run(&["agents", "birds"]).done();
+    assert!(table.contains("owl (leads)"), "{table}");
+    let sent = host.run(&["send", "--to", "birds", "--content", "hello", "--json"]);
+    let sent = sent.done_json().to_string();
+    assert!(sent.contains("\"receiver\":\"owl\""), "{sent}");
+    assert!(!sent.contains("parrot"), "{sent}");
+    let taken = host.run(&["coalition", "birds", "parrot"]).failed(1);
+    assert!(taken.contains("birds"), "{taken}");
+    let stranger = host.run(&["coalition", "x", "parrot", "--leader", "owl"]);
+    let stranger = stranger.failed(2);
+    assert!(stranger.contains("owl"), "{stranger}");
+    assert_eq!(birds.signal("-INT"), (Some(0), String::new()));
+    let gone = host.run(&["agents", "birds"]).done();
+    assert!(gone.contains("nobody"), "{gone}");
+    drop((parrot, owl));
+}
+
+#[test]
+fn who_watches_ends_when_nobody_reads_any_more() {
+    let host = Host::new();
+    let _parrot = host.echo("parrot");
+    let mut watching = host
+        .command(&["agents", "--watch"])
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    let mut output = BufReader::new(watching.stdout.take().unwrap());
+    output.read_line(&mut line).unwrap();
+    assert!(line.contains("present  parrot"), "{line}");
+    // As `head` does. Nothing else happens that would be told; a watchdog ends a test that hangs.
+    drop(output);
+    assert!(watching.wait().unwrap().success());
+}

@@ -1,0 +1,297 @@
+//! Coalitions: names of their own that stand for several agents, such as the agents of modules
+//! that are physically joined.
+//!
+//! A coalition is an entry with the role [`Role::Coalition`], which says who its [`Members`] are,
+//! by name: an agent that moves to another host stays a member. It has no queue; a letter to it is
+//! one letter to each member, or to its leader. Members may be coalitions.
+//!
+//! What the network says about coalitions may be hostile, so the number of members, how deep
+//! coalitions are nested and how many agents one name can mean are bounded.
+
+use std::collections::HashSet;
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{Directory, Entry, NameError, Role, check_name};
+
+/// Who belongs to a coalition, and who leads it.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(try_from = "Said", into = "Said")]
+pub struct Members {
+    names: Arc<[Arc<str>]>,
+    leader: Option<Arc<str>>,
+}
+
+/// As it is written: `{"members": [name], "leader": name}`.
+#[derive(Serialize, Deserialize)]
+struct Said {
+    members: Vec<Arc<str>>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    leader: Option<Arc<str>>,
+}
+
+impl Members {
+    /// Most members of one coalition.
+    pub const MAX_MEMBERS: usize = 64;
+    /// Longest names of all members together, in bytes: they have to fit an mDNS record.
+    pub const MAX_BYTES: usize = 2048;
+
+    /// These members, in this order; who is named twice counts once. Letters to the coalition go
+    /// to all of them, or to the leader only when there is one.
+    ///
+    /// # Errors
+    /// When there are none or too many, one has no name that an agent can have, or the leader is
+    /// no member.
+    pub fn new<N: Into<Arc<str>>>(
+        names: impl IntoIterator<Item = N>,
+        leader: Option<Arc<str>>,
+    ) -> Result<Self, MembersError> {
+        let (mut members, mut bytes) = (Vec::<Arc<str>>::new(), 0);
+        for name in names.into_iter().map(Into::into) {
+            check_name(&name)?;
+            if members.contains(&name) {
+                continue;
+            }
+            bytes += name.len();
+            members.push(name);
+            if members.len() > Self::MAX_MEMBERS || bytes > Self::MAX_BYTES {
+                return Err(MembersError::TooMany);
+            }
+        }
+        if members.is_empty() {
+            return Err(MembersError::None);
+        }
+        if let Some(leader) = &leader
+            && !members.contains(leader)
+        {
+            return Err(MembersError::Leader(leader.to_string()));
+        }
+        Ok(Self {
+            names: members.into(),
+            leader,
+        })
+    }
+
+    /// Their names, at least one.
+    #[must_use]
+    pub fn names(&self) -> &[Arc<str>] {
+        &self.names
+    }
+
+    /// Who gets all letters to the coalition, if somebody does.
+    #[must_use]
+    pub fn leader(&self) -> Option<&Arc<str>> {
+        self.leader.as_ref()
+    }
+
+    /// Those to whom letters to the coalition go.
+    fn addressed(&self) -> &[Arc<str>] {
+        match &self.leader {
+            Some(leader) => std::slice::from_ref(leader),
+            None => &self.names,
+        }
+    }
+}
+
+impl TryFrom<Said> for Members {
+    type Error = MembersError;
+
+    fn try_from(said: Said) -> Result<Self, MembersError> {
+        Self::new(said.members, said.leader)
+    }
+}
+
+impl From<Members> for Said {
+    fn from(members: Members) -> Self {
+        Self {
+            members: members.names.to_vec(),
+            leader: members.leader,
+        }
+    }
+}
+
+/// Why these cannot be the members of a coalition.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum MembersError {
+    /// There are none.
+    #[error("a coalition needs a member")]
+    None,
+    /// There are too many.
+    #[error(
+        "too many members: at most {max} with names of {bytes} bytes together; form several \
+         coalitions, and one of them",
+        max = Members::MAX_MEMBERS,
+        bytes = Members::MAX_BYTES
+    )]
+    TooMany,
+    /// A member has no name that an agent can have.
+    #[error("member: {0}")]
+    Name(#[from] NameError),
+    /// The leader is no member.
+    #[error("the leader {0:?} is no member; name it among the members, too")]
+    Leader(String),
+}
+
+/// How deep coalitions of coalitions are followed.
+const MAX_DEPTH: usize = 4;
+/// Most agents that one coalition means, its coalitions included.
+const MAX_AGENTS: usize = 256;
+
+/// The agents that a letter from `sender` to this coalition goes to, and the names of members that
+/// nobody has, or that are beyond the bounds.
+pub(crate) fn agents_of(
+    directory: &dyn Directory,
+    coalition: &Entry,
+    sender: &str,
+) -> (Vec<Arc<Entry>>, Vec<Arc<str>>) {
+    let mut gathered = Gathered {
+        seen: HashSet::from([Arc::clone(&coalition.name)]),
+        ..Gathered::default()
+    };
+    gathered.add(directory, coalition, sender, 1);
+    (gathered.agents, gathered.missing)
+}
+
+#[derive(Default)]
+struct Gathered {
+    seen: HashSet<Arc<str>>,
+    agents: Vec<Arc<Entry>>,
+    missing: Vec<Arc<str>>,
+}
+
+impl Gathered {
+    fn add(&mut self, directory: &dyn Directory, coalition: &Entry, sender: &str, depth: usize) {
+        let Role::Coalition(members) = &coalition.role else {
+            return;
+        };
+        let led = members.leader().is_some();
+        for name in members.addressed() {
+            // Its members write to a coalition, not to themselves; its leader is meant, whoever
+            // writes. And who is a member twice gets one letter.
+            if (!led && **name == *sender) || !self.seen.insert(Arc::clone(name)) {
+                continue;
+            }
+            let full = self.agents.len() + self.missing.len() >= MAX_AGENTS;
+            match directory.lookup(name).filter(|_| !full) {
+                Some(entry) => match &entry.role {
+                    Role::Agent => self.agents.push(entry),
+                    Role::Coalition(_) if depth < MAX_DEPTH => {
+                        self.add(directory, &entry, sender, depth + 1);
+                    }
+                    _ => self.missing.push(Arc::clone(name)),
+                },
+                None => self.missing.push(Arc::clone(name)),
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use fipa_transport::Incarnation;
+
+    use super::*;
+    use crate::{MemoryDirectory, Mts, Registration, Resolution, resolve};
+
+    fn directory(agents: &[&str]) -> MemoryDirectory {
+        let directory = MemoryDirectory::new(Mts::new("mts", Incarnation::random()));
+        for name in agents {
+            let agent = Registration::new(*name, Incarnation::random(), Vec::new());
+            directory.register(agent).unwrap();
+        }
+        directory
+    }
+
+    fn form(directory: &MemoryDirectory, name: &str, members: &[&str], leader: Option<&str>) {
+        let members = Members::new(members.iter().copied(), leader.map(Into::into)).unwrap();
+        let mut coalition = Registration::new(name, Incarnation::random(), Vec::new());
+        coalition.role = Role::Coalition(members);
+        directory.register(coalition).unwrap();
+    }
+
+    fn meant(directory: &MemoryDirectory, name: &str, sender: &str) -> (Vec<String>, Vec<String>) {
+        match resolve(directory, name, sender).unwrap() {
+            Resolution::Coalition { agents, missing } => (
+                agents.iter().map(|entry| entry.name.to_string()).collect(),
+                missing.iter().map(ToString::to_string).collect(),
+            ),
+            Resolution::None => (Vec::new(), Vec::new()),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn members_are_checked() {
+        let none: [&str; 0] = [];
+        assert_eq!(Members::new(none, None), Err(MembersError::None));
+        let stranger = Members::new(["a"], Some("b".into()));
+        assert_eq!(stranger, Err(MembersError::Leader("b".to_owned())));
+        assert!(matches!(
+            Members::new([""], None),
+            Err(MembersError::Name(_))
+        ));
+        let many: Vec<String> = (0..65).map(|number| number.to_string()).collect();
+        assert_eq!(Members::new(many, None), Err(MembersError::TooMany));
+        let long: Vec<String> = ["a", "b", "c"].map(|name| name.repeat(700)).into();
+        assert_eq!(Members::new(long, None), Err(MembersError::TooMany));
+        let twice = Members::new(["a", "b", "a"], None).unwrap();
+        assert_eq!(twice.names().len(), 2);
+        let json = serde_json::to_string(&twice).unwrap();
+        assert_eq!(json, r#"{"members":["a","b"]}"#);
+        assert_eq!(serde_json::from_str::<Members>(&json).unwrap(), twice);
+        let stranger = r#"{"members":["a"],"leader":"b"}"#;
+        assert!(serde_json::from_str::<Members>(stranger).is_err());
+    }
+
+    #[test]
+    fn a_coalition_means_its_members_but_the_sender_or_its_leader() {
+        let directory = directory(&["a", "b", "c"]);
+        form(&directory, "all", &["a", "b", "gone", "c"], None);
+        form(&directory, "led", &["a", "b"], Some("b"));
+        let (agents, missing) = meant(&directory, "all", "b");
+        assert_eq!(
+            (agents, missing),
+            (vec!["a".into(), "c".into()], vec!["gone".into()])
+        );
+        assert_eq!(meant(&directory, "led", "c").0, ["b"]);
+        assert_eq!(meant(&directory, "led", "b").0, ["b"]);
+        form(&directory, "alone", &["a"], None);
+        assert_eq!(resolve(&directory, "alone", "a").unwrap(), Resolution::None);
+        // Patterns mean agents.
+        let Resolution::Multicast(entries) = resolve(&directory, ".*", "a").unwrap() else {
+            panic!("a pattern");
+        };
+        assert!(entries.iter().all(|entry| entry.role == Role::Agent));
+    }
+
+    #[test]
+    fn coalitions_of_coalitions_end() {
+        let directory = directory(&["a", "b", "z"]);
+        form(&directory, "one", &["a", "two"], None);
+        form(&directory, "two", &["one", "b", "two", "a"], None);
+        assert_eq!(meant(&directory, "one", "z").0, ["a", "b"]);
+        for depth in 0..10 {
+            form(
+                &directory,
+                &format!("d{depth}"),
+                &[&format!("d{}", depth + 1), "a"],
+                None,
+            );
+        }
+        let (agents, missing) = meant(&directory, "d0", "z");
+        assert_eq!((agents, missing), (vec!["a".into()], vec!["d4".into()]));
+        for outer in 0..60 {
+            let names: Vec<String> = (0..60).map(|inner| format!("n{outer}.{inner}")).collect();
+            let names: Vec<&str> = names.iter().map(String::as_str).collect();
+            form(&directory, &format!("n{outer}"), &names, None);
+        }
+        let outer: Vec<String> = (0..60).map(|outer| format!("n{outer}")).collect();
+        let outer: Vec<&str> = outer.iter().map(String::as_str).collect();
+        form(&directory, "crowd", &outer, None);
+        let (agents, missing) = meant(&directory, "crowd", "z");
+        assert!(agents.is_empty());
+        assert!(missing.len() < MAX_AGENTS + 200, "{}", missing.len());
+    }
+}

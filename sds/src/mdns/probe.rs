@@ -1,0 +1,216 @@
+//! What the network does with multicast, found out interface by interface, for people who wonder
+//! why nobody is found.
+//!
+//! A question goes out by multicast from the port of multicast DNS, which others answer by
+//! multicast, and the same from a port of its own, which they answer directly (RFC 6762 clause
+//! 6.7). The answers tell both directions apart. Nothing is registered, and nobody is changed.
+
+use std::collections::BTreeSet;
+use std::io;
+use std::net::{IpAddr, Ipv6Addr, SocketAddr, UdpSocket};
+use std::time::{Duration, Instant};
+
+use if_addrs::Interface;
+use simple_dns::{CLASS, Name, Packet, QCLASS, QTYPE, Question, TYPE};
+use socket2::{Domain, Protocol, Socket, Type};
+
+use super::whole::{self, group_v4, group_v6};
+use super::{MdnsConfig, SERVICE_TYPE};
+
+/// Asked for beside our own type: anybody with any service answers (RFC 6763 clause 9).
+const ANY_SERVICE: &str = "_services._dns-sd._udp.local.";
+/// When the question is asked. Who has just multicast an answer may rest for a second (RFC 6762
+/// clause 6).
+const ASKED: [Duration; 3] = [
+    Duration::ZERO,
+    Duration::from_millis(300),
+    Duration::from_millis(1300),
+];
+/// How long answers are waited for in all. Gateways speak every two to two and a half seconds.
+const PATIENCE: Duration = Duration::from_millis(2700);
+/// How long nobody is looked at.
+const TICK: Duration = Duration::from_millis(5);
+/// Most others that are remembered of one interface.
+const MAX_OTHERS: usize = 1000;
+
+/// What was found out on one interface, for one family of addresses.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Multicast {
+    /// The name of the interface.
+    pub interface: String,
+    /// The address of this host on it.
+    pub address: IpAddr,
+    /// Why nothing could be sent or heard, if that is so.
+    pub error: Option<String>,
+    /// Whether this host heard its own question: the system lets multicast out, and in.
+    pub heard_itself: bool,
+    /// Others that were heard by multicast, whatever they said.
+    pub heard: BTreeSet<IpAddr>,
+    /// Others that answered directly what was asked by multicast.
+    pub answered: BTreeSet<IpAddr>,
+}
+
+/// Finds out what the network does with multicast, on all interfaces that the configuration names,
+/// loopback only when it is named. Blocks for about three seconds.
+///
+/// # Errors
+/// When the interfaces of this machine are not to be had.
+pub fn probe(config: &MdnsConfig) -> io::Result<Vec<Multicast>> {
+    let mut own: Vec<IpAddr> = Vec::new();
+    let mut probes: Vec<Probe> = Vec::new();
+    for interface in whole::interfaces(config)? {
+        own.push(interface.ip());
+        let named = !config.interfaces.is_empty();
+        let same = |probe: &Probe| {
+            probe.found.interface == interface.name
+                && probe.found.address.is_ipv4() == interface.ip().is_ipv4()
+        };
+        if (named || !interface.is_loopback()) && !probes.iter().any(same) {
+            probes.push(Probe::open(&interface, config.port));
+        }
+    }
+    let question = question().map_err(io::Error::other)?;
+    let mut buffer = vec![0; whole::MAX_PACKET];
+    let (started, mut asked) = (Instant::now(), 0);
+    while started.elapsed() < PATIENCE && !probes.is_empty() {
+        if ASKED
+            .get(asked)
+            .is_some_and(|due| started.elapsed() >= *due)
+        {
+            asked += 1;
+            for probe in &mut probes {
+                probe.ask(&question);
+            }
+        }
+        for probe in &mut probes {
+            probe.listen(&mut buffer, &question, &own);
+        }
+        std::thread::sleep(TICK);
+    }
+    Ok(probes.into_iter().map(|probe| probe.found).collect())
+}
+
+/// One interface, for one family.
+struct Probe {
+    found: Multicast,
+    sockets: Option<Sockets>,
+}
+
+struct Sockets {
+    /// In the group.
+    group: UdpSocket,
+    /// On a port of its own.
+    direct: UdpSocket,
+    /// The group.
+    to: SocketAddr,
+}
+
+impl Probe {
+    fn open(interface: &Interface, port: u16) -> Self {
+        let found = Multicast {
+            interface: interface.name.clone(),
+            address: interface.ip(),
+            error: None,
+            heard_itself: false,
+            heard: BTreeSet::new(),
+            answered: BTreeSet::new(),
+        };
+        let mut probe = Self {
+            found,
+            sockets: None,
+        };
+        match Sockets::open(interface, port) {
+            Ok(sockets) => probe.sockets = Some(sockets),
+            Err(error) => probe.failed(&error),
+        }
+        probe
+    }
+
+    fn failed(&mut self, error: &io::Error) {
+        self.found.error.get_or_insert_with(|| error.to_string());
+    }
+
+    fn ask(&mut self, question: &[u8]) {
+        let Some(sockets) = &self.sockets else {
+            return;
+        };
+        let sent = sockets.group.send_to(question, sockets.to);
+        let sent = sent.and_then(|_| sockets.direct.send_to(question, sockets.to));
+        if let Err(error) = sent {
+            self.failed(&error);
+        }
+    }
+
+    /// Takes in what has come.
+    fn listen(&mut self, buffer: &mut [u8], question: &[u8], own: &[IpAddr]) {
+        let Some(sockets) = &self.sockets else {
+            return;
+        };
+        let found = &mut self.found;
+        receive(&sockets.group, buffer, |packet, from| {
+            if own.contains(&from) {
+                found.heard_itself |= packet == question;
+            } else if found.heard.len() < MAX_OTHERS {
+                found.heard.insert(from);
+            }
+        });
+        receive(&sockets.direct, buffer, |packet, from| {
+            if !own.contains(&from)
+                && whole::is_plausible(packet)
+                && found.answered.len() < MAX_OTHERS
+            {
+                found.answered.insert(from);
+            }
+        });
+    }
+}
+
+impl Sockets {
+    fn open(interface: &Interface, port: u16) -> io::Result<Self> {
+        let (group, to) = match interface.ip() {
+            IpAddr::V4(address) => group_v4(address, port)?,
+            IpAddr::V6(_) => group_v6(interface.index.unwrap_or_default(), port)?,
+        };
+        let direct = Socket::new(Domain::for_address(to), Type::DGRAM, Some(Protocol::UDP))?;
+        direct.set_nonblocking(true)?;
+        match interface.ip() {
+            IpAddr::V4(address) => {
+                direct.set_multicast_if_v4(&address)?;
+                direct.set_multicast_ttl_v4(255)?;
+                direct.set_multicast_loop_v4(true)?;
+                direct.bind(&SocketAddr::new(address.into(), 0).into())?;
+            }
+            IpAddr::V6(_) => {
+                direct.set_multicast_if_v6(interface.index.unwrap_or_default())?;
+                direct.set_multicast_hops_v6(255)?;
+                direct.bind(&SocketAddr::new(Ipv6Addr::UNSPECIFIED.into(), 0).into())?;
+            }
+        }
+        let direct = direct.into();
+        Ok(Self { group, direct, to })
+    }
+}
+
+/// Hands over every packet that is there, with the address it came from.
+fn receive(socket: &UdpSocket, buffer: &mut [u8], mut packet: impl FnMut(&[u8], IpAddr)) {
+    // Nothing there is an error, too; and what is wrong with one packet is no matter.
+    while let Ok((len, from)) = socket.recv_from(buffer) {
+        packet(buffer.get(..len).unwrap_or_default(), from.ip());
+    }
+}
+
+/// Asks who offers our service, or any.
+fn question() -> Result<Vec<u8>, simple_dns::SimpleDnsError> {
+    // Nobody reads the number of a question; it tells this one from others of this host.
+    let mut packet = Packet::new_query(fastrand::u16(1..));
+    for name in [SERVICE_TYPE, ANY_SERVICE] {
+        packet.questions.push(Question::new(
+            Name::new(name.trim_end_matches('.'))?,
+            QTYPE::TYPE(TYPE::PTR),
+            QCLASS::CLASS(CLASS::IN),
+            false,
+        ));
+    }
+    packet.build_bytes_vec_compressed()
+}

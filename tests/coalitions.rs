@@ -1,0 +1,300 @@
+//! Coalitions: one name for several agents, on two hosts whose gateways know each other.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use fipa::config::Sources;
+use fipa::{
+    Agent, AgentId, Change, Coalition, CoalitionError, Config, Deliveries, Domain, Entry,
+    FailureReason, Gateway, Kind, Members, Outcome, Performative, RegisterOptions, Role,
+};
+
+struct Host {
+    gateway: Gateway,
+    domain: Domain,
+    config: Config,
+}
+
+impl Host {
+    async fn start(peer: Option<&Self>) -> Self {
+        static NEXT: AtomicU32 = AtomicU32::new(0);
+        let number = NEXT.fetch_add(1, Ordering::Relaxed);
+        let mark = format!("{}-{number}", std::process::id());
+        let mut set = vec![
+            format!("domain=coalitions-{mark}"),
+            format!("mts.name=gateway-{mark}"),
+            "discovery.mdns=false".to_owned(),
+        ];
+        if let Some(peer) = peer {
+            let mut ways = peer.gateway.locations().iter();
+            let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
+            let address = way.address();
+            set.push(format!(
+                "discovery.static={{ peer = [\"tcp://{address}\"] }}"
+            ));
+        }
+        let sources = Sources {
+            set,
+            ..Sources::default()
+        };
+        let config = Config::load(&sources).unwrap();
+        Self {
+            gateway: Gateway::open(&config).await.unwrap(),
+            domain: Domain::open(&config).await.unwrap(),
+            config,
+        }
+    }
+
+    fn form(&self, name: &str, members: &[&str], leader: Option<&str>) -> Coalition {
+        let options = RegisterOptions::default();
+        let formed = self
+            .domain
+            .form(name, members.iter().copied(), leader, options);
+        formed.unwrap()
+    }
+
+    async fn knows(&self, names: &[&str]) {
+        let directory = self.domain.directory();
+        until(&format!("{names:?} are known"), || {
+            names.iter().all(|name| directory.known(name).is_some())
+        })
+        .await;
+    }
+}
+
+async fn until(what: &str, condition: impl Fn() -> bool) {
+    let started = Instant::now();
+    while !condition() {
+        assert!(started.elapsed() < Duration::from_secs(60), "never: {what}");
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+}
+
+async fn tell(from: &Agent, to: &str, content: &str) -> Deliveries {
+    let message = from
+        .message(Performative::Inform)
+        .receiver(AgentId::new(to).unwrap())
+        .content(content.to_owned())
+        .build()
+        .unwrap();
+    from.send(message).await.unwrap()
+}
+
+async fn hears(agent: &Agent, content: &str) {
+    let received = agent.receive().await.unwrap();
+    assert_eq!(received.message.content().unwrap(), content);
+}
+
+fn to(deliveries: &Deliveries) -> BTreeSet<&str> {
+    deliveries.0.iter().map(|one| &*one.receiver).collect()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_letter_to_a_coalition_reaches_its_members_or_its_leader() {
+    let near = Host::start(None).await;
+    let far = Host::start(Some(&near)).await;
+    let rover = near.domain.register("rover").unwrap();
+    let arm = far.domain.register("arm").unwrap();
+    let camera = far.domain.register("camera").unwrap();
+    let mut team = near.form("team", &["rover", "arm", "camera"], None);
+    far.knows(&["team", "rover"]).await;
+    near.knows(&["arm", "camera"]).await;
+
+    // From a member, on the other host than who has formed it.
+    let sent = tell(&camera, "team", "all").await;
+    assert!(sent.all_succeeded(), "{sent}");
+    assert_eq!(to(&sent), BTreeSet::from(["arm", "rover"]));
+    hears(&rover, "all").await;
+    hears(&arm, "all").await;
+    assert!(camera.try_receive().unwrap().is_none());
+
+    // Its leader is on the other host.
+    team.change(["rover", "arm", "camera"], Some("arm"))
+        .unwrap();
+    let sent = tell(&rover, "team", "lead").await;
+    assert_eq!(to(&sent), BTreeSet::from(["arm"]), "{sent}");
+    assert!(sent.all_succeeded());
+    hears(&arm, "lead").await;
+
+    // A loan works, although nobody can lend for several.
+    team.change(["arm", "camera"], None).unwrap();
+    let message = rover
+        .message(Performative::Inform)
+        .receiver(AgentId::new("team").unwrap())
+        .build()
+        .unwrap();
+    let mut loan = rover.loan(message, 5).unwrap();
+    loan.content_mut().copy_from_slice(b"large");
+    let sent = rover.send_loan(loan).await.unwrap();
+    assert!(sent.all_succeeded(), "{sent}");
+    hears(&arm, "large").await;
+    hears(&camera, "large").await;
+
+    // Who is not there has an outcome, too.
+    team.change(["arm", "leg"], None).unwrap();
+    let sent = tell(&rover, "team", "who").await;
+    assert_eq!(to(&sent), BTreeSet::from(["arm", "leg"]));
+    let leg = sent.0.iter().find(|one| &*one.receiver == "leg").unwrap();
+    assert!(matches!(
+        leg.outcome,
+        Outcome::Failed {
+            reason: FailureReason::NoSuchAgent,
+            ..
+        }
+    ));
+    hears(&arm, "who").await;
+    team.dissolve().unwrap();
+    assert!(!tell(&rover, "team", "nobody").await.all_succeeded());
+    for host in [near, far] {
+        host.gateway.close().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_cannot_be_is_refused_and_changes_nothing() {
+    let host = Host::start(None).await;
+    let mut team = host.form("team", &["a", "b"], Some("b"));
+    let options = RegisterOptions::default;
+    let form = |name: &str, members: &[&str]| {
+        host.domain
+            .form(name, members.iter().copied(), None, options())
+    };
+    assert!(matches!(
+        form("team", &["a"]),
+        Err(CoalitionError::Register(_))
+    ));
+    assert!(matches!(form("x", &[]), Err(CoalitionError::Members(_))));
+    let stranger = team.split("other", &["c"], None, options());
+    assert!(matches!(stranger, Err(CoalitionError::NoMember(name)) if name == "c"));
+    assert!(team.split("other", &["a", "b"], None, options()).is_err());
+    let taken = form("taken", &["z"]).unwrap();
+    assert!(team.split("taken", &["a"], None, options()).is_err());
+    let many: Vec<String> = (0..Members::MAX_MEMBERS).map(|n| n.to_string()).collect();
+    let many = host.domain.form("many", many, None, options()).unwrap();
+    let (error, many) = *team.merge(many).unwrap_err();
+    assert!(matches!(error, CoalitionError::Members(_)));
+    // One that was formed in another domain is not removed here.
+    let elsewhere = Host::start(None).await;
+    let foreign = elsewhere.form("foreign", &["q"], None);
+    let (error, foreign) = *team.merge(foreign).unwrap_err();
+    assert!(matches!(error, CoalitionError::Register(_)), "{error}");
+    let names: Vec<String> = team
+        .members()
+        .names()
+        .iter()
+        .map(ToString::to_string)
+        .collect();
+    assert_eq!(names, ["a", "b"]);
+    let seen = host.domain.directory().lookup("team").unwrap();
+    assert_eq!(seen.role, Role::Coalition(team.members().clone()));
+    // Who leads goes with the part that has the leader.
+    let part = team.split("part", &["b"], Some("b"), options()).unwrap();
+    assert_eq!(team.members().leader(), None);
+    team.merge(part).unwrap();
+    drop((taken, many, foreign));
+}
+
+/// Who is in which coalition, as it is told to somebody who only watches.
+#[derive(Default)]
+struct Seen(BTreeMap<Arc<str>, Members>);
+
+impl Seen {
+    fn put(&mut self, entry: &Entry) {
+        if let Role::Coalition(members) = &entry.role {
+            self.0.insert(Arc::clone(&entry.name), members.clone());
+        }
+    }
+
+    fn take(&mut self, change: &Change) {
+        for change in change.single() {
+            match change {
+                Change::Joined(entry) | Change::Changed { after: entry, .. } => self.put(entry),
+                Change::Left(entry) => drop(self.0.remove(&entry.name)),
+                other => panic!("{other:?}"),
+            }
+        }
+    }
+
+    /// Each module is in one coalition: never in two, never in none.
+    fn check(&self) {
+        let mut all: Vec<&str> = self
+            .0
+            .values()
+            .flat_map(|members| members.names().iter().map(|name| &**name))
+            .collect();
+        all.sort_unstable();
+        assert_eq!(all, ["m0", "m1", "m2", "m3", "m4", "m5"], "{:?}", self.0);
+    }
+}
+
+async fn watch(domain: Domain, over: Arc<AtomicBool>) -> usize {
+    let mut changes = domain.directory().watch();
+    let mut seen = Seen::default();
+    for entry in domain.directory().entries().iter() {
+        seen.put(entry);
+    }
+    seen.check();
+    let mut told = 0;
+    while !over.load(Ordering::Relaxed) {
+        let waited = tokio::time::timeout(Duration::from_millis(20), changes.next()).await;
+        if let Ok(Some(change)) = waited {
+            seen.take(&change);
+            seen.check();
+            told += 1;
+        }
+        // Who looks sees no half state either.
+        let mut looked = Seen::default();
+        for entry in domain.directory().entries().iter() {
+            looked.put(entry);
+        }
+        looked.check();
+    }
+    told
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nobody_sees_a_merger_or_a_split_half_done() {
+    let near = Host::start(None).await;
+    let far = Host::start(Some(&near)).await;
+    let modules = ["m0", "m1", "m2", "m3", "m4", "m5"];
+    let mut whole = near.form("whole", &modules, Some("m0"));
+    far.knows(&["whole"]).await;
+    let over = Arc::new(AtomicBool::new(false));
+    let beside = Domain::open(&near.config).await.unwrap();
+    until("it is known beside", || {
+        beside.directory().lookup("whole").is_some()
+    })
+    .await;
+    let watching: Vec<_> = [beside, near.domain.clone(), far.domain.clone()]
+        .map(|domain| tokio::spawn(watch(domain, Arc::clone(&over))))
+        .into();
+    for round in 0..40 {
+        let parting = ["m1", modules[2 + round % 4]];
+        let part = whole.split(
+            &format!("part {round}"),
+            &parting,
+            None,
+            RegisterOptions::default(),
+        );
+        let part = part.unwrap();
+        tokio::time::sleep(Duration::from_millis(3)).await;
+        whole.merge(part).unwrap();
+        assert_eq!(&**whole.members().leader().unwrap(), "m0");
+    }
+    let last = whole
+        .split("last", &["m5"], None, RegisterOptions::default())
+        .unwrap();
+    far.knows(&["last"]).await;
+    over.store(true, Ordering::Relaxed);
+    for watching in watching {
+        assert!(watching.await.unwrap() > 0, "nothing was told");
+    }
+    drop((whole, last));
+    for host in [near, far] {
+        host.gateway.close().await;
+    }
+}
