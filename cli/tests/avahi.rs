@@ -1,4 +1,4 @@
-//! With the real Avahi, in a network namespace of its own: `avahi-browse` lists the agents of a
+//! With the real Avahi, on another host of a network of its own: `avahi-browse` lists the agents of a
 //! gateway with the keys of the peers, for as long as they are there.
 //!
 //! Needs root, and of Debian the packages avahi-daemon, avahi-utils, dbus, iproute2 and
@@ -9,63 +9,15 @@
 mod common;
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::os::unix::fs::MetadataExt;
-use std::path::Path;
-use std::process::{Child, Command, Stdio};
-use std::thread;
 use std::time::{Duration, Instant};
 
 use common::{Host, Running};
+use fipa_testbed::{Avahi, Network, enter, isolated};
 use serde_json::Value;
-
-const TOOLS: [&str; 6] = [
-    "avahi-daemon",
-    "avahi-browse",
-    "dbus-daemon",
-    "ip",
-    "mount",
-    "unshare",
-];
 
 #[test]
 fn avahi_lists_the_agents() {
-    let mut missing: Vec<&str> = TOOLS.into_iter().filter(|tool| !is_there(tool)).collect();
-    if fs::metadata("/proc/self").unwrap().uid() != 0 {
-        missing.push("root");
-    }
-    if !missing.is_empty() {
-        let missing = missing.join(", ");
-        assert!(
-            std::env::var("CI").as_deref() != Ok("true"),
-            "missing: {missing}"
-        );
-        eprintln!("SKIPPED, not a success: the test with Avahi needs {missing}");
-        return;
-    }
-    // What is started in there ends with it, and what is mounted and set up is gone.
-    let inside = Command::new("unshare")
-        .args(["--net", "--mount", "--pid", "--fork", "--kill-child"])
-        .args(["--mount-proc", "--"])
-        .arg(std::env::current_exe().unwrap())
-        .args(["--exact", "in_the_namespace", "--ignored", "--nocapture"])
-        .env(INSIDE, "1")
-        .env("TMPDIR", "/run")
-        .output()
-        .unwrap();
-    assert!(
-        inside.status.success(),
-        "{}{}",
-        String::from_utf8_lossy(&inside.stdout),
-        String::from_utf8_lossy(&inside.stderr)
-    );
-}
-
-const INSIDE: &str = "FIPA_CLI_TEST_IN_NAMESPACE";
-
-fn is_there(tool: &str) -> bool {
-    let path = std::env::var_os("PATH").unwrap_or_default();
-    std::env::split_paths(&path).any(|dir| dir.join(tool).is_file())
+    isolated("in_the_namespace", &Avahi::TOOLS);
 }
 
 const FIRST: &str = "arm.left@robot.local";
@@ -76,11 +28,16 @@ const SECOND: &str = "camera";
 #[test]
 #[ignore = "is run by the other test in a network namespace"]
 fn in_the_namespace() {
-    assert!(
-        std::env::var_os(INSIDE).is_some(),
-        "started by the other test"
-    );
-    let _daemons = start_avahi();
+    enter();
+    fipa_testbed::run("mount -t tmpfs tmpfs /tmp");
+    fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
+    let network = Network::new(2);
+    let avahi = Avahi::start(network.host(1));
+    network.host(0).enter(|| agents_come_and_go(&avahi));
+}
+
+fn agents_come_and_go(avahi: &Avahi<'_>) {
+    let wait_for = |names: &[&str]| wait_for(avahi, names);
     let host = Host::new();
     let gateway = host.start(&[
         "up",
@@ -177,10 +134,10 @@ impl Shown {
 
 /// Waits until `avahi-browse` shows these agents and no other.
 #[track_caller]
-fn wait_for(names: &[&str]) -> BTreeMap<String, Shown> {
+fn wait_for(avahi: &Avahi<'_>, names: &[&str]) -> BTreeMap<String, Shown> {
     let start = Instant::now();
     loop {
-        let shown = browse();
+        let shown = browse(avahi);
         if shown.keys().eq(names) {
             return shown;
         }
@@ -195,20 +152,12 @@ fn wait_for(names: &[&str]) -> BTreeMap<String, Shown> {
 const WATCHDOG: Duration = Duration::from_secs(60);
 
 /// What `avahi-browse` shows, by the exact name.
-fn browse() -> BTreeMap<String, Shown> {
-    let output = Command::new("avahi-browse")
-        .args(["-rpt", "_fipa_service_directory._udp"])
-        .env(BUS_VARIABLE, BUS)
-        .stderr(Stdio::inherit())
-        .output()
-        .unwrap();
-    // It may have failed, and then an empty list means nothing.
-    assert!(output.status.success(), "{}", output.status);
+fn browse(avahi: &Avahi<'_>) -> BTreeMap<String, Shown> {
     let mut agents = BTreeMap::new();
-    for line in String::from_utf8(output.stdout).unwrap().lines() {
+    for line in avahi.browse("_fipa_service_directory._udp") {
         // =;interface;protocol;label;type;domain;host;address;port;"key=value" ...
         let fields: Vec<&str> = line.splitn(10, ';').collect();
-        let &["=", "fipa0", "IPv4", label, .., txt] = &fields[..] else {
+        let &["=", "eth0", "IPv4", label, .., txt] = &fields[..] else {
             continue;
         };
         let txt = txt.trim_matches('"').split("\" \"");
@@ -220,91 +169,4 @@ fn browse() -> BTreeMap<String, Shown> {
         assert!(agents.insert(name, shown).is_none(), "twice: {line}");
     }
     agents
-}
-
-const BUS_CONFIG: &str = r#"<!DOCTYPE busconfig PUBLIC
- "-//freedesktop//DTD D-Bus Bus Configuration 1.0//EN"
- "http://www.freedesktop.org/standards/dbus/1.0/busconfig.dtd">
-<busconfig><type>system</type><listen>unix:path=/run/fipa-test-bus</listen>
-<auth>EXTERNAL</auth><policy context="default"><allow user="*"/><allow own="*"/>
-<allow send_destination="*"/><allow receive_sender="*"/></policy></busconfig>"#;
-
-const AVAHI_CONFIG: &str = "[server]\nhost-name=peer\nallow-interfaces=fipa0\nuse-ipv6=no\n\
-[publish]\npublish-workstation=no\n";
-
-const BUS_VARIABLE: &str = "DBUS_SYSTEM_BUS_ADDRESS";
-const BUS: &str = "unix:path=/run/fipa-test-bus";
-
-/// A process that ends with the test.
-struct Daemon(Child);
-
-impl Daemon {
-    fn start(program: &str, arguments: &[&str]) -> Self {
-        let mut command = Command::new(program);
-        Self(
-            command
-                .args(arguments)
-                .env(BUS_VARIABLE, BUS)
-                .spawn()
-                .unwrap(),
-        )
-    }
-
-    #[track_caller]
-    fn wait_until(&mut self, ready: impl Fn() -> bool) {
-        let start = Instant::now();
-        while !ready() {
-            assert_eq!(self.0.try_wait().unwrap(), None, "it has ended");
-            assert!(start.elapsed() < WATCHDOG, "it was never ready");
-            thread::sleep(Duration::from_millis(5));
-        }
-    }
-}
-
-impl Drop for Daemon {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-/// Avahi, and before it the bus on which its tools find it.
-fn start_avahi() -> [Daemon; 2] {
-    // Avahi keeps its process number and socket in /run, and takes no loopback interface.
-    run("mount -t tmpfs tmpfs /run");
-    run("mount -t tmpfs tmpfs /dev/shm");
-    run("ip link set lo up");
-    run("ip link add fipa0 type veth peer name fipa1");
-    run("ip addr add 10.99.0.1/24 dev fipa0");
-    run("ip link set fipa0 up");
-    run("ip link set fipa1 up");
-    fs::write("/run/bus.conf", BUS_CONFIG).unwrap();
-    fs::write("/run/avahi.conf", AVAHI_CONFIG).unwrap();
-    let mut bus = Daemon::start("dbus-daemon", &["--config-file=/run/bus.conf", "--nofork"]);
-    bus.wait_until(|| Path::new("/run/fipa-test-bus").exists());
-    let mut avahi = Daemon::start(
-        "avahi-daemon",
-        &[
-            "--no-drop-root",
-            "--no-chroot",
-            "--no-rlimits",
-            "--file=/run/avahi.conf",
-        ],
-    );
-    // Its tools find it on the bus, where it comes some time after it has begun to run.
-    avahi.wait_until(|| {
-        let browse = Command::new("avahi-browse")
-            .args(["-t", "_fipa_service_directory._udp"])
-            .env(BUS_VARIABLE, BUS)
-            .stderr(Stdio::null())
-            .status();
-        browse.unwrap().success()
-    });
-    [avahi, bus]
-}
-
-fn run(command: &str) {
-    let mut words = command.split(' ');
-    let status = Command::new(words.next().unwrap()).args(words).status();
-    assert!(status.unwrap().success(), "{command}");
 }

@@ -29,6 +29,9 @@ fn inside_the_doctor_says_what_the_network_does() {
 
     let mut up = fipa(there, "there");
     let _gateway = Running::start(up.arg("up").stdout(Stdio::null()));
+    // Who has nothing to announce has nothing to answer.
+    let mut echo = fipa(there, "there");
+    let _agent = Running::start(echo.args(["echo", "parrot"]).stdout(Stdio::null()));
     let deadline = Instant::now() + Duration::from_secs(60);
     let found = loop {
         let (verdict, found) = multicast(here);

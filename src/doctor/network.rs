@@ -90,7 +90,8 @@ fn multicast(found: &Multicast) -> Check {
         (_, 0) => wrong(
             Verdict::Doubtful,
             &format!(
-                "comes in, and may not get out: {} were heard, and nobody answered",
+                "comes in, and may not get out: {} was heard, and nobody answered (who has no agents \
+                 to announce has nothing to answer)",
                 hosts(found.heard.iter())
             ),
             &format!(

@@ -13,6 +13,7 @@
 mod beacon;
 mod ear;
 mod held;
+mod pace;
 mod probe;
 mod record;
 mod task;
@@ -29,6 +30,7 @@ use tokio::sync::{Notify, broadcast};
 
 use self::beacon::Digest;
 use self::held::Holdings;
+use self::pace::Pace;
 pub use self::probe::{Multicast, probe};
 use crate::table::Table;
 use crate::{
@@ -257,6 +259,7 @@ impl std::fmt::Debug for Shared {
 struct Own {
     closed: bool,
     agents: HashMap<Arc<str>, Announced>,
+    pace: Pace,
     /// Full names of which the daemon has just said goodbye, and until when they rest. It says so
     /// twice, and would take the second goodbye for somebody else's claim to the name.
     resting: HashMap<Arc<str>, Instant>,
@@ -314,7 +317,7 @@ impl Shared {
     }
 
     /// Announces the entry under the first label, from this attempt on, that is free; at once, or
-    /// when the label has rested.
+    /// when the label has rested and it is its turn.
     fn announce(
         &self,
         own: &mut Own,
@@ -330,13 +333,19 @@ impl Shared {
             }
             attempt += 1;
         };
+        let rested = own.resting.get(&fullname).copied();
         let before = own.agents.get(&entry.name);
         let before = before.filter(|announced| announced.fullname == fullname);
+        // What is announced already is changed at once, and taken back at once.
+        let turn = match before {
+            Some(_) => None,
+            None => own.pace.turn(Instant::now(), fastrand::f64()),
+        };
         let announced = Announced {
             entry: Arc::clone(entry),
             digest: Digest::of(&record::encode(entry)),
             host: before.map_or_else(Incarnation::random, |announced| announced.host),
-            due: own.resting.get(&fullname).copied(),
+            due: rested.max(turn),
             fullname,
             attempt,
         };

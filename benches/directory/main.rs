@@ -1,15 +1,19 @@
-//! The service directory with 10,000 entries: looking up, searching, watching, each beside the
-//! standard library's map or the bare channel that it stands on.
+//! The service directory: with 10,000 entries, looking up, searching, watching, each beside the
+//! standard library's map or the bare channel that it stands on; then two hosts with 500 agents
+//! each on a network of their own, which takes root (`crowd`).
 #![allow(
     clippy::unwrap_used,
-    reason = "a test or bench that cannot go on may panic"
+    clippy::print_stdout,
+    reason = "a bench that cannot go on may panic, and prints what it has measured"
 )]
+
+mod crowd;
 
 use std::collections::HashMap;
 use std::hint::black_box;
 use std::sync::Arc;
 
-use criterion::{Criterion, criterion_group, criterion_main};
+use criterion::{Criterion, criterion_group};
 use fipa_sds::{
     Change, Directory, Exchange, MemoryDirectory, MergedDirectory, Mts, Query, Registration,
     StaticDirectory, resolve,
@@ -112,4 +116,13 @@ fn watching(criterion: &mut Criterion) {
 }
 
 criterion_group!(benches, looking_up, searching, watching);
-criterion_main!(benches);
+
+fn main() {
+    // The same program again, in namespaces of its own.
+    if std::env::args().any(|argument| argument == "crowd_in_namespaces") {
+        return crowd::measure();
+    }
+    benches();
+    Criterion::default().configure_from_args().final_summary();
+    fipa_testbed::isolated("crowd_in_namespaces", &[]);
+}

@@ -1,0 +1,186 @@
+//! Three hosts, each with a gateway process, whose links are cut and healed in random order, seeded:
+//! after every healing the processes of all hosts see the same agents again, though announcements
+//! and goodbyes were missed meanwhile. And a gateway that vanished without a goodbye is noticed by
+//! those who write to its agents.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::print_stdout, reason = "how long it took is worth knowing")]
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::process::Stdio;
+use std::time::{Duration, Instant};
+
+use fipa::config::Sources;
+use fipa::{Agent, AgentId, Config, Domain, Performative, Role};
+use fipa_testbed::{Host, Network, Running, enter, isolated};
+use tokio::runtime::{Builder, Runtime};
+
+const WATCHDOG: Duration = Duration::from_secs(90);
+
+#[test]
+fn processes_agree_after_every_healing() {
+    isolated("inside_processes_agree_after_every_healing", &[]);
+}
+
+#[test]
+#[ignore = "is run by the other test in namespaces of its own"]
+fn inside_processes_agree_after_every_healing() {
+    enter();
+    fipa_testbed::run("mount -t tmpfs tmpfs /tmp");
+    fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
+    let seed = std::env::var("FIPA_LINKS_SEED").ok();
+    let seed = seed.map_or(3, |seed| seed.parse().unwrap());
+    println!("FIPA_LINKS_SEED={seed}");
+    let mut random = fastrand::Rng::with_seed(seed);
+    let network = Network::new(3);
+    let mut robots: Vec<Robot> = network.hosts().iter().map(Robot::start).collect();
+    for robot in &mut robots {
+        robot.change(0);
+    }
+    agree(&robots);
+    for round in 0..3 {
+        let mut cut = BTreeSet::new();
+        for _ in 0..6 {
+            let at = random.usize(0..robots.len());
+            match random.usize(0..3) {
+                0 if cut.remove(&at) => network.host(at).plug(),
+                0 => {
+                    cut.insert(at);
+                    network.host(at).unplug();
+                }
+                _ => robots[at].change(random.usize(0..4)),
+            }
+            std::thread::sleep(Duration::from_millis(random.u64(0..600)));
+        }
+        for at in cut {
+            network.host(at).plug();
+        }
+        let healed = Instant::now();
+        agree(&robots);
+        println!(
+            "round {round}: all agree {:.1?} after healing",
+            healed.elapsed()
+        );
+    }
+
+    // Killed: no goodbye. Who writes to an agent behind it is told, and nobody believes in it any
+    // more.
+    robots[2].change_to(0, true);
+    agree(&robots);
+    robots[2].gateway = None;
+    let killed = Instant::now();
+    let gone = robots[2].agents.keys().next().unwrap().clone();
+    robots[0].fails_to_reach(&gone);
+    until("it is noticed", || !robots[0].view().contains(&gone));
+    println!("noticed {:.1?} after it was killed", killed.elapsed());
+}
+
+/// A host with its gateway, a process of its own, and agents that come and go.
+struct Robot {
+    name: String,
+    gateway: Option<Running>,
+    domain: Domain,
+    agents: BTreeMap<String, Agent>,
+    writer: Agent,
+    runtime: Runtime,
+}
+
+impl Robot {
+    fn start(host: &Host) -> Self {
+        let name = host.name().to_owned();
+        let set = [
+            format!("domain={name}"),
+            format!("mts.name={name}-mts"),
+            format!("transport.tcp.listen=[\"{}:0\"]", host.ipv4()),
+            "mts.deadline=2s".to_owned(),
+        ];
+        let mut up = host.command(env!("CARGO_BIN_EXE_fipa"));
+        for setting in &set {
+            up.args(["--set", setting]);
+        }
+        let gateway = Running::start(up.arg("up").stdout(Stdio::null()).stderr(Stdio::null()));
+        let runtime = Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()
+            .unwrap();
+        let config = Config::load(&Sources {
+            set: set.to_vec(),
+            ..Sources::default()
+        });
+        let domain = runtime.block_on(Domain::open(&config.unwrap())).unwrap();
+        let writer = domain.register(&format!("{name}.writer")).unwrap();
+        Self {
+            name,
+            gateway: Some(gateway),
+            domain,
+            agents: BTreeMap::new(),
+            writer,
+            runtime,
+        }
+    }
+
+    /// An agent comes or goes.
+    fn change(&mut self, number: usize) {
+        let name = self.name_of(number);
+        self.change_to(number, !self.agents.contains_key(&name));
+    }
+
+    fn change_to(&mut self, number: usize, here: bool) {
+        let name = self.name_of(number);
+        match self.agents.remove(&name) {
+            Some(agent) if here => drop(self.agents.insert(name, agent)),
+            None if here => {
+                let agent = self.domain.register(&name).unwrap();
+                self.agents.insert(name, agent);
+            }
+            _ => {}
+        }
+    }
+
+    fn name_of(&self, number: usize) -> String {
+        format!("{}.agent {number}", self.name)
+    }
+
+    /// The agents on all hosts, as a process of this one sees them.
+    fn view(&self) -> BTreeSet<String> {
+        let directory = self.domain.directory();
+        directory.refresh();
+        let entries = directory.entries();
+        let agents = entries.iter().filter(|entry| entry.role == Role::Agent);
+        agents.map(|entry| entry.name.to_string()).collect()
+    }
+
+    fn fails_to_reach(&self, name: &str) {
+        let message = self
+            .writer
+            .message(Performative::Inform)
+            .receiver(AgentId::new(name).unwrap())
+            .build()
+            .unwrap();
+        let sent = self.runtime.block_on(self.writer.send(message)).unwrap();
+        assert!(!sent.all_succeeded(), "{sent}");
+    }
+}
+
+/// Waits until all see the same: everybody that is there.
+fn agree(robots: &[Robot]) {
+    let all: BTreeSet<String> = robots
+        .iter()
+        .flat_map(|robot| {
+            let agents = robot.agents.keys().cloned();
+            agents.chain([robot.writer.name().to_owned()])
+        })
+        .collect();
+    until("they agree", || {
+        robots.iter().all(|robot| robot.view() == all)
+    });
+}
+
+fn until(what: &str, condition: impl Fn() -> bool) {
+    let started = Instant::now();
+    while !condition() {
+        assert!(started.elapsed() < WATCHDOG, "never: {what}");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
