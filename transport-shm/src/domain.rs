@@ -10,7 +10,7 @@ use std::os::fd::OwnedFd;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use fipa_transport::Incarnation;
 use iceoryx2::node::{Node, NodeState, NodeView};
@@ -20,18 +20,8 @@ use rustix::fs::{FlockOperation, Mode, OFlags, fchmod, flock, fstat, open, stat}
 
 use crate::layout::Svc;
 use crate::memory::SHM;
-use crate::presence::{Names, Neighbour, has_ended};
+use crate::presence::{Names, Neighbour, wait_for_looks};
 use crate::{ShmConfig, ShmError};
-
-/// How long the living have to take the letters of the dead, who may be stopped, or have too
-/// little of the processor.
-const PATIENCE_TO_LOOK: Duration = Duration::from_secs(1);
-
-/// How long those have who do not listen yet, and may never.
-const GRACE: Duration = Duration::from_millis(100);
-
-/// How long to wait before asking again who has looked.
-const STEP: Duration = Duration::from_millis(5);
 
 /// What [`cleanup_dead`] did.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -187,33 +177,12 @@ impl Domain {
     }
 
     /// Waits until the living have taken what the dead have sent, and says how many there are.
-    ///
-    /// A look that was going on may have passed the letters by; the one after it, begun when the
-    /// dead were dead, has not.
     pub(crate) fn settle(&self) -> Result<usize, ShmError> {
         let all = self.all()?.into_iter();
         let living = all.filter_map(|one| Neighbour::open(&self.names, one).ok());
-        let mut waited_for: Vec<_> = living.map(|one| (one.looks(), one)).collect();
-        let alive = waited_for.len();
-        let began = Instant::now();
-        loop {
-            let waited = began.elapsed();
-            waited_for.retain(|(before, one)| {
-                let patience = match before {
-                    0 => GRACE,
-                    _ => PATIENCE_TO_LOOK,
-                };
-                let has_looked = one.looks().wrapping_sub(*before) >= 2;
-                !has_looked && waited < patience && !has_ended(one.live().as_ref())
-            });
-            if waited_for.is_empty() || self.closing.load(Ordering::SeqCst) {
-                return Ok(alive);
-            }
-            for (_, one) in &waited_for {
-                one.ring();
-            }
-            std::thread::sleep(STEP);
-        }
+        let living: Vec<Neighbour> = living.collect();
+        wait_for_looks(living.iter(), || self.closing.load(Ordering::SeqCst));
+        Ok(living.len())
     }
 
     /// Rings at every process, and says how many are there.

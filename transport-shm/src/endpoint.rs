@@ -24,7 +24,7 @@ use crate::memory::Budget;
 use crate::outbox::{Opening, Outbox, Posted};
 use crate::peers::Peer;
 use crate::pool::Pool;
-use crate::presence::{Bell, GLANCE, Neighbour, Presence};
+use crate::presence::{Bell, GLANCE, Neighbour, Presence, wait_for_looks};
 use crate::shift::Shift;
 use crate::{ShmConfig, ShmError};
 
@@ -487,6 +487,11 @@ impl Endpoint {
         }
         // While others still know that this process is there.
         self.pool.close();
+        // What others have not taken yet they must take before the way it came is gone.
+        let peers: Vec<_> = self.peers.read().values().cloned().collect();
+        peers.iter().for_each(|peer| peer.retire());
+        wait_for_looks(peers.iter().filter_map(|peer| peer.untaken()), || false);
+        drop(peers);
         let mut concluded = Vec::new();
         let peers = {
             let mut inbox = self.inbox.lock();

@@ -11,6 +11,9 @@ use tokio::task::AbortHandle;
 use crate::outbox::Outbox;
 use crate::presence::{Neighbour, Watched, has_ended};
 
+/// No count of looks.
+const NEVER: u64 = u64::MAX;
+
 /// Another process.
 ///
 /// Its end is final: [`Peer::end`] first says so, then stops its outbox from taking letters; and
@@ -21,6 +24,8 @@ pub(crate) struct Peer {
     neighbour: Neighbour,
     outbox: Mutex<Option<Arc<Outbox>>>,
     ended: AtomicBool,
+    /// How often the process had looked when a letter to it was abandoned last.
+    abandoned_at: AtomicU64,
     used: AtomicU64,
     watcher: OnceLock<AbortHandle>,
 }
@@ -32,6 +37,7 @@ impl Peer {
             neighbour,
             outbox: Mutex::new(None),
             ended: AtomicBool::new(false),
+            abandoned_at: AtomicU64::new(NEVER),
             used: AtomicU64::new(0),
             watcher: OnceLock::new(),
         }
@@ -148,7 +154,35 @@ impl Peer {
     /// Forgets an attempt, and says whether it was here.
     pub(crate) fn abandon(&self, attempt: AttemptId) -> bool {
         let outbox = self.outbox.lock().clone();
-        outbox.is_some_and(|outbox| outbox.abandon(attempt))
+        let abandoned = outbox.is_some_and(|outbox| outbox.abandon(attempt));
+        if abandoned {
+            self.abandoned_at
+                .store(self.neighbour.looks(), Ordering::Relaxed);
+        }
+        abandoned
+    }
+
+    /// From now on it takes no letters. What waits still waits.
+    pub(crate) fn retire(&self) {
+        if let Some(outbox) = &*self.outbox.lock() {
+            outbox.retire();
+        }
+    }
+
+    /// The process, when letters may still lie in its mailbox. While they do, the outbox must not
+    /// go: iceoryx2 0.10 never lets go of memory for requests that it finds when their sender has
+    /// gone.
+    pub(crate) fn untaken(&self) -> Option<&Neighbour> {
+        let waiting = self
+            .outbox
+            .lock()
+            .as_ref()
+            .is_some_and(|it| it.waiting() > 0);
+        let abandoned_at = self.abandoned_at.load(Ordering::Relaxed);
+        let looked_since = self.neighbour.looks().wrapping_sub(abandoned_at) >= 2;
+        let abandoned = abandoned_at != NEVER && !looked_since;
+        let ended = self.ended.load(Ordering::SeqCst);
+        (!ended && (waiting || abandoned)).then_some(&self.neighbour)
     }
 
     pub(crate) fn mark_used(&self, now: u64) {
@@ -161,10 +195,10 @@ impl Peer {
 
     /// Whether nothing would be lost by forgetting it.
     pub(crate) fn is_idle(&self) -> bool {
-        self.outbox
-            .lock()
-            .as_ref()
-            .is_none_or(|outbox| outbox.is_idle())
+        let outbox = self.outbox.lock();
+        let is_idle = outbox.as_ref().is_none_or(|outbox| outbox.is_idle());
+        drop(outbox);
+        is_idle && self.untaken().is_none()
     }
 }
 

@@ -339,11 +339,6 @@ impl Neighbour {
         self.page.words().looks.load(Ordering::Acquire)
     }
 
-    /// Makes the process look, whether it is awake or not.
-    pub(crate) fn ring(&self) {
-        ring(&self.bell);
-    }
-
     /// What becomes readable when the process ends.
     pub(crate) fn live(&self) -> &Arc<OwnedFd> {
         &self.live
@@ -387,6 +382,43 @@ impl Neighbour {
         ring(&self.bell);
         self.rung.store(heard, Ordering::Relaxed);
         true
+    }
+}
+
+/// How long others have to look into their mailboxes, who may be stopped, or have too little of
+/// the processor.
+const PATIENCE: Duration = Duration::from_secs(1);
+
+/// How long those have who do not listen yet, and may never.
+const GRACE: Duration = Duration::from_millis(100);
+
+/// How long to wait before asking again who has looked.
+const STEP: Duration = Duration::from_millis(5);
+
+/// Waits until these processes have taken everything that is in their mailboxes now, or `stop`
+/// says so. Gives up on those who do not look for too long.
+///
+/// A look that was going on may have passed something by; the one after it has not.
+pub(crate) fn wait_for_looks<'a>(at: impl Iterator<Item = &'a Neighbour>, stop: impl Fn() -> bool) {
+    let mut waited_for: Vec<_> = at.map(|one| (one.looks(), one)).collect();
+    let began = Instant::now();
+    loop {
+        let waited = began.elapsed();
+        waited_for.retain(|(before, one)| {
+            let patience = match before {
+                0 => GRACE,
+                _ => PATIENCE,
+            };
+            let has_looked = one.looks().wrapping_sub(*before) >= 2;
+            !has_looked && waited < patience && !has_ended(one.live.as_ref())
+        });
+        if waited_for.is_empty() || stop() {
+            return;
+        }
+        for (_, one) in &waited_for {
+            ring(&one.bell);
+        }
+        std::thread::sleep(STEP);
     }
 }
 

@@ -347,6 +347,40 @@ fn the_dead_are_cleaned_up_after_when_their_last_letters_have_been_taken() {
 }
 
 #[test]
+fn whoever_leaves_waits_until_its_last_letters_have_been_taken() {
+    let place = Place::new();
+    let receiver = Process::start(&place, "drop", Incarnation::from_u64(1));
+    let (sender, sent) = place.listening();
+    receiver.wait_until_up(&sender);
+    wait_for("answer", || sent.conclusions() == 1);
+    receiver.signal("-STOP");
+    let to = location_of(receiver.incarnation);
+    for number in 0..4 {
+        let one = attempt();
+        sender
+            .dispatch(one, &to, parcel(vec![1; 3000].into()))
+            .unwrap();
+        if number % 2 == 0 {
+            sender.abandon(one);
+        }
+    }
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            std::thread::sleep(std::time::Duration::from_millis(300));
+            receiver.signal("-CONT");
+        });
+        sender.close();
+    });
+    assert_eq!(sent.conclusions(), 3);
+    wait_for("end of the connection", || {
+        !place
+            .traces()
+            .iter()
+            .any(|file| file.ends_with(".connection"))
+    });
+}
+
+#[test]
 fn a_tool_removes_what_the_dead_have_left() {
     let place = Place::new();
     let mut receiver = Process::start(&place, "receive", Incarnation::from_u64(1));
@@ -362,6 +396,8 @@ fn a_tool_removes_what_the_dead_have_left() {
     });
     let cleaned = cleanup_dead(&place.config()).unwrap();
     assert_eq!((cleaned.alive, cleaned.removed), (2, 0));
+    // So that neither cleans up after the other.
+    sender.signal("-STOP");
     receiver.kill();
     sender.kill();
     assert!(!place.traces().is_empty());
