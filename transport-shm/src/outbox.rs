@@ -254,9 +254,10 @@ impl Outbox {
             Some(_) => Content::Elsewhere(content),
             None => Content::Here,
         };
-        // SAFETY: the pieces are as long as `places.end - places.start` says (they are what the
-        // header and the places were computed from), and the payload has `places.end` bytes.
-        // Nothing refers to the payload of a request just taken.
+        // SAFETY: what is written of the pieces, without a content that lies elsewhere, is as long
+        // as `places.end - places.start` says (they are what the header and the places were
+        // computed from), and the payload has `places.end` bytes. Nothing refers to the payload of
+        // a request just taken.
         unsafe { write(payload, places.start, &pieces, written) };
         // SAFETY: all bytes from `start` on were just written, and those before are memory of a
         // shared mapping, filled by the kernel or by earlier requests.
