@@ -30,6 +30,11 @@
 //! mdns = true
 //! interfaces = []                     # empty: all that listen; names or addresses otherwise
 //! static = { crex-mts = ["tcp://10.0.0.2:7788"] }   # (none by default)
+//! [security]
+//! keys = ""                           # directory of `fipa keys init`; empty: nothing is encrypted
+//! insecure = false                    # open to the network without keys
+//! loopback = false                    # with keys: peers on this host prove who they are, too
+//! old_peers = []                      # with keys: addresses of old peers, which cannot
 //! [monitor]
 //! check = "off"                       # or warn, enforce: whether agents keep to their protocols
 //! answer = false                      # whether what breaks one is answered with not-understood
@@ -78,6 +83,8 @@ pub struct Config {
     pub transport: Transports,
     /// `[discovery]`: how other hosts are found.
     pub discovery: Discovery,
+    /// `[security]`: who is let in from other hosts.
+    pub security: Security,
     /// `[monitor]`: whether agents keep to their protocols.
     pub monitor: Monitor,
 }
@@ -167,6 +174,22 @@ pub struct Peer {
     pub name: String,
     /// Where it listens, in order of preference; at least one.
     pub locations: Vec<Location>,
+}
+
+/// `[security]`: who is let in from other hosts. Without keys everybody who can connect is, so
+/// gateways listen on loopback only, unless the owner wants it otherwise.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Security {
+    /// `keys`: the directory with this host's keys and the certificates that it trusts; empty: none.
+    pub keys: String,
+    /// `insecure`: whether the gateway may be open to the network without keys.
+    pub insecure: bool,
+    /// `loopback`: whether peers on loopback addresses have to prove who they are, too.
+    pub loopback: bool,
+    /// `old_peers`: addresses of old peers, which cannot prove who they are; letters in their
+    /// dialects are exchanged with them nevertheless. At most 64.
+    pub old_peers: Vec<IpAddr>,
 }
 
 /// `[monitor]`: whether agents keep to their protocols. Without the feature `monitor` nothing is
@@ -265,6 +288,12 @@ impl Config {
                 mdns: true,
                 interfaces: Vec::new(),
                 peers: Vec::new(),
+            },
+            security: Security {
+                keys: String::new(),
+                insecure: false,
+                loopback: false,
+                old_peers: Vec::new(),
             },
             monitor: Monitor {
                 check: Check::Off,

@@ -75,6 +75,9 @@ pub enum OpenError {
     /// The socket of a watcher cannot be used.
     #[error("cannot listen to the processes of the domain: {0}")]
     Watch(std::io::Error),
+    /// The keys that the configuration names cannot be used.
+    #[error("security.keys: {0}")]
+    Keys(String),
     /// Other hosts cannot be looked for.
     #[error("discovery: {0}")]
     Discovery(String),
@@ -111,6 +114,9 @@ impl Domain {
                 gateway: false,
                 // Another way than shared memory between processes of this host; never further.
                 contacts: None,
+                // What stays on this host needs no proof.
+                #[cfg(feature = "secure")]
+                security: None,
                 view: &|host, _| Ok(host),
             },
         )?;

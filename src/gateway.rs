@@ -4,6 +4,8 @@
 
 mod clerk;
 mod exchange;
+#[cfg(feature = "secure")]
+mod guard;
 mod neighbours;
 mod publisher;
 
@@ -22,6 +24,8 @@ use tokio::task::JoinHandle;
 
 use self::clerk::Clerk;
 use self::exchange::{Exchanging, Means};
+#[cfg(feature = "secure")]
+use self::guard::Guard;
 pub use self::neighbours::Neighbour;
 use self::neighbours::{Neighbours, View};
 use self::publisher::{Keeper, Publisher};
@@ -49,6 +53,13 @@ impl Gateway {
     /// When the configuration, the domain's directory or a configured address cannot be used, or
     /// the domain has a gateway already.
     pub async fn open(config: &Config) -> Result<Self, OpenError> {
+        #[cfg(feature = "secure")]
+        let guard = Guard::open(&config.security, &config.mts.name)?;
+        #[cfg(not(feature = "secure"))]
+        if !config.security.keys.is_empty() {
+            let without = "this program was built without the feature `secure`";
+            return Err(OpenError::Keys(without.to_owned()));
+        }
         let contacts = Arc::new(Acquaintances::default());
         let exchange = Arc::new(Exchanging::new(Incarnation::random().as_u64()));
         let made = Mutex::new(None);
@@ -58,6 +69,8 @@ impl Gateway {
                 name: config.mts.name.as_str().into(),
                 gateway: true,
                 contacts: Some(Arc::clone(&contacts) as Arc<dyn Contacts>),
+                #[cfg(feature = "secure")]
+                security: guard.as_ref().map(Guard::security),
                 view: &|host, mts| {
                     let network = network(config, mts)?;
                     let told = exchange.directory() as Arc<dyn Directory>;
@@ -109,6 +122,10 @@ impl Gateway {
         let keeper = Keeper::new(publisher);
         gateway.tasks.push(tokio::spawn(keeper.run()));
         gateway.open_for_letters(config, known)?;
+        #[cfg(feature = "secure")]
+        gateway
+            .tasks
+            .extend(guard.map(|guard| tokio::spawn(guard.run())));
         Ok(gateway)
     }
 

@@ -30,6 +30,7 @@
 //! * [`blocking`] is for processes without an async runtime.
 //! * [`routes`] tells which way letters would go now, and why.
 //! * [`doctor`] says what is wrong with a machine.
+//! * [`keys`] (feature `secure`) is who may speak with this host from others.
 //! * [`Gateway`] (feature `net`) is what `fipa up` runs; robot processes do not need it.
 //!
 //! What must not live here: delivery (that is `fipa-mts`), transports, terminals.
@@ -47,6 +48,8 @@ pub mod doctor;
 mod domain;
 #[cfg(feature = "net")]
 mod gateway;
+#[cfg(feature = "secure")]
+pub mod keys;
 mod place;
 #[cfg(feature = "monitor")]
 pub mod protocol;

@@ -46,6 +46,9 @@ pub(crate) struct Role<'a> {
     pub(crate) gateway: bool,
     /// Who is told of agents of other hosts that have written.
     pub(crate) contacts: Option<Arc<dyn Contacts>>,
+    /// What peers have to prove to it.
+    #[cfg(feature = "secure")]
+    pub(crate) security: Option<fipa_transport_net::secure::Security>,
     /// Makes the view of the directory in which receivers are looked up.
     pub(crate) view: &'a View<'a>,
 }
@@ -313,6 +316,8 @@ fn tcp(
         listen: listen(&config.transport.tcp, role),
         identity: identity(config, role, place, incarnation)?,
         limits,
+        #[cfg(feature = "secure")]
+        security: role.security.clone(),
     };
     Ok(Arc::new(TcpTransport::new(config, handle.clone())))
 }

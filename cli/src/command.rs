@@ -9,6 +9,7 @@ mod demo;
 mod doctor;
 mod echo;
 mod encode;
+mod keys;
 mod protocol;
 mod routes;
 mod send;
@@ -36,6 +37,7 @@ pub(crate) enum Command {
     Decode(decode::Arguments),
     Encode(encode::Arguments),
     Protocol(protocol::Arguments),
+    Keys(keys::Arguments),
     Config(config::Arguments),
 }
 
@@ -55,6 +57,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Decode(arguments) => decode::run(arguments, global),
         Command::Encode(arguments) => encode::run(arguments, global),
         Command::Protocol(arguments) => protocol::run(arguments, global),
+        Command::Keys(arguments) => keys::run(arguments, global),
         Command::Config(arguments) => config::run(arguments, global),
     }
 }

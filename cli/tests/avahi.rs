@@ -46,6 +46,8 @@ fn agents_come_and_go(avahi: &Avahi<'_>) {
         "discovery.mdns=true",
         "--set",
         "transport.tcp.listen=[\"10.99.0.1:0\"]",
+        "--set",
+        "security.insecure=true",
     ]);
     let first = start_first(&host);
     let second = host.echo(SECOND);

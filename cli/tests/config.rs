@@ -108,6 +108,12 @@ listen = [\"127.0.0.1:0\"]             # default
 mdns = true                          # default
 interfaces = []                      # default
 
+[security]
+keys = \"\"                            # default
+insecure = false                     # default
+loopback = false                     # default
+old_peers = []                       # default
+
 [monitor]
 check = \"off\"                        # default
 answer = false                       # default

@@ -3,6 +3,7 @@
 use std::collections::HashSet;
 use std::fmt::Display;
 use std::hash::Hash;
+use std::net::SocketAddr;
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
@@ -36,6 +37,9 @@ const MAX_ADDRESSES: usize = 16;
 const MAX_INTERFACES: usize = 64;
 /// Most static gateways.
 const MAX_PEERS: usize = 1024;
+
+/// Most addresses of old peers that need not prove who they are.
+const MAX_OLD_PEERS: usize = 64;
 
 /// Most files with protocols.
 const MAX_PROTOCOLS: usize = 128;
@@ -79,6 +83,7 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
     );
     found.interfaces(&config.discovery.interfaces);
     found.peers(&config.discovery.peers);
+    found.security(config);
     found.protocols(&config.monitor.protocols);
     found.0
 }
@@ -107,6 +112,47 @@ impl Findings {
                     MAX_DOMAIN
                 ),
             );
+        }
+    }
+
+    fn security(&mut self, config: &Config) {
+        let security = &config.security;
+        let has_keys = !security.keys.is_empty();
+        if security.old_peers.len() > MAX_OLD_PEERS {
+            let path = ["security", "old_peers"];
+            self.too_many(&path, security.old_peers.len(), MAX_OLD_PEERS);
+        }
+        if has_keys && security.insecure {
+            self.add(
+                &["security", "insecure"],
+                "is true, and there are keys",
+                "take one of them out: with keys nothing else is spoken to other hosts",
+            );
+        }
+        if has_keys && config.mts.transports.contains(&Kind::Udp) {
+            self.add(
+                &["mts", "transports"],
+                "lists udp, which is not encrypted, and there are keys",
+                "take udp out; tcp is encrypted when there are keys",
+            );
+        }
+        if has_keys || security.insecure {
+            return;
+        }
+        for (kind, listen) in [
+            (Kind::Tcp, &config.transport.tcp.listen),
+            (Kind::Udp, &config.transport.udp.listen),
+        ] {
+            // What is no address is told elsewhere.
+            let mut addresses = listen.iter().filter(|text| is_numeric_address(text));
+            let open = addresses.find(|text| !is_on_loopback(text));
+            if let Some(open) = open.filter(|_| config.mts.transports.contains(&kind)) {
+                self.add(
+                    &["transport", kind.name(), "listen"],
+                    format_args!("lists {open}, where everybody would be let in"),
+                    "make keys (`fipa keys init`), or accept it with `security.insecure = true`",
+                );
+            }
         }
     }
 
@@ -362,6 +408,12 @@ impl Findings {
             format!("use at most {most}"),
         );
     }
+}
+
+/// Whether an address with port, as text, is one of this host only.
+fn is_on_loopback(text: &str) -> bool {
+    let address = text.parse::<SocketAddr>();
+    address.is_ok_and(|address| address.ip().to_canonical().is_loopback())
 }
 
 /// Whether this is `host:port` with a port one can connect to.

@@ -143,6 +143,34 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::list(&config.discovery.interfaces),
     },
     Key {
+        path: &["security", "keys"],
+        shape: Shape::Text,
+        expected: r#"a directory such as "/etc/fipa/keys", or "" for none"#,
+        write: |config, value| text(value).map(|keys| config.security.keys = keys),
+        read: |config| Value::Text(config.security.keys.clone()),
+    },
+    Key {
+        path: &["security", "insecure"],
+        shape: Shape::Plain,
+        expected: "true or false",
+        write: |config, value| truth(value).map(|open| config.security.insecure = open),
+        read: |config| Value::Truth(config.security.insecure),
+    },
+    Key {
+        path: &["security", "loopback"],
+        shape: Shape::Plain,
+        expected: "true or false",
+        write: |config, value| truth(value).map(|too| config.security.loopback = too),
+        read: |config| Value::Truth(config.security.loopback),
+    },
+    Key {
+        path: &["security", "old_peers"],
+        shape: Shape::List,
+        expected: r#"a list of addresses such as ["10.0.0.9"]"#,
+        write: |config, value| items(value, ip).map(|all| config.security.old_peers = all),
+        read: |config| Value::list(&config.security.old_peers),
+    },
+    Key {
         path: &["monitor", "check"],
         shape: Shape::Text,
         expected: r#""off", "warn" or "enforce""#,
@@ -344,6 +372,11 @@ pub(super) fn is_interface_name(text: &str) -> bool {
         && !text
             .chars()
             .any(|c| c.is_whitespace() || c.is_control() || matches!(c, '/' | ':'))
+}
+
+fn ip(value: &Toml) -> Result<IpAddr, Wrong> {
+    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+    text.parse().map_err(|error| Wrong::new(value, error))
 }
 
 fn interface(value: &Toml) -> Result<Interface, Wrong> {

@@ -91,6 +91,10 @@ fn every_key_is_read() {
         interfaces = ["wlan0", "10.0.0.7", "fe80::1"]
         [discovery.static]
         sherpa-mts = ["tcp://10.0.0.2:7788", "tcp://sherpa.local:7788"]
+        [security]
+        keys = "/etc/fipa/keys"
+        loopback = true
+        old_peers = ["10.0.0.9", "::1"]
         [monitor]
         check = "enforce"
         answer = true
@@ -119,6 +123,10 @@ fn every_key_is_read() {
     );
     assert!(config.transport.udp.listen.is_empty());
     assert!(!config.discovery.mdns);
+    assert_eq!(config.security.keys, "/etc/fipa/keys");
+    assert!(config.security.loopback && !config.security.insecure);
+    let old: [std::net::IpAddr; 2] = ["10.0.0.9", "::1"].map(|text| text.parse().unwrap());
+    assert_eq!(config.security.old_peers, old);
     assert_eq!(config.monitor.check, Check::Enforce);
     assert!(config.monitor.answer);
     assert_eq!(config.monitor.protocols, ["lift.scxml"]);
@@ -267,6 +275,12 @@ listen = ["127.0.0.1:0"]             # default
 mdns = true                          # default
 interfaces = []                      # default
 
+[security]
+keys = ""                            # default
+insecure = false                     # default
+loopback = false                     # default
+old_peers = []                       # default
+
 [monitor]
 check = "off"                        # default
 answer = false                       # default
@@ -342,6 +356,7 @@ prop_compose! {
         config.transport.shm.spin = Duration::from_nanos(spin);
         config.transport.tcp.listen =
             ports.iter().map(|port| format!("[fe80::1%eth0]:{port}")).collect();
+        config.security.insecure = true;
         config.discovery.mdns = mdns;
         config.discovery.interfaces = interfaces.into_iter().map(Interface::Name).collect();
         config.discovery.peers = peers
@@ -385,4 +400,34 @@ proptest! {
             prop_assert!(!mistake.to_string().contains('\n'), "{}", mistake);
         }
     }
+}
+
+#[test]
+fn a_gateway_is_open_to_the_network_with_keys_or_by_its_owners_word() {
+    let open = "transport.tcp.listen=0.0.0.0:7788";
+    let mistakes = |set: &[&str]| {
+        let sources = Sources {
+            set: set.iter().map(|text| (*text).to_owned()).collect(),
+            ..Sources::default()
+        };
+        match Config::load(&sources) {
+            Ok(_) => String::new(),
+            Err(ConfigError::Mistakes(all)) => all.iter().map(|one| one.what.clone()).collect(),
+            Err(other) => panic!("{other}"),
+        }
+    };
+    assert!(mistakes(&[open]).contains("`transport.tcp.listen` lists 0.0.0.0:7788"));
+    assert!(mistakes(&["transport.tcp.listen=[fe80::1%eth0]:7788"]).contains("fe80::1"));
+    assert_eq!(mistakes(&[open, "security.insecure=true"]), "");
+    assert_eq!(mistakes(&[open, "security.keys=/etc/fipa/keys"]), "");
+    assert_eq!(
+        mistakes(&[open, "mts.transports=shm"]),
+        "",
+        "nothing listens"
+    );
+    assert_eq!(mistakes(&["transport.tcp.listen=[::1]:7788"]), "");
+    // What does not go together.
+    let keys = "security.keys=/etc/fipa/keys";
+    assert!(mistakes(&[keys, "security.insecure=true"]).contains("`security.insecure`"));
+    assert!(mistakes(&[keys, "mts.transports=shm,udp,tcp"]).contains("not encrypted"));
 }

@@ -1,5 +1,5 @@
 //! The acknowledged round trip of a letter on loopback, beside raw TCP that moves as many bytes
-//! one way and one byte back: what this transport adds.
+//! one way and one byte back: what this transport adds, and what TLS adds to it.
 #![allow(
     clippy::unwrap_used,
     reason = "a test or bench that cannot go on may panic"
@@ -24,6 +24,11 @@ use parking_lot::Mutex;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Runtime;
+
+#[cfg(feature = "secure")]
+#[path = "../tests/common/certificates.rs"]
+#[allow(dead_code, reason = "the tests use all of it")]
+mod certificates;
 
 const SIZES: [usize; 4] = [100, 1 << 10, 64 << 10, 1 << 20];
 
@@ -54,8 +59,14 @@ fn runtime() -> Runtime {
         .unwrap()
 }
 
-fn endpoint(runtime: &Runtime) -> (TcpTransport, Location, Receiver<Conclusion>) {
-    let config = TcpConfig {
+type Party = (TcpTransport, Location, Receiver<Conclusion>);
+
+fn endpoint(runtime: &Runtime) -> Party {
+    listening(runtime, config())
+}
+
+fn config() -> TcpConfig {
+    TcpConfig {
         listen: vec!["127.0.0.1:0".into()],
         identity: Identity {
             name: "bench".into(),
@@ -64,7 +75,27 @@ fn endpoint(runtime: &Runtime) -> (TcpTransport, Location, Receiver<Conclusion>)
             host: "here".into(),
         },
         limits: Limits::default(),
-    };
+        #[cfg(feature = "secure")]
+        security: None,
+    }
+}
+
+/// Two that know each other.
+#[cfg(feature = "secure")]
+fn secured(client: &Runtime, server: &Runtime) -> (Party, Party) {
+    let host = certificates::Host::new("bench", &[]);
+    let [near, far] = [client, server].map(|runtime| {
+        let security = Some(host.security(&[&host]));
+        let config = TcpConfig {
+            security,
+            ..config()
+        };
+        listening(runtime, config)
+    });
+    (near, far)
+}
+
+fn listening(runtime: &Runtime, config: TcpConfig) -> Party {
     let transport = TcpTransport::new(config, runtime.handle().clone());
     let (sender, receiver) = channel();
     let sink = Arc::new(Accepting(Mutex::new(sender)));
@@ -148,18 +179,22 @@ fn round_trip(criterion: &mut Criterion) {
         });
         drop(to_task);
 
-        let (sender, _, conclusions) = endpoint(&client);
-        let (receiver, there, _) = endpoint(&server);
+        let kinds = [
+            ("letter", (endpoint(&client), endpoint(&server))),
+            #[cfg(feature = "secure")]
+            ("letter_tls", secured(&client, &server)),
+        ];
         let parcel = parcel(content.clone());
-        group.bench_function(BenchmarkId::new("letter", size), |bencher| {
-            bencher.iter(|| {
-                let attempt = AttemptId(1);
-                sender.dispatch(attempt, &there, parcel.clone()).unwrap();
-                let conclusion = conclusions.recv().unwrap();
-                assert_eq!(conclusion, Conclusion::Answered(Answer::Accepted));
+        for (name, ((sender, _, conclusions), (_receiver, there, _))) in kinds {
+            group.bench_function(BenchmarkId::new(name, size), |bencher| {
+                bencher.iter(|| {
+                    let attempt = AttemptId(1);
+                    sender.dispatch(attempt, &there, parcel.clone()).unwrap();
+                    let conclusion = conclusions.recv().unwrap();
+                    assert_eq!(conclusion, Conclusion::Answered(Answer::Accepted));
+                });
             });
-        });
-        drop((sender, receiver));
+        }
     }
     group.finish();
 }

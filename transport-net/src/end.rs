@@ -28,6 +28,8 @@ pub(crate) enum End {
     Idle,
     /// There are too many connections.
     Crowd,
+    /// Trust in the peer has been withdrawn.
+    Distrusted,
     /// The peer opened another connection in place of this one.
     Superseded,
     /// This endpoint closes.
@@ -90,6 +92,7 @@ impl End {
                 WayFault::Congested,
                 "too many connections (max_connections)",
             ),
+            Self::Distrusted => (WayFault::Refused, "the peer is not trusted any more"),
             Self::Superseded => (WayFault::Broken, "the peer opened another connection"),
             Self::Closed => (WayFault::Closed, "this endpoint has been closed"),
         };

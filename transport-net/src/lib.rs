@@ -16,6 +16,8 @@ mod answer;
 mod end;
 mod hello;
 mod identity;
+#[cfg(feature = "secure")]
+pub mod secure;
 mod seldom;
 mod tcp;
 mod udp;

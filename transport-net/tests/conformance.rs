@@ -102,6 +102,46 @@ mod tcp_ipv4 {
     fipa_transport::conformance_tests!(Tcp::new("127.0.0.1:0"));
 }
 
+/// With TLS, between endpoints with one certificate.
+#[cfg(feature = "secure")]
+mod tls {
+    use std::sync::Arc;
+
+    use fipa_transport::conformance::Fixture;
+    use fipa_transport::{Location, Transport};
+    use fipa_transport_net::TcpTransport;
+
+    use super::{Tcp, common};
+
+    struct Tls {
+        tcp: Tcp,
+        host: common::certificates::Host,
+    }
+
+    impl Tls {
+        fn new(address: &'static str) -> Self {
+            Self {
+                tcp: Tcp::new(address),
+                host: common::certificates::Host::new(common::NAME, &[]),
+            }
+        }
+    }
+
+    impl Fixture for Tls {
+        fn endpoint(&self) -> Arc<dyn Transport> {
+            let mut config = common::config(&[self.tcp.address]);
+            config.security = Some(self.host.security(&[&self.host]));
+            Arc::new(TcpTransport::new(config, self.tcp.runtime.handle().clone()))
+        }
+
+        fn nowhere(&self) -> Location {
+            self.tcp.nowhere()
+        }
+    }
+
+    fipa_transport::conformance_tests!(Tls::new("127.0.0.1:0"));
+}
+
 mod tcp_ipv6 {
     use super::Tcp;
     fipa_transport::conformance_tests!(Tcp::new("[::1]:0"));

@@ -28,7 +28,8 @@ use crate::report::{self, Failure};
 Examples:
   fipa up
   fipa up -v                                        who joins and who leaves
-  fipa up --set 'transport.tcp.listen=[\"[::]:7788\"]'  open to the network
+  fipa up --set security.keys=$HOME/.config/fipa/keys --set transport.tcp.listen=0.0.0.0:7788
+                                                    open to hosts that are trusted (fipa keys)
   fipa up --set discovery.mdns=false                found by nobody who is not told
   fipa up --json | head -n 1                        one line when it is ready
 

@@ -377,6 +377,7 @@ impl Party {
         let mut settings = vec![
             format!("domain=host{at}"),
             "discovery.mdns=false".to_owned(),
+            "security.insecure=true".to_owned(),
             format!("mts.name=gateway{at}"),
             format!("mts.transports={transports}"),
             format!("mts.deadline={}ms", plan.deadline.as_millis()),

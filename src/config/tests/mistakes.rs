@@ -18,12 +18,12 @@ fn mistakes_are_named_with_line_and_key() {
         (
             "deadline = \"5s\"\n",
             "fipa.toml:1: unknown key `deadline`; did you mean `mts.deadline`? \
-             (known at the top: domain, mts, transport, discovery, monitor, routes)",
+             (known at the top: domain, mts, transport, discovery, security, monitor, routes)",
         ),
         (
             "[discover]\nmdns = true\n",
             "fipa.toml:1: unknown key `discover`; did you mean `discovery`? \
-             (known at the top: domain, mts, transport, discovery, monitor, routes)",
+             (known at the top: domain, mts, transport, discovery, security, monitor, routes)",
         ),
         (
             "[transport.quic]\nlisten = []\n",

@@ -17,7 +17,11 @@ use super::config::Limits;
 use super::endpoint::{Endpoint, Stranger};
 use super::frame::{FrameReader, MAGIC};
 use super::link::Running;
+use super::proof::Proof;
+#[cfg(feature = "secure")]
+use super::tls;
 use super::unframed;
+use super::wire::{Reading, Writing};
 use crate::address;
 use crate::seldom::warn_seldom;
 
@@ -94,18 +98,26 @@ async fn receive(endpoint: Arc<Endpoint>, place: Stranger, stream: TcpStream, fr
         tracing::debug!(%from, "connection broke at once: {error}");
         return;
     }
+    let patience = endpoint.limits().handshake_timeout;
+    let max_letter = endpoint.limits().max_letter;
+    #[cfg(feature = "secure")]
+    let (stream, place) = match prove(&endpoint, place, stream, from, patience).await {
+        Some(unproved) => unproved,
+        None => return,
+    };
+    let may_frame = endpoint.config.takes_frames_of(from.ip());
     let (mut read, write) = stream.into_split();
     let mut begun = BytesMut::with_capacity(FIRST_READ);
-    let patience = endpoint.limits().handshake_timeout;
     let refused = match timeout(patience, read.read_buf(&mut begun)).await {
         Ok(Ok(1..)) => match begun.first() {
-            Some(first) if *first == MAGIC[0] => {
+            Some(first) if *first == MAGIC[0] && may_frame => {
                 let Some((link, sink)) = endpoint.accepted() else {
                     return;
                 };
-                let reader = FrameReader::new(endpoint.limits().max_letter, begun);
+                let reader = FrameReader::new(max_letter, begun);
+                let ends = (Reading::Plain(read), Writing::Plain(write));
                 Running::new(endpoint, link, sink, None)
-                    .serve((read, write), reader, from, || drop(place))
+                    .serve(ends, Proof::default(), reader, from, || drop(place))
                     .await;
                 return;
             }
@@ -130,4 +142,51 @@ async fn receive(endpoint: Arc<Endpoint>, place: Stranger, stream: TcpStream, fr
     let counter = &endpoint.tally().refused_nonsense;
     let before = counter.fetch_add(1, Ordering::Relaxed);
     warn_seldom(before, format_args!("{from}: connection closed: {refused}"));
+}
+
+/// Has a peer prove who it is, and serves it to its end; or gives back the connection of one that
+/// need not.
+#[cfg(feature = "secure")]
+async fn prove(
+    endpoint: &Arc<Endpoint>,
+    place: Stranger,
+    stream: TcpStream,
+    from: SocketAddr,
+    patience: Duration,
+) -> Option<(TcpStream, Stranger)> {
+    let Some(security) = &endpoint.config.security else {
+        return Some((stream, place));
+    };
+    let mut first = [0];
+    let refused = match timeout(patience, stream.peek(&mut first)).await {
+        Ok(Ok(1..)) if first == [tls::FIRST_BYTE] => {
+            match tls::accept(security, stream, patience).await {
+                Ok(secured) => {
+                    let (link, sink) = endpoint.accepted()?;
+                    let proof = Proof::of(security, secured.certificate);
+                    let reader = FrameReader::new(endpoint.limits().max_letter, BytesMut::new());
+                    Running::new(endpoint.clone(), link, sink, None)
+                        .serve(secured.ends, proof, reader, from, || drop(place))
+                        .await;
+                    return None;
+                }
+                Err(why) => why,
+            }
+        }
+        Ok(Ok(1..)) if !security.covers(from.ip()) || security.excepts(from.ip()) => {
+            return Some((stream, place));
+        }
+        Ok(Ok(1..)) => "it did not prove who is there".to_owned(),
+        // Somebody only looked whether the port is open.
+        Ok(Ok(0)) => return None,
+        Ok(Err(error)) => error.to_string(),
+        Err(_) => "no byte came in time".to_owned(),
+    };
+    let counter = &endpoint.tally().refused_unproved;
+    let before = counter.fetch_add(1, Ordering::Relaxed);
+    warn_seldom(
+        before,
+        format_args!("{from}: connection refused: {refused}"),
+    );
+    None
 }

@@ -1,5 +1,6 @@
 //! What the owner of an endpoint chooses.
 
+use std::net::IpAddr;
 use std::time::Duration;
 
 use crate::Identity;
@@ -16,6 +17,31 @@ pub struct TcpConfig {
     pub identity: Identity,
     /// What it takes and how long it waits.
     pub limits: Limits,
+    /// What peers have to prove. Without it nobody has to prove anything.
+    #[cfg(feature = "secure")]
+    pub security: Option<crate::secure::Security>,
+}
+
+impl TcpConfig {
+    /// Whether frames are taken from a peer at this address that has proved nothing.
+    pub(crate) fn takes_frames_of(&self, ip: IpAddr) -> bool {
+        #[cfg(feature = "secure")]
+        if let Some(security) = &self.security {
+            return !security.covers(ip);
+        }
+        let _anybody = ip;
+        true
+    }
+
+    /// Whether letters may go to an old peer at this address, which cannot prove anything.
+    pub(crate) fn gives_old_peers_at(&self, ip: IpAddr) -> bool {
+        #[cfg(feature = "secure")]
+        if let Some(security) = &self.security {
+            return !security.covers(ip) || security.excepts(ip);
+        }
+        let _anybody = ip;
+        true
+    }
 }
 
 /// Bounds of a TCP endpoint. Memory is at most about `max_connections` × (`max_queued_bytes` +

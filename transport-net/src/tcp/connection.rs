@@ -6,8 +6,10 @@
 
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::io::IoSlice;
+use std::sync::Arc;
 use std::time::Instant;
 
+use fipa_acl::{EnvelopeView, Letter};
 use fipa_transport::{
     Answer, AttemptId, Body, Conclusion, Incarnation, Parcel, WayError, WayFault,
 };
@@ -15,6 +17,7 @@ use fipa_transport::{
 use super::config::Limits;
 use super::frame::{self, Frame};
 use super::outbox::{About, Outbox, Progress};
+use super::proof::Proof;
 use crate::end::End;
 use crate::hello::Hello;
 
@@ -61,6 +64,7 @@ pub(crate) struct Connection {
     role: Role,
     hello: Hello,
     peer: Option<Hello>,
+    proof: Proof,
     /// Whether parcels may be sent: the peer is known, and knows this side.
     open: bool,
     /// Whether it is about to end for idleness: what comes now needs another connection.
@@ -87,6 +91,7 @@ pub(crate) struct Connection {
 struct Sent {
     /// None when it was abandoned.
     attempt: Option<AttemptId>,
+    receiver: Arc<str>,
     letter_len: u64,
     begun: bool,
 }
@@ -114,6 +119,7 @@ impl Connection {
             role,
             hello,
             peer: None,
+            proof: Proof::default(),
             open: false,
             retiring: false,
             ended: false,
@@ -147,6 +153,30 @@ impl Connection {
         self.say_hello();
     }
 
+    /// The peer has proved who it is, before anything else.
+    pub(crate) fn proved(&mut self, proof: Proof) {
+        self.proof = proof;
+    }
+
+    /// Whether the peer may send this letter: whoever has proved who it is speaks for its agents
+    /// only.
+    ///
+    /// # Errors
+    /// Why not.
+    pub(crate) fn admits(&self, letter: &Letter) -> Result<(), String> {
+        if !self.proof.restricts() {
+            return Ok(());
+        }
+        let envelope = letter.envelope();
+        let view = EnvelopeView::parse(&envelope);
+        let view = view.map_err(|error| format!("its envelope cannot be read: {error}"))?;
+        match view.from_name() {
+            Some(name) if self.proof.speaks_for(&name.to_string()) => Ok(()),
+            Some(name) => Err(format!("the peer's certificate does not speak for {name}")),
+            None => Err("it names no sender".to_owned()),
+        }
+    }
+
     /// The peer that has introduced itself is wanted.
     pub(crate) fn welcome(&mut self) {
         if self.role == Role::Acceptor {
@@ -173,6 +203,9 @@ impl Connection {
         let peer_max = self.peer.as_ref().map_or(u64::MAX, |peer| peer.max_letter);
         if letter_len > peer_max {
             return Err(SendError::Way(too_large_for_peer(letter_len, peer_max)));
+        }
+        if !self.proof.speaks_for(&parcel.receiver) {
+            return Err(SendError::Way(not_its_agent(&parcel.receiver)));
         }
         let Limits {
             max_in_flight,
@@ -204,6 +237,7 @@ impl Connection {
             id,
             Sent {
                 attempt: Some(attempt),
+                receiver: Arc::clone(&parcel.receiver),
                 letter_len,
                 begun: false,
             },
@@ -435,6 +469,15 @@ impl Connection {
         self.outbox.push_urgent(About::Control, frame);
     }
 
+    /// Why this peer cannot get what was meant for whoever is there.
+    fn unfit(&self, sent: &Sent, peer: &Hello) -> Option<WayError> {
+        if sent.letter_len > peer.max_letter {
+            return Some(too_large_for_peer(sent.letter_len, peer.max_letter));
+        }
+        let is_its = self.proof.speaks_for(&sent.receiver);
+        (!is_its).then(|| not_its_agent(&sent.receiver))
+    }
+
     fn greet(&mut self, hello: Hello, now: Instant) -> Result<(), End> {
         let found = hello.identity.incarnation;
         if let Role::Dialler { expected } = self.role
@@ -446,21 +489,22 @@ impl Connection {
         if hello.max_in_flight == 0 {
             return Err(End::Nonsense("the peer takes no parcels at all".into()));
         }
+        if let Some(what) = self.proof.contradicts(&hello.identity.name) {
+            return Err(End::Nonsense(what));
+        }
         self.clock.busy = now;
         self.events.push_back(Event::Greeted);
-        // These were taken before it was known how much the peer takes.
-        let too_large: Vec<(u64, u64)> = self
+        // These were taken before it was known who the peer is, and how much it takes.
+        let unfit: Vec<(u64, WayError)> = self
             .sent
             .iter()
-            .filter(|(_, sent)| sent.letter_len > hello.max_letter)
-            .map(|(id, sent)| (*id, sent.letter_len))
+            .filter_map(|(id, sent)| Some((*id, self.unfit(sent, &hello)?)))
             .collect();
-        for (id, len) in too_large {
+        for (id, error) in unfit {
             self.outbox.remove_parcel(id);
             let sent = self.sent.remove(&id);
             if let Some(attempt) = sent.and_then(|sent| sent.attempt) {
                 self.attempts.remove(&attempt);
-                let error = too_large_for_peer(len, hello.max_letter);
                 let concluded = Event::Concluded(attempt, Conclusion::NotSent(error));
                 self.events.push_back(concluded);
             }
@@ -514,6 +558,11 @@ pub(crate) fn letter_len(parcel: &Parcel) -> u64 {
         Body::Letter(letter) => letter.len() as u64,
         Body::Report(_) | Body::Credit => 0,
     }
+}
+
+fn not_its_agent(receiver: &str) -> WayError {
+    let detail = format!("the certificate of the peer there does not speak for {receiver}");
+    WayError::new(WayFault::Refused, detail)
 }
 
 fn too_large_for_peer(len: u64, max: u64) -> WayError {

@@ -46,6 +46,10 @@ counters! {
     unframed_out,
     /// Connections closed because of what the peer sent, or because it was too slow.
     refused_nonsense,
+    /// Letters refused because the peer's certificate does not speak for their senders.
+    refused_senders,
+    /// Connections that had to prove who is there, and did not.
+    refused_unproved,
     /// Connections refused or pushed out because there were too many.
     refused_crowd,
     /// Failures of the operating system to hand out a new connection.

@@ -259,7 +259,7 @@ async fn deliver(round: &Round, errand: &Errand, begun: &Mutex<bool>) -> Conclus
         Ok(letter) => letter,
         Err(not_sent) => return not_sent,
     };
-    let (mut stream, _) = match dial::open(endpoint.limits(), to.address()).await {
+    let (mut stream, peer) = match dial::open(endpoint.limits(), to.address()).await {
         Ok(opened) => opened,
         Err(Unreachable(what)) => {
             count(&endpoint.tally().dial_failures);
@@ -267,6 +267,10 @@ async fn deliver(round: &Round, errand: &Errand, begun: &Mutex<bool>) -> Conclus
             return Conclusion::NotSent(WayError::new(WayFault::Unreachable, detail));
         }
     };
+    if !endpoint.config.gives_old_peers_at(peer.ip()) {
+        let detail = format!("{peer} cannot prove who it is, and is no exception");
+        return Conclusion::NotSent(WayError::new(WayFault::Refused, detail));
+    }
     if to.signature() == Signature::JadeProxy
         && let Some(here) = stream.local_addr().ok()
         && let Some(here) = endpoint.reachable_at(here)

@@ -16,6 +16,10 @@ use super::config::Limits;
 use super::endpoint::Endpoint;
 use super::frame::FrameReader;
 use super::link::{Link, Running};
+use super::proof::Proof;
+#[cfg(feature = "secure")]
+use super::tls;
+use super::wire::{self, Reading, Writing};
 use crate::address::{self, Target};
 use crate::end::End;
 
@@ -49,11 +53,44 @@ pub(crate) async fn dial(
     if let Err(error) = prepare(&stream, &limits) {
         return running.fail(unreachable(&error));
     }
+    let (ends, proof) = tokio::select! {
+        proved = prove(&running, stream, peer) => match proved {
+            Ok(proved) => proved,
+            Err(why) => return running.fail(unreachable(&why)),
+        },
+        end = link.leaving() => return running.fail(end),
+    };
     link.connected(Instant::now());
     let reader = FrameReader::new(limits.max_letter, BytesMut::new());
-    running
-        .serve(stream.into_split(), reader, peer, || {})
-        .await;
+    running.serve(ends, proof, reader, peer, || {}).await;
+}
+
+/// Has the peer prove who it is, where it has to.
+#[cfg(feature = "secure")]
+async fn prove(
+    running: &Running,
+    stream: TcpStream,
+    peer: SocketAddr,
+) -> Result<((Reading, Writing), Proof), String> {
+    let config = &running.endpoint().config;
+    match &config.security {
+        Some(security) if security.covers(peer.ip()) => {
+            let patience = config.limits.handshake_timeout;
+            let secured = tls::connect(security, stream, peer, patience).await?;
+            Ok((secured.ends, Proof::of(security, secured.certificate)))
+        }
+        _ => Ok((wire::plain(stream), Proof::default())),
+    }
+}
+
+/// Nobody has to prove anything.
+#[cfg(not(feature = "secure"))]
+async fn prove(
+    _running: &Running,
+    stream: TcpStream,
+    _peer: SocketAddr,
+) -> Result<((Reading, Writing), Proof), String> {
+    Ok((wire::plain(stream), Proof::default()))
 }
 
 /// Why no connection could be opened.

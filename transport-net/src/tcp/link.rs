@@ -10,10 +10,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use fipa_transport::{Answer, AttemptId, Introduction, Location, Parcel, Sink, Ticket};
+use fipa_transport::{
+    Answer, AttemptId, Body, FailureReason, Introduction, Location, Parcel, Sink, Ticket,
+};
 use parking_lot::Mutex;
-use tokio::io::AsyncReadExt;
-use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::sync::{Notify, watch};
 use tokio::time::{sleep_until, timeout};
 
@@ -21,7 +21,10 @@ use super::connection::{Connection, Event, MAX_ID, SendError};
 use super::counters::count;
 use super::endpoint::Endpoint;
 use super::frame::FrameReader;
+use super::proof::Proof;
+use super::wire::{Reading, Writing};
 use crate::end::End;
+use crate::seldom::warn_seldom;
 
 /// Pieces handed to the kernel in one call.
 const MAX_SLICES: usize = 64;
@@ -46,7 +49,7 @@ pub(crate) struct Link {
 #[derive(Debug)]
 struct State {
     connection: Connection,
-    writer: Option<Arc<OwnedWriteHalf>>,
+    writer: Option<Arc<Writing>>,
     /// Why the task is to end the connection.
     ending: Option<End>,
 }
@@ -81,6 +84,11 @@ impl Link {
     /// The socket is connected.
     pub(crate) fn connected(&self, now: Instant) {
         self.state.lock().connection.connected(now);
+    }
+
+    /// The peer has proved this, before its hello.
+    fn proved(&self, proof: &Proof) {
+        self.state.lock().connection.proved(proof.clone());
     }
 
     /// Takes a parcel for sending, and writes what the kernel takes at once.
@@ -124,6 +132,17 @@ impl Link {
         let _ = self.over.subscribe().wait_for(|over| *over).await;
     }
 
+    /// Whether the peer may send this.
+    ///
+    /// # Errors
+    /// Why not.
+    fn admits(&self, parcel: &Parcel) -> Result<(), String> {
+        let Body::Letter(letter) = &parcel.body else {
+            return Ok(());
+        };
+        self.state.lock().connection.admits(letter)
+    }
+
     /// The endpoint's number for an arrival on this link.
     fn ticket(&self, id: u64) -> Ticket {
         Ticket(u64::from(self.number) * MAX_ID + id)
@@ -155,7 +174,7 @@ impl State {
             }
             let mut slices = [IoSlice::new(&[]); MAX_SLICES];
             let count = self.connection.gather(&mut slices);
-            match writer.try_write_vectored(&slices[..count]) {
+            match writer.try_write(&slices[..count]) {
                 Ok(0) => {
                     let nothing = "the system takes no more bytes".into();
                     self.ending.get_or_insert(End::Broken(nothing));
@@ -173,7 +192,14 @@ impl State {
                 }
             }
         }
-        Flushed::All
+        match writer.try_finish() {
+            Ok(()) => Flushed::All,
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => Flushed::Rest,
+            Err(error) => {
+                self.ending.get_or_insert(End::Broken(error.to_string()));
+                Flushed::Rest
+            }
+        }
     }
 }
 
@@ -210,6 +236,12 @@ impl Running {
         }
     }
 
+    /// Where it belongs.
+    #[cfg(feature = "secure")]
+    pub(crate) fn endpoint(&self) -> &Endpoint {
+        &self.endpoint
+    }
+
     /// Ends a link whose socket could not be connected.
     pub(crate) fn fail(mut self, end: End) {
         self.end = end;
@@ -218,17 +250,23 @@ impl Running {
     /// Serves the connection to its end. `greeted` is called when the peer has introduced itself.
     pub(crate) async fn serve(
         mut self,
-        (read, writer): (OwnedReadHalf, OwnedWriteHalf),
+        (read, writer): (Reading, Writing),
+        proof: Proof,
         mut reader: FrameReader,
         from: SocketAddr,
         greeted: impl FnOnce() + Send,
     ) {
         let mut read = read;
         let writer = Arc::new(writer);
+        self.link.proved(&proof);
         self.link.state.lock().writer = Some(writer.clone());
         let mut greeted = Some(greeted);
-        let end = self.exchange(&mut read, &writer, &mut reader, from, &mut greeted);
-        self.end = end.await;
+        let exchange = self.exchange(&mut read, &writer, &mut reader, from, &mut greeted);
+        let end = tokio::select! {
+            end = exchange => end,
+            () = proof.withdrawn() => End::Distrusted,
+        };
+        self.end = end;
         drop(writer);
         let (link, patience) = (self.link.clone(), self.endpoint.limits().handshake_timeout);
         let orderly = self.end.is_orderly();
@@ -242,8 +280,8 @@ impl Running {
 
     async fn exchange(
         &mut self,
-        read: &mut OwnedReadHalf,
-        writer: &OwnedWriteHalf,
+        read: &mut Reading,
+        writer: &Writing,
         reader: &mut FrameReader,
         from: SocketAddr,
         greeted: &mut Option<impl FnOnce() + Send>,
@@ -276,7 +314,7 @@ impl Running {
             }
             let mut space = reader.space();
             tokio::select! {
-                arrived = read.read_buf(&mut space) => {
+                arrived = read.read(&mut space) => {
                     let arrived = match arrived {
                         Ok(0) => return End::Hangup,
                         Ok(bytes) => bytes,
@@ -370,6 +408,14 @@ impl Running {
                 let Some(peer) = &self.peer else {
                     return Err(End::Nonsense("a parcel from nobody".into()));
                 };
+                if let Err(refused) = self.link.admits(&parcel) {
+                    let before = &self.endpoint.tally().refused_senders;
+                    let before = before.fetch_add(1, Ordering::Relaxed);
+                    warn_seldom(before, format_args!("{from}: letter refused: {refused}"));
+                    self.link
+                        .answer(id, &Answer::failed(FailureReason::Refused, &refused));
+                    return Ok(());
+                }
                 let from = peer.hop.clone();
                 let ticket = self.link.ticket(id);
                 let verdict = self.sink.arrived(fipa_transport::Arrival {
@@ -415,7 +461,7 @@ impl Drop for Running {
 
 /// Writes what is left, closes this direction, and waits for the peer to close the other: closing
 /// while bytes of the peer are unread would destroy what is on its way to it.
-async fn farewell(link: &Link, mut read: OwnedReadHalf) {
+async fn farewell(link: &Link, mut read: Reading) {
     loop {
         let writer = {
             let mut state = link.state.lock();
@@ -430,6 +476,5 @@ async fn farewell(link: &Link, mut read: OwnedReadHalf) {
         }
     }
     link.state.lock().writer = None;
-    let mut ignored = [0; 4096];
-    while matches!(read.read(&mut ignored).await, Ok(1..)) {}
+    read.drain().await;
 }

@@ -18,7 +18,11 @@ mod endpoint;
 mod frame;
 mod link;
 mod outbox;
+mod proof;
+#[cfg(feature = "secure")]
+mod tls;
 mod unframed;
+mod wire;
 
 use std::sync::Arc;
 

@@ -2,6 +2,9 @@
 //! waiting for a condition.
 #![allow(dead_code, reason = "each test file uses a part of it")]
 
+#[cfg(feature = "secure")]
+pub(crate) mod certificates;
+
 use std::collections::HashMap;
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -25,9 +28,12 @@ pub(crate) fn runtime() -> Runtime {
         .unwrap()
 }
 
+/// What every endpoint of the tests is called.
+pub(crate) const NAME: &str = "test-mts";
+
 fn identity() -> Identity {
     Identity {
-        name: "test-mts".into(),
+        name: NAME.into(),
         incarnation: Incarnation::random(),
         domain: "test".into(),
         host: "here".into(),
@@ -57,6 +63,8 @@ pub(crate) fn config(listen: &[&str]) -> TcpConfig {
             handshake_timeout: Duration::from_secs(30),
             ..Limits::default()
         },
+        #[cfg(feature = "secure")]
+        security: None,
     }
 }
 

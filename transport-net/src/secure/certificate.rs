@@ -1,0 +1,236 @@
+//! What a certificate says: which message transport service it is of, which agents that service
+//! may speak for, and for how long.
+//!
+//! Both stand among the subject's alternative names as URIs (RFC 5280 section 4.2.1.6):
+//! `urn:fipa:mts:NAME`, exactly once, and `urn:fipa:agent:NAME` for each agent; without one the
+//! service may speak for every agent. Names are percent-encoded UTF-8; an agent's name that ends
+//! with `*` stands for all names that begin so.
+//!
+//! What must not live here: whether anybody is trusted.
+
+use std::fmt;
+use std::sync::Arc;
+
+use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, percent_decode_str, utf8_percent_encode};
+use ring::digest::{SHA256, SHA256_OUTPUT_LEN, digest};
+use rustls::pki_types::{CertificateDer, UnixTime};
+use x509_parser::prelude::{FromDer, GeneralName, X509Certificate};
+
+const MTS: &str = "urn:fipa:mts:";
+const AGENT: &str = "urn:fipa:agent:";
+
+/// What stays as it is in a URI (RFC 3986 section 2.3).
+const KEPT: &AsciiSet = &NON_ALPHANUMERIC
+    .remove(b'-')
+    .remove(b'.')
+    .remove(b'_')
+    .remove(b'~');
+
+/// Longest certificate that is looked at, in bytes.
+const MAX_LEN: usize = 64 * 1024;
+
+/// Most agents that a certificate may name.
+const MAX_AGENTS: usize = 1024;
+
+/// The SHA-256 of a certificate's DER form; shown as 64 hexadecimal digits.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Fingerprint([u8; SHA256_OUTPUT_LEN]);
+
+impl Fingerprint {
+    pub(super) fn of(certificate: &[u8]) -> Self {
+        let mut fingerprint = [0; SHA256_OUTPUT_LEN];
+        fingerprint.copy_from_slice(digest(&SHA256, certificate).as_ref());
+        Self(fingerprint)
+    }
+}
+
+impl fmt::Display for Fingerprint {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+    }
+}
+
+impl fmt::Debug for Fingerprint {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(self, f)
+    }
+}
+
+/// A certificate that was read.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Certificate {
+    der: CertificateDer<'static>,
+    fingerprint: Fingerprint,
+    certified: Arc<Certified>,
+    /// In seconds since 1970-01-01 00:00 UTC.
+    from: i64,
+    until: i64,
+}
+
+/// Whom a certificate is of, and for whom that service may speak.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Certified {
+    mts: String,
+    agents: Vec<String>,
+}
+
+/// A certificate that says nothing, or nothing that can be used here.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum CertificateError {
+    /// It is longer than 64 KiB.
+    #[error("{0} bytes; at most {MAX_LEN} are looked at")]
+    TooLong(usize),
+    /// It is no X.509 certificate.
+    #[error("no X.509 certificate: {0}")]
+    Malformed(String),
+    /// It names no message transport service, or several.
+    #[error("{0} names of message transport services ({MTS}…) where one has to be")]
+    Services(usize),
+    /// It names more agents than are looked at.
+    #[error("it names more than {MAX_AGENTS} agents")]
+    Agents,
+    /// A name is no UTF-8, or empty.
+    #[error("{0}: not a name")]
+    Name(String),
+}
+
+impl Certificate {
+    /// Reads a certificate in DER form.
+    ///
+    /// # Errors
+    /// When it is none, or names nobody.
+    pub fn from_der(der: Vec<u8>) -> Result<Self, CertificateError> {
+        if der.len() > MAX_LEN {
+            return Err(CertificateError::TooLong(der.len()));
+        }
+        let malformed = |error: &dyn fmt::Display| CertificateError::Malformed(error.to_string());
+        let (rest, read) = X509Certificate::from_der(&der).map_err(|error| malformed(&error))?;
+        if !rest.is_empty() {
+            return Err(malformed(&format_args!("{} bytes behind it", rest.len())));
+        }
+        let names = read.subject_alternative_name();
+        let names = names.map_err(|error| malformed(&error))?;
+        let names = names.map_or(&[][..], |names| &names.value.general_names);
+        let certified = Certified::of(names)?;
+        let validity = read.validity();
+        let (from, until) = (validity.not_before, validity.not_after);
+        Ok(Self {
+            fingerprint: Fingerprint::of(&der),
+            certified: Arc::new(certified),
+            from: from.timestamp(),
+            until: until.timestamp(),
+            der: der.into(),
+        })
+    }
+
+    /// The certificate in DER form.
+    #[must_use]
+    pub fn der(&self) -> &CertificateDer<'static> {
+        &self.der
+    }
+
+    /// What tells it from every other certificate.
+    #[must_use]
+    pub fn fingerprint(&self) -> Fingerprint {
+        self.fingerprint
+    }
+
+    /// Whom it is of.
+    #[must_use]
+    pub fn certified(&self) -> &Arc<Certified> {
+        &self.certified
+    }
+
+    /// The first and the last second at which it holds, since 1970-01-01 00:00 UTC.
+    #[must_use]
+    pub fn validity(&self) -> (i64, i64) {
+        (self.from, self.until)
+    }
+
+    /// Whether it holds at this time.
+    pub(super) fn holds(&self, now: UnixTime) -> Holds {
+        let now = i64::try_from(now.as_secs()).unwrap_or(i64::MAX);
+        match now {
+            now if now < self.from => Holds::NotYet,
+            now if now > self.until => Holds::NoMore,
+            _ => Holds::Now,
+        }
+    }
+}
+
+/// Whether a certificate holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Holds {
+    NotYet,
+    Now,
+    NoMore,
+}
+
+impl Certified {
+    fn of(names: &[GeneralName<'_>]) -> Result<Self, CertificateError> {
+        let mut services = Vec::new();
+        let mut agents = Vec::new();
+        for name in names {
+            let GeneralName::URI(uri) = name else {
+                continue;
+            };
+            if let Some(encoded) = uri.strip_prefix(MTS) {
+                services.push(decoded(encoded)?);
+            } else if let Some(encoded) = uri.strip_prefix(AGENT) {
+                agents.push(decoded(encoded)?);
+            }
+        }
+        if agents.len() > MAX_AGENTS {
+            return Err(CertificateError::Agents);
+        }
+        match <[String; 1]>::try_from(services) {
+            Ok([mts]) => Ok(Self { mts, agents }),
+            Err(services) => Err(CertificateError::Services(services.len())),
+        }
+    }
+
+    /// The name of the message transport service.
+    #[must_use]
+    pub fn mts(&self) -> &str {
+        &self.mts
+    }
+
+    /// The agents it may speak for, a name ending with `*` standing for all that begin so; empty
+    /// when it may speak for every agent.
+    #[must_use]
+    pub fn agents(&self) -> &[String] {
+        &self.agents
+    }
+
+    /// Whether the service may speak for the agent with this name, or for itself.
+    #[must_use]
+    pub fn speaks_for(&self, name: &str) -> bool {
+        self.agents.is_empty()
+            || self.mts == name
+            || self
+                .agents
+                .iter()
+                .any(|agent| match agent.strip_suffix('*') {
+                    Some(beginning) => name.starts_with(beginning),
+                    None => agent == name,
+                })
+    }
+}
+
+fn decoded(encoded: &str) -> Result<String, CertificateError> {
+    let name = percent_decode_str(encoded).decode_utf8();
+    match name {
+        Ok(name) if !name.is_empty() => Ok(name.into_owned()),
+        _ => Err(CertificateError::Name(encoded.to_owned())),
+    }
+}
+
+/// The alternative names with which a certificate says this.
+#[must_use]
+pub fn alternative_names(mts: &str, agents: &[String]) -> Vec<String> {
+    let encoded = |prefix: &str, name: &str| format!("{prefix}{}", utf8_percent_encode(name, KEPT));
+    let mut names = vec![encoded(MTS, mts)];
+    names.extend(agents.iter().map(|agent| encoded(AGENT, agent)));
+    names
+}

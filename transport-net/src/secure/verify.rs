@@ -1,0 +1,143 @@
+//! Whether whoever presents a certificate is trusted.
+
+use std::collections::HashMap;
+
+use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
+use rustls::crypto::{CryptoProvider, WebPkiSupportedAlgorithms, verify_tls13_signature};
+use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
+use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
+use rustls::{
+    CertificateError, DigitallySignedStruct, DistinguishedName, Error, PeerIncompatible,
+    SignatureScheme,
+};
+
+use super::certificate::{Certificate, Fingerprint, Holds};
+
+/// The certificates of trusted peers.
+#[derive(Debug)]
+pub(super) struct Known {
+    trusted: HashMap<Fingerprint, Certificate>,
+    algorithms: WebPkiSupportedAlgorithms,
+}
+
+impl Known {
+    pub(super) fn new(trusted: Vec<Certificate>, provider: &CryptoProvider) -> Self {
+        Self {
+            trusted: trusted
+                .into_iter()
+                .map(|certificate| (certificate.fingerprint(), certificate))
+                .collect(),
+            algorithms: provider.signature_verification_algorithms,
+        }
+    }
+
+    pub(super) fn find(&self, presented: &CertificateDer<'_>) -> Option<&Certificate> {
+        self.trusted.get(&Fingerprint::of(presented))
+    }
+
+    pub(super) fn trusts(&self, fingerprint: Fingerprint) -> bool {
+        self.trusted.contains_key(&fingerprint)
+    }
+
+    /// Whether a certificate is one of a trusted peer, and holds now. That the peer has its key is
+    /// asked by its signature over the handshake.
+    fn check(&self, presented: &CertificateDer<'_>, now: UnixTime) -> Result<(), Error> {
+        let certificate = self.find(presented);
+        let certificate = certificate.ok_or(CertificateError::UnknownIssuer)?;
+        match certificate.holds(now) {
+            Holds::Now => Ok(()),
+            Holds::NotYet => Err(CertificateError::NotValidYet.into()),
+            Holds::NoMore => Err(CertificateError::Expired.into()),
+        }
+    }
+
+    fn check_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signed: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        verify_tls13_signature(message, certificate, signed, &self.algorithms)
+    }
+}
+
+/// TLS 1.2 is not offered; who gets here nevertheless has made a mistake.
+fn only_tls13() -> Result<HandshakeSignatureValid, Error> {
+    Err(PeerIncompatible::Tls12NotOfferedOrEnabled.into())
+}
+
+impl ServerCertVerifier for Known {
+    fn verify_server_cert(
+        &self,
+        presented: &CertificateDer<'_>,
+        _intermediates: &[CertificateDer<'_>],
+        // Addresses change; who is there is what the certificate says.
+        _address: &ServerName<'_>,
+        _ocsp: &[u8],
+        now: UnixTime,
+    ) -> Result<ServerCertVerified, Error> {
+        self.check(presented, now)?;
+        Ok(ServerCertVerified::assertion())
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        _message: &[u8],
+        _certificate: &CertificateDer<'_>,
+        _signed: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        only_tls13()
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signed: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        self.check_signature(message, certificate, signed)
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        self.algorithms.supported_schemes()
+    }
+}
+
+impl ClientCertVerifier for Known {
+    fn root_hint_subjects(&self) -> &[DistinguishedName] {
+        // Whom this host trusts is nobody's business.
+        &[]
+    }
+
+    fn verify_client_cert(
+        &self,
+        presented: &CertificateDer<'_>,
+        _intermediates: &[CertificateDer<'_>],
+        now: UnixTime,
+    ) -> Result<ClientCertVerified, Error> {
+        self.check(presented, now)?;
+        Ok(ClientCertVerified::assertion())
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        _message: &[u8],
+        _certificate: &CertificateDer<'_>,
+        _signed: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        only_tls13()
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signed: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        self.check_signature(message, certificate, signed)
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        self.algorithms.supported_schemes()
+    }
+}

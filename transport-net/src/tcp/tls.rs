@@ -1,0 +1,205 @@
+//! TLS over the socket of a link: the handshake, and records in both directions.
+//!
+//! The handshake is tokio-rustls's. Afterwards the session is taken apart from its stream, because
+//! a link is written by whoever has something to send, on its own thread, and read by its task.
+
+use std::io::{self, BufRead as _, IoSlice, Write as _};
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::buf::Limit;
+use bytes::{Buf as _, BufMut as _, BytesMut};
+use parking_lot::Mutex;
+use rustls::Connection;
+use rustls::pki_types::ServerName;
+use tokio::net::TcpStream;
+use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
+use tokio::time::timeout;
+use tokio_rustls::{TlsAcceptor, TlsConnector};
+
+use super::wire::{Reading, Writing};
+use crate::secure::{Certificate, Security};
+
+/// The first byte of a TLS connection: a record with a handshake (RFC 8446 section 5.1).
+pub(crate) const FIRST_BYTE: u8 = 22;
+
+/// Bytes read from the socket at once: the longest record (RFC 8446 section 5.2).
+const RECORD: usize = 5 + (1 << 14) + 256;
+
+/// Encrypted bytes that wait for the kernel before no more are taken.
+const MAX_WAITING: usize = 1 << 18;
+
+/// A connection over which the peer has proved who it is.
+pub(crate) struct Secured {
+    pub(crate) ends: (Reading, Writing),
+    /// The peer's.
+    pub(crate) certificate: Certificate,
+}
+
+/// Answers a peer that begins TLS.
+pub(crate) async fn accept(
+    security: &Security,
+    stream: TcpStream,
+    patience: Duration,
+) -> Result<Secured, String> {
+    let acceptor = TlsAcceptor::from(security.server());
+    let shaken = timeout(patience, acceptor.accept(stream)).await;
+    let shaken = shaken.map_err(|_| too_slow(patience))?;
+    let (stream, session) = shaken.map_err(|error| told(&error))?.into_inner();
+    secured(security, stream, session.into())
+}
+
+/// Begins TLS with the peer at this address.
+pub(crate) async fn connect(
+    security: &Security,
+    stream: TcpStream,
+    peer: SocketAddr,
+    patience: Duration,
+) -> Result<Secured, String> {
+    let connector = TlsConnector::from(security.client());
+    // Neither told to the peer nor compared with anything: who is there says the certificate.
+    let name = ServerName::from(peer.ip());
+    let shaken = timeout(patience, connector.connect(name, stream)).await;
+    let shaken = shaken.map_err(|_| too_slow(patience))?;
+    let (stream, session) = shaken.map_err(|error| told(&error))?.into_inner();
+    secured(security, stream, session.into())
+}
+
+fn too_slow(patience: Duration) -> String {
+    format!("no TLS handshake within {patience:?} (handshake_timeout)")
+}
+
+fn told(error: &io::Error) -> String {
+    format!("no TLS connection: {error} (`fipa keys list` on both sides)")
+}
+
+fn secured(
+    security: &Security,
+    stream: TcpStream,
+    mut session: Connection,
+) -> Result<Secured, String> {
+    let certificate = security.peer(session.peer_certificates());
+    let certificate = certificate.ok_or("the peer's certificate is not trusted any more")?;
+    session.set_buffer_limit(Some(MAX_WAITING));
+    let (read, write) = stream.into_split();
+    let session = Arc::new(Session(Mutex::new(session)));
+    let incoming = Incoming {
+        session: session.clone(),
+        records: BytesMut::new(),
+    };
+    Ok(Secured {
+        ends: (Reading::Tls(read, incoming), Writing::Tls(write, session)),
+        certificate,
+    })
+}
+
+/// The keys and buffers of a connection.
+#[derive(Debug)]
+pub(crate) struct Session(Mutex<Connection>);
+
+impl Session {
+    /// Encrypts what there is room for, and hands it to the kernel as far as that takes it.
+    pub(crate) fn write(
+        &self,
+        socket: &OwnedWriteHalf,
+        slices: &[IoSlice<'_>],
+    ) -> io::Result<usize> {
+        let mut session = self.0.lock();
+        let pushed = push(&mut session, socket);
+        let taken = session.writer().write_vectored(slices)?;
+        if taken == 0 {
+            // There is no room: what the kernel said counts.
+            return pushed.and(Err(io::ErrorKind::WouldBlock.into()));
+        }
+        match push(&mut session, socket) {
+            Err(error) if error.kind() != io::ErrorKind::WouldBlock => Err(error),
+            _ => Ok(taken),
+        }
+    }
+
+    /// Hands the kernel what is encrypted.
+    pub(crate) fn push(&self, socket: &OwnedWriteHalf) -> io::Result<()> {
+        push(&mut self.0.lock(), socket)
+    }
+}
+
+fn push(session: &mut Connection, socket: &OwnedWriteHalf) -> io::Result<()> {
+    while session.wants_write() {
+        session.write_tls(&mut Kernel(socket))?;
+    }
+    Ok(())
+}
+
+/// The socket as what TLS writes to.
+struct Kernel<'a>(&'a OwnedWriteHalf);
+
+impl io::Write for Kernel<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.try_write(bytes)
+    }
+
+    fn write_vectored(&mut self, slices: &[IoSlice<'_>]) -> io::Result<usize> {
+        self.0.try_write_vectored(slices)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// The reading side of a session.
+pub(crate) struct Incoming {
+    session: Arc<Session>,
+    /// Bytes from the socket that have not been decrypted.
+    records: BytesMut,
+}
+
+impl Incoming {
+    pub(crate) async fn read(
+        &mut self,
+        socket: &OwnedReadHalf,
+        space: &mut Limit<&mut BytesMut>,
+    ) -> io::Result<usize> {
+        loop {
+            if let Some(taken) = self.decrypt(space)? {
+                return Ok(taken);
+            }
+            socket.readable().await?;
+            self.records.reserve(RECORD);
+            match socket.try_read_buf(&mut self.records) {
+                Ok(0) => return Ok(0),
+                Ok(_) => {}
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
+    /// Takes what is decrypted, or can be; none when more has to come. Nothing, when the peer has
+    /// closed its direction.
+    fn decrypt(&mut self, space: &mut Limit<&mut BytesMut>) -> io::Result<Option<usize>> {
+        let mut session = self.session.0.lock();
+        loop {
+            let mut reader = session.reader();
+            match reader.fill_buf() {
+                Ok(chunk) => {
+                    let (wanted, room) = (chunk.len(), space.remaining_mut());
+                    let taken = chunk.get(..room.min(wanted)).unwrap_or(chunk);
+                    let len = taken.len();
+                    space.put_slice(taken);
+                    reader.consume(len);
+                    return Ok(Some(len));
+                }
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+                Err(error) => return Err(error),
+            }
+            if self.records.is_empty() {
+                return Ok(None);
+            }
+            session.read_tls(&mut (&mut self.records).reader())?;
+            let processed = session.process_new_packets();
+            processed.map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))?;
+        }
+    }
+}

@@ -1,0 +1,245 @@
+//! Who is let in when peers have to prove who they are.
+#![cfg(feature = "secure")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test or bench that cannot go on may panic"
+)]
+
+mod common;
+
+use std::io::{Read as _, Write as _};
+use std::net::{IpAddr, Ipv4Addr, TcpStream};
+use std::time::{Duration, SystemTime};
+
+use common::certificates::Host;
+use common::{NAME, Party, accepted, config, letter_parcel, parcel, until};
+use fipa_acl::{AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter};
+use fipa_transport::{Answer, Conclusion, FailureReason, WayFault};
+use fipa_transport_net::secure::{Rules, Security};
+
+fn party(security: Security) -> Party {
+    let mut config = config(&["127.0.0.1:0"]);
+    config.security = Some(security);
+    Party::with(config)
+}
+
+/// Both know each other.
+fn friends(left: &Host, right: &Host) -> (Party, Party) {
+    (
+        party(left.security(&[right])),
+        party(right.security(&[left])),
+    )
+}
+
+/// No letter gets from the one to the other, and nothing has arrived.
+fn assert_refused(from: &Party, to: &Party) -> String {
+    from.send(1, to.location(), parcel(1, "let me in")).unwrap();
+    let Conclusion::NotSent(error) = from.conclusion(1) else {
+        panic!("it was sent: {:?}", from.conclusion(1));
+    };
+    assert_eq!(to.arrivals(), 0);
+    error.to_string()
+}
+
+fn letter_from(sender: &str) -> Letter {
+    let base = EnvelopeParams {
+        to: vec![AgentId::new("arm_1").unwrap()],
+        from: Some(AgentId::new(sender).unwrap()),
+        acl_representation: Some(AclRepresentation::BitEfficient),
+        date: Some("20261120T112644998Z".parse().unwrap()),
+        ..EnvelopeParams::default()
+    };
+    let envelope = Envelope {
+        base,
+        extensions: Vec::new(),
+    };
+    let message = bytes::Bytes::from_static(b"message");
+    Letter::new(envelope.encode_standard().unwrap(), message)
+}
+
+#[test]
+fn peers_that_trust_each_other_exchange_letters_of_any_size() {
+    let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
+    let (from, to) = friends(&rover, &crex);
+    from.assert_reaches(1, &to);
+    let large = vec![7; 5 << 20];
+    from.send(2, to.location(), parcel(2, large.clone()))
+        .unwrap();
+    assert_eq!(from.conclusion(2), accepted());
+    to.assert_reaches(3, &from);
+    let arrived = to.sink.record.lock().arrivals[1].0.clone();
+    assert_eq!(arrived, parcel(2, large));
+    assert_eq!(from.transport.counters().dialled, 1);
+}
+
+#[test]
+fn strangers_are_refused_on_either_side() {
+    let (rover, crex, stranger) = (
+        Host::new(NAME, &[]),
+        Host::new(NAME, &[]),
+        Host::new(NAME, &[]),
+    );
+    // Nobody vouched for this certificate.
+    let to = party(crex.security(&[&rover]));
+    let from = party(stranger.security(&[&crex]));
+    assert_refused(&from, &to);
+    // Whoever listens there is somebody else.
+    let from = party(rover.security(&[&stranger]));
+    let told = assert_refused(&from, &to);
+    assert!(told.contains("UnknownIssuer"), "{told}");
+    until("it was counted", || {
+        (to.transport.counters().refused_unproved >= 2).then_some(())
+    });
+}
+
+#[test]
+fn certificates_that_do_not_hold_now_are_refused() {
+    let day = Duration::from_secs(86_400);
+    let now = SystemTime::now();
+    let rover = Host::new(NAME, &[]);
+    for (from, until, what) in [
+        (now - 2 * day, now - day, "Expired"),
+        (now + day, now + 2 * day, "NotValidYet"),
+    ] {
+        let crex = Host::valid(NAME, &[], from, until);
+        let (from, to) = friends(&rover, &crex);
+        let told = assert_refused(&from, &to);
+        assert!(told.contains(what), "{told}");
+        assert_refused(&to, &from);
+    }
+}
+
+#[test]
+fn a_certificate_without_its_key_is_of_no_use() {
+    let (rover, thief) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
+    let stolen = Host::new(NAME, &[]).with_key_of(&thief);
+    let rules = Rules::default();
+    let refused = Security::new(stolen.credentials(&[&rover]), rules);
+    assert!(
+        refused.is_err(),
+        "key and certificate do not belong together"
+    );
+}
+
+#[test]
+fn who_proved_one_name_cannot_take_another() {
+    let (rover, crex) = (Host::new(NAME, &[]), Host::new("somebody-else", &[]));
+    let (from, to) = friends(&rover, &crex);
+    let told = assert_refused(&from, &to);
+    assert!(told.contains("somebody-else"), "{told}");
+}
+
+#[test]
+fn a_peer_speaks_for_its_own_agents_only() {
+    let rover = Host::new(NAME, &["rover", "rover_*"]);
+    let crex = Host::new(NAME, &["crex", "arm_1"]);
+    let (from, to) = friends(&rover, &crex);
+    for (attempt, sender) in [(1, "rover"), (2, "rover_arm")] {
+        let letter = letter_parcel(attempt, letter_from(sender));
+        from.send(attempt, to.location(), letter).unwrap();
+        assert_eq!(from.conclusion(attempt), accepted(), "{sender}");
+    }
+    let claimed = letter_parcel(3, letter_from("crex"));
+    from.send(3, to.location(), claimed).unwrap();
+    let Conclusion::Answered(Answer::Failed { reason, .. }) = from.conclusion(3) else {
+        panic!("{:?}", from.conclusion(3));
+    };
+    assert_eq!(reason, FailureReason::Refused);
+    assert_eq!(to.arrivals(), 2);
+    assert_eq!(to.transport.counters().refused_senders, 1);
+    // Nor does it get letters for agents of others, whatever the directory says.
+    let mut stray = letter_parcel(4, letter_from("rover"));
+    stray.receiver = "sherpa".into();
+    let refused = from.send(4, to.location(), stray.clone()).unwrap_err();
+    assert_eq!(refused.fault, WayFault::Refused);
+    // Also when the connection is only opened for it.
+    let later = party(rover.security(&[&crex]));
+    later.send(1, to.location(), stray).unwrap();
+    let Conclusion::NotSent(refused) = later.conclusion(1) else {
+        panic!("{:?}", later.conclusion(1));
+    };
+    assert_eq!(refused.fault, WayFault::Refused);
+}
+
+#[test]
+fn withdrawn_trust_ends_the_connection() {
+    let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
+    let security = crex.security(&[&rover]);
+    let to = party(security.clone());
+    let from = party(rover.security(&[&crex]));
+    from.assert_reaches(1, &to);
+    security.replace(crex.credentials(&[])).unwrap();
+    until("the connection ends", || {
+        (to.transport.counters().connections == 0).then_some(())
+    });
+    until("the other side has noticed", || {
+        (from.transport.counters().connections == 0).then_some(())
+    });
+    from.send(2, to.location(), parcel(2, "again")).unwrap();
+    assert!(matches!(from.conclusion(2), Conclusion::NotSent(_)));
+    // And trust that is given again lets in again.
+    security.replace(crex.credentials(&[&rover])).unwrap();
+    from.assert_reaches(3, &to);
+}
+
+#[test]
+fn a_new_key_takes_over_while_letters_pass() {
+    let (rover, crex, renewed) = (
+        Host::new(NAME, &[]),
+        Host::new(NAME, &[]),
+        Host::new(NAME, &[]),
+    );
+    let security = crex.security(&[&rover]);
+    let to = party(security.clone());
+    let from = party(rover.security(&[&crex, &renewed]));
+    from.assert_reaches(1, &to);
+    security.replace(renewed.credentials(&[&rover])).unwrap();
+    from.assert_reaches(2, &to);
+    assert_eq!(
+        from.transport.counters().dialled,
+        1,
+        "the connection has stayed"
+    );
+}
+
+#[test]
+fn nothing_is_said_in_the_clear_to_who_has_to_prove_who_he_is() {
+    let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
+    let to = party(crex.security(&[&rover]));
+    // A peer of ours without keys, both ways.
+    let plain = Party::new();
+    assert_refused(&plain, &to);
+    assert_refused(&to, &plain);
+    // An old peer's letter, and frames.
+    for first in [&b"\xfe\x10"[..], b"fipa\x01\x01\0\0", b"<?xml", b"garbage"] {
+        let address = to.location().address().to_owned();
+        let mut stream = TcpStream::connect(address).unwrap();
+        stream.write_all(first).unwrap();
+        let mut said = Vec::new();
+        // A reset is as good as an end.
+        let _ = stream.read_to_end(&mut said);
+        assert_eq!(said, b"", "an answer to {first:?}");
+    }
+    assert_eq!(to.arrivals() + to.sink.record.lock().unframed.len(), 0);
+}
+
+#[test]
+fn an_old_peer_may_be_an_exception_and_is_nothing_more() {
+    let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
+    let rules = Rules {
+        loopback: true,
+        old_peers: vec![IpAddr::V4(Ipv4Addr::LOCALHOST)],
+    };
+    let security = Security::new(crex.credentials(&[&rover]), rules).unwrap();
+    let to = party(security);
+    let address = to.location().address().to_owned();
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream
+        .write_all(&letter_from("cpp-sender").to_bytes())
+        .unwrap();
+    stream.shutdown(std::net::Shutdown::Write).unwrap();
+    until("its letter", || {
+        (to.sink.record.lock().unframed.len() == 1).then_some(())
+    });
+    assert_refused(&Party::new(), &to);
+}
