@@ -161,6 +161,7 @@ impl Monitor {
         Verdict::Accepted(Accepted {
             protocol: machine.name(),
             state: state_name(machine, passed.state),
+            own: machine.state(passed.state).is_some(),
             opened: passed.opened,
             ended: is_final(machine, passed.state),
             over: is_over(machine, passed.state),

@@ -39,6 +39,9 @@ pub struct Accepted<'m> {
     pub protocol: &'m str,
     /// The new state: of the participant whom the message concerns, the first of several.
     pub state: &'m str,
+    /// Whether that is a state of the protocol's own, and none that all have: `not-understood`,
+    /// `cancelling`, `cancelled`, `undelivered`.
+    pub own: bool,
     /// Whether the message began the conversation, or brought another participant in.
     pub opened: bool,
     /// Whether the protocol may end in the new state.

@@ -297,6 +297,7 @@ impl<'a> Dialogue<'a> {
                 }
                 Ok(Meaning {
                     standing: match accepted.state {
+                        _ if accepted.own => Standing::Own,
                         "not-understood" => Standing::NotUnderstood,
                         "cancelling" => Standing::Cancelling,
                         "cancelled" => Standing::Cancelled,

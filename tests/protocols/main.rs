@@ -448,6 +448,24 @@ async fn protocols_of_ones_own_are_read_and_checked() {
         .unwrap();
     rover.receive().await.unwrap();
 
+    // Its states are its own, whatever they are called.
+    let named = r#"<scxml initial="1">
+        <state id="1"><transition performative="propose" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from="a" to="b" target="cancelling"/></state>
+        <state id="cancelling"><transition performative="agree" from="b" to="a" target="3"/></state>
+        <state id="3" final="yes"/></scxml>"#;
+    std::fs::write(&file, named).unwrap();
+    let (rover, arm) = pair(&[&set]).await;
+    let propose = say(&rover, Performative::Propose, &arm);
+    rover.send(propose).await.unwrap();
+    let first = arm.receive().await.unwrap().message;
+    let mut task = arm.take_part(&first).unwrap();
+    let inform = say(&rover, Performative::Inform, &arm);
+    rover.send(inform).await.unwrap();
+    let second = task.next(PATIENCE).await.unwrap();
+    assert_eq!(*second.performative(), Performative::Inform);
+    assert_eq!(task.state(), "cancelling");
+
     std::fs::write(&file, own.replace("target=\"3\"", "target=\"4\"")).unwrap();
     let error = Domain::open(&config(&[&set])).await.err().unwrap();
     assert!(matches!(error, OpenError::Protocol(_)));
