@@ -224,6 +224,15 @@ fn without_white_space_keywords_end_words() {
     assert_eq!(message.user_defined()[0].1, ")");
 }
 
+/// Whoever looks for the end of every word in all that is left would not come to an end here.
+#[test]
+fn a_million_bytes_without_white_space() {
+    let words = format!("(inform{})", ":protocolx".repeat(100_000));
+    assert_eq!(decode(words).unwrap().protocol(), Some("x"));
+    let strings = format!("(inform{})", ":language#1\"x".repeat(100_000));
+    assert_eq!(decode(strings).unwrap().language(), Some("x"));
+}
+
 #[test]
 fn errors_say_where_and_what() {
     for (text, offset, problem) in [

@@ -7,6 +7,10 @@ use crate::scan::{self, TOPS};
 /// Deepest nesting of expressions that is accepted.
 pub(super) const MAX_EXPRESSION_DEPTH: usize = 64;
 
+/// No keyword is longer, with what follows it. Without a bound, one that is followed by no blank would
+/// be looked for in all that is left.
+const NEAR: usize = 16;
+
 const WORD: &str = "FIPA00070 Word";
 const STRING: &str = "FIPA00070 String";
 const EXPRESSION: &str = "FIPA00070 Expression";
@@ -139,7 +143,8 @@ impl<'a> Lexer<'a> {
             return Err(self.unexpected(clause, expected));
         };
         // Nearly everybody writes small letters, and a blank or a parenthesis behind them.
-        if let Some(len) = scan::find(rest, scan::no_token, |byte| !is_token_byte(byte))
+        let near = rest.get(..NEAR).unwrap_or(rest);
+        if let Some(len) = scan::find(near, scan::no_token, |byte| !is_token_byte(byte))
             && let Some((name, behind)) = rest.split_at_checked(len)
             && let Some(parameter) = of(name)
         {
@@ -177,14 +182,12 @@ impl<'a> Lexer<'a> {
         glued: Option<&Keywords<T>>,
         what: &'static str,
     ) -> Result<Text<'a>, DecodeError> {
-        let ends = |byte: u8| !is_token_byte(byte);
-        let len = scan::find(self.rest, scan::no_token, ends).unwrap_or(self.rest.len());
-        let mut word = self.rest.get(..len).unwrap_or_default();
-        if let Some(keywords) = glued
-            && let Some(len) = glued_keyword(self.rest, len, keywords)
-        {
-            word = self.rest.get(..len).unwrap_or_default();
-        }
+        let len = match glued {
+            Some(keywords) => glued_len(self.rest, keywords),
+            None => scan::find(self.rest, scan::no_token, |byte| !is_token_byte(byte)),
+        };
+        let word = self.rest.get(..len.unwrap_or(self.rest.len()));
+        let word = word.unwrap_or_default();
         if word.is_empty() {
             return Err(self.unexpected(WORD, what));
         }
@@ -381,21 +384,22 @@ pub(super) fn holds_keyword<T>(word: &str, keywords: &Keywords<T>) -> bool {
     })
 }
 
-/// Where in a word of this length at the beginning of the bytes, but not in front, a keyword begins.
-fn glued_keyword<T>(bytes: &[u8], len: usize, keywords: &Keywords<T>) -> Option<usize> {
-    let colon = |from: usize| {
-        let word = bytes.get(from..len)?;
-        Some(from + scan::find_byte(word, b':')?)
-    };
-    let mut from = 1;
-    while let Some(at) = colon(from) {
+/// Where the word at the beginning of the bytes ends, a keyword behind its first byte ending it too.
+fn glued_len<T>(bytes: &[u8], keywords: &Keywords<T>) -> Option<usize> {
+    let marks = |word| scan::no_token(word) | scan::is(word, b':');
+    let ends = |byte: u8| !is_token_byte(byte) || byte == b':';
+    let mut from = 0;
+    loop {
+        let at = from + scan::find(bytes.get(from..)?, marks, ends)?;
+        if bytes.get(at) != Some(&b':') {
+            return Some(at);
+        }
         let behind = bytes.get(at + 1..).unwrap_or_default();
-        if is_glued_keyword(behind, keywords) {
+        if at > 0 && is_glued_keyword(behind, keywords) {
             return Some(at);
         }
         from = at + 1;
     }
-    None
 }
 
 fn is_glued_keyword<T>(behind_colon: &[u8], keywords: &Keywords<T>) -> bool {

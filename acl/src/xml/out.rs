@@ -2,6 +2,7 @@
 
 use crate::Dialect;
 use crate::error::EncodeError;
+use crate::scan::{self, TOPS};
 use crate::word::is_token;
 
 /// A document in the making.
@@ -188,22 +189,22 @@ impl<'a> Out<'a> {
 /// Where the first byte is that is looked for.
 fn marked(bytes: &[u8], looked_for: u8) -> Option<usize> {
     let mut before = 0;
-    // Content may be long. Written so that the compiler looks at many bytes at once.
-    for chunk in bytes.as_chunks::<32>().0 {
-        let mut found = 0;
-        for byte in chunk {
-            let mark = u8::from(*byte < b' ')
-                | u8::from(*byte == b'"')
-                | u8::from(*byte == b'&')
-                | u8::from(*byte == b'<')
-                | u8::from(*byte == b'>')
-                | u8::from(*byte == 0xef);
-            found |= (mark * MARK) | (u8::from(*byte == b' ') * SPACE);
+    // Content may be long, and is looked at eight bytes at a time. '"' and '&', '<' and '>' differ in
+    // one bit each.
+    let eights = |byte: u8| u64::from_le_bytes([byte; 8]);
+    for eight in bytes.as_chunks::<8>().0 {
+        let word = u64::from_le_bytes(*eight);
+        let mut marks = scan::below(word, 0x20)
+            | scan::is(word & eights(!0x04), b'"')
+            | scan::is(word & eights(!0x02), b'<')
+            | scan::is(word, 0xef);
+        if looked_for & SPACE != 0 {
+            marks |= scan::is(word, b' ');
         }
-        if found & looked_for != 0 {
+        if marks & TOPS != 0 {
             break;
         }
-        before += chunk.len();
+        before += eight.len();
     }
     let class = |byte: u8| CLASS.get(usize::from(byte)).copied().unwrap_or_default();
     let rest = bytes.get(before..)?.iter();
