@@ -6,6 +6,8 @@
 
 #[cfg(feature = "mdns")]
 mod network;
+#[cfg(feature = "net")]
+mod security;
 #[cfg(feature = "shm")]
 mod shm;
 
@@ -48,7 +50,7 @@ pub enum Verdict {
 #[must_use]
 pub fn examine(config: &Config) -> Vec<Check> {
     #[cfg_attr(
-        not(any(feature = "shm", feature = "mdns")),
+        not(any(feature = "shm", feature = "net")),
         expect(unused_mut, reason = "nothing is examined")
     )]
     let mut checks = Vec::new();
@@ -60,16 +62,18 @@ pub fn examine(config: &Config) -> Vec<Check> {
     if config.discovery.mdns {
         network::examine(config, &mut checks);
     }
-    #[cfg(not(any(feature = "shm", feature = "mdns")))]
+    #[cfg(feature = "net")]
+    security::examine(config, &mut checks);
+    #[cfg(not(any(feature = "shm", feature = "net")))]
     let _ = config;
     checks
 }
 
 /// Makes the checks of one area.
-#[cfg(any(feature = "shm", feature = "mdns"))]
+#[cfg(any(feature = "shm", feature = "net"))]
 pub(crate) struct Area(pub(crate) &'static str);
 
-#[cfg(any(feature = "shm", feature = "mdns"))]
+#[cfg(any(feature = "shm", feature = "net"))]
 impl Area {
     pub(crate) fn fine(&self, check: &'static str, found: impl Into<String>) -> Check {
         Check {

@@ -1,0 +1,141 @@
+//! Who is let in from other hosts, and whether the keys that decide it can be used.
+
+use super::{Area, Check, Verdict};
+use crate::Config;
+
+const AREA: Area = Area("security");
+const KEYS: &str = "keys";
+
+pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
+    if !config.security.keys.is_empty() {
+        keys(config, checks);
+    } else if config.security.insecure {
+        checks.push(AREA.wrong(
+            KEYS,
+            Verdict::Doubtful,
+            "there are none, and security.insecure = true: whoever reaches the gateway is let in, and \
+             can read everything",
+            "make keys (`fipa keys init`), unless everybody on this network may",
+        ));
+    } else {
+        checks.push(AREA.fine(KEYS, "there are none: the gateway stays on loopback"));
+    }
+}
+
+#[cfg(not(feature = "secure"))]
+fn keys(_config: &Config, checks: &mut Vec<Check>) {
+    checks.push(AREA.wrong(
+        KEYS,
+        Verdict::Bad,
+        "security.keys is set, and this program was built without the feature `secure`",
+        "build it with the feature, or take security.keys out",
+    ));
+}
+
+#[cfg(feature = "secure")]
+fn keys(config: &Config, checks: &mut Vec<Check>) {
+    use crate::keys::{Certificate, Keys};
+    use std::time::{SystemTime, UNIX_EPOCH};
+
+    /// A certificate that ends so soon is told, in seconds.
+    const SOON: i64 = 30 * 86_400;
+    let credentials = match Keys::at(&config.security.keys).credentials() {
+        Ok(credentials) => credentials,
+        Err(error) => {
+            let advice = "see `fipa keys list`, and security.keys";
+            checks.push(AREA.wrong(KEYS, Verdict::Bad, error.to_string(), advice));
+            return;
+        }
+    };
+    let named = credentials.own.certified().mts();
+    if named != config.mts.name {
+        let found = format!(
+            "the certificate is of {named:?}, and mts.name is {:?}: peers would refuse this gateway",
+            config.mts.name
+        );
+        let advice = "set mts.name to it, or make keys anew in an empty directory";
+        checks.push(AREA.wrong(KEYS, Verdict::Bad, found, advice));
+    }
+    if credentials.trusted.is_empty() {
+        let advice = "trust the certificates of the others: `fipa keys trust FILE`";
+        let found = "no other host is trusted, so none gets in";
+        checks.push(AREA.wrong(KEYS, Verdict::Doubtful, found, advice));
+    }
+    let now = SystemTime::now().duration_since(UNIX_EPOCH);
+    let now = now.map_or(0, |since| {
+        i64::try_from(since.as_secs()).unwrap_or(i64::MAX)
+    });
+    let mut ending = |whose: &str, certificate: &Certificate, renew: &str| {
+        let (from, until) = certificate.validity();
+        let (verdict, what) = match now {
+            now if now > until => (Verdict::Bad, "has ended"),
+            now if now < from => (Verdict::Bad, "does not hold yet; is the clock right?"),
+            now if now > until - SOON => (Verdict::Doubtful, "ends within 30 days"),
+            _ => return,
+        };
+        let found = format!("the certificate of {whose} {what}");
+        checks.push(AREA.wrong(KEYS, verdict, found, renew));
+    };
+    ending("this host", &credentials.own, "`fipa keys renew`");
+    for trusted in &credentials.trusted {
+        let whose = trusted.certified().mts().to_owned();
+        ending(
+            &whose,
+            trusted,
+            "ask its owner for a new one (`fipa keys renew` there)",
+        );
+    }
+    if checks.iter().all(|check| check.area != AREA.0) {
+        let count = credentials.trusted.len();
+        checks.push(AREA.fine(KEYS, format!("{count} other hosts are trusted")));
+    }
+}
+
+#[cfg(all(test, feature = "secure"))]
+mod tests {
+    use super::*;
+    use crate::keys::{Keys, VALID};
+
+    fn verdicts(config: &Config) -> Vec<(Verdict, String)> {
+        let mut checks = Vec::new();
+        examine(config, &mut checks);
+        let told = checks.into_iter().map(|check| (check.verdict, check.found));
+        told.collect()
+    }
+
+    #[test]
+    fn what_lets_nobody_in_or_everybody_is_told() {
+        let mut config = Config::for_host("sherpa");
+        assert_eq!(verdicts(&config)[0].0, Verdict::Fine);
+        config.security.insecure = true;
+        assert_eq!(verdicts(&config)[0].0, Verdict::Doubtful);
+        config.security.insecure = false;
+        let dir = tempfile::tempdir().unwrap();
+        config.security.keys = dir.path().display().to_string();
+        assert_eq!(verdicts(&config)[0].0, Verdict::Bad, "no keys there");
+        let keys = Keys::at(dir.path());
+        keys.init(&config.mts.name, &[], VALID).unwrap();
+        let found = verdicts(&config);
+        assert_eq!(found.len(), 1);
+        assert!(found[0].1.contains("no other host is trusted"));
+        let other = tempfile::tempdir().unwrap();
+        let other = Keys::at(other.path());
+        other.init("crex-mts", &[], VALID / 1000).unwrap();
+        keys.trust(&std::fs::read(other.own_file()).unwrap())
+            .unwrap();
+        let found = verdicts(&config);
+        assert_eq!(found.len(), 1);
+        assert_eq!(found[0].0, Verdict::Doubtful);
+        assert!(
+            found[0].1.contains("crex-mts ends within"),
+            "{}",
+            found[0].1
+        );
+        config.mts.name = "another".to_owned();
+        assert!(
+            verdicts(&config)
+                .iter()
+                .any(|found| found.0 == Verdict::Bad)
+        );
+    }
+}
