@@ -89,9 +89,11 @@ impl Agent {
     }
 
     /// An answer from this agent, as FIPA00037 has it: to whom the message wants answers, in the
-    /// same conversation.
+    /// same conversation, with a new `reply-with` of its own.
     pub fn reply(&self, to: &Message, performative: Performative) -> MessageBuilder {
-        to.reply(performative).sender(self.id.clone())
+        to.reply(performative)
+            .sender(self.id.clone())
+            .reply_with(self.unique_id())
     }
 
     /// Sends a message to its receivers, each an agent's name or a pattern of names, and waits

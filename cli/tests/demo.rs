@@ -4,8 +4,13 @@
 
 use std::io::{BufRead, BufReader, Read};
 use std::process::{Child, Command, Stdio};
+use std::sync::{Mutex, PoisonError};
 
 use serde_json::Value;
+
+/// Demos find their hosts by mDNS on loopback, where they would hear of each other, and their
+/// agents have the same names.
+static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
 fn demo(arguments: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_fipa"));
@@ -37,6 +42,7 @@ fn parts(pid: u32) -> usize {
 
 #[test]
 fn every_step_does_what_it_says() {
+    let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
     let child = demo(&["--json"]).stdout(Stdio::piped()).spawn().unwrap();
     let pid = child.id();
     let output = child.wait_with_output().unwrap();
@@ -59,6 +65,7 @@ fn every_step_does_what_it_says() {
 
 #[test]
 fn an_interrupted_demo_leaves_nothing_behind() {
+    let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
     let mut child: Child = demo(&[])
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())

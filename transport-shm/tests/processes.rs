@@ -219,8 +219,10 @@ fn content_for_many_of_a_killed_sender_stays_as_long_as_it_is_read() {
     }
     got.arrived.lock().unwrap().clear();
     assert_eq!(receiver.counters().borrowed, 0);
-    let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
-    assert!(!maps.contains(&format!("{dead}.")), "still mapped");
+    wait_for("the end of the mapping", || {
+        let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
+        !maps.contains(&format!("{dead}."))
+    });
     receiver.close();
     assert_eq!(place.traces(), Vec::<String>::new());
 }
