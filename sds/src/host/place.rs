@@ -82,8 +82,9 @@ pub(super) struct Place {
 }
 
 /// How long to wait for the lock of the domain while nothing changes in the directory. It is held
-/// for some milliseconds at most, unless its holder has been stopped.
-const PATIENCE: Duration = Duration::from_secs(10);
+/// for some milliseconds, unless its holder has been stopped, or waits for the disk: a file system
+/// that lets go of much at once, or a worn card, can hold up a rename for more than ten seconds.
+const PATIENCE: Duration = Duration::from_secs(30);
 
 /// How long to wait while others have their turn: some processes of a robot with hundreds may
 /// start at the same time on a machine that is busy.
@@ -188,7 +189,7 @@ impl Place {
         let Some(threads) = self.threads.try_lock() else {
             return Ok(None);
         };
-        Ok(self.try_domain()?.then_some(Guard {
+        Ok(self.try_domain()?.then(|| Guard {
             place: self,
             _threads: threads,
         }))
