@@ -75,6 +75,7 @@ impl Robot {
                     format!("mts.name={name}-mts"),
                     "discovery.interfaces=[\"eth0\"]".to_owned(),
                     format!("transport.tcp.listen=[\"{}:0\"]", host.ipv4()),
+                    "security.insecure=true".to_owned(),
                 ],
                 ..Sources::default()
             };

@@ -93,6 +93,7 @@ impl Robot {
             format!("mts.name={name}-mts"),
             format!("transport.tcp.listen=[\"{}:0\"]", host.ipv4()),
             "mts.deadline=2s".to_owned(),
+            "security.insecure=true".to_owned(),
         ];
         let mut up = host.command(env!("CARGO_BIN_EXE_fipa"));
         for setting in &set {

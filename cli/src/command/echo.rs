@@ -118,7 +118,9 @@ fn wants_an_answer(message: &Message) -> bool {
 /// What goes wrong with one answer does not end the agent.
 async fn answer(agent: &Agent, incoming: &Incoming) {
     let message = &incoming.message;
-    let mut reply = agent.reply(message, Performative::Inform);
+    // Not `Agent::reply`, whose reply-with would ask for an answer to the answer.
+    let reply = message.reply(Performative::Inform);
+    let mut reply = reply.sender(agent.id().clone());
     if let Some(content) = message.content() {
         reply = reply.content(content.clone());
     }
