@@ -192,7 +192,12 @@ impl Connected {
     }
 
     /// Makes the content of a letter and notes when it was begun.
-    fn content(&self, letters: &Letters, number: usize, began: &mut Vec<u64>) -> Result<ZBytes, String> {
+    fn content(
+        &self,
+        letters: &Letters,
+        number: usize,
+        began: &mut Vec<u64>,
+    ) -> Result<ZBytes, String> {
         let byte = byte_of(number);
         let (Some(memory), true) = (&self.memory, letters.fill != Fill::Copied) else {
             // There is no memory to be loaned: what is not filled is there before.
