@@ -326,10 +326,8 @@ fn a_receiver_survives_more_killed_senders_than_it_has_connections() {
 #[test]
 fn the_dead_are_cleaned_up_after_when_their_last_letters_have_been_taken() {
     let place = Place::new();
-    let (receiver, connected) = (
-        Process::start(&place, "drop", Incarnation::from_u64(1)),
-        |file: &String| file.ends_with(".connection"),
-    );
+    let mut receiver = Process::start(&place, "drop", Incarnation::from_u64(1));
+    let connected = |file: &String| file.ends_with(".connection");
     let connections = || place.traces().iter().filter(|file| connected(file)).count();
     let mut sender = Process::start(&place, "send", receiver.incarnation);
     wait_for("connection", || connections() >= 2);
@@ -346,12 +344,15 @@ fn the_dead_are_cleaned_up_after_when_their_last_letters_have_been_taken() {
         assert_eq!((cleaned.alive, cleaned.failed), (1, 0));
     });
     wait_for("end of the connection", || connections() == 0);
+    receiver.kill();
+    cleanup_dead(&place.config()).unwrap();
+    assert_eq!(place.traces(), Vec::<String>::new());
 }
 
 #[test]
 fn whoever_leaves_waits_until_its_last_letters_have_been_taken() {
     let place = Place::new();
-    let receiver = Process::start(&place, "drop", Incarnation::from_u64(1));
+    let mut receiver = Process::start(&place, "drop", Incarnation::from_u64(1));
     let (sender, sent) = place.listening();
     receiver.wait_until_up(&sender);
     wait_for("answer", || sent.conclusions() == 1);
@@ -380,6 +381,9 @@ fn whoever_leaves_waits_until_its_last_letters_have_been_taken() {
             .iter()
             .any(|file| file.ends_with(".connection"))
     });
+    receiver.kill();
+    cleanup_dead(&place.config()).unwrap();
+    assert_eq!(place.traces(), Vec::<String>::new());
 }
 
 #[test]

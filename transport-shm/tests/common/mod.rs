@@ -22,9 +22,10 @@ use tokio::runtime::Runtime;
 
 /// A domain of its own, removed in the end.
 pub(crate) struct Place {
+    // First: what still runs on it has a part in the domain.
+    pub(crate) runtime: Runtime,
     pub(crate) directory: tempfile::TempDir,
     pub(crate) prefix: String,
-    pub(crate) runtime: Runtime,
 }
 
 impl Place {
