@@ -82,6 +82,20 @@ pub enum KeysError {
     /// A certificate that cannot be used.
     #[error(transparent)]
     Certificate(#[from] CertificateError),
+    /// The certificate is of another service.
+    #[error(
+        "the certificate in {} is of {certified:?}, and mts.name is {name:?}: peers would refuse this \
+         gateway",
+        dir.display()
+    )]
+    Name {
+        /// Where the certificate is.
+        dir: PathBuf,
+        /// Whose it is.
+        certified: String,
+        /// Who wants to use it.
+        name: String,
+    },
     /// It was revoked once.
     #[error("the certificate {0} was revoked; its owner has to make a new one")]
     Revoked(Fingerprint),
@@ -100,7 +114,19 @@ pub enum KeysError {
 
 /// What is in the directory at one time, as far as that is seen without reading it.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Stamp([Option<(SystemTime, u64)>; 3]);
+pub(crate) struct Stamp([Option<(i64, i64, u64)>; 3]);
+
+impl Stamp {
+    /// Whether something was changed so recently that another change may bear the same time.
+    pub(crate) fn is_fresh(&self) -> bool {
+        let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+        let now = now.map_or(i64::MAX, |now| {
+            i64::try_from(now.as_secs()).unwrap_or(i64::MAX)
+        });
+        let seconds = self.0.iter().flatten().map(|(seconds, ..)| *seconds);
+        seconds.max().is_some_and(|newest| newest >= now - 1)
+    }
+}
 
 impl Keys {
     /// The keys in this directory, which need not be there.
@@ -248,7 +274,23 @@ impl Keys {
     /// # Errors
     /// When one cannot be read, or is revoked as well.
     pub fn trusted(&self) -> Result<Vec<Certificate>, KeysError> {
-        self.all("trusted")
+        let (confirmed, mut doubtful) = self.confirmed();
+        match doubtful.pop() {
+            None => Ok(confirmed),
+            Some(error) => Err(error),
+        }
+    }
+
+    /// The certificates of trusted peers that can be read, in that order, and why others cannot:
+    /// those are not to be trusted, as their owner may have meant to revoke them.
+    pub(crate) fn confirmed(&self) -> (Vec<Certificate>, Vec<KeysError>) {
+        let (all, mut doubtful) = self.all("trusted");
+        let (revoked, confirmed) = all
+            .into_iter()
+            .partition::<Vec<_>, _>(|it| self.file("revoked", it.fingerprint()).exists());
+        let revoked = revoked.iter().map(Certificate::fingerprint);
+        doubtful.extend(revoked.map(KeysError::Revoked));
+        (confirmed, doubtful)
     }
 
     /// The certificates that are not to be trusted again.
@@ -256,7 +298,11 @@ impl Keys {
     /// # Errors
     /// When one cannot be read.
     pub fn revoked(&self) -> Result<Vec<Certificate>, KeysError> {
-        self.all("revoked")
+        let (revoked, mut doubtful) = self.all("revoked");
+        match doubtful.pop() {
+            None => Ok(revoked),
+            Some(error) => Err(error),
+        }
     }
 
     /// Withdraws trust for good: from the certificate whose fingerprint begins so, or from all of the
@@ -294,11 +340,28 @@ impl Keys {
         Ok(meant)
     }
 
-    /// What a gateway needs of all this.
+    /// What the gateway with this name needs of all this.
+    ///
+    /// # Errors
+    /// When there are no keys, they are of another service, or something cannot be read.
+    pub fn credentials_of(&self, mts: &str) -> Result<Credentials, KeysError> {
+        let credentials = self.credentials()?;
+        let certified = credentials.own.certified().mts();
+        if certified != mts {
+            return Err(KeysError::Name {
+                dir: self.dir.clone(),
+                certified: certified.to_owned(),
+                name: mts.to_owned(),
+            });
+        }
+        Ok(credentials)
+    }
+
+    /// This host's certificate and key, and whom it trusts, whatever the service is called.
     ///
     /// # Errors
     /// When there are no keys, or something cannot be read.
-    pub fn credentials(&self) -> Result<Credentials, KeysError> {
+    fn credentials(&self) -> Result<Credentials, KeysError> {
         let own = self.own()?;
         let file = self.dir.join("own.key");
         let meta = fs::metadata(&file).map_err(|source| io_error(&file, source))?;
@@ -320,7 +383,8 @@ impl Keys {
         ];
         Stamp(parts.map(|path| {
             let meta = fs::metadata(path).ok()?;
-            Some((meta.modified().ok()?, meta.ino()))
+            // Also counts up when rights change.
+            Some((meta.ctime(), meta.ctime_nsec(), meta.ino()))
         }))
     }
 
@@ -328,23 +392,32 @@ impl Keys {
         self.dir.join(folder).join(format!("{fingerprint}.pem"))
     }
 
-    fn all(&self, folder: &str) -> Result<Vec<Certificate>, KeysError> {
+    /// The certificates in this folder that can be read, ordered by the names of their services,
+    /// and why others cannot.
+    fn all(&self, folder: &str) -> (Vec<Certificate>, Vec<KeysError>) {
         let dir = self.dir.join(folder);
         let listed = match fs::read_dir(&dir) {
             Ok(listed) => listed,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-            Err(error) => return Err(io_error(&dir, error)),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Default::default(),
+            Err(error) => return (Vec::new(), vec![io_error(&dir, error)]),
         };
-        let mut all = Vec::new();
-        for entry in listed.take(MAX_PEERS + 1) {
-            let path = entry.map_err(|error| io_error(&dir, error))?.path();
-            if path.extension().is_some_and(|extension| extension == "pem") {
-                all.push(only(&path, &read(&path)?)?);
+        let (mut all, mut unread) = (Vec::new(), Vec::new());
+        for (number, entry) in listed.take(MAX_PEERS + 1).enumerate() {
+            if number == MAX_PEERS {
+                let what = format!("more than {MAX_PEERS} certificates; the others are left out");
+                unread.push(contents(&dir, &what));
+                break;
             }
-        }
-        if all.len() > MAX_PEERS {
-            let what = format!("more than {MAX_PEERS} certificates");
-            return Err(contents(&dir, &what));
+            match entry.map(|entry| entry.path()) {
+                Ok(path) if path.extension().is_some_and(|it| it == "pem") => {
+                    match read(&path).and_then(|pem| only(&path, &pem)) {
+                        Ok(certificate) => all.push(certificate),
+                        Err(error) => unread.push(error),
+                    }
+                }
+                Ok(_) => {}
+                Err(error) => unread.push(io_error(&dir, error)),
+            }
         }
         all.sort_by(|a, b| {
             let name = |it: &Certificate| it.certified().mts().to_owned();
@@ -352,7 +425,7 @@ impl Keys {
                 .cmp(&name(b))
                 .then(a.fingerprint().cmp(&b.fingerprint()))
         });
-        Ok(all)
+        (all, unread)
     }
 }
 

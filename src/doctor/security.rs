@@ -34,28 +34,25 @@ fn keys(_config: &Config, checks: &mut Vec<Check>) {
 
 #[cfg(feature = "secure")]
 fn keys(config: &Config, checks: &mut Vec<Check>) {
-    use crate::keys::{Certificate, Keys};
+    use crate::keys::{Certificate, Keys, KeysError};
     use std::time::{SystemTime, UNIX_EPOCH};
 
     /// A certificate that ends so soon is told, in seconds.
     const SOON: i64 = 30 * 86_400;
-    let credentials = match Keys::at(&config.security.keys).credentials() {
+    let keys = Keys::at(&config.security.keys);
+    let credentials = match keys.credentials_of(&config.mts.name) {
         Ok(credentials) => credentials,
         Err(error) => {
-            let advice = "see `fipa keys list`, and security.keys";
+            let advice = match error {
+                KeysError::Name { .. } => {
+                    "set mts.name to it, or make keys anew in an empty directory"
+                }
+                _ => "see `fipa keys list`, and security.keys",
+            };
             checks.push(AREA.wrong(KEYS, Verdict::Bad, error.to_string(), advice));
             return;
         }
     };
-    let named = credentials.own.certified().mts();
-    if named != config.mts.name {
-        let found = format!(
-            "the certificate is of {named:?}, and mts.name is {:?}: peers would refuse this gateway",
-            config.mts.name
-        );
-        let advice = "set mts.name to it, or make keys anew in an empty directory";
-        checks.push(AREA.wrong(KEYS, Verdict::Bad, found, advice));
-    }
     if credentials.trusted.is_empty() {
         let advice = "trust the certificates of the others: `fipa keys trust FILE`";
         let found = "no other host is trusted, so none gets in";

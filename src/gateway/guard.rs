@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use fipa_transport_net::secure::{Credentials, Rules, Security};
+use fipa_transport_net::secure::{Rules, Security};
 
 use crate::config;
 use crate::domain::OpenError;
@@ -17,6 +17,10 @@ pub(super) struct Guard {
     name: String,
     security: Security,
     seen: Stamp,
+    /// Whether what was seen then may have changed since without looking different.
+    fresh: bool,
+    /// Why what is there cannot be used, when it cannot.
+    fault: Option<String>,
 }
 
 impl Guard {
@@ -27,7 +31,8 @@ impl Guard {
         }
         let keys = Keys::at(&config.keys);
         let seen = keys.stamp();
-        let credentials = read(&keys, name).map_err(OpenError::Keys)?;
+        let credentials = keys.credentials_of(name);
+        let credentials = credentials.map_err(|error| OpenError::Keys(error.to_string()))?;
         let rules = Rules {
             loopback: config.loopback,
             old_peers: config.old_peers.clone(),
@@ -38,7 +43,9 @@ impl Guard {
             keys,
             name: name.to_owned(),
             security,
+            fresh: seen.is_fresh(),
             seen,
+            fault: None,
         }))
     }
 
@@ -52,43 +59,156 @@ impl Guard {
         let mut look = tokio::time::interval(LOOK);
         loop {
             look.tick().await;
-            let now = self.keys.stamp();
-            if now == self.seen {
-                continue;
-            }
-            let (keys, name) = (self.keys.clone(), self.name.clone());
-            let read = tokio::task::spawn_blocking(move || read(&keys, &name)).await;
-            let replaced = match read {
-                Ok(Ok(credentials)) => {
-                    let count = credentials.trusted.len();
-                    let replaced = self.security.replace(credentials);
-                    replaced.map(|()| count).map_err(|error| error.to_string())
-                }
-                Ok(Err(error)) => Err(error),
-                Err(error) => Err(error.to_string()),
-            };
-            match replaced {
-                Ok(count) => tracing::info!(trusted = count, "the keys were read again"),
+            self = match tokio::task::spawn_blocking(move || self.looked()).await {
+                Ok(guard) => guard,
                 Err(error) => {
-                    tracing::warn!(
-                        "the keys have changed and cannot be used: {error}; those before stay"
-                    );
+                    tracing::error!(%error, "the keys are not looked after any more");
+                    return;
+                }
+            };
+        }
+    }
+
+    /// Uses what has changed. What cannot be read is looked at again every time: it may be mended by
+    /// a change that its directory does not show.
+    fn looked(mut self) -> Self {
+        let now = self.keys.stamp();
+        let changed = now != self.seen;
+        if !changed && !self.fresh && self.fault.is_none() {
+            return self;
+        }
+        self.fresh = now.is_fresh();
+        let used = self.keys.credentials_of(&self.name);
+        let used = used
+            .map_err(|error| error.to_string())
+            .and_then(|credentials| {
+                let count = credentials.trusted.len();
+                let replaced = self.security.replace(credentials);
+                replaced.map(|()| count).map_err(|error| error.to_string())
+            });
+        self.seen = now;
+        match used {
+            Ok(count) => {
+                if changed || self.fault.take().is_some() {
+                    tracing::info!(trusted = count, "the keys were read again");
                 }
             }
-            self.seen = now;
+            Err(error) => {
+                self.keep_confirmed(&error);
+                self.fault = Some(error);
+            }
+        }
+        self
+    }
+
+    /// Somebody has changed the keys, and it cannot be told all that was meant. It may have been to
+    /// revoke one, so only those stay trusted that can still be read there. The gateway's own key
+    /// stays, as without one nobody could be spoken with at all.
+    fn keep_confirmed(&self, error: &str) {
+        let (confirmed, _) = self.keys.confirmed();
+        let count = confirmed.len();
+        let kept = self.security.trust_only(confirmed);
+        if self.fault.as_deref() == Some(error) {
+            return;
+        }
+        match kept {
+            Ok(()) => tracing::error!(
+                trusted = count,
+                "the keys have changed and cannot be read: {error}; only peers whose certificates can \
+                 still be read are trusted until that is mended (`fipa keys list`)"
+            ),
+            Err(kept) => tracing::error!("{error}; and those before cannot be used: {kept}"),
         }
     }
 }
 
-fn read(keys: &Keys, name: &str) -> Result<Credentials, String> {
-    let credentials = keys.credentials().map_err(|error| error.to_string())?;
-    let certified = credentials.own.certified().mts();
-    if certified != name {
-        return Err(format!(
-            "the certificate in {} is of {certified:?}, and `mts.name` is {name:?}: peers would refuse \
-             this gateway",
-            keys.dir().display()
-        ));
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+    use crate::keys::{Certificate, VALID};
+
+    /// Keys that trust two peers, and a guard of them.
+    struct Scene {
+        keys: Keys,
+        guard: Option<Guard>,
+        peers: [Certificate; 2],
+        _dir: tempfile::TempDir,
     }
-    Ok(credentials)
+
+    impl Scene {
+        fn new() -> Self {
+            let dir = tempfile::tempdir().unwrap();
+            let keys = Keys::at(dir.path().join("own"));
+            keys.init("rover-mts", &[], VALID).unwrap();
+            let peers = ["crex-mts", "sherpa-mts"].map(|name| {
+                let peer = Keys::at(dir.path().join(name));
+                peer.init(name, &[], VALID).unwrap();
+                let trusted = keys.trust(&fs::read(peer.own_file()).unwrap()).unwrap();
+                trusted[0].clone()
+            });
+            let config = config::Security {
+                keys: keys.dir().display().to_string(),
+                ..crate::Config::for_host("rover").security
+            };
+            let guard = Guard::open(&config, "rover-mts").unwrap();
+            Self {
+                keys,
+                guard,
+                peers,
+                _dir: dir,
+            }
+        }
+
+        fn trusts(&mut self) -> [bool; 2] {
+            let guard = self.guard.take().unwrap().looked();
+            let security = guard.security();
+            self.guard = Some(guard);
+            [0, 1].map(|peer: usize| security.trusts(self.peers[peer].fingerprint()))
+        }
+
+        fn file(&self, peer: usize) -> std::path::PathBuf {
+            let fingerprint = self.peers[peer].fingerprint();
+            let folder = self.keys.dir().join("trusted");
+            folder.join(format!("{fingerprint}.pem"))
+        }
+    }
+
+    #[test]
+    fn a_certificate_that_cannot_be_read_any_more_is_not_trusted_until_it_can() {
+        let mut scene = Scene::new();
+        assert_eq!(scene.trusts(), [true, true]);
+        let pem = fs::read(scene.file(0)).unwrap();
+        fs::remove_file(scene.file(0)).unwrap();
+        fs::write(scene.file(0), "nothing").unwrap();
+        assert_eq!(scene.trusts(), [false, true]);
+        assert_eq!(scene.trusts(), [false, true], "and it stays so");
+        // Written in place: the directory does not change.
+        fs::write(scene.file(0), pem).unwrap();
+        assert_eq!(scene.trusts(), [true, true]);
+    }
+
+    #[test]
+    fn a_revocation_counts_whatever_else_cannot_be_read() {
+        let mut scene = Scene::new();
+        scene.keys.revoke("crex-mts").unwrap();
+        fs::write(scene.keys.dir().join("trusted/other.pem"), "nothing").unwrap();
+        assert_eq!(scene.trusts(), [false, true]);
+        // Nor does a copy of what was revoked count.
+        let name = scene.file(0).file_name().unwrap().to_owned();
+        fs::copy(scene.keys.dir().join("revoked").join(name), scene.file(0)).unwrap();
+        assert_eq!(scene.trusts(), [false, true]);
+    }
+
+    #[test]
+    fn without_the_own_certificate_trust_can_still_be_withdrawn() {
+        let mut scene = Scene::new();
+        fs::remove_file(scene.keys.own_file()).unwrap();
+        assert_eq!(scene.trusts(), [true, true]);
+        scene.keys.revoke("sherpa-mts").unwrap();
+        assert_eq!(scene.trusts(), [true, false]);
+        fs::remove_dir_all(scene.keys.dir()).unwrap();
+        assert_eq!(scene.trusts(), [false, false]);
+    }
 }

@@ -207,16 +207,20 @@ fn failed(error: &KeysError, keys: &Keys) -> Failure {
 }
 
 fn described(certificate: &Certificate) -> String {
-    let certified = certificate.certified();
-    let agents = match certified.agents() {
-        [] => "every agent".to_owned(),
-        agents => agents.join(", "),
-    };
     format!(
-        "  fingerprint {}\n  speaks for {agents}\n  holds until {}\n",
+        "  fingerprint {}\n  speaks for {}\n  holds until {}\n",
         certificate.fingerprint(),
+        spoken_for(certificate),
         date(certificate.validity().1)
     )
+}
+
+/// The agents that its host may speak for.
+fn spoken_for(certificate: &Certificate) -> String {
+    match certificate.certified().agents() {
+        [] => "every agent".to_owned(),
+        agents => agents.join(", "),
+    }
 }
 
 /// A day in UTC.
@@ -249,15 +253,10 @@ fn list(keys: &Keys, json: bool) -> Result<Result<(), Failure>, KeysError> {
     let own = own.as_slice();
     for (what, certificates) in [("own", own), ("trusted", &trusted), ("revoked", &revoked)] {
         for certificate in certificates {
-            let certified = certificate.certified();
-            let agents = match certified.agents() {
-                [] => "every agent".to_owned(),
-                agents => agents.join(", "),
-            };
             table.add_row([
                 what.to_owned(),
-                certified.mts().to_owned(),
-                agents,
+                certificate.certified().mts().to_owned(),
+                spoken_for(certificate),
                 date(certificate.validity().1),
                 certificate.fingerprint().to_string(),
             ]);

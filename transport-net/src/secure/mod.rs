@@ -69,6 +69,8 @@ pub struct Rules {
 
 /// Credentials in the form that TLS needs.
 struct Prepared {
+    own: Certificate,
+    key: PrivateKeyDer<'static>,
     known: Arc<Known>,
     server: Arc<ServerConfig>,
     client: Arc<ClientConfig>,
@@ -98,6 +100,18 @@ impl Security {
         Ok(())
     }
 
+    /// Trusts these peers and no others from now on, with the key and certificate there were.
+    ///
+    /// # Errors
+    /// When they cannot be used; those before stay.
+    pub fn trust_only(&self, trusted: Vec<Certificate>) -> Result<(), CredentialsError> {
+        let (own, key) = {
+            let now = self.now.read();
+            (now.own.clone(), now.key.clone_key())
+        };
+        self.replace(Credentials { own, key, trusted })
+    }
+
     /// Whether whoever is at this address has to prove who it is.
     pub(crate) fn covers(&self, ip: IpAddr) -> bool {
         self.rules.loopback || !ip.to_canonical().is_loopback()
@@ -114,7 +128,8 @@ impl Security {
     }
 
     /// Whether a peer with this certificate is trusted now.
-    pub(crate) fn trusts(&self, fingerprint: Fingerprint) -> bool {
+    #[must_use]
+    pub fn trusts(&self, fingerprint: Fingerprint) -> bool {
         self.now.read().known.trusts(fingerprint)
     }
 
@@ -155,12 +170,14 @@ impl Prepared {
             .with_protocol_versions(&[&TLS13])?
             .dangerous()
             .with_custom_certificate_verifier(known.clone())
-            .with_client_auth_cert(chain, key)?;
+            .with_client_auth_cert(chain, key.clone_key())?;
         // A session that is resumed would not ask whether the peer is still trusted.
         server.send_tls13_tickets = 0;
         client.resumption = Resumption::disabled();
         client.enable_sni = false;
         Ok(Self {
+            own,
+            key,
             known,
             server: Arc::new(server),
             client: Arc::new(client),
