@@ -17,7 +17,7 @@ use crate::ShmConfig;
 use crate::counters::{Tally, count};
 use crate::layout::{Ack, Active, BlankAck, Header, MailServer, Places, Svc};
 use crate::library::{Borrowed, Library, NotRead};
-use crate::memory::populate;
+use crate::memory::{Address, populate};
 use crate::presence::{Bell, Looks};
 use crate::segment::Reference;
 
@@ -336,7 +336,7 @@ impl Inbox {
             lending: self.lending.clone(),
         });
         let bytes = Bytes::from_owner(Content {
-            bytes: content,
+            bytes: Address(content),
             _held: held.clone(),
         });
         (bytes, held)
@@ -371,13 +371,9 @@ impl Drop for Held {
 
 /// Content in a sender's memory.
 struct Content {
-    bytes: NonNull<[u8]>,
+    bytes: Address<[u8]>,
     _held: Arc<Held>,
 }
-
-// SAFETY: the memory is shared memory of the process, mapped for reading, not bound to a thread;
-// the owner that keeps it mapped is itself Send and Sync.
-unsafe impl Send for Content {}
 
 impl AsRef<[u8]> for Content {
     fn as_ref(&self) -> &[u8] {
@@ -385,7 +381,7 @@ impl AsRef<[u8]> for Content {
         // long as that lives: the server keeps connections of senders that are gone while content
         // is held there, and never more of them than it can (`Lending::begin`). An honest sender
         // does not write there after sending; see the crate's documentation on trust.
-        unsafe { self.bytes.as_ref() }
+        unsafe { self.bytes.0.as_ref() }
     }
 }
 

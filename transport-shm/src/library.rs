@@ -154,9 +154,9 @@ pub(crate) struct Borrowed {
 impl AsRef<[u8]> for Borrowed {
     fn as_ref(&self) -> &[u8] {
         // SAFETY: `Volume::begin` has found `len` bytes of room in the mapping, which lives as
-        // long as the volume, and all of the mapping in the file, which is not shortened while
-        // this process has the lock: until this is dropped. An honest sender does not write there meanwhile; see the
-        // crate's documentation on trust.
+        // long as the volume, and all pages of the mapping in the file, which is not shortened
+        // while this process has the lock: until this is dropped. An honest sender does not write
+        // there meanwhile; see the crate's documentation on trust.
         unsafe { std::slice::from_raw_parts(self.volume.file.content(), self.len) }
     }
 }

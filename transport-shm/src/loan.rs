@@ -9,6 +9,7 @@ use fipa_transport::LoanedContent;
 use parking_lot::Mutex;
 
 use crate::layout::{Blank, Pending};
+use crate::memory::Address;
 use crate::outbox::Outbox;
 
 /// One loan: a request of which the content's place has been handed out.
@@ -18,7 +19,11 @@ use crate::outbox::Outbox;
 #[derive(Debug)]
 pub(crate) struct Loan {
     /// The payload: `front` bytes for what stands in front, then the content, then the rest.
-    payload: NonNull<u8>,
+    ///
+    /// Through it, the content is written only by `ShmLoan`, of which there is one, before it is
+    /// shared, and only read afterwards; front and tail are written only by whoever takes the
+    /// blank request out of the state, of whom there is one.
+    payload: Address<u8>,
     front: usize,
     content: usize,
     payload_len: usize,
@@ -39,14 +44,6 @@ enum State {
     Lost,
 }
 
-// SAFETY: the pointer is to memory that the request in `state` owns, which may go to another
-// thread. Through the pointer, the content is written only by `ShmLoan`, of which there is one,
-// before it is shared, and only read afterwards; front and tail are written only by whoever takes
-// the blank request out of the state, of whom there is one.
-unsafe impl Send for Loan {}
-// SAFETY: as above.
-unsafe impl Sync for Loan {}
-
 impl Loan {
     /// The payload of `blank` must be at least `front + content` bytes long.
     pub(crate) fn new(
@@ -63,7 +60,7 @@ impl Loan {
             "a loan as long as it was asked for"
         );
         Self {
-            payload: NonNull::from(payload).cast(),
+            payload: Address(NonNull::from(payload).cast()),
             front,
             content,
             payload_len,
@@ -80,7 +77,7 @@ impl Loan {
     }
 
     fn content_start(&self) -> *mut u8 {
-        self.payload.as_ptr().wrapping_add(self.front)
+        self.payload.0.as_ptr().wrapping_add(self.front)
     }
 
     /// Whether `content` is all of this loan's content.
@@ -93,12 +90,17 @@ impl Loan {
         front <= self.front && tail <= self.payload_len - self.front - self.content
     }
 
+    /// How much may be written from where the payload begins.
+    pub(crate) fn payload_len(&self) -> usize {
+        self.payload_len
+    }
+
     pub(crate) fn front(&self) -> usize {
         self.front
     }
 
     pub(crate) fn payload(&self) -> NonNull<u8> {
-        self.payload
+        self.payload.0
     }
 
     /// Takes the request to be sent, once.

@@ -5,9 +5,10 @@
 //! SIGBUS, which ends the process. So pages are asked for with `MADV_POPULATE_WRITE` first, which
 //! reports an error instead.
 
+use std::fs::{File, Metadata, OpenOptions};
 use std::os::fd::{AsFd, OwnedFd};
-use std::os::unix::fs::MetadataExt;
-use std::path::PathBuf;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
 use std::ptr::NonNull;
 use std::time::{Duration, Instant};
 
@@ -15,6 +16,7 @@ use fipa_transport::{WayError, WayFault};
 use rustix::fs::{FlockOperation, Mode, OFlags, flock, open};
 use rustix::io::Errno;
 use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mmap, munmap};
+use rustix::param::page_size;
 
 use crate::presence::Names;
 use crate::{ShmConfig, ShmError};
@@ -28,7 +30,8 @@ const MARGIN: u64 = 256 << 10;
 /// What an endpoint needs to begin with.
 const START: u64 = 1 << 20;
 
-/// Length of a page of memory, in bytes.
+/// Length of the first part of every file of ours, in bytes: whole pages on most machines, a part of
+/// one on those with larger pages.
 pub(crate) const PAGE: usize = 4096;
 
 /// How long to wait for others who are taking memory.
@@ -146,12 +149,35 @@ impl Budget {
             .flatten()
             .filter(|file| file.file_name().to_string_lossy().starts_with(&self.prefix))
             .filter_map(|file| file.metadata().ok())
+            // Everybody may put files here; those of others are not this domain's.
+            .filter(is_ours)
             .map(|metadata| metadata.blocks() * 512)
             .sum()
     }
 }
 
-fn no_room(need: u64, what: &str) -> WayError {
+fn is_ours(found: &Metadata) -> bool {
+    found.uid() == rustix::process::geteuid().as_raw()
+}
+
+/// Opens a file of shared memory that another process of this user has made.
+///
+/// The directory is everybody's. What others put there under such a name, they could shorten while
+/// it is mapped here; so nothing is followed, waited for or used but a file of this user.
+pub(crate) fn open_ours(
+    path: &Path,
+    options: &mut OpenOptions,
+) -> std::io::Result<(File, Metadata)> {
+    let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits();
+    let file = options.custom_flags(flags as i32).open(path)?;
+    let found = file.metadata()?;
+    if !found.is_file() || !is_ours(&found) {
+        return Err(std::io::ErrorKind::InvalidData.into());
+    }
+    Ok((file, found))
+}
+
+pub(crate) fn no_room(need: u64, what: &str) -> WayError {
     WayError::new(
         WayFault::Congested,
         format_args!("{need} more bytes of shared memory are needed, and {SHM} {what}: enlarge it"),
@@ -168,9 +194,12 @@ fn free_bytes() -> std::io::Result<u64> {
 /// `start` must be in shared memory that is mapped for writing and stays mapped during the call;
 /// a range that is not merely gives an error.
 pub(crate) fn populate(start: *const u8, len: usize) -> Result<(), WayError> {
-    let first = (start as usize) & !(PAGE - 1);
+    // The kernel's pages: it refuses what does not begin with one, which must not be taken for the
+    // refusal of a kernel that cannot do it at all.
+    let page = page_size();
+    let first = (start as usize) & !(page - 1);
     let end = (start as usize).saturating_add(len);
-    let len = end.saturating_sub(first).next_multiple_of(PAGE);
+    let len = end.saturating_sub(first).next_multiple_of(page);
     loop {
         // SAFETY: MADV_POPULATE_WRITE changes nothing that a program can see: it makes the kernel
         // provide pages as a write would, keeping their contents, and reports an error where a
@@ -190,18 +219,25 @@ pub(crate) fn populate(start: *const u8, len: usize) -> Result<(), WayError> {
     }
 }
 
+/// Where something lies in memory that is mapped. Says nothing of who may read or write there, and
+/// keeps nothing mapped: whoever makes a reference of it answers for both.
+#[derive(Debug)]
+pub(crate) struct Address<T: ?Sized>(pub(crate) NonNull<T>);
+
+// SAFETY: a number, as far as this type goes. Mapped memory belongs to the process and not to a
+// thread, and nothing can be done with the address without an `unsafe` block of its own. Beside it
+// in a struct, what keeps the memory mapped has to be `Send` and `Sync` for itself, and the compiler
+// sees to that.
+unsafe impl<T: ?Sized> Send for Address<T> {}
+// SAFETY: as above; a shared address can only be copied.
+unsafe impl<T: ?Sized> Sync for Address<T> {}
+
 /// A file of shared memory that this process has mapped, from its beginning.
 #[derive(Debug)]
 pub(crate) struct Mapping {
-    start: NonNull<u8>,
+    start: Address<u8>,
     len: usize,
 }
-
-// SAFETY: a mapping is memory of this process's address space, not of a thread. Whoever makes a
-// reference into it answers for what else happens there.
-unsafe impl Send for Mapping {}
-// SAFETY: as above; a shared `Mapping` only tells where it is.
-unsafe impl Sync for Mapping {}
 
 impl Mapping {
     pub(crate) fn new(file: impl AsFd, len: usize, protection: ProtFlags) -> std::io::Result<Self> {
@@ -217,11 +253,14 @@ impl Mapping {
             )
         }?;
         let start = NonNull::new(start.cast()).ok_or(std::io::ErrorKind::OutOfMemory)?;
-        Ok(Self { start, len })
+        Ok(Self {
+            start: Address(start),
+            len,
+        })
     }
 
     pub(crate) fn start(&self) -> NonNull<u8> {
-        self.start
+        self.start.0
     }
 
     pub(crate) fn len(&self) -> usize {
@@ -233,6 +272,6 @@ impl Drop for Mapping {
     fn drop(&mut self) {
         // SAFETY: mapped by `new` with this length, and nothing refers to it any more: whoever
         // lends a part of it lends for no longer than it keeps the mapping.
-        let _ = unsafe { munmap(self.start.as_ptr().cast(), self.len) };
+        let _ = unsafe { munmap(self.start.0.as_ptr().cast(), self.len) };
     }
 }

@@ -1,6 +1,7 @@
 //! The sending side of one other process's mailbox.
 
 use std::collections::{HashMap, VecDeque};
+use std::ops::Range;
 use std::ptr::NonNull;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Weak};
@@ -249,18 +250,18 @@ impl Outbox {
         let mut blank = self.take(&mut state, places.end)?;
         let header = Header::new(&header, offset(places.start)?, self.own, token);
         *blank.user_header_mut() = header.referring(reference);
-        let payload = NonNull::from(blank.payload_mut()).cast();
+        let payload = blank.payload_mut();
+        let room = places.start..payload.len();
+        let payload = NonNull::from(payload).cast();
         let written = match reference {
             Some(_) => Content::Elsewhere(content),
             None => Content::Here,
         };
-        // SAFETY: what is written of the pieces, without a content that lies elsewhere, is as long
-        // as `places.end - places.start` says (they are what the header and the places were
-        // computed from), and the payload has `places.end` bytes. Nothing refers to the payload of
-        // a request just taken.
-        unsafe { write(payload, places.start, &pieces, written) };
-        // SAFETY: all bytes from `start` on were just written, and those before are memory of a
-        // shared mapping, filled by the kernel or by earlier requests.
+        // SAFETY: `room` ends where the payload does. Nothing refers to the payload of a request
+        // just taken.
+        unsafe { write(payload, room, &pieces, written) };
+        // SAFETY: what was not just written is memory of a shared mapping, filled by the kernel or
+        // by earlier requests; every value is a byte.
         let filled = unsafe { blank.assume_init() };
         let pending = filled.send().map_err(send_error)?;
         if pending.number_of_server_connections() == 0 {
@@ -346,11 +347,12 @@ impl Outbox {
         content: &Bytes,
     ) -> Result<bool, WayError> {
         *blank.user_header_mut() = header;
-        // SAFETY: the loan has room for the front, which begins at `start` and ends where the
-        // content begins, and for the tail, as the caller has checked. The content, which is all
-        // that anybody else refers to, is not written, and whoever has taken the request is the
-        // only one to write to the rest.
-        unsafe { write(loan.payload(), start, pieces, Content::InPlace(content)) };
+        let room = start..loan.payload_len();
+        // SAFETY: `room` ends where the payload does, which the request just taken owns. The
+        // content, which is all that anybody else refers to, is not written: the front, which
+        // begins at `start`, ends where it begins, as the caller has checked, and what is in place
+        // is left out. Whoever has taken the request is the only one to write to the rest.
+        unsafe { write(loan.payload(), room, pieces, Content::InPlace(content)) };
         // SAFETY: front, content and tail are written; the rest is memory of a shared mapping.
         let filled: Filled = unsafe { blank.assume_init() };
         match filled.send() {
@@ -606,12 +608,17 @@ enum Content<'a> {
     Elsewhere(&'a Bytes),
 }
 
-/// Writes pieces behind each other, `at` bytes behind `start`.
+/// Writes pieces behind each other into this room, counted in bytes behind `start`.
+///
+/// # Panics
+/// When they are longer than that. Lengths come from other crates, and nothing but this looks at
+/// whether they are those of what is written.
 ///
 /// # Safety
-/// There must be room, and nothing else may refer to what is written.
-unsafe fn write(start: NonNull<u8>, at: usize, pieces: &Pieces<'_>, content: Content<'_>) {
-    let mut at = at;
+/// The room must be within memory that may be written, and nothing else may refer to what of it is
+/// written.
+unsafe fn write(start: NonNull<u8>, room: Range<usize>, pieces: &Pieces<'_>, content: Content<'_>) {
+    let Range { start: mut at, end } = room;
     for piece in pieces.iter() {
         let place = start.as_ptr().wrapping_add(at);
         let is = |content: &Bytes| std::ptr::eq(&content[..], piece);
@@ -620,9 +627,11 @@ unsafe fn write(start: NonNull<u8>, at: usize, pieces: &Pieces<'_>, content: Con
             Content::InPlace(content) => !is(content),
             Content::Here | Content::Elsewhere(_) => true,
         };
+        let most = end.saturating_sub(at);
+        assert!(piece.len() <= most, "pieces as long as the header says");
         if is_written {
-            // SAFETY: the caller vouches for the room; a piece is not in it, because nothing else
-            // refers to it.
+            // SAFETY: `place` has room for it, as was just seen, in the memory that the caller
+            // vouches for; a piece is not in that memory, because nothing else refers to it.
             unsafe { place.copy_from_nonoverlapping(piece.as_ptr(), piece.len()) };
         }
         at += piece.len();

@@ -10,7 +10,7 @@ use fipa_transport::{Incarnation, LoanedContent, WayError, WayFault};
 use parking_lot::Mutex;
 
 use crate::domain::Domain;
-use crate::memory::{Budget, PAGE, populate};
+use crate::memory::{Budget, PAGE, no_room, populate};
 use crate::segment::{Reference, SegmentFile};
 
 /// How many segments a process has at most.
@@ -141,11 +141,15 @@ impl Pool {
 
     fn make_file(&self, number: u64, room: usize) -> Result<(SegmentFile, u64), WayError> {
         let path = self.domain.names().content(self.own, number);
-        let cannot = |e: std::io::Error| {
-            let text = format_args!("cannot make {}: {e}", path.display());
-            WayError::new(WayFault::Exhausted, text)
+        let cannot = |e: std::io::Error| match e.kind() {
+            ErrorKind::StorageFull => no_room(room as u64, "is full"),
+            _ => {
+                let text = format_args!("cannot make {}: {e}", path.display());
+                WayError::new(WayFault::Exhausted, text)
+            }
         };
         let file = SegmentFile::create(&path, room).map_err(cannot)?;
+        // The pages are there; this makes them ones that the sender need not fault in.
         populate(file.mapping().start().as_ptr(), file.mapping().len())?;
         let begun = file.begin();
         let generation = begun.ok_or_else(|| cannot(ErrorKind::ResourceBusy.into()))?;
@@ -342,10 +346,11 @@ impl LoanedContent for ManyLoan {
         // SAFETY: the range lies in the segment's mapping, which has room for `len` bytes (the
         // pool gives out no other) and lives as long as the segment. Nothing else refers to it:
         // the segment was idle, this is the only `ManyLoan` of it, borrowed mutably, and no letter
-        // refers to this generation before `freeze`. Other processes map it for reading, and hold
-        // the lock while they do, which this process had alone when it began the generation. The
-        // pages are there (`populate`), filled by the kernel or by earlier contents, and the file
-        // is not shortened while this process holds the lock.
+        // refers to this generation before `freeze`. Other processes have it mapped for reading, but
+        // make references into it only under the lock and for the generation that is there, and
+        // this process had the lock alone when it began this one. The pages are there
+        // (`SegmentFile::create`), filled by the kernel or by earlier contents, and the file is not
+        // shortened while this process holds the lock.
         unsafe { std::slice::from_raw_parts_mut(segment.file.content(), *len) }
     }
 

@@ -26,7 +26,7 @@ use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
 use crate::domain::files_in;
-use crate::memory::{Mapping, PAGE, SHM};
+use crate::memory::{Mapping, PAGE, SHM, open_ours};
 use crate::segment;
 
 /// Nobody but the owner.
@@ -317,8 +317,8 @@ impl Neighbour {
         if has_ended(&live) {
             return Err(ErrorKind::NotFound.into());
         }
-        let page = File::open(names.page(of))?;
-        if page.metadata()?.len() < PAGE as u64 {
+        let (page, found) = open_ours(&names.page(of), File::options().read(true))?;
+        if found.len() < PAGE as u64 {
             return Err(io::Error::new(
                 ErrorKind::InvalidData,
                 "the page is too short",
@@ -336,7 +336,7 @@ impl Neighbour {
     /// How often the process has looked into its mailbox to the end; 0 when it does not listen
     /// yet.
     pub(crate) fn looks(&self) -> u64 {
-        self.page.words().looks.load(Ordering::Acquire)
+        read(&self.page.words().looks)
     }
 
     /// What becomes readable when the process ends.
@@ -353,11 +353,13 @@ impl Neighbour {
     pub(crate) fn is_awake(&self) -> bool {
         fence(Ordering::SeqCst);
         let words = self.page.words();
-        if words.lookers.load(Ordering::SeqCst) != 0 {
+        // Relaxed is what may be done to memory that is mapped for reading; the fence is what the
+        // agreement with `looking` and `heard` stands on.
+        if words.lookers.load(Ordering::Relaxed) != 0 {
             self.looked.store(true, Ordering::Relaxed);
             return true;
         }
-        self.rung.load(Ordering::Relaxed) == words.heard.load(Ordering::SeqCst)
+        self.rung.load(Ordering::Relaxed) == words.heard.load(Ordering::Relaxed)
     }
 
     /// Whether it was looking when it was last asked.
@@ -378,7 +380,7 @@ impl Neighbour {
                 }
             }
         }
-        let heard = self.page.words().heard.load(Ordering::SeqCst);
+        let heard = read(&self.page.words().heard);
         ring(&self.bell);
         self.rung.store(heard, Ordering::Relaxed);
         true
@@ -466,6 +468,14 @@ struct Words {
     looks: AtomicU64,
 }
 
+/// What another process counts; whatever is done next happens after it was read. On memory that is
+/// mapped for reading only relaxed loads are allowed, so the order is the fence's.
+fn read(count: &AtomicU64) -> u64 {
+    let count = count.load(Ordering::Relaxed);
+    fence(Ordering::Acquire);
+    count
+}
+
 /// A mapped page.
 #[derive(Debug)]
 struct Page(Mapping);
@@ -478,8 +488,9 @@ impl Page {
     fn words(&self) -> &Words {
         // SAFETY: the mapping lives as long as self, is aligned to a page and longer than `Words`,
         // whose every value is valid, and every process accesses these words atomically only.
-        // Neighbours map it for reading and only load. The file is never shortened: its process
-        // does not, and who opens it has looked at its length.
+        // Neighbours map it for reading and only load, relaxed, which Rust allows there for words
+        // as long as a pointer. The file is never shortened: its process does not, nobody but this
+        // user can, and who opens it has looked at its length and owner.
         unsafe { self.0.start().cast::<Words>().as_ref() }
     }
 }

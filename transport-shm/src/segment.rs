@@ -14,19 +14,20 @@
 //! A letter that its sender has given up may still be lying in a mailbox. So every content has a
 //! generation, which moves while the lock is held alone; who has taken the shared lock compares
 //! it with the reference. For the same reason the file's length is asked for under the lock, and
-//! nothing is read beyond it.
+//! nothing is read beyond it; nor where the file has no pages, which reading would have to take.
 
 use std::fs::File;
 use std::io;
 use std::mem::offset_of;
 use std::os::unix::fs::{FileExt, MetadataExt, OpenOptionsExt};
 use std::path::Path;
-use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering, fence};
 
-use rustix::fs::{FlockOperation, OFlags, flock};
+use rustix::fs::{FallocateFlags, FlockOperation, fallocate, flock};
+use rustix::io::Errno;
 use rustix::mm::ProtFlags;
 
-use crate::memory::{Mapping, PAGE};
+use crate::memory::{Mapping, PAGE, open_ours};
 
 /// Where a content lies: in which segment of its sender, and as which of its contents.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -54,7 +55,8 @@ pub(crate) struct SegmentFile {
 }
 
 impl SegmentFile {
-    /// A new segment with room for this much content, none of whose pages are there.
+    /// A new segment with room for this much content, all of whose pages are there: those who read
+    /// it could otherwise meet one that was never written, and a full file system.
     pub(crate) fn create(path: &Path, room: usize) -> io::Result<Self> {
         let file = File::options()
             .read(true)
@@ -63,22 +65,20 @@ impl SegmentFile {
             .mode(0o600)
             .open(path)?;
         let len = PAGE.checked_add(room).ok_or(io::ErrorKind::FileTooLarge)?;
-        file.set_len(len as u64)?;
+        while let Err(e) = fallocate(&file, FallocateFlags::empty(), 0, len as u64) {
+            if e != Errno::INTR {
+                return Err(e.into());
+            }
+        }
         let mapping = Mapping::new(&file, len, ProtFlags::READ | ProtFlags::WRITE)?;
         Ok(Self { file, mapping })
     }
 
     /// Another process's segment, for reading.
     pub(crate) fn open(path: &Path) -> io::Result<Self> {
-        let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits();
-        let file = File::options()
-            .read(true)
-            .custom_flags(flags as i32)
-            .open(path)?;
-        let found = file.metadata()?;
-        let ours = found.uid() == rustix::process::geteuid().as_raw();
+        let (file, found) = open_ours(path, File::options().read(true))?;
         let len = usize::try_from(found.len()).unwrap_or(0);
-        if !found.is_file() || !ours || len <= PAGE {
+        if len <= PAGE {
             return Err(io::ErrorKind::InvalidData.into());
         }
         let mapping = Mapping::new(&file, len, ProtFlags::READ)?;
@@ -102,15 +102,20 @@ impl SegmentFile {
     fn label(&self) -> &Label {
         // SAFETY: the mapping lives as long as self, is aligned to a page and longer than a
         // `Label`, whose every value is valid. Every process accesses these words atomically
-        // only; those that map the segment for reading only load. The page is there: the file is
+        // only; those that map the segment for reading only load, and relaxed, which is the load
+        // that Rust allows on memory that cannot be written. The page is there: the file is
         // shortened only by its sender, who does not look here afterwards, or when that has ended,
-        // and only while nobody has the lock, which all others who look here have.
+        // and only while nobody has the lock, which all others who look here have. A process of
+        // this user that keeps to no lock could end this one in simpler ways.
         unsafe { self.mapping.start().cast::<Label>().as_ref() }
     }
 
     /// The generation of the content that lies here. To be called under the lock.
     pub(crate) fn generation(&self) -> u64 {
-        self.label().generation.load(Ordering::SeqCst)
+        let generation = self.label().generation.load(Ordering::Relaxed);
+        // The lock orders the content behind it; this says so to the compiler.
+        fence(Ordering::Acquire);
+        generation
     }
 
     /// Begins another content, unless the last one is still read. The lock is shared afterwards.
@@ -150,12 +155,13 @@ impl SegmentFile {
         self.lock(FlockOperation::NonBlockingLockExclusive).is_ok() && self.file.set_len(0).is_ok()
     }
 
-    /// Whether the file is as long as it was when it was mapped. To be called under the lock.
+    /// Whether all of what was mapped is there, so that it can be read. To be called under the
+    /// lock.
     pub(crate) fn is_whole(&self) -> bool {
         let mapped = self.mapping.len() as u64;
         self.file
             .metadata()
-            .is_ok_and(|found| found.len() >= mapped)
+            .is_ok_and(|found| found.len() >= mapped && found.blocks() * 512 >= mapped)
     }
 
     /// Whether the file has a name, by which others could find it.
@@ -168,7 +174,7 @@ impl SegmentFile {
     fn lock(&self, how: FlockOperation) -> io::Result<()> {
         loop {
             match flock(&self.file, how) {
-                Err(rustix::io::Errno::INTR) => {}
+                Err(Errno::INTR) => {}
                 done => return done.map_err(Into::into),
             }
         }
@@ -179,10 +185,9 @@ impl SegmentFile {
 pub(crate) fn remove(path: &Path) {
     // Emptied first: a file that is only unlinked stays as long as somebody has it mapped,
     // whether it is read or not.
-    if let Ok(file) = File::options()
-        .write(true)
-        .custom_flags((OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32)
-        .open(path)
+    if let Ok((file, found)) = open_ours(path, File::options().write(true))
+        // Somebody else's link to another file of this user would have that emptied.
+        && found.nlink() == 1
         && flock(&file, FlockOperation::NonBlockingLockExclusive).is_ok()
     {
         let _ = file.set_len(0);
@@ -247,6 +252,28 @@ mod tests {
         drop(sender);
         remove(&path);
         assert!(!reader.is_whole());
+    }
+
+    #[test]
+    fn what_reading_would_have_to_take_is_not_read() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("1.content");
+        let sparse = File::create_new(&path).unwrap();
+        sparse.set_len(16 * PAGE as u64).unwrap();
+        let reader = SegmentFile::open(&path).unwrap();
+        reader.share().unwrap();
+        assert!(!reader.is_whole());
+    }
+
+    #[test]
+    fn what_has_another_name_is_not_emptied() {
+        let directory = tempfile::tempdir().unwrap();
+        let [other, path] = ["other", "1.content"].map(|name| directory.path().join(name));
+        std::fs::write(&other, "precious").unwrap();
+        std::fs::hard_link(&other, &path).unwrap();
+        remove(&path);
+        assert!(!path.exists());
+        assert_eq!(std::fs::read_to_string(&other).unwrap(), "precious");
     }
 
     #[test]
