@@ -342,7 +342,13 @@ impl Monitor {
         // Looked at first, so that nonsense drives nothing out.
         let begins = step(&protocol.initial().steps, heard.act, u32::MAX, u32::MAX);
         if begins.is_none() {
-            return Err(Denied::NotOpened(machine));
+            // Who asked may have named the agent in `reply-to`, without telling it.
+            let named = parent == NONE && self.agent.is_some() && !heard.own;
+            return Err(if named && protocol.is_answer(heard.act) {
+                Denied::Unchecked(Unchecked::BegunElsewhere)
+            } else {
+                Denied::NotOpened(machine)
+            });
         }
         self.make_room(parent);
         let at = self.table.insert(id, parent, machine, millis(now));

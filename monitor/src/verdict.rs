@@ -141,9 +141,9 @@ pub enum Unchecked {
     /// It names nobody to whom it is sent.
     #[error("the message has no receiver")]
     NoReceiver,
-    /// It belongs to a protocol within its conversation that began between others: the agent that
-    /// watches itself was not told.
-    #[error("the protocol within the conversation began between others")]
+    /// It belongs to a conversation, or a protocol within one, that began between others: the agent
+    /// that watches itself was not told. So are answers of the recruited to whom a `reply-to` names.
+    #[error("the conversation, or the protocol within it, began between others")]
     BegunElsewhere,
     /// A conversation id or name is too long to be kept, or there are too many receivers.
     #[error(

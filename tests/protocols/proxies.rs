@@ -121,6 +121,38 @@ async fn the_recruited_answer_directly() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn the_recruited_answer_whom_they_are_told_to() {
+    let config = config(&["monitor.check=enforce"]);
+    let join = async |name: &str| {
+        let domain = Domain::open(&config).await.unwrap();
+        domain.register(name).unwrap()
+    };
+    let [rover, recruiter] = [join("rover").await, join("recruiter").await];
+    // The base is told of nothing before the answers come.
+    let [arm, base] = [join("arm").await, join("base").await];
+    let initiator = async {
+        let proxy = proxy(&rover, &recruiter);
+        let _answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
+    };
+    let goes_between = async {
+        let first = recruiter.receive().await.unwrap().message;
+        let mut task = recruiter.take_part(&first).unwrap();
+        task.agree("").await.unwrap();
+        let query = query(&recruiter, "arm").reply_to(base.id().clone());
+        task.pass_on(query, PATIENCE).await.unwrap();
+        task.inform("recruited").await.unwrap();
+    };
+    let designated = async {
+        for act in [Performative::Agree, Performative::Inform] {
+            let answer = base.receive().await.unwrap().message;
+            assert_eq!(*answer.performative(), act);
+            assert_eq!(answer.sender().unwrap().name(), "arm");
+        }
+    };
+    tokio::join!(initiator, goes_between, answer(&arm), designated);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn who_asks_for_others_may_refuse_and_find_nobody() {
     let [rover, broker, _arm] = three("broker").await;
     let initiator = async {

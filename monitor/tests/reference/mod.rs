@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 
-use fipa_monitor::{Library, Machine, Scope};
+use fipa_monitor::{Library, Machine, Scope, Transition};
 
 mod talk;
 
@@ -102,9 +102,34 @@ impl<'l> Reference<'l> {
                 self.talks.insert(words.id.clone(), conversation);
                 says
             }
-            Err(_) => Says::Wrong("not-opened"),
+            Err(_) => match self.agent {
+                Some(agent) if agent != words.from && is_answer_only(machine, words.act) => {
+                    Says::Nothing
+                }
+                _ => Says::Wrong("not-opened"),
+            },
         }
     }
+}
+
+/// Whether somebody may answer so in a conversation that he did not begin, and nobody begins one so.
+fn is_answer_only(machine: &Machine, act: &str) -> bool {
+    let begins = options(machine, machine.initial().id());
+    let begins = begins
+        .iter()
+        .any(|first| matches(first.performative(), act));
+    let mut all = machine
+        .states()
+        .iter()
+        .flat_map(|state| state.transitions());
+    let answers = |transition: &Transition| {
+        let initiator = machine.initiator();
+        let mut others = machine.roles().iter().filter(|role| *role != initiator);
+        matches(transition.performative(), act)
+            && matches(transition.to(), initiator)
+            && others.any(|role| matches(transition.from(), role))
+    };
+    !begins && (act == "not-understood" || all.any(answers))
 }
 
 impl<'l> Conversation<'l> {
