@@ -168,13 +168,18 @@ impl Agent {
         deadline: Duration,
     ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
         let sending = self.begin(message, letter, deadline);
-        async move {
-            let outcomes = sending?.outcomes().await;
-            let deliveries = outcomes
-                .into_iter()
-                .map(|(receiver, outcome)| Delivery { receiver, outcome });
-            Ok(Deliveries(deliveries.collect()))
-        }
+        async move { Ok(deliveries(sending?).await) }
+    }
+
+    /// Sends a message whose outcomes are asked for later, with [`deliveries`], or never.
+    #[cfg(feature = "monitor")]
+    pub(crate) fn send_off(
+        &self,
+        message: &Message,
+        deadline: Duration,
+    ) -> Result<Sending, SendError> {
+        let letter = letter_for(message, SystemTime::now());
+        self.begin(message, letter, deadline)
     }
 
     fn begin(
@@ -312,6 +317,13 @@ impl Drop for Agent {
             }
         }
     }
+}
+
+/// Waits until every receiver has an outcome.
+pub(crate) async fn deliveries(sending: Sending) -> Deliveries {
+    let outcomes = sending.outcomes().await.into_iter();
+    let delivered = outcomes.map(|(receiver, outcome)| Delivery { receiver, outcome });
+    Deliveries(delivered.collect())
 }
 
 /// The digits of the payload's length are the one thing in an envelope that depends on the

@@ -4,9 +4,10 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
+use fipa_mts::Sending;
 
 use super::bids::Bids;
-use super::dialogue::{Dialogue, DialogueError, after, name_of, unreached};
+use super::dialogue::{Dialogue, DialogueError, after, name_of, settle, unreached};
 use crate::agent::Agent;
 
 impl Agent {
@@ -122,12 +123,13 @@ impl<'a> Auction<'a> {
         price: impl Into<Bytes>,
         patience: Duration,
     ) -> Result<Bids, DialogueError> {
-        self.reject_undecided().await?;
+        let rejections = self.reject_undecided()?;
+        let due = after(patience);
         let mut bids = Bids::default();
         if self.bidders.is_empty() {
+            settle(rejections, due).await;
             return Ok(bids);
         }
-        let due = after(patience);
         let call = self.message(Performative::Cfp, price);
         let told = self.dialogue.tell(call, due).await?;
         bids.silent.extend(unreached(&told).map(str::to_owned));
@@ -149,6 +151,7 @@ impl<'a> Auction<'a> {
             bids.add(answer);
         }
         bids.silent.extend(called);
+        settle(rejections, due).await;
         Ok(bids)
     }
 
@@ -177,13 +180,13 @@ impl<'a> Auction<'a> {
     /// # Errors
     /// When it was closed before, or the message cannot be sent.
     pub async fn close(&mut self, content: impl Into<Bytes>) -> Result<(), DialogueError> {
-        self.reject_undecided().await?;
-        if self.bidders.is_empty() {
-            return Ok(());
+        let rejections = self.reject_undecided()?;
+        if !self.bidders.is_empty() {
+            let end = self.message(Performative::Inform, content);
+            let told = self.dialogue.tell(end, None).await?;
+            self.lose(unreached(&told));
         }
-        let end = self.message(Performative::Inform, content);
-        let told = self.dialogue.tell(end, None).await?;
-        self.lose(unreached(&told));
+        settle(rejections, None).await;
         Ok(())
     }
 
@@ -209,16 +212,14 @@ impl<'a> Auction<'a> {
         message.receivers(self.bidders.clone()).content(content)
     }
 
-    async fn reject_undecided(&mut self) -> Result<(), DialogueError> {
+    /// All at once, so that nobody waits for who cannot be reached any more.
+    fn reject_undecided(&mut self) -> Result<Vec<Sending>, DialogueError> {
+        let mut rejections = Vec::new();
         while let Some(bid) = self.undecided.pop() {
             let act = Performative::RejectProposal;
-            match self.dialogue.answer(&bid, act, "", None).await {
-                // Who has gone away needs no rejection.
-                Ok(()) | Err(DialogueError::NotDelivered { .. }) => {}
-                Err(other) => return Err(other),
-            }
+            rejections.push(self.dialogue.post_answer(&bid, act, "", None)?);
         }
-        Ok(())
+        Ok(rejections)
     }
 
     /// These cannot be called any more.

@@ -3,10 +3,11 @@
 use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
+use fipa_mts::Sending;
 
 use super::bids::Bids;
-use super::dialogue::{Dialogue, DialogueError, after, name_of, unreached};
-use crate::agent::Agent;
+use super::dialogue::{Dialogue, DialogueError, after, name_of, only_delivered, settle, unreached};
+use crate::agent::{Agent, deliveries};
 
 impl Agent {
     /// Calls for proposals (`cfp`, FIPA00029) and collects those that come within `patience`; it
@@ -65,6 +66,8 @@ pub struct ContractNet<'a> {
     bids: Bids,
     /// With whom it has not ended.
     open: Vec<AgentId>,
+    /// Rejections on their way.
+    rejections: Vec<Sending>,
 }
 
 /// What an agent whose proposal was accepted made of it.
@@ -92,6 +95,7 @@ impl<'a> ContractNet<'a> {
             dialogue,
             bids: Bids::default(),
             open: receivers.to_vec(),
+            rejections: Vec::new(),
         };
         net.lose(unreached(&sent));
         let called = net.open.iter().map(|agent| agent.name().to_owned());
@@ -132,10 +136,10 @@ impl<'a> ContractNet<'a> {
         let senders = again.iter().filter_map(|proposal| proposal.sender());
         let senders: Vec<AgentId> = senders.cloned().collect();
         let mut called: Vec<String> = again.iter().map(name_of).collect();
-        let sent = match senders.is_empty() {
+        let sending = match senders.is_empty() {
             true => None,
-            false => match self.dialogue.tell(call.receivers(senders), due).await {
-                Ok(sent) => Some(sent),
+            false => match self.dialogue.post(call.receivers(senders), due) {
+                Ok(sending) => Some(sending),
                 Err(error) => {
                     // They can still be accepted.
                     self.bids.proposals = again.into_iter().chain(others).collect();
@@ -144,18 +148,22 @@ impl<'a> ContractNet<'a> {
             },
         };
         self.bids = Bids::default();
-        if let Some(sent) = &sent {
-            self.lose(unreached(sent));
-            called.retain(|name| !unreached(sent).any(|lost| lost == name));
-        }
         for proposal in &others {
-            self.reject(proposal, "").await?;
+            self.reject(proposal, "")?;
         }
-        self.collect(called, due).await
+        if let Some(sending) = sending {
+            let sent = deliveries(sending).await;
+            self.lose(unreached(&sent));
+            called.retain(|name| !unreached(&sent).any(|lost| lost == name));
+        }
+        self.collect(called, due).await?;
+        self.settle(due).await;
+        Ok(())
     }
 
     /// Accepts these proposals and rejects all others, and waits for what those who were accepted
-    /// make of it. `content` goes with both.
+    /// make of it. `content` goes with both. All are told at once: nobody waits for who cannot be
+    /// reached any more.
     ///
     /// # Errors
     /// When an answer cannot be sent. What becomes of each award is in the list.
@@ -168,24 +176,25 @@ impl<'a> ContractNet<'a> {
         let due = after(patience);
         let mut results = Vec::new();
         let mut at_work = Vec::new();
+        let mut told = Vec::new();
         for proposal in std::mem::take(&mut self.bids.proposals) {
-            if !accepted.contains(&proposal) {
-                self.reject(&proposal, content).await?;
-                continue;
+            if accepted.contains(&proposal) {
+                let act = Performative::AcceptProposal;
+                let content = content.to_owned();
+                let sending = self.dialogue.post_answer(&proposal, act, content, due)?;
+                told.push((name_of(&proposal), sending));
+            } else {
+                self.reject(&proposal, content)?;
             }
-            let agent = name_of(&proposal);
-            let act = Performative::AcceptProposal;
-            let answered = self
-                .dialogue
-                .answer(&proposal, act, content.to_owned(), due);
-            match answered.await {
+        }
+        for (agent, sending) in told {
+            match only_delivered(&deliveries(sending).await) {
                 Ok(()) => at_work.push(agent),
-                Err(error @ DialogueError::NotDelivered { .. }) => {
+                Err(error) => {
                     self.open.retain(|open| open.name() != agent);
                     let result = Err(error);
                     results.push(Awarded { agent, result });
                 }
-                Err(other) => return Err(other),
             }
         }
         while !at_work.is_empty() {
@@ -200,7 +209,7 @@ impl<'a> ContractNet<'a> {
                             (agent, Err(DialogueError::Failed(Box::new(message))))
                         }
                         _ => {
-                            self.late(&message).await?;
+                            self.late(&message)?;
                             continue;
                         }
                     }
@@ -229,6 +238,7 @@ impl<'a> ContractNet<'a> {
             let result = Err(DialogueError::TimedOut);
             results.push(Awarded { agent, result });
         }
+        self.settle(due).await;
         Ok(results)
     }
 
@@ -262,7 +272,7 @@ impl<'a> ContractNet<'a> {
                     called.swap_remove(at);
                     self.bids.add(answer);
                 }
-                None => self.late(&answer).await?,
+                None => self.late(&answer)?,
             }
         }
         self.bids.silent.extend(called);
@@ -270,25 +280,26 @@ impl<'a> ContractNet<'a> {
     }
 
     /// What is proposed after the time of the call is rejected; what else comes then ends by itself.
-    async fn late(&mut self, answer: &Message) -> Result<(), DialogueError> {
+    fn late(&mut self, answer: &Message) -> Result<(), DialogueError> {
         if *answer.performative() == Performative::Propose {
-            self.reject(answer, "late").await?;
+            self.reject(answer, "late")?;
         }
         Ok(())
     }
 
-    async fn reject(&mut self, proposal: &Message, content: &str) -> Result<(), DialogueError> {
+    fn reject(&mut self, proposal: &Message, content: &str) -> Result<(), DialogueError> {
         let from = name_of(proposal);
         self.open.retain(|open| open.name() != from);
         let act = Performative::RejectProposal;
-        let rejected = self
-            .dialogue
-            .answer(proposal, act, content.to_owned(), None);
-        match rejected.await {
-            // Who has gone away needs no rejection.
-            Ok(()) | Err(DialogueError::NotDelivered { .. }) => Ok(()),
-            Err(other) => Err(other),
-        }
+        let content = content.to_owned();
+        let sending = self.dialogue.post_answer(proposal, act, content, None)?;
+        self.rejections.push(sending);
+        Ok(())
+    }
+
+    /// Waits until the rejections have arrived or failed, so that whoever ends now takes none back.
+    async fn settle(&mut self, due: Option<Instant>) {
+        settle(self.rejections.drain(..), due).await;
     }
 
     /// These cannot be reached.

@@ -5,9 +5,10 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, BuildError, Message, MessageBuilder, Performative, Time};
 use fipa_monitor::{Header, Monitor, Unchecked, Verdict, Violation};
+use fipa_mts::Sending;
 use fipa_transport::{FailureReason, Incarnation, Outcome};
 
-use crate::agent::{Agent, Deliveries, Delivery, ReceiveError, SendError};
+use crate::agent::{Agent, Deliveries, Delivery, ReceiveError, SendError, deliveries};
 
 /// Why a protocol did not yield what it was begun for.
 #[derive(Debug, thiserror::Error)]
@@ -154,16 +155,25 @@ impl<'a> Dialogue<'a> {
         message: MessageBuilder,
         due: Option<Instant>,
     ) -> Result<Deliveries, DialogueError> {
-        let message = message.protocol(self.protocol.as_str());
-        self.tell_within(message, due).await
+        Ok(deliveries(self.post(message, due)?).await)
     }
 
-    /// The same in the protocol that the message names, which runs within this one.
-    pub(super) async fn tell_within(
+    /// The same without waiting for the outcomes: it is on its way when this returns.
+    pub(super) fn post(
         &mut self,
         message: MessageBuilder,
         due: Option<Instant>,
-    ) -> Result<Deliveries, DialogueError> {
+    ) -> Result<Sending, DialogueError> {
+        let message = message.protocol(self.protocol.as_str());
+        self.post_within(message, due)
+    }
+
+    /// The same in the protocol that the message names, which runs within this one.
+    pub(super) fn post_within(
+        &mut self,
+        message: MessageBuilder,
+        due: Option<Instant>,
+    ) -> Result<Sending, DialogueError> {
         self.replies += 1;
         let mut message = message
             .conversation_id(self.id.as_str())
@@ -179,7 +189,7 @@ impl<'a> Dialogue<'a> {
         }
         let message = message.build()?;
         self.check(&message).map_err(Wrong::of_ours)?;
-        Ok(self.agent.send_within(message, deadline).await?)
+        Ok(self.agent.send_off(&message, deadline)?)
     }
 
     /// Answers a message of this conversation.
@@ -190,8 +200,20 @@ impl<'a> Dialogue<'a> {
         content: impl Into<bytes::Bytes>,
         due: Option<Instant>,
     ) -> Result<(), DialogueError> {
-        let answer = self.agent.reply(to, act).content(content);
-        only_delivered(&self.tell(answer, due).await?)
+        let sending = self.post_answer(to, act, content, due)?;
+        only_delivered(&deliveries(sending).await)
+    }
+
+    /// The same without waiting for the outcome, so that several can be answered at once and nobody
+    /// waits for who cannot be reached.
+    pub(super) fn post_answer(
+        &mut self,
+        to: &Message,
+        act: Performative,
+        content: impl Into<bytes::Bytes>,
+        due: Option<Instant>,
+    ) -> Result<Sending, DialogueError> {
+        self.post(self.agent.reply(to, act).content(content), due)
     }
 
     /// The next message, or none by then. What does not fit the protocol is an error, and so is what
@@ -345,6 +367,22 @@ impl Wrong {
                 message: Box::new(message.clone()),
             },
             Self::Unchecked(why) => DialogueError::Unchecked(why),
+        }
+    }
+}
+
+/// Waits until it is known what became of these messages, though not longer than until then. That
+/// changes nothing: who has gone away needs no rejection.
+pub(super) async fn settle(sent: impl IntoIterator<Item = Sending>, due: Option<Instant>) {
+    for sending in sent {
+        let settled = deliveries(sending);
+        match due {
+            None => drop(settled.await),
+            Some(due) => {
+                if tokio::time::timeout_at(due.into(), settled).await.is_err() {
+                    return;
+                }
+            }
         }
     }
 }

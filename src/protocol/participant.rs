@@ -6,7 +6,7 @@ use bytes::Bytes;
 use fipa_acl::{Message, MessageBuilder, Performative};
 
 use super::dialogue::{Dialogue, DialogueError, after, name_of, only_delivered, unreached};
-use crate::agent::Agent;
+use crate::agent::{Agent, deliveries};
 
 /// How a participant answers in the end.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -232,7 +232,8 @@ impl Task<'_> {
             let agents = answers_to.receivers().iter().cloned();
             message = agents.fold(message, MessageBuilder::reply_to);
         }
-        let told = self.dialogue.tell_within(message, after(patience)).await?;
+        let sending = self.dialogue.post_within(message, after(patience))?;
+        let told = deliveries(sending).await;
         let lost: Vec<&str> = unreached(&told).collect();
         let all = built.receivers().iter().map(|agent| agent.name());
         let reached: Vec<String> = all

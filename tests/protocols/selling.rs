@@ -17,10 +17,13 @@ fn cfp(agent: &Agent, content: &str) -> MessageBuilder {
     agent.message(Performative::Cfp).content(content.to_owned())
 }
 
-fn from<'m>(messages: &'m [Message], name: &str) -> &'m Message {
+fn name(message: &Message) -> &str {
+    message.sender().unwrap().name()
+}
+
+fn from<'m>(messages: &'m [Message], sender: &str) -> &'m Message {
     let mut messages = messages.iter();
-    let sent = |message: &&Message| message.sender().is_some_and(|sender| sender.name() == name);
-    messages.find(sent).unwrap()
+    messages.find(|message| name(message) == sender).unwrap()
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -149,6 +152,54 @@ async fn who_breaks_a_contract_net_spoils_it_for_nobody_else() {
         assert!(results[0].result.is_ok());
     };
     tokio::join!(participants, initiator);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn winners_do_not_wait_for_losers() {
+    let config = config(&["monitor.check=enforce", "mts.queue=1"]);
+    let (here, there) = (
+        Domain::open(&config).await.unwrap(),
+        Domain::open(&config).await.unwrap(),
+    );
+    let rover = here.register("rover").unwrap();
+    let arms = ["loser", "winner"].map(|name| there.register(name).unwrap());
+    let [loser, winner] = &arms;
+    let (proposed, first) = tokio::sync::oneshot::channel();
+    let (done, told) = tokio::sync::oneshot::channel();
+    let loses = async {
+        let call = loser.receive().await.unwrap().message;
+        let bid = loser.reply(&call, Performative::Propose).build().unwrap();
+        loser.send(bid).await.unwrap();
+        // Its queue is full, so that the rejection has to wait.
+        let full = loser.message(Performative::Inform);
+        let full = full.receiver(loser.id().clone()).content("full");
+        loser.send(full.build().unwrap()).await.unwrap();
+        proposed.send(()).unwrap();
+        told.await.unwrap();
+        assert_eq!(text(&loser.receive().await.unwrap().message), "full");
+        let rejected = loser.receive().await.unwrap().message;
+        assert_eq!(*rejected.performative(), Performative::RejectProposal);
+    };
+    let wins = async {
+        let call = winner.receive().await.unwrap().message;
+        first.await.unwrap();
+        let mut task = winner.take_part(&call).unwrap();
+        assert!(task.propose("10", PATIENCE).await.unwrap());
+        task.reply(Reply::Inform("done".into())).await.unwrap();
+        done.send(()).unwrap();
+    };
+    let initiator = async {
+        let mut net = rover
+            .contract_net(cfp(&rover, "carry"), &ids(&arms), PATIENCE)
+            .await
+            .unwrap();
+        let bids = net.bids().proposals.clone();
+        assert_eq!(name(&bids[0]), "loser", "it is told first");
+        let results = net.award(&bids[1..], "", PATIENCE).await.unwrap();
+        assert_eq!(results.len(), 1);
+        assert!(results[0].result.is_ok(), "{results:?}");
+    };
+    tokio::join!(loses, wins, initiator);
 }
 
 #[tokio::test(flavor = "multi_thread")]
