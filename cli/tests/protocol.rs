@@ -120,11 +120,11 @@ fn protocols_are_drawn() {
     let mermaid = fs::read_to_string(file).unwrap();
     assert!(mermaid.starts_with("stateDiagram-v2\n"), "{mermaid}");
     assert!(
-        mermaid.contains("    s0 --> s1 : initiator: request\n"),
+        mermaid.contains("    s0 --> s1 : request from initiator\n"),
         "{mermaid}"
     );
     assert!(
-        mermaid.contains("participant: agree (optional)"),
+        mermaid.contains("agree from participant (optional)"),
         "{mermaid}"
     );
 }

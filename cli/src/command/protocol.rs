@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, Subcommand, ValueEnum};
 use comfy_table::{Table, presets};
 use fipa::monitor::scxml::MAX_FILE;
-use fipa::monitor::{After, Cancel, Library, Machine, Scope, State};
+use fipa::monitor::{After, Cancel, Library, Machine, Scope, State, Subprotocol, Transition};
 use serde_json::{Value, json};
 
 use crate::input;
@@ -280,6 +280,30 @@ fn after(when: After) -> String {
     }
 }
 
+/// What is said, in words.
+fn act(step: &Transition) -> &str {
+    match step.performative() {
+        ".*" => "anything",
+        named => named,
+    }
+}
+
+/// Who says it or hears it, in words.
+fn role(named: &str) -> &str {
+    match named {
+        ".*" => "anybody",
+        named => named,
+    }
+}
+
+/// The protocols that may run within a state, in words.
+fn within(sub: &Subprotocol) -> String {
+    match sub.name() {
+        ".*" => "any protocol".to_owned(),
+        named => format!("protocol {named}"),
+    }
+}
+
 fn described(machine: &Machine) -> Value {
     let state = |state: &State| {
         let transitions = state.transitions().iter().map(|transition| {
@@ -352,18 +376,20 @@ fn told(machine: &Machine) -> String {
             };
             lines.push(format!(
                 "  {} from {} to {} -> {}{optional}",
-                step.performative(),
-                step.from(),
-                step.to(),
+                act(step),
+                role(step.from()),
+                role(step.to()),
                 machine.target(step)
             ));
         }
         for sub in state.subprotocols() {
-            let answers = sub.proxied_to().map(|to| format!(", its answers to {to}"));
+            let answers = sub
+                .proxied_to()
+                .map(|to| format!(", its answers to {}", role(to)));
             lines.push(format!(
-                "  protocol {} within, begun by {}{}",
-                sub.name(),
-                sub.from(),
+                "  {} within, begun by {}{}",
+                within(sub),
+                role(sub.from()),
                 answers.unwrap_or_default()
             ));
         }

@@ -6,6 +6,8 @@ use std::fmt::Write as _;
 
 use fipa::monitor::{Machine, State};
 
+use super::{act, role, within};
+
 const MARGIN: usize = 24;
 const ROW: usize = 22;
 const HEAD: usize = 30;
@@ -42,6 +44,8 @@ struct Line {
     top: usize,
     bottom: usize,
     track: usize,
+    /// Of [`LINES`].
+    colour: usize,
 }
 
 pub(super) fn svg(machine: &Machine) -> String {
@@ -122,12 +126,12 @@ fn rows(machine: &Machine, state: &State) -> Vec<Row> {
             ""
         };
         let to = if machine.roles().len() > 2 {
-            format!(" to {}", step.to())
+            format!(" to {}", role(step.to()))
         } else {
             String::new()
         };
         Row {
-            text: format!("{}: {}{to}{optional}", step.from(), step.performative()),
+            text: format!("{}: {}{to}{optional}", role(step.from()), act(step)),
             colour: colour(machine, step.from()),
             dashed: step.is_optional(),
             target: number(machine.target(step)),
@@ -140,12 +144,14 @@ fn rows(machine: &Machine, state: &State) -> Vec<Row> {
         target: number(machine.timeout_target(timeout)),
     });
     let within = state.subprotocols().iter().map(|sub| {
-        let answers = sub.proxied_to().map(|to| format!(", answers to {to}"));
+        let answers = sub
+            .proxied_to()
+            .map(|to| format!(", answers to {}", role(to)));
         Row {
             text: format!(
-                "{}: begins protocol {}{}",
-                sub.from(),
-                sub.name(),
+                "{}: begins {}{}",
+                role(sub.from()),
+                within(sub),
                 answers.unwrap_or_default()
             ),
             colour: colour(machine, sub.from()),
@@ -190,6 +196,7 @@ fn lines(placed: &[Placed<'_>]) -> Vec<Line> {
                 top: ends.iter().copied().min().unwrap_or(arrow),
                 bottom: ends.iter().copied().max().unwrap_or(arrow),
                 track: 0,
+                colour: 0,
             });
         }
     }
@@ -203,6 +210,15 @@ fn lines(placed: &[Placed<'_>]) -> Vec<Line> {
         let overlaps = |other: &Line| other.top < line.bottom + 6 && line.top < other.bottom + 6;
         let taken = |track: usize| before.iter().any(|it| it.track == track && overlaps(it));
         line.track = (0..).find(|track| !taken(*track)).unwrap_or(0);
+        // Lines that cross have different colours, as long as there are enough.
+        let used = |colour: usize, all: bool| {
+            let same = before.iter().filter(|other| other.colour == colour);
+            same.filter(|other| all || overlaps(other)).count()
+        };
+        let colours = 0..LINES.len();
+        line.colour = colours
+            .min_by_key(|colour| (used(*colour, false), used(*colour, true)))
+            .unwrap_or(0);
     }
     lines
 }
@@ -298,7 +314,7 @@ fn leading(out: &mut String, row: &Row, y: usize, width: usize, lines: &[Line]) 
         .target
         .and_then(|target| lines.iter().find(|line| line.target == target));
     if let Some(line) = line {
-        let colour = LINES[line.target % LINES.len()];
+        let colour = LINES[line.colour];
         let dashes = if row.dashed {
             " stroke-dasharray=\"5 4\""
         } else {
@@ -319,7 +335,7 @@ fn line_to(out: &mut String, line: &Line, placed: &[Placed<'_>], end: usize) {
     let Some(target) = placed.get(line.target) else {
         return;
     };
-    let colour = LINES[line.target % LINES.len()];
+    let colour = LINES[line.colour];
     let (x, y) = (track_x(end, line.track), target.top + HEAD / 2);
     let _ = writeln!(
         out,

@@ -4,6 +4,8 @@ use std::fmt::Write as _;
 
 use fipa::monitor::Machine;
 
+use super::{act, role, within};
+
 pub(super) fn diagram(machine: &Machine) -> String {
     let mut out = "stateDiagram-v2\n".to_owned();
     let number = |id: &str| machine.states().iter().position(|state| state.id() == id);
@@ -21,7 +23,12 @@ pub(super) fn diagram(machine: &Machine) -> String {
             } else {
                 ""
             };
-            let label = format!("{}: {}{optional}", step.from(), step.performative());
+            let to = if machine.roles().len() > 2 {
+                format!(" to {}", role(step.to()))
+            } else {
+                String::new()
+            };
+            let label = format!("{} from {}{to}{optional}", act(step), role(step.from()));
             let _ = writeln!(out, "    s{at} --> s{target} : {}", escaped(&label));
         }
         if let Some(timeout) = state.timeout() {
@@ -30,7 +37,11 @@ pub(super) fn diagram(machine: &Machine) -> String {
             let _ = writeln!(out, "    s{at} --> s{target} : after {after}");
         }
         for sub in state.subprotocols() {
-            let label = format!("protocol {} begun by {}", sub.name(), sub.from());
+            let answers = sub
+                .proxied_to()
+                .map(|to| format!(", answers to {}", role(to)));
+            let answers = answers.unwrap_or_default();
+            let label = format!("{} begun by {}{answers}", within(sub), role(sub.from()));
             let _ = writeln!(out, "    s{at} --> s{at} : {}", escaped(&label));
         }
         if state.is_final() {
@@ -45,6 +56,8 @@ fn escaped(text: &str) -> String {
     let mut out = String::new();
     for c in text.chars() {
         match c {
+            // Older versions take a second colon for the end of a label.
+            ':' => out.push_str("#58;"),
             '#' => out.push_str("#35;"),
             ';' => out.push_str("#59;"),
             '"' => out.push_str("#quot;"),

@@ -27,12 +27,11 @@ pub(super) fn diagram<'a>(conversations: impl Iterator<Item = &'a Conversation>)
             continue;
         };
         let title = escaped(&conversation.title());
-        let _ = writeln!(
-            text,
-            "    Note over {},{}: {title}",
-            alias(first),
-            alias(last)
-        );
+        let over = match participants.len() {
+            1 => alias(first).to_owned(),
+            _ => format!("{},{}", alias(first), alias(last)),
+        };
+        let _ = writeln!(text, "    Note over {over}: {title}");
         for step in &conversation.steps {
             let (from, to) = (alias(&step.from), alias(&step.to));
             let label = escaped(&step.label);

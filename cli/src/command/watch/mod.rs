@@ -330,7 +330,9 @@ impl Show<'_> {
         }
         let text = match &self.form {
             Form::Json => machine::summary(&self.tally),
-            Form::Lines(Person { look }) | Form::Sequence(look) => self.tally.told(*look),
+            Form::Lines(Person { look }) => self.tally.told(*look),
+            // Behind a diagram there is a blank line already.
+            Form::Sequence(look) => self.tally.told(*look).trim_start_matches('\n').to_owned(),
         };
         self.print(&text)?;
         if let (Some(file), Some(conversations)) = (mermaid, &self.conversations) {
