@@ -137,4 +137,15 @@ mod tests {
         assert!(names.is(alice, "carol") && names.is(bob, "bob"));
         assert_eq!(names.len(), 2);
     }
+
+    #[test]
+    fn long_names_do_not_stay() {
+        let mut names = Names::new(RandomState::new());
+        for (len, kept) in [(200, true), (1_000, false)] {
+            let name = names.acquire(&"x".repeat(len));
+            names.release(name);
+            let left = names.entries[name as usize].name.capacity();
+            assert_eq!(left >= len, kept, "{len}: {left}");
+        }
+    }
 }

@@ -296,6 +296,17 @@ mod tests {
     }
 
     #[test]
+    fn long_ids_do_not_stay() {
+        let mut table = Table::new(RandomState::new());
+        for (len, kept) in [(200, true), (1_000, false)] {
+            let at = table.insert(&"x".repeat(len), NONE, 0, 1);
+            table.remove(at);
+            let left = table.slots[at as usize].conversation.id.capacity();
+            assert_eq!(left >= len, kept, "{len}: {left}");
+        }
+    }
+
+    #[test]
     fn children_hang_on_their_parent() {
         let mut table = Table::new(RandomState::new());
         let main = table.insert("main", NONE, 0, 1);

@@ -306,6 +306,119 @@ fn hostile_files_end_in_errors() {
     is(&with(&roles), "more than 32 roles");
 }
 
+/// What is one more than these is refused.
+#[test]
+fn files_may_have_as_much_as_the_limits_say() {
+    let allowed = |text: &str| drop(Machine::read("f", text).unwrap());
+    let refused = |text: &str, words: &str| {
+        let error = Machine::read("f", text).unwrap_err().to_string();
+        assert!(error.contains(words), "{words}: {error}");
+    };
+    let step = |act: usize, to: &str, target: usize| {
+        format!("<transition performative='p{act}' from='a' to='{to}' target='s{target}'/>")
+    };
+    // Each state leads to the next one.
+    let chain = |states: usize, steps: usize, more: &str| {
+        let inner = |at: usize| {
+            let next = (at + 1).min(states - 1);
+            (0..steps)
+                .map(|act| step(act, "b", next))
+                .collect::<String>()
+        };
+        let states = (0..states).map(|at| {
+            let end = if at + 1 == states { more } else { "" };
+            format!("<state id='s{at}'>{}{end}</state>", inner(at))
+        });
+        format!("<scxml initial='s0'>{}</scxml>", states.collect::<String>())
+    };
+    allowed(&chain(500, 1, ""));
+    refused(&chain(501, 1, ""), "more than 500 states");
+    allowed(&chain(500, 4, ""));
+    let more = step(5, "b", 499);
+    refused(&chain(500, 4, &more), "more than 2000 transitions");
+    allowed(&chain(2, 100, ""));
+    refused(&chain(2, 101, ""), "more than 100 transitions of a state");
+    let roles = |roles: usize| {
+        let steps: String = (1..roles)
+            .map(|role| step(0, &format!("r{role}"), 1))
+            .collect();
+        format!("<scxml initial='s0'><state id='s0'>{steps}</state><final id='s1'/></scxml>")
+    };
+    allowed(&roles(32));
+    refused(&roles(33), "more than 32 roles");
+    let good = with(GOOD).replace(" xmlns:f=\"urn:fipa-rs:protocol\"", "");
+    let and = |attributes: &str| good.replacen("<scxml", &format!("<scxml {attributes}"), 1);
+    let name = |len: usize| format!("name='{}'", "x".repeat(len));
+    allowed(&and(&name(256)));
+    refused(&and(&name(257)), "more than 256 bytes in an attribute");
+    // Beside `initial`.
+    let many = |count: usize| -> String { (0..count).map(|at| format!(" a{at}='1'")).collect() };
+    allowed(&and(&many(63)));
+    refused(&and(&many(64)), "more than 64 attributes");
+    let deep = |levels: usize| {
+        let inner = format!("{}{}</state>", "<x>".repeat(levels), "</x>".repeat(levels));
+        good.replacen("</state>", &inner, 1)
+    };
+    allowed(&deep(32));
+    refused(&deep(33), "more than 32 levels");
+    let padded = |len: usize| format!("{good}{}", " ".repeat(len - good.len()));
+    allowed(&padded(MAX_FILE));
+    refused(&padded(MAX_FILE + 1), "at most 1048576");
+}
+
+#[test]
+fn spans_have_units() {
+    let after = |span: &str| {
+        let timeout = format!("{GOOD}<transition f:after=\"{span}\" target=\"2\"/>");
+        let machine = Machine::read("f", &with(&timeout)).ok()?;
+        match machine.initial().timeout()?.after() {
+            After::Span(span) => Some(span),
+            _ => None,
+        }
+    };
+    for (span, ms) in [
+        ("1ms", Some(1)),
+        ("30s", Some(30_000)),
+        ("2min", Some(120_000)),
+        ("3h", Some(10_800_000)),
+        ("24h", Some(86_400_000)),
+        ("86400001ms", None),
+        ("0s", None),
+        ("3d", None),
+        ("3", None),
+        ("h", None),
+        ("-1s", None),
+        ("18446744073709551615h", None),
+    ] {
+        assert_eq!(after(span), ms.map(Duration::from_millis), "{span}");
+    }
+}
+
+#[test]
+fn what_means_one_thing_may_be_said_twice() {
+    let file = |one: [&str; 3], other: [&str; 3]| {
+        let step = |[from, to, target]: [&str; 3]| {
+            format!("<transition performative='inform' from='{from}' to='{to}' target='{target}'/>")
+        };
+        let first = "<transition performative='request' from='a' to='b|c' target='1'/>";
+        let text = format!(
+            "<scxml initial='0'><state id='0'>{first}</state><state id='1'>{}{}\
+             <transition performative='agree' from='b' to='c' target='2'/>\
+             <transition performative='agree' from='c' to='b' target='3'/></state>\
+             <final id='2'/><final id='3'/></scxml>",
+            step(one),
+            step(other)
+        );
+        Machine::read("f", &text)
+    };
+    // Leading to the same state, from others, and to others.
+    assert!(file(["b", "a", "2"], ["b", "a", "2"]).is_ok());
+    assert!(file(["b", "a", "2"], ["c", "a", "3"]).is_ok());
+    assert!(file(["b", "a", "2"], ["b", "c", "3"]).is_ok());
+    let error = file(["b", "a", "2"], ["b", "a|c", "3"]).unwrap_err();
+    assert!(matches!(error.mistakes[0].problem, Problem::Ambiguous(_)));
+}
+
 /// The largest file that the limits allow is read, or refused, before anybody gets impatient.
 #[test]
 fn large_files_take_little_time() {

@@ -592,15 +592,47 @@ fn who_had_others_recruited_cannot_check_their_answers() {
 }
 
 #[test]
+fn who_is_named_in_reply_to_cannot_check_the_answers() {
+    // That dan gets them, only ann and ben know.
+    let mut stage = Stage::new(Monitor::agent(library(), "dan"));
+    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
+    for words in ["agree ben>dan", "inform ben>dan", "not-understood ben>dan"] {
+        assert_eq!(stage.check(&say_in("fipa-query", words)), elsewhere);
+    }
+    let bid = say_in("fipa-contract-net", "propose ben>dan");
+    assert_eq!(stage.check(&bid), elsewhere);
+    assert!(stage.monitor.is_empty());
+    // What is no answer, in no state; what only an initiator says; what dan says himself.
+    for (protocol, words) in [
+        ("fipa-query", "propose ben>dan"),
+        ("fipa-query", "cancel ben>dan"),
+        ("fipa-contract-net", "accept-proposal ben>dan"),
+        ("fipa-query", "inform dan>ben"),
+        ("fipa-query", "not-understood dan>ben"),
+    ] {
+        let wrong = stage.wrong(say_in(protocol, words));
+        assert_eq!(wrong.kind, Kind::NotOpened, "{words}");
+    }
+    // A conversation that does begin is one.
+    stage.right(say_in("fipa-query", "query-ref ben>dan"));
+    let wrong = stage.wrong(say_in("fipa-query", "inform ben>dan"));
+    assert_eq!(wrong.kind, Kind::WrongSender);
+    // An observer sees the beginning of everything.
+    let mut stage = Stage::observer();
+    let wrong = stage.wrong(say_in("fipa-query", "inform ben>dan"));
+    assert_eq!(wrong.kind, Kind::NotOpened);
+}
+
+#[test]
 fn what_is_over_or_abandoned_is_forgotten() {
     let mut stage = Stage::observer();
     for id in ["done", "open", "won"] {
         stage.right(request("request ann>ben").conversation_id(id));
     }
     stage.right(request("inform ben>ann").conversation_id("done"));
-    stage.pass(59);
+    stage.pass(60);
     assert_eq!(stage.monitor.len(), 3);
-    assert_eq!(stage.pass(2), []);
+    assert_eq!(stage.pass(1), []);
     assert_eq!(stage.monitor.len(), 2);
     let abandoned = |id: &str| Event::Abandoned {
         protocol: "fipa-request".into(),
@@ -651,6 +683,11 @@ fn there_is_room_for_so_many() {
     stage.right(say("cfp ann>1,2,3"));
     stage.right(say("cfp ann>4"));
     assert_eq!(stage.wrong(say("cfp ann>5")).kind, Kind::TooMany);
+    let id = "all at once";
+    stage.right(say("cfp ann>1,2,3,4").conversation_id(id));
+    let more = say("cfp ann>1,2,3,4,5").conversation_id("too many");
+    let too_large = Verdict::Unchecked(Unchecked::TooLarge);
+    assert_eq!(stage.check(&more), too_large);
     // Conversations within.
     let mut stage = Stage::new(Monitor::observer(library()).with_limits({
         limits.conversations = 100;
