@@ -76,6 +76,12 @@ pub(crate) fn put(
     Ok(letter.stamped(stamp))
 }
 
+/// Bytes that the stamp of a service with this name takes, at most.
+pub(crate) fn room(name: &str) -> usize {
+    // What stands around the name: marks, lengths, date and incarnation.
+    name.len().saturating_add(64)
+}
+
 /// The names in the letter's effective intended-receiver parameter, or `to` when it has none.
 pub(crate) fn receivers(letter: &Letter) -> Result<Vec<String>, DecodeError> {
     let envelope = letter.envelope();
@@ -91,4 +97,29 @@ pub(crate) fn sender(letter: &Letter) -> Option<String> {
     let envelope = letter.envelope();
     let view = EnvelopeView::parse(&envelope).ok()?;
     view.from_name().map(|name| name.as_str().into_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::{Duration, UNIX_EPOCH};
+
+    use super::*;
+
+    #[test]
+    fn a_stamp_has_the_room_that_is_said() {
+        // Until the end of the four-digit years.
+        let far = UNIX_EPOCH + Duration::from_secs(250_000_000_000);
+        for name in ["m", "gateway-of-a-robot", &"long".repeat(200)] {
+            for utc in [UNIX_EPOCH, far] {
+                let incarnation = Incarnation::from_u64(u64::MAX);
+                let stamped = put(Letter::default(), name, incarnation, utc).unwrap();
+                assert!(
+                    stamped.len() <= room(name),
+                    "{} {}",
+                    stamped.len(),
+                    name.len()
+                );
+            }
+        }
+    }
 }

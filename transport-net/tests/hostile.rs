@@ -10,9 +10,9 @@ use std::io::{Read, Write};
 use std::net::{Shutdown, TcpStream};
 use std::time::Duration;
 
-use common::{Party, config, parcel, until};
+use common::{Party, accepted, config, parcel, rogue_hello, until, written};
 use fipa_acl::Envelope;
-use fipa_transport::{Conclusion, Kind, Location, WayFault};
+use fipa_transport::{Conclusion, Kind, Location, Parcel, Verdict, WayFault};
 use fipa_transport_net::{Counters, Limits};
 
 /// A letter as a fipa_services peer sent it.
@@ -60,25 +60,28 @@ fn counted(party: &Party, what: impl Fn(&Counters) -> u64, expected: u64) {
 
 /// The first 24 bytes of a frame.
 fn header(kind: u8, body_len: u64) -> Vec<u8> {
+    header_of(kind, 1, body_len)
+}
+
+fn header_of(kind: u8, id: u64, body_len: u64) -> Vec<u8> {
     let mut header = b"fipa\x01".to_vec();
     header.extend([kind, 0, 0]);
-    header.extend(1_u64.to_le_bytes());
+    header.extend(id.to_le_bytes());
     header.extend(body_len.to_le_bytes());
     header
 }
 
 fn hello(incarnation: u64) -> Vec<u8> {
-    let mut body = Vec::new();
-    body.extend(incarnation.to_le_bytes());
-    body.extend((1_u64 << 30).to_le_bytes());
-    body.extend(100_u32.to_le_bytes());
-    body.extend(1_u64.to_le_bytes());
-    for text in ["rogue", "test", "there", "tcp://127.0.0.1:1"] {
-        body.extend((text.len() as u16).to_le_bytes());
-        body.extend(text.as_bytes());
-    }
-    body.push(0);
+    let body = rogue_hello(incarnation);
     let mut frame = header(1, body.len() as u64);
+    frame.extend(body);
+    frame
+}
+
+/// A parcel, as a rogue sends it.
+fn frame(id: u64, parcel: &Parcel) -> Vec<u8> {
+    let body = written(parcel);
+    let mut frame = header_of(2, id, body.len() as u64);
     frame.extend(body);
     frame
 }
@@ -291,4 +294,70 @@ fn a_peer_that_stops_reading_is_given_up() {
         other => panic!("{other:?}"),
     }
     drop(server.join().unwrap());
+}
+
+#[test]
+fn an_introduced_peer_that_floods_is_shut_out_and_nobody_else_notices() {
+    let mut narrow = config(&["127.0.0.1:0"]);
+    narrow.limits.max_in_flight = 64;
+    // One side answers late, and has as many to answer as may be; the other answers, and nobody
+    // reads it.
+    let late = Party::judging(narrow.clone(), Verdict::Later);
+    let busy = Party::with(narrow);
+    for party in [&late, &busy] {
+        let mut stream = connect(party);
+        stream.write_all(&hello(77)).unwrap();
+        let mut sent = 0;
+        let flood = (1..).map(|id| frame(id, &parcel(id, "x"))).map(|frame| {
+            sent += 1;
+            stream.write_all(&frame)
+        });
+        // Ends when the other side has closed.
+        let error = flood.into_iter().find_map(Result::err).unwrap();
+        let kinds = [
+            std::io::ErrorKind::ConnectionReset,
+            std::io::ErrorKind::BrokenPipe,
+        ];
+        assert!(kinds.contains(&error.kind()), "{error}");
+        assert!(sent > 64, "{sent}");
+        counted(party, |c| c.refused_nonsense, 1);
+        counted(party, |c| c.connections, 0);
+    }
+    // No more than may be in flight was taken.
+    assert_eq!(late.arrivals(), 64);
+    Party::new().assert_reaches(1, &busy);
+}
+
+#[test]
+fn memory_for_announced_content_is_bounded_and_nobody_else_notices() {
+    const EACH: usize = 8 << 20;
+    let mut generous = config(&["127.0.0.1:0"]);
+    generous.limits.max_arriving = 20 << 20;
+    let party = Party::lending(generous);
+    let rogues: Vec<TcpStream> = (1..=5)
+        .map(|n| {
+            let mut stream = connect(&party);
+            stream.write_all(&hello(n)).unwrap();
+            // A letter that hardly begins.
+            let letter = frame(1, &parcel(1, vec![0; EACH]));
+            stream.write_all(&letter[..10_000]).unwrap();
+            stream
+        })
+        .collect();
+    counted(&party, |c| c.connections, 5);
+    until("two places", || (party.lent().0 == 2 * EACH).then_some(()));
+    // Whoever really sends has one, too, or is served without.
+    let honest = Party::new();
+    for (attempt, len) in [(1, 1 << 20), (2, EACH), (3, 100)] {
+        let sent = parcel(attempt, vec![attempt as u8; len]);
+        honest.send(attempt, party.location(), sent).unwrap();
+        assert_eq!(honest.conclusion(attempt), accepted());
+    }
+    let (_, most) = party.lent();
+    assert_eq!(most, 2 * EACH + (1 << 20));
+    let counters = party.transport.counters();
+    assert_eq!((counters.placed, counters.parcels_in), (1, 3));
+    // Who leaves gives back what it had.
+    drop(rogues);
+    until("no place", || (party.lent().0 == 0).then_some(()));
 }

@@ -10,7 +10,7 @@ use std::net::UdpSocket;
 use std::sync::Arc;
 use std::time::Duration;
 
-use common::{Recorder, accepted, parcel, runtime, udp_config, until};
+use common::{Recorder, accepted, parcel, rogue_hello, runtime, udp_config, until, written};
 use fipa_transport::{AttemptId, Conclusion, Kind, Location, Sink, Transport, WayFault};
 use fipa_transport_net::{UdpConfig, UdpTransport};
 use tokio::runtime::Runtime;
@@ -131,6 +131,89 @@ fn hellos_without_a_cookie_take_no_memory_and_get_little() {
     assert_eq!(replies, 2000);
     let counters = far.transport.counters();
     assert_eq!((counters.accepted, counters.connections), (0, 0));
+    near.assert_reaches(1, &far.location);
+}
+
+/// A connection as a rogue opens it; and the number that it has at the other side.
+fn introduced(to: &Party, incarnation: u64) -> (UdpSocket, u64) {
+    let socket = stranger(to);
+    let mut reply = [0; 2048];
+    socket.send(&hello(1, [0; 16])).unwrap();
+    socket.recv(&mut reply).unwrap();
+    assert_eq!(reply[5], 2, "a cookie");
+    let cookie = reply[16..32].try_into().unwrap();
+    let mut bytes = hello(1, cookie);
+    let body = rogue_hello(incarnation);
+    bytes[40..42].copy_from_slice(&(body.len() as u16).to_le_bytes());
+    bytes[42..42 + body.len()].copy_from_slice(&body);
+    socket.send(&bytes).unwrap();
+    socket.recv(&mut reply).unwrap();
+    assert_eq!(reply[5], 3, "a welcome");
+    (
+        socket,
+        u64::from_le_bytes(reply[16..24].try_into().unwrap()),
+    )
+}
+
+/// A data packet of a connection.
+fn packet(to: u64, number: u64, frames: &[u8]) -> Vec<u8> {
+    let mut bytes = b"fipa\x01\x06\0\0".to_vec();
+    bytes.extend(to.to_le_bytes());
+    bytes.extend(number.to_le_bytes());
+    bytes.extend(frames);
+    bytes
+}
+
+#[test]
+fn nonsense_after_the_handshake_ends_the_connection_and_no_other() {
+    let (near, far) = (Party::new(), Party::new());
+    near.assert_reaches(0, &far.location);
+    let mut acknowledgement = vec![1];
+    acknowledgement.extend(1_000_u64.to_le_bytes());
+    acknowledgement.extend([0; 5]);
+    let answer = [&[3][..], &7_u64.to_le_bytes(), &[1, 0]].concat();
+    let torn = [&[2][..], &1_u64.to_le_bytes(), b"half a header"].concat();
+    let far_away = [&[5][..], &u64::MAX.to_le_bytes()].concat();
+    let nonsense = [vec![99, 1, 2], acknowledgement, answer, torn, far_away];
+    for (refused, frames) in (1..).zip(&nonsense) {
+        let (socket, number) = introduced(&far, refused);
+        socket.send(&packet(number, 1, frames)).unwrap();
+        until("an end", || {
+            let counters = far.transport.counters();
+            let ended = counters.refused_nonsense == refused && counters.connections == 1;
+            ended.then_some(())
+        });
+        near.assert_reaches(refused, &far.location);
+    }
+}
+
+#[test]
+fn letters_that_wait_for_one_that_never_comes_take_bounded_memory() {
+    let mut narrow = udp_config(&["127.0.0.1:0"]);
+    narrow.limits.max_in_flight = 64;
+    narrow.limits.max_queued_bytes = 1 << 20;
+    let (near, far) = (Party::new(), Party::with(narrow));
+    near.assert_reaches(0, &far.location);
+    let (many, large) = (introduced(&far, 1), introduced(&far, 2));
+    // Never the first one. What the other side's buffer has no room for is lost.
+    for id in 2..5_000_u64 {
+        for ((socket, number), len) in [(&many, 1), (&large, 60_000)] {
+            let body = written(&parcel(id, vec![0; len]));
+            let frames = [&[2][..], &id.to_le_bytes(), &body].concat();
+            let _ = socket.send(&packet(*number, id, &frames));
+        }
+        if id % 500 == 0 {
+            near.assert_reaches(id, &far.location);
+        }
+    }
+    let counters = far.transport.counters();
+    assert_eq!(counters.connections, 3);
+    let waiting = counters.parcels_in - near.transport.counters().parcels_out;
+    // So many letters of the one, and what 1 MiB holds of the other's.
+    let most = 64 + (1 << 20) / 60_000;
+    assert!((65..=most).contains(&waiting), "{waiting} of {most}");
+    // None was handed on before its turn.
+    assert_eq!(far.sink.record.lock().arrivals.len(), 10);
     near.assert_reaches(1, &far.location);
 }
 

@@ -11,8 +11,8 @@ use parking_lot::Mutex;
 
 use crate::transport::LoanedContent;
 use crate::{
-    Answer, Arrival, AttemptId, Conclusion, Introduction, Kind, ListenError, Location, Parcel,
-    Sink, Ticket, Transport, Verdict, WayError, WayFault,
+    Answer, Arrival, Arriving, AttemptId, Conclusion, Introduction, Kind, ListenError, Location,
+    Parcel, Sink, Ticket, Transport, Verdict, WayError, WayFault,
 };
 
 /// A way of failing.
@@ -224,6 +224,10 @@ impl Sink for Filter {
         let fault = self.shared.pending.lock().remove(&attempt);
         let conclusion = if fault.is_some() { lost() } else { conclusion };
         self.sink.concluded(attempt, conclusion);
+    }
+
+    fn memory_for(&self, arriving: &Arriving<'_>) -> Option<Box<dyn LoanedContent>> {
+        self.sink.memory_for(arriving)
     }
 
     fn introduced(&self, peer: &Introduction) {

@@ -26,6 +26,6 @@ pub use location::{Kind, Location, LocationError, Signature};
 pub use outcome::{Attempt, FailureReason, Outcome};
 pub use parcel::{Body, Parcel, Report, Stream};
 pub use transport::{
-    Answer, Arrival, AttemptId, Conclusion, Hop, Introduction, ListenError, LoanedContent, Sink,
-    Ticket, Transport, Verdict, WayError, WayFault,
+    Answer, Arrival, Arriving, AttemptId, Conclusion, Hop, Introduction, ListenError,
+    LoanedContent, Sink, Ticket, Transport, Verdict, WayError, WayFault,
 };

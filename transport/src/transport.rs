@@ -8,7 +8,7 @@ use bytes::Bytes;
 use fipa_acl::Letter;
 use serde::Serialize;
 
-use crate::{FailureReason, Kind, Location, Parcel};
+use crate::{FailureReason, Kind, Location, Parcel, Stream};
 
 /// One way of moving letters.
 ///
@@ -134,6 +134,14 @@ pub trait Sink: Send + Sync {
     /// An attempt came to its end.
     fn concluded(&self, attempt: AttemptId, conclusion: Conclusion);
 
+    /// Memory for the content of a letter of which only the beginning has arrived, when the letter
+    /// can be passed on from there without a copy. The transport then writes what arrives right
+    /// into it, and the letter's content is what it freezes to. Asked for large content only.
+    fn memory_for(&self, arriving: &Arriving<'_>) -> Option<Box<dyn LoanedContent>> {
+        let _ = arriving;
+        None
+    }
+
     /// A service has introduced itself on a connection that was opened: parcels can go both ways
     /// from now on. Transports without connections say nothing; nor need a sink listen.
     fn introduced(&self, peer: &Introduction) {
@@ -167,6 +175,21 @@ pub struct Arrival {
     pub from: Hop,
     /// For [`Transport::answer`], when the verdict is [`Verdict::Later`].
     pub ticket: Ticket,
+}
+
+/// A letter whose content is about to arrive. Nothing of it has been checked but the lengths.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Arriving<'a> {
+    /// The name of the receiving agent.
+    pub receiver: &'a str,
+    /// Whose order it belongs to.
+    pub stream: Stream,
+    /// Bytes in front of the content: name, envelope and head of the message.
+    pub front: usize,
+    /// Bytes of the content.
+    pub len: usize,
+    /// Bytes behind the content.
+    pub tail: usize,
 }
 
 /// The message transport service that handed a parcel over.

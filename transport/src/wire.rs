@@ -17,8 +17,8 @@ use zerocopy::little_endian::{U16, U32, U64};
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
 
 use crate::{
-    Attempt, Body, FailureReason, Incarnation, Kind, Location, Outcome, Parcel, Report, Stream,
-    WayError, WayFault,
+    Arriving, Attempt, Body, FailureReason, Incarnation, Kind, Location, Outcome, Parcel, Report,
+    Stream, WayError, WayFault,
 };
 
 /// The header of a parcel: [`HEADER_LEN`] bytes, little-endian.
@@ -185,6 +185,30 @@ impl ParcelHeader {
         self.content_len.get()
     }
 
+    /// What is arriving, when the parcel with this header is a letter, and this is what stands in
+    /// front of its content. None also when it makes no sense, which is told once all is there.
+    #[must_use]
+    pub fn arriving<'a>(&self, front: &'a [u8]) -> Option<Arriving<'a>> {
+        if self.kind != LETTER || front.len() as u64 != self.front_len() {
+            return None;
+        }
+        let name = front.get(..usize::from(self.name_len.get()))?;
+        Some(Arriving {
+            receiver: std::str::from_utf8(name).ok()?,
+            stream: self.stream(),
+            front: front.len(),
+            len: usize::try_from(self.content_len.get()).ok()?,
+            tail: usize::try_from(self.tail_len.get()).ok()?,
+        })
+    }
+
+    fn stream(&self) -> Stream {
+        Stream {
+            sender: Incarnation::from_u64(self.sender.get()),
+            receiver: Incarnation::from_u64(self.receiver.get()),
+        }
+    }
+
     /// The parcel with this header and a body that lies in one piece. Nothing is copied but the
     /// name.
     ///
@@ -256,10 +280,7 @@ impl ParcelHeader {
         };
         Ok(Parcel {
             receiver,
-            stream: Stream {
-                sender: Incarnation::from_u64(self.sender.get()),
-                receiver: Incarnation::from_u64(self.receiver.get()),
-            },
+            stream: self.stream(),
             sequence: self.sequence.get(),
             after: self.after.get(),
             remaining: Duration::from_micros(self.remaining_us.get()).min(MAX_REMAINING),

@@ -34,7 +34,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::Letter;
-use fipa_sds::{Directory, Entry, Pattern, Resolution, Role};
+use fipa_sds::{Directory, Entry, Pattern, Reach, Resolution, Role};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind, Location,
     Outcome, Parcel, Report, Stream, Verdict,
@@ -49,7 +49,7 @@ pub use inbox::Received;
 use lane::{Delivery, Lane, Moved};
 pub use notice::{News, Notice};
 
-use crate::Map;
+use crate::{Map, stamp};
 use peers::Peers;
 pub use peers::{Peer, PeerState};
 pub use routes::{Route, Standing, Way, WayState};
@@ -397,6 +397,26 @@ impl Core {
             return None;
         }
         self.desk.choose(now.instant, &entry, &[])
+    }
+
+    /// The first way that a letter of others, for this life of an agent with this name, would take
+    /// from here now, if this service passes it on within its host; and the bytes that its stamp
+    /// takes.
+    #[must_use]
+    pub fn first_way_onwards(
+        &self,
+        now: Now,
+        life: Incarnation,
+        receiver: &str,
+    ) -> Option<(Location, usize)> {
+        let config = &self.desk.config;
+        if !config.forwards || self.agents.contains_key(&life) {
+            return None;
+        }
+        let entry = self.desk.receiver(life, receiver)?;
+        let here = entry.role == Role::Agent && entry.reach == Reach::Local;
+        let way = here.then(|| self.desk.choose(now.instant, &entry, &[]))?;
+        Some((way?, stamp::room(&config.name)))
     }
 
     /// The kind of transport by which a letter to these receivers would go first to two of them at

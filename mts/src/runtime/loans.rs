@@ -2,7 +2,7 @@
 
 use bytes::Bytes;
 use fipa_acl::{Letter, Payload};
-use fipa_transport::{Incarnation, Kind, LoanedContent, Location, Transport, WayError};
+use fipa_transport::{Arriving, Incarnation, Kind, LoanedContent, Location, Transport, WayError};
 
 use super::{Mts, Shared};
 use crate::core::{Now, Submission};
@@ -75,6 +75,26 @@ impl Mts {
 }
 
 impl Shared {
+    /// Memory for the content of a letter that arrives for somebody else on this host: that of the
+    /// transport by which it will be passed on.
+    pub(super) fn memory_for(&self, arriving: &Arriving<'_>) -> Loaned {
+        let Arriving {
+            receiver,
+            stream,
+            front,
+            len,
+            tail,
+        } = *arriving;
+        let (way, stamp) = {
+            let state = self.state.lock();
+            let life = stream.receiver;
+            state.core.first_way_onwards(Now::read(), life, receiver)?
+        };
+        self.loan_from(way.kind(), |transport| {
+            transport.loan(&way, front.saturating_add(stamp), len, tail)
+        })
+    }
+
     /// A loan, if this transport gives one.
     fn loan_from(
         &self,

@@ -6,7 +6,8 @@ use std::sync::atomic::Ordering;
 
 use fipa_acl::Letter;
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Conclusion, FailureReason, Introduction, Kind, Sink, Verdict,
+    Answer, Arrival, Arriving, AttemptId, Conclusion, FailureReason, Introduction, Kind,
+    LoanedContent, Sink, Verdict,
 };
 
 use super::Shared;
@@ -57,6 +58,10 @@ impl Sink for Receiving {
             .core
             .handle_conclusion(Now::read(), attempt, conclusion);
         shared.carry_out(state);
+    }
+
+    fn memory_for(&self, arriving: &Arriving<'_>) -> Option<Box<dyn LoanedContent>> {
+        self.shared.upgrade()?.memory_for(arriving)
     }
 
     fn introduced(&self, peer: &Introduction) {

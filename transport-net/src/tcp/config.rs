@@ -60,6 +60,10 @@ pub struct Limits {
     /// Most bytes per connection that wait to be handed to the kernel; a single letter is always
     /// let in. Default 64 MiB.
     pub max_queued_bytes: usize,
+    /// Most bytes of [the sink's memory](fipa_transport::Sink::memory_for) that are taken for
+    /// content which has been announced and is arriving, on all connections together. What is
+    /// beyond is read into memory that grows as it arrives. Default 32 MiB.
+    pub max_arriving: usize,
     /// How long opening a connection may take. Default 2 s.
     pub connect_timeout: Duration,
     /// How long a new connection may take to say hello. Default 5 s.
@@ -87,6 +91,7 @@ impl Default for Limits {
             max_strangers: 64,
             max_in_flight: 1024,
             max_queued_bytes: 64 << 20,
+            max_arriving: 32 << 20,
             connect_timeout: Duration::from_secs(2),
             handshake_timeout: Duration::from_secs(5),
             stall_timeout: Duration::from_secs(10),

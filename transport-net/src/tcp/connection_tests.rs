@@ -5,7 +5,7 @@ use fipa_acl::Letter;
 use fipa_transport::Stream;
 use proptest::prelude::*;
 
-use super::super::frame::{FrameReader, HEADER_LEN};
+use super::super::frame::{FrameReader, HEADER_LEN, Space};
 use super::*;
 use crate::hello::tests::sample;
 
@@ -92,12 +92,14 @@ impl Side {
     /// Up to `max` bytes come out of the network.
     fn receive(&mut self, max: usize, now: Instant) {
         let step = {
-            let mut space = self.reader.space();
+            let Space::Buffer(mut space) = self.reader.space() else {
+                panic!("no memory was offered");
+            };
             let step = max.min(self.coming.len()).min(space.remaining_mut());
             space.put_slice(&self.coming.split_to(step));
             step
         };
-        while let Some(frame) = self.reader.next().unwrap() {
+        while let Some(frame) = self.reader.next(|_| None).unwrap() {
             if let Err(end) = self.connection.handle_frame(frame, now) {
                 self.finish(end);
             }

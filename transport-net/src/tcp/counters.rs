@@ -40,6 +40,10 @@ counters! {
     parcels_out,
     /// Parcels that arrived in frames.
     parcels_in,
+    /// Large contents that were read from the socket into the memory they are passed on from.
+    placed,
+    /// Bytes of these that had been read together with what stands in front, and were copied.
+    placed_moved_bytes,
     /// Old peers' letters that arrived.
     unframed_in,
     /// Letters handed to old peers.

@@ -23,6 +23,7 @@ use super::connection::{Connection, Role};
 use super::counters::{Tally, count};
 use super::courier::{self, Couriers};
 use super::link::{Link, MAX_LINKS, of_ticket};
+use super::place::Rooms;
 use crate::address;
 use crate::end::End;
 use crate::hello::Hello;
@@ -34,6 +35,8 @@ pub(crate) struct Endpoint {
     pub(crate) runtime: Handle,
     /// Letters to old peers.
     pub(crate) couriers: Couriers,
+    /// What is taken for content that is arriving.
+    pub(crate) rooms: Rooms,
     tally: Tally,
     registry: Mutex<Registry>,
 }
@@ -101,6 +104,7 @@ impl Endpoint {
             config,
             runtime,
             couriers: Couriers::default(),
+            rooms: Rooms::default(),
             tally: Tally::default(),
             registry: Mutex::default(),
         })

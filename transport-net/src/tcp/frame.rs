@@ -12,10 +12,10 @@
 //!
 //! The first byte tells a frame (`f`) from the letter of an old peer (`FE`, `FD`, `<`).
 //!
-//! [`FrameReader`] turns bytes in pieces of any size into frames. A large body is read straight
-//! into one buffer of its own, which grows as the bytes arrive: announcing much takes no memory.
+//! [`FrameReader`] turns bytes in pieces of any size into frames.
 
-use bytes::buf::Limit;
+mod reader;
+
 use bytes::{Buf, BufMut, Bytes, BytesMut};
 use fipa_transport::wire::{HEADER_LEN as PARCEL_HEADER_LEN, ParcelHeader, WireError};
 use fipa_transport::{Answer, Parcel};
@@ -24,6 +24,8 @@ use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
 
 use crate::answer::{self, MAX_ANSWER};
 use crate::hello::{Hello, MAX_HELLO};
+
+pub(crate) use self::reader::{FrameReader, Placed, Space};
 
 /// What every frame begins with. A later version of the protocol keeps these eight bytes' layout.
 #[derive(
@@ -53,13 +55,6 @@ const GOODBYE: u8 = 6;
 
 /// Room in a parcel's body beside the letter: receiver name, or a whole report.
 const PARCEL_ALLOWANCE: u64 = 128 * 1024;
-
-/// Bytes of the buffer that headers and small bodies are read into.
-const CHUNK: usize = 16 * 1024;
-
-/// A body's own buffer begins with at most this much, and grows to at most four times what has
-/// arrived. Memory that nothing was put into is not really taken from the system.
-const FIRST_STEP: usize = 4 << 20;
 
 /// A frame as it arrived.
 #[derive(Debug, PartialEq)]
@@ -160,120 +155,6 @@ fn put_header(out: &mut BytesMut, kind: u8, id: u64, body_len: u64) {
     out.put_slice(header.as_bytes());
 }
 
-/// Bytes in, frames out.
-#[derive(Debug)]
-pub(crate) struct FrameReader {
-    /// Longest body of a parcel frame.
-    max_parcel: u64,
-    /// Headers, small bodies and the beginnings of large ones.
-    chunk: BytesMut,
-    /// The frame whose body is arriving.
-    body: Option<PartialBody>,
-}
-
-#[derive(Debug)]
-struct PartialBody {
-    header: FrameHeader,
-    bytes: BytesMut,
-    /// Length of the whole body.
-    len: usize,
-}
-
-impl FrameReader {
-    /// A reader for a connection on which `begun` has arrived already, with room for letters of
-    /// `max_letter` bytes.
-    pub(crate) fn new(max_letter: usize, begun: BytesMut) -> Self {
-        Self {
-            max_parcel: (max_letter as u64).saturating_add(PARCEL_ALLOWANCE),
-            chunk: begun,
-            body: None,
-        }
-    }
-
-    /// Where the next bytes are to be put. To be called again after each time bytes were put
-    /// there, and [`next`](Self::next) in between until it has no more.
-    pub(crate) fn space(&mut self) -> Limit<&mut BytesMut> {
-        if let Some(body) = &mut self.body
-            && body.missing() >= CHUNK
-        {
-            // What is missing of a large body goes where it stays. Its rest, once smaller than
-            // the chunk, is fetched together with what follows it.
-            body.make_room();
-            let limit = body.missing().min(body.bytes.capacity() - body.bytes.len());
-            return (&mut body.bytes).limit(limit);
-        }
-        self.chunk
-            .reserve(CHUNK.saturating_sub(self.chunk.len()).max(1));
-        let limit = self.chunk.capacity() - self.chunk.len();
-        (&mut self.chunk).limit(limit)
-    }
-
-    /// The next whole frame, if it has arrived.
-    ///
-    /// # Errors
-    /// When what arrived is no frame. The connection is of no use then.
-    pub(crate) fn next(&mut self) -> Result<Option<Frame>, FrameError> {
-        let mut body = match self.body.take() {
-            Some(body) => body,
-            None => match self.begin()? {
-                Some(body) => body,
-                None => return Ok(None),
-            },
-        };
-        body.take_from(&mut self.chunk);
-        if body.missing() > 0 {
-            self.body = Some(body);
-            return Ok(None);
-        }
-        finish(body.header, body.bytes.freeze()).map(Some)
-    }
-
-    /// Whether a frame has begun to arrive and is not complete.
-    pub(crate) fn is_partial(&self) -> bool {
-        self.body.is_some() || !self.chunk.is_empty()
-    }
-
-    fn begin(&mut self) -> Result<Option<PartialBody>, FrameError> {
-        // Nonsense is recognised by its first bytes, not only once there is enough of it.
-        let begun = self.chunk.len().min(MAGIC.len());
-        if self.chunk[..begun] != MAGIC[..begun] {
-            let mut found = [0; 4];
-            found[..begun].copy_from_slice(&self.chunk[..begun]);
-            return Err(FrameError::Magic(found));
-        }
-        let Ok((header, _)) = FrameHeader::read_from_prefix(&self.chunk) else {
-            return Ok(None);
-        };
-        let len = header.checked_body_len(self.max_parcel)?;
-        self.chunk.advance(HEADER_LEN);
-        Ok(Some(PartialBody {
-            header,
-            bytes: BytesMut::with_capacity(len.min(FIRST_STEP)),
-            len,
-        }))
-    }
-}
-
-impl PartialBody {
-    /// Moves what there is of this body from the chunk.
-    fn take_from(&mut self, chunk: &mut BytesMut) {
-        let there = self.missing().min(chunk.len());
-        self.bytes.put_slice(&chunk[..there]);
-        chunk.advance(there);
-    }
-
-    fn missing(&self) -> usize {
-        self.len - self.bytes.len()
-    }
-
-    fn make_room(&mut self) {
-        if self.bytes.len() == self.bytes.capacity() {
-            let step = self.bytes.len().saturating_mul(3).min(self.missing());
-            self.bytes.reserve(step);
-        }
-    }
-}
-
 impl FrameHeader {
     fn checked_body_len(&self, max_parcel: u64) -> Result<usize, FrameError> {
         if self.version != VERSION {
@@ -305,12 +186,7 @@ fn finish(header: FrameHeader, mut body: Bytes) -> Result<Frame, FrameError> {
     Ok(match header.kind {
         HELLO => Frame::Hello(Hello::decode(&body).ok_or(FrameError::Hello)?),
         PARCEL => {
-            let Ok((parcel_header, _)) = ParcelHeader::read_from_prefix(&body) else {
-                let found = body.len() as u64;
-                let announced = PARCEL_HEADER_LEN as u64;
-                return Err(WireError::BodyLength { announced, found }.into());
-            };
-            body.advance(PARCEL_HEADER_LEN);
+            let parcel_header = parcel_header(&mut body)?;
             let parcel = Box::new(parcel_header.parcel(body)?);
             Frame::Parcel { id, parcel }
         }
@@ -323,6 +199,32 @@ fn finish(header: FrameHeader, mut body: Bytes) -> Result<Frame, FrameError> {
         GOODBYE => Frame::Goodbye { last: id },
         other => return Err(FrameError::Kind(other)),
     })
+}
+
+/// A parcel whose content lies in memory of its own.
+fn finish_apart(
+    header: FrameHeader,
+    mut front: Bytes,
+    content: Bytes,
+    tail: Bytes,
+) -> Result<Frame, FrameError> {
+    let parcel_header = parcel_header(&mut front)?;
+    let parcel = parcel_header.parcel_of_pieces(front, content, tail)?;
+    Ok(Frame::Parcel {
+        id: header.id.get(),
+        parcel: Box::new(parcel),
+    })
+}
+
+/// Takes the parcel's header from the front of a body.
+fn parcel_header(body: &mut Bytes) -> Result<ParcelHeader, WireError> {
+    let Ok((header, _)) = ParcelHeader::read_from_prefix(body) else {
+        let found = body.len() as u64;
+        let announced = PARCEL_HEADER_LEN as u64;
+        return Err(WireError::BodyLength { announced, found });
+    };
+    body.advance(PARCEL_HEADER_LEN);
+    Ok(header)
 }
 
 #[cfg(test)]

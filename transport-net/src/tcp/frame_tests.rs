@@ -1,10 +1,12 @@
 use std::time::Duration;
 
 use fipa_acl::{Letter, Payload};
-use fipa_transport::{Body, FailureReason, Incarnation, Stream};
+use fipa_transport::{Arriving, Body, FailureReason, Incarnation, LoanedContent, Stream};
 use proptest::prelude::*;
 
+use super::reader::{APART_FROM, CHUNK, FIRST_STEP};
 use super::*;
+use crate::tcp::place::{Place, Rooms};
 
 fn letter_parcel(head: Vec<u8>, content: Vec<u8>) -> Parcel {
     let payload = Payload {
@@ -27,30 +29,72 @@ fn letter_parcel(head: Vec<u8>, content: Vec<u8>) -> Parcel {
 }
 
 /// Puts bytes into the reader in pieces of at most these sizes, over and over.
-fn read(
+fn read(reader: &mut FrameReader, bytes: &[u8], sizes: &[usize]) -> Result<Vec<Frame>, FrameError> {
+    read_into(reader, bytes, sizes, |_| None)
+}
+
+/// The same with memory for contents.
+fn read_into(
     reader: &mut FrameReader,
     mut bytes: &[u8],
     sizes: &[usize],
+    mut memory: impl FnMut(&Arriving<'_>) -> Option<Place>,
 ) -> Result<Vec<Frame>, FrameError> {
     let mut frames = Vec::new();
     let mut sizes = sizes.iter().cycle();
     while !bytes.is_empty() {
         let mut space = reader.space();
-        assert!(
-            space.remaining_mut() > 0,
-            "a full buffer would read as end of stream"
-        );
-        let step = (*sizes.next().unwrap())
-            .max(1)
-            .min(bytes.len())
-            .min(space.remaining_mut());
-        space.put_slice(&bytes[..step]);
+        let room = room(&space);
+        assert!(room > 0, "a full buffer would read as end of stream");
+        let step = (*sizes.next().unwrap()).max(1).min(bytes.len()).min(room);
+        match &mut space {
+            Space::Buffer(buffer) => buffer.put_slice(&bytes[..step]),
+            Space::Content(content) => content[..step].copy_from_slice(&bytes[..step]),
+        }
+        reader.put(step);
         bytes = &bytes[step..];
-        while let Some(frame) = reader.next()? {
+        while let Some(frame) = reader.next(&mut memory)? {
             frames.push(frame);
         }
+        // What waits until more comes is where it belongs, or the beginning of a header.
+        assert!(reader.chunk.len() < HEADER_LEN, "{reader:?}");
     }
     Ok(frames)
+}
+
+fn room(space: &Space<'_>) -> usize {
+    match space {
+        Space::Buffer(buffer) => buffer.remaining_mut(),
+        Space::Content(content) => content.len(),
+    }
+}
+
+/// Memory of the sink's.
+struct Memory(Vec<u8>);
+
+impl LoanedContent for Memory {
+    fn content_mut(&mut self) -> &mut [u8] {
+        &mut self.0
+    }
+
+    fn freeze(self: Box<Self>) -> Bytes {
+        self.0.into()
+    }
+}
+
+fn place(len: usize) -> Option<Place> {
+    let room = Rooms::default().take(len, len)?;
+    Some(Place::new(Box::new(Memory(vec![0; len])), room))
+}
+
+fn content(frame: &Frame) -> &Bytes {
+    let Frame::Parcel { parcel, .. } = frame else {
+        panic!("{frame:?}")
+    };
+    let Body::Letter(letter) = &parcel.body else {
+        panic!("{parcel:?}")
+    };
+    &letter.payload().content
 }
 
 fn reader(max_letter: usize) -> FrameReader {
@@ -108,7 +152,7 @@ fn announcing_much_takes_no_memory() {
         read(&mut reader, &header(VERSION, PARCEL, announced), &[24]),
         Ok(vec![])
     );
-    assert!(reader.space().remaining_mut() <= FIRST_STEP);
+    assert!(room(&reader.space()) <= FIRST_STEP);
     for filled in 0..100 {
         let step = vec![0; 64 * 1024];
         assert_eq!(read(&mut reader, &step, &[usize::MAX]), Ok(vec![]));
@@ -117,6 +161,79 @@ fn announcing_much_takes_no_memory() {
         assert_eq!(body.bytes.len(), arrived);
         assert!(body.bytes.capacity() <= 4 * arrived.max(FIRST_STEP));
     }
+}
+
+#[test]
+fn large_content_is_read_into_the_memory_that_is_offered_and_nowhere_else() {
+    let large = parcel(9, &letter_parcel(vec![1; 300], vec![2; 100_000])).unwrap();
+    let small = parcel(9, &letter_parcel(vec![1; 300], vec![2; 1000])).unwrap();
+    let (large, small) = (large.concat(), small.concat());
+    let mut reader = reader(1 << 20);
+    let mut places = Vec::new();
+    let mut memory = |arriving: &Arriving<'_>| {
+        let Arriving {
+            receiver,
+            front,
+            len,
+            tail,
+            ..
+        } = *arriving;
+        assert_eq!((receiver, front, tail), ("arm@crex", 8 + 8 + 300, 1));
+        let memory = Memory(vec![0; len]);
+        places.push(memory.0.as_ptr());
+        let room = Rooms::default().take(len, len)?;
+        Some(Place::new(Box::new(memory), room))
+    };
+    let run = [&large[..], &large, &large].concat();
+    let first = read_into(&mut reader, &run, &[usize::MAX], &mut memory).unwrap();
+    let Placed { contents, moved } = reader.take_placed();
+    assert_eq!(contents, 3);
+    // Of the first letter only, what came with its front.
+    assert!(moved > 0 && moved < CHUNK as u64, "{moved}");
+    // Answers, as they come between letters, and letters that come one by one.
+    let run = [&answer(1, &Answer::Busy)[..], &large, &ping(), &large].concat();
+    let second = read_into(&mut reader, &run, &[7, usize::MAX], &mut memory).unwrap();
+    let placed = reader.take_placed();
+    assert_eq!((placed.contents, placed.moved), (2, 0));
+    let run = [small, large].concat();
+    let third = read_into(&mut reader, &run, &[usize::MAX], &mut memory).unwrap();
+    let found = [
+        &first[0], &first[1], &first[2], &second[1], &second[3], &third[1],
+    ];
+    assert_eq!(found.map(|frame| content(frame).as_ptr()), places[..]);
+    assert!(
+        found
+            .iter()
+            .all(|frame| *content(frame) == [2; 100_000][..])
+    );
+    assert_eq!(content(&third[0]), &[2; 1000][..]);
+}
+
+#[test]
+fn lengths_that_do_not_add_up_get_no_memory() {
+    let whole = parcel(9, &letter_parcel(vec![1; 10], vec![2; 100_000])).unwrap();
+    let mut bytes = whole.concat();
+    // The body is said to be a byte longer than its parts are.
+    let len = u64::from_le_bytes(bytes[16..24].try_into().unwrap()) + 1;
+    bytes[16..24].copy_from_slice(&len.to_le_bytes());
+    bytes.push(0);
+    let refused = read_into(&mut reader(1 << 20), &bytes, &[usize::MAX], |_| {
+        panic!("memory for nonsense")
+    });
+    assert!(matches!(
+        refused,
+        Err(FrameError::Parcel(WireError::BodyLength { .. }))
+    ));
+    // Nor does what is too short to be worth it.
+    let short = parcel(
+        9,
+        &letter_parcel(vec![1; APART_FROM as usize], vec![2; 100]),
+    )
+    .unwrap();
+    let read = read_into(&mut reader(1 << 20), &short.concat(), &[usize::MAX], |_| {
+        panic!("memory for little")
+    });
+    assert_eq!(read.unwrap().len(), 1);
 }
 
 #[test]
@@ -175,9 +292,13 @@ proptest! {
             .map(|bytes| read(&mut reader(1 << 20), bytes, &[usize::MAX]).unwrap().remove(0))
             .collect();
         for sizes in [&sizes, &small] {
-            let mut reader = reader(1 << 20);
-            prop_assert_eq!(&read(&mut reader, &written.concat(), sizes).unwrap(), &alone);
-            prop_assert!(!reader.is_partial());
+            for offered in [false, true] {
+                let mut reader = reader(1 << 20);
+                let memory = |arriving: &Arriving<'_>| offered.then(|| place(arriving.len))?;
+                let found = read_into(&mut reader, &written.concat(), sizes, memory).unwrap();
+                prop_assert_eq!(&found, &alone);
+                prop_assert!(!reader.is_partial());
+            }
         }
     }
 

@@ -7,11 +7,11 @@
 use std::io::{self, IoSlice};
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Instant;
 
 use fipa_transport::{
-    Answer, AttemptId, Body, FailureReason, Introduction, Location, Parcel, Sink, Ticket,
+    Answer, Arriving, AttemptId, Body, FailureReason, Introduction, Location, Parcel, Sink, Ticket,
 };
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
@@ -20,7 +20,8 @@ use tokio::time::{sleep_until, timeout};
 use super::connection::{Connection, Event, MAX_ID, SendError};
 use super::counters::count;
 use super::endpoint::Endpoint;
-use super::frame::FrameReader;
+use super::frame::{FrameReader, Placed};
+use super::place::Place;
 use super::proof::Proof;
 use super::wire::{Reading, Writing};
 use crate::end::End;
@@ -350,8 +351,10 @@ impl Running {
     ) -> Result<(), End> {
         let now = Instant::now();
         let link = self.link.clone();
+        reader.put(arrived);
         loop {
-            let frame = reader.next().map_err(|e| End::Nonsense(e.to_string()))?;
+            let frame = reader.next(|arriving| self.place_for(arriving));
+            let frame = frame.map_err(|e| End::Nonsense(e.to_string()))?;
             let Some(frame) = frame else { break };
             let events: [Option<Event>; 2];
             {
@@ -373,9 +376,25 @@ impl Running {
                 self.handle_event(event, from, greeted).await?;
             }
         }
+        let placed = reader.take_placed();
+        if placed != Placed::default() {
+            let tally = self.endpoint.tally();
+            let add = |counter: &AtomicU64, more| counter.fetch_add(more, Ordering::Relaxed);
+            add(&tally.placed, placed.contents);
+            add(&tally.placed_moved_bytes, placed.moved);
+        }
         let mut state = link.state.lock();
         state.connection.received(arrived, reader.is_partial(), now);
         Ok(())
+    }
+
+    /// Where the content goes that a peer has announced who has introduced himself.
+    fn place_for(&self, arriving: &Arriving<'_>) -> Option<Place> {
+        self.peer.as_ref()?;
+        let most = self.endpoint.limits().max_arriving;
+        let room = self.endpoint.rooms.take(arriving.len, most)?;
+        let memory = self.sink.memory_for(arriving)?;
+        Some(Place::new(memory, room))
     }
 
     async fn handle_event(

@@ -1,6 +1,6 @@
 //! Framed, acknowledged letters over TCP.
 //!
-//! * [`frame`]: the bytes.
+//! * [`frame`]: the bytes; [`place`]: memory for what arrives, from where it is passed on.
 //! * [`connection`] with its [`outbox`]: the protocol of one connection, without socket or clock.
 //! * [`link`]: a connection with its socket; [`dial`] and [`accept`] make them.
 //! * [`endpoint`]: what the connections share.
@@ -18,6 +18,7 @@ mod endpoint;
 mod frame;
 mod link;
 mod outbox;
+mod place;
 mod proof;
 #[cfg(feature = "secure")]
 mod tls;
@@ -45,7 +46,8 @@ use crate::end::End;
 ///
 /// The first parcel to a location opens a connection, which then carries everything to and from
 /// that peer, whoever opened it, until it has been idle for some time. Letters are written from
-/// the memory they lie in, and read into one piece of memory each.
+/// the memory they lie in, and read into one piece of memory each; large content into memory of
+/// [the sink's](Sink::memory_for), if it offers some.
 ///
 /// To a location with the [signature](Signature) of an old peer, each letter goes over a connection
 /// of its own, in that peer's dialect, and is concluded as [handed](fipa_transport::Conclusion::Handed).

@@ -8,8 +8,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bytes::buf::Limit;
-use bytes::{Buf as _, BufMut as _, BytesMut};
+use bytes::{Buf as _, BytesMut};
 use parking_lot::Mutex;
 use rustls::Connection;
 use rustls::pki_types::ServerName;
@@ -18,6 +17,7 @@ use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::time::timeout;
 use tokio_rustls::{TlsAcceptor, TlsConnector};
 
+use super::frame::Space;
 use super::wire::{Reading, Writing};
 use crate::secure::{Certificate, Security};
 
@@ -159,7 +159,7 @@ impl Incoming {
     pub(crate) async fn read(
         &mut self,
         socket: &OwnedReadHalf,
-        space: &mut Limit<&mut BytesMut>,
+        space: &mut Space<'_>,
     ) -> io::Result<usize> {
         loop {
             if let Some(taken) = self.decrypt(space)? {
@@ -178,16 +178,13 @@ impl Incoming {
 
     /// Takes what is decrypted, or can be; none when more has to come. Nothing, when the peer has
     /// closed its direction.
-    fn decrypt(&mut self, space: &mut Limit<&mut BytesMut>) -> io::Result<Option<usize>> {
+    fn decrypt(&mut self, space: &mut Space<'_>) -> io::Result<Option<usize>> {
         let mut session = self.session.0.lock();
         loop {
             let mut reader = session.reader();
             match reader.fill_buf() {
                 Ok(chunk) => {
-                    let (wanted, room) = (chunk.len(), space.remaining_mut());
-                    let taken = chunk.get(..room.min(wanted)).unwrap_or(chunk);
-                    let len = taken.len();
-                    space.put_slice(taken);
+                    let len = space.fill(chunk);
                     reader.consume(len);
                     return Ok(Some(len));
                 }

@@ -7,12 +7,11 @@ use std::io::{self, IoSlice};
 #[cfg(feature = "secure")]
 use std::sync::Arc;
 
-use bytes::BytesMut;
-use bytes::buf::Limit;
 use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
 use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
 
+use super::frame::Space;
 #[cfg(feature = "secure")]
 use super::tls::{Incoming, Session};
 
@@ -39,9 +38,12 @@ pub(crate) fn plain(stream: TcpStream) -> (Reading, Writing) {
 
 impl Reading {
     /// Reads what is there, as far as there is space. Nothing is lost when this is dropped.
-    pub(crate) async fn read(&mut self, space: &mut Limit<&mut BytesMut>) -> io::Result<usize> {
+    pub(crate) async fn read(&mut self, space: &mut Space<'_>) -> io::Result<usize> {
         match self {
-            Self::Plain(socket) => socket.read_buf(space).await,
+            Self::Plain(socket) => match space {
+                Space::Buffer(buffer) => socket.read_buf(buffer).await,
+                Space::Content(content) => socket.read(content).await,
+            },
             #[cfg(feature = "secure")]
             Self::Tls(socket, incoming) => incoming.read(socket, space).await,
         }

@@ -12,13 +12,15 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use fipa_acl::{Letter, Payload};
+use fipa_transport::wire::ParcelHeader;
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel, Sink,
-    Stream, Ticket, Transport, Verdict, WayError,
+    Answer, Arrival, Arriving, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, LoanedContent,
+    Location, Parcel, Sink, Stream, Ticket, Transport, Verdict, WayError,
 };
 use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport, UdpConfig, UdpLimits};
 use parking_lot::Mutex;
 use tokio::runtime::Runtime;
+use zerocopy::IntoBytes as _;
 
 pub(crate) fn runtime() -> Runtime {
     tokio::runtime::Builder::new_multi_thread()
@@ -78,6 +80,8 @@ pub(crate) struct Record {
 pub(crate) struct Recorder {
     pub(crate) record: Mutex<Record>,
     verdict: Verdict,
+    /// Bytes of memory for contents that are lent now, and were at most, if any is.
+    lent: Option<Arc<Mutex<(usize, usize)>>>,
 }
 
 impl Default for Recorder {
@@ -85,7 +89,32 @@ impl Default for Recorder {
         Self {
             record: Mutex::default(),
             verdict: Verdict::Now(Answer::Accepted),
+            lent: None,
         }
+    }
+}
+
+/// Memory for content that is arriving.
+struct Lent {
+    memory: Vec<u8>,
+    of: Arc<Mutex<(usize, usize)>>,
+}
+
+impl LoanedContent for Lent {
+    fn content_mut(&mut self) -> &mut [u8] {
+        &mut self.memory
+    }
+
+    fn freeze(mut self: Box<Self>) -> Bytes {
+        let content = std::mem::take(&mut self.memory);
+        self.of.lock().0 -= content.len();
+        content.into()
+    }
+}
+
+impl Drop for Lent {
+    fn drop(&mut self) {
+        self.of.lock().0 -= self.memory.len();
     }
 }
 
@@ -98,6 +127,16 @@ impl Sink for Recorder {
         } = arrival;
         self.record.lock().arrivals.push((parcel, from, ticket));
         self.verdict.clone()
+    }
+
+    fn memory_for(&self, arriving: &Arriving<'_>) -> Option<Box<dyn LoanedContent>> {
+        let of = Arc::clone(self.lent.as_ref()?);
+        let mut lent = of.lock();
+        lent.0 += arriving.len;
+        lent.1 = lent.1.max(lent.0);
+        drop(lent);
+        let memory = vec![0; arriving.len];
+        Some(Box::new(Lent { memory, of }))
     }
 
     fn arrived_unframed(&self, letter: Letter, via: Kind, from: IpAddr) {
@@ -136,12 +175,36 @@ impl Party {
     }
 
     pub(crate) fn judging(config: TcpConfig, verdict: Verdict) -> Self {
+        Self::telling(
+            config,
+            Recorder {
+                verdict,
+                ..Recorder::default()
+            },
+        )
+    }
+
+    /// One whose sink lends memory for contents.
+    pub(crate) fn lending(config: TcpConfig) -> Self {
+        Self::telling(
+            config,
+            Recorder {
+                lent: Some(Arc::default()),
+                ..Recorder::default()
+            },
+        )
+    }
+
+    /// Bytes that its sink lends now, and lent at most.
+    pub(crate) fn lent(&self) -> (usize, usize) {
+        let lent = self.sink.lent.as_ref();
+        lent.map(|lent| *lent.lock()).unwrap_or_default()
+    }
+
+    fn telling(config: TcpConfig, sink: Recorder) -> Self {
         let runtime = runtime();
         let transport = TcpTransport::new(config, runtime.handle().clone());
-        let sink = Arc::new(Recorder {
-            record: Mutex::default(),
-            verdict,
-        });
+        let sink = Arc::new(sink);
         let locations = transport.listen(sink.clone()).unwrap();
         Self {
             transport,
@@ -208,6 +271,29 @@ pub(crate) fn parcel(sequence: u64, content: impl Into<Bytes>) -> Parcel {
         sequence,
         Letter::new(Bytes::from_static(b"envelope"), payload),
     )
+}
+
+/// What somebody says of himself who means no good.
+pub(crate) fn rogue_hello(incarnation: u64) -> Vec<u8> {
+    let mut body = Vec::new();
+    body.extend(incarnation.to_le_bytes());
+    body.extend((1_u64 << 30).to_le_bytes());
+    body.extend(100_u32.to_le_bytes());
+    body.extend(1_u64.to_le_bytes());
+    for text in ["rogue", "test", "there", "tcp://127.0.0.1:1"] {
+        body.extend((text.len() as u16).to_le_bytes());
+        body.extend(text.as_bytes());
+    }
+    body.push(0);
+    body
+}
+
+/// A parcel as it stands in frames and packets.
+pub(crate) fn written(parcel: &Parcel) -> Vec<u8> {
+    let (header, pieces) = ParcelHeader::of(parcel).unwrap();
+    let mut bytes = header.as_bytes().to_vec();
+    bytes.extend(pieces.concat());
+    bytes
 }
 
 pub(crate) fn letter_parcel(sequence: u64, letter: Letter) -> Parcel {
