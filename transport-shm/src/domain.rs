@@ -261,6 +261,7 @@ impl Domain {
         self.remove_empty(&nodes);
         self.remove_halves(&nodes);
         self.remove_untagged();
+        self.remove_orphans();
         // Who starts must not wait for what follows: iceoryx2 waits in vain, and for long, for
         // whatever a dead process was making when it was killed.
         drop(lock);
@@ -296,6 +297,9 @@ impl Domain {
             }
         }
         if dead > 0 {
+            let lock = self.lock()?;
+            self.remove_orphans();
+            drop(lock);
             // Only who looks into its mailbox lets go of its side of connections with the dead.
             self.ring_all()?;
         }
@@ -395,6 +399,62 @@ impl Domain {
                 let _ = std::fs::remove_file(file.path());
             }
         }
+    }
+
+    /// Removes the connections of ports that nobody has any more. iceoryx2 0.10 leaves one behind
+    /// when a process is killed after making its file and before saying which end it is: then
+    /// neither end is the last to go. To be called under the lock, under which nobody makes a
+    /// port; a port says that it is there before it connects, and as long as it does.
+    ///
+    /// Whoever lives and still has such a connection open keeps its memory, and does not mind that
+    /// the file is gone.
+    fn remove_orphans(&self) {
+        // Without all the ports nobody can say whose is missing.
+        let Ok(ports) = self.ports() else {
+            return;
+        };
+        for file in files_in(Path::new(SHM)) {
+            let name = file.file_name();
+            let name = name.to_string_lossy();
+            let ends = name
+                .strip_prefix(&self.prefix())
+                .and_then(|name| name.strip_suffix(".connection"))
+                .map(|name| name.rsplitn(3, '_'));
+            let Some(mut ends) = ends else {
+                continue;
+            };
+            if let (Some(receiver), Some(sender)) = (ends.next(), ends.next())
+                && [sender, receiver].iter().any(|port| !ports.contains(*port))
+            {
+                // Met again next time if it fails.
+                let _ = std::fs::remove_file(file.path());
+            }
+        }
+    }
+
+    /// The ports of all nodes, dead ones too.
+    fn ports(&self) -> std::io::Result<HashSet<String>> {
+        let mut ports = HashSet::new();
+        for node in std::fs::read_dir(self.config.root.join("nodes"))? {
+            let node = node?;
+            if !node.file_type()?.is_dir() {
+                continue;
+            }
+            let tags = match std::fs::read_dir(node.path()) {
+                Ok(tags) => tags,
+                // It leaves just now.
+                Err(e) if e.kind() == std::io::ErrorKind::NotFound => continue,
+                Err(e) => return Err(e),
+            };
+            for tag in tags {
+                let name = tag?.file_name();
+                let name = name.to_string_lossy();
+                let port = name.strip_suffix(".port_tag");
+                let port = port.and_then(|name| name.rsplit('_').next());
+                ports.extend(port.map(str::to_owned));
+            }
+        }
+        Ok(ports)
     }
 
     fn services(&self) -> PathBuf {

@@ -412,6 +412,57 @@ fn a_tool_removes_what_the_dead_have_left() {
     assert_eq!(place.traces(), Vec::<String>::new());
 }
 
+/// What iceoryx2 leaves of a connection whose maker was killed before it said which end it is: a
+/// file whose state is that of no end, so that neither is the last to go.
+#[test]
+fn a_connection_that_nobody_has_an_end_of_is_removed() {
+    let place = Place::new();
+    let ((sender, sent), (receiver, got)) = (place.listening(), place.listening());
+    let exchange = || {
+        let one = attempt();
+        let content = vec![1; 5000].into();
+        sender
+            .dispatch(one, &receiver.location(), parcel(content))
+            .unwrap();
+        wait_for("answer", || sent.conclusion_of(one).is_some());
+        assert_eq!(
+            sent.conclusion_of(one),
+            Some(Conclusion::Answered(Answer::Accepted))
+        );
+    };
+    exchange();
+    let connections = || {
+        let mut found = place.traces();
+        found.retain(|file| file.ends_with(".connection"));
+        found.sort();
+        found
+    };
+    let of_the_living = connections();
+    assert_eq!(of_the_living.len(), 2);
+    for file in &of_the_living {
+        // The end of somebody who is gone in place of the second, then of the first.
+        let name = file.strip_suffix(".connection").unwrap();
+        let (first, _) = name.rsplit_once('_').unwrap();
+        let (front, _) = first.rsplit_once('_').unwrap();
+        for orphan in [
+            format!("{first}_77.connection"),
+            format!("{front}_77_78.connection"),
+        ] {
+            std::fs::write(orphan, vec![0; 49_220]).unwrap();
+        }
+    }
+    assert!(connections().len() > 2);
+    cleanup_dead(&place.config()).unwrap();
+    assert_eq!(connections(), of_the_living);
+    exchange();
+    // What it holds is content in the sender's memory.
+    drop(got.arrived.lock().unwrap().split_off(0));
+    sender.close();
+    receiver.close();
+    drop((sender, receiver));
+    assert_eq!(place.traces(), Vec::<String>::new());
+}
+
 #[test]
 fn whoever_starts_later_removes_it_too() {
     let place = Place::new();
