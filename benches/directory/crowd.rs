@@ -13,7 +13,11 @@ use tokio::runtime::{Builder, Runtime};
 const AGENTS: usize = 500;
 /// Announcements are repeated for some seconds.
 const SETTLING: Duration = Duration::from_secs(15);
-const IDLE: Duration = Duration::from_secs(30);
+/// Records are asked for again before their two minutes are over, so each window is longer than
+/// that; later, questions for everything become rarer.
+const IDLE: Duration = Duration::from_secs(130);
+/// The peak is that of parts this long.
+const PART: Duration = Duration::from_secs(5);
 const WATCHDOG: Duration = Duration::from_secs(120);
 
 /// Measures, within namespaces of its own, and prints.
@@ -34,14 +38,32 @@ pub(crate) fn measure() {
         "2 hosts x {AGENTS} agents: registered after {there:.1?}, complete mutual view after {seen:.1?}"
     );
     std::thread::sleep(SETTLING);
-    let before: Vec<Spent> = network.hosts().iter().map(Spent::of).collect();
-    let since = Instant::now();
-    std::thread::sleep(IDLE);
+    for window in 1..=2 {
+        idle(&network, window);
+    }
+}
+
+/// What the hosts use when nothing happens.
+fn idle(network: &Network, window: u32) {
+    let look = || -> Vec<Spent> { network.hosts().iter().map(Spent::of).collect() };
+    let (before, since) = (look(), Instant::now());
+    let mut peaks = vec![0.0_f64; before.len()];
+    let (mut part, mut of_part) = (Instant::now(), look());
+    while since.elapsed() < IDLE {
+        std::thread::sleep(PART);
+        let (now, seconds) = (look(), part.elapsed().as_secs_f64());
+        part = Instant::now();
+        for ((peak, before), now) in peaks.iter_mut().zip(&of_part).zip(&now) {
+            *peak = peak.max((now.bytes - before.bytes) as f64 / seconds / 1000.0);
+        }
+        of_part = now;
+    }
     let seconds = since.elapsed().as_secs_f64();
-    for (host, before) in network.hosts().iter().zip(before) {
-        let after = Spent::of(host);
+    for (((host, before), after), peak) in network.hosts().iter().zip(before).zip(look()).zip(peaks)
+    {
         println!(
-            "idle, {}: {:.2} % of a core, {:.2} kB/s sent in {:.1} packets/s",
+            "idle, window {window} of {seconds:.0} s, {}: {:.2} % of a core, {:.2} kB/s sent in {:.1} \
+             packets/s, at most {peak:.1} kB/s over 5 s",
             host.name(),
             (after.cpu - before.cpu).as_secs_f64() / seconds * 100.0,
             (after.bytes - before.bytes) as f64 / seconds / 1000.0,

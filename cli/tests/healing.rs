@@ -11,8 +11,8 @@ use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 use fipa::config::Sources;
-use fipa::{Agent, AgentId, Config, Domain, Performative, Role};
-use fipa_testbed::{Host, Network, Running, enter, isolated};
+use fipa::{Agent, AgentId, Config, Domain, Incarnation, Performative, Role};
+use fipa_testbed::{Ghost, Host, Network, Running, enter, isolated};
 use tokio::runtime::{Builder, Runtime};
 
 const WATCHDOG: Duration = Duration::from_secs(90);
@@ -63,16 +63,30 @@ fn inside_processes_agree_after_every_healing() {
         );
     }
 
-    // Killed: no goodbye. Who writes to an agent behind it is told, and nobody believes in it any
-    // more.
+    // Killed: no goodbye. Its beacons go on, so that who only listens believes in it. Who writes
+    // to an agent behind it is told, and does not believe in it any more.
     robots[2].change_to(0, true);
     agree(&robots);
-    robots[2].gateway = None;
-    let killed = Instant::now();
     let gone = robots[2].agents.keys().next().unwrap().clone();
+    let gateway = robots[0].gateway_of(&gone);
+    let mut ghost = network.host(2).enter(|| {
+        let beacon = format!("{gateway}\x0d_fipa_gateway");
+        Ghost::of(&beacon, network.host(2).ipv4(), 5353)
+    });
+    robots[2].gateway = None;
+    ghost.speak();
+    let killed = Instant::now();
     robots[0].fails_to_reach(&gone);
-    until("it is noticed", || !robots[0].view().contains(&gone));
+    until("it is noticed by use", || !robots[0].view().contains(&gone));
     println!("noticed {:.1?} after it was killed", killed.elapsed());
+
+    // Who has not written notices when the beacons end.
+    drop(ghost);
+    let silent = Instant::now();
+    until("it is noticed by its silence", || {
+        !robots[1].view().contains(&gone)
+    });
+    println!("noticed {:.1?} after its last beacon", silent.elapsed());
 }
 
 /// A host with its gateway, a process of its own, and agents that come and go.
@@ -150,6 +164,12 @@ impl Robot {
         let entries = directory.entries();
         let agents = entries.iter().filter(|entry| entry.role == Role::Agent);
         agents.map(|entry| entry.name.to_string()).collect()
+    }
+
+    /// The gateway behind which this agent is.
+    fn gateway_of(&self, name: &str) -> Incarnation {
+        let entry = self.domain.directory().known(name).unwrap();
+        entry.mts.incarnation
     }
 
     fn fails_to_reach(&self, name: &str) {

@@ -80,6 +80,36 @@ pub trait Directory: Send + Sync {
         let _ = (name, incarnation);
         Err(DeregisterError::ReadOnly)
     }
+
+    /// Removes these, by name and incarnation, then registers or changes those. One that fails
+    /// does not keep the others from it.
+    fn update(&self, leaving: &[(Arc<str>, Incarnation)], joining: Vec<Registration>) -> Updated {
+        let left = leaving
+            .iter()
+            .map(|(name, incarnation)| self.deregister(name, *incarnation));
+        Updated {
+            left: left.collect(),
+            joined: joining.into_iter().map(|one| self.register(one)).collect(),
+        }
+    }
+
+    /// Whether this back end knows better than others which coalitions there are at the message
+    /// transport service of this incarnation. A [merged view](crate::MergedDirectory) then takes
+    /// them from here only: of two that each tell a merger in one go, but not at the same moment,
+    /// it would make one with a state in between.
+    fn speaks_for(&self, mts: Incarnation) -> bool {
+        let _ = mts;
+        false
+    }
+}
+
+/// What became of the parts of an [update](Directory::update), in their order.
+#[derive(Debug)]
+pub struct Updated {
+    /// Of those that were to be removed.
+    pub left: Vec<Result<(), DeregisterError>>,
+    /// Of those that were to be registered.
+    pub joined: Vec<Result<Arc<Entry>, RegisterError>>,
 }
 
 /// Why an agent was not registered.

@@ -38,7 +38,7 @@ mod watch;
 
 pub use coalition::{Members, MembersError};
 pub use contacts::ContactDirectory;
-pub use directory::{DeregisterError, Directory, RegisterError};
+pub use directory::{DeregisterError, Directory, RegisterError, Updated};
 pub use entry::{Entry, EntryError, Mts, Reach, Registration, Role, Source};
 pub use exchange::{EXCHANGE_ONTOLOGY, Exchange, ExchangeDirectory, ExchangeError};
 pub use host::{Departures, HostConfig, HostDirectory, HostError, SocketId};

@@ -7,7 +7,7 @@ use arc_swap::ArcSwapOption;
 use fipa_transport::Incarnation;
 
 use crate::{
-    Change, DeregisterError, Directory, Entry, RegisterError, Registration, Subscriber, Watch,
+    Change, DeregisterError, Directory, Entry, RegisterError, Registration, Role, Subscriber, Watch,
 };
 
 /// Several directories as one.
@@ -78,8 +78,11 @@ impl Directory for MergedDirectory {
         // Taken before reading: what changes meanwhile is read again next time.
         let generations = self.generations().collect();
         let mut merged: HashMap<Arc<str>, Arc<Entry>> = HashMap::new();
-        for one in self.back_ends.iter() {
+        for (at, one) in self.back_ends.iter().enumerate() {
             for entry in one.entries().iter() {
+                if !counts(&self.back_ends, at, entry) {
+                    continue;
+                }
                 let better = merged
                     .get(&entry.name)
                     .is_none_or(|holder| entry.precedes(holder));
@@ -117,6 +120,10 @@ impl Directory for MergedDirectory {
         watch.merging(MergedView::new(&self.back_ends))
     }
 
+    fn speaks_for(&self, mts: Incarnation) -> bool {
+        self.back_ends.iter().any(|one| one.speaks_for(mts))
+    }
+
     fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {
         if let Some(holder) = self.lookup(&registration.name)
             && holder.incarnation != registration.incarnation
@@ -144,8 +151,22 @@ impl Directory for MergedDirectory {
 }
 
 fn holder(back_ends: &[Arc<dyn Directory>], name: &str) -> Option<Arc<Entry>> {
-    let claims = back_ends.iter().filter_map(|one| one.known(name));
+    let claims = back_ends.iter().enumerate().filter_map(|(at, one)| {
+        let entry = one.known(name)?;
+        counts(back_ends, at, &entry).then_some(entry)
+    });
     claims.reduce(|best, next| if next.precedes(&best) { next } else { best })
+}
+
+/// Whether what that back end says counts: of coalitions, what the one that
+/// [speaks](Directory::speaks_for) for their message transport service says.
+fn counts(back_ends: &[Arc<dyn Directory>], at: usize, entry: &Entry) -> bool {
+    if !matches!(entry.role, Role::Coalition(_)) {
+        return true;
+    }
+    let mts = entry.mts.incarnation;
+    let speaker = back_ends.iter().position(|one| one.speaks_for(mts));
+    speaker.is_none_or(|speaker| speaker == at)
 }
 
 /// What a watcher of a merged view has been told so far.
@@ -201,5 +222,81 @@ impl MergedView {
                 }
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Members, MemoryDirectory, Mts, Query};
+
+    /// A back end that speaks for everybody.
+    struct Speaker(MemoryDirectory);
+
+    impl Directory for Speaker {
+        fn known(&self, name: &str) -> Option<Arc<Entry>> {
+            self.0.known(name)
+        }
+
+        fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
+            self.0.known_incarnation(incarnation)
+        }
+
+        fn entries(&self) -> Arc<[Arc<Entry>]> {
+            self.0.entries()
+        }
+
+        fn generation(&self) -> u64 {
+            self.0.generation()
+        }
+
+        fn subscribe(&self, subscriber: &Subscriber) {
+            self.0.subscribe(subscriber);
+        }
+
+        fn speaks_for(&self, _: Incarnation) -> bool {
+            true
+        }
+    }
+
+    fn team(members: &[&str]) -> Registration {
+        let members = Members::new(members.iter().copied(), None).unwrap();
+        Registration {
+            role: Role::Coalition(members),
+            registered: std::time::UNIX_EPOCH,
+            ..Registration::new("team", Incarnation::from_u64(7), Vec::new())
+        }
+    }
+
+    #[test]
+    fn coalitions_are_taken_from_who_speaks_for_them() {
+        let mts = Mts::new("mts", Incarnation::from_u64(1));
+        let first = Arc::new(MemoryDirectory::new(mts.clone()));
+        let speaker = Arc::new(Speaker(MemoryDirectory::new(mts)));
+        let merged = MergedDirectory::new(vec![first.clone(), speaker.clone()]);
+        let mut watch = merged.watch();
+        // The other is ahead, and then behind.
+        let before = speaker.0.register(team(&["a"])).unwrap();
+        assert_eq!(watch.try_next(), Some(Change::Joined(Arc::clone(&before))));
+        first.register(team(&["a", "b"])).unwrap();
+        assert_eq!(watch.try_next(), None);
+        assert_eq!(merged.known("team"), Some(Arc::clone(&before)));
+        assert_eq!(merged.search(&Query::all()), [Arc::clone(&before)]);
+        let after = speaker.0.register(team(&["a", "b", "c"])).unwrap();
+        let changed = Change::Changed {
+            before,
+            after: Arc::clone(&after),
+        };
+        assert_eq!(watch.try_next(), Some(changed));
+        let id = after.incarnation;
+        speaker.0.deregister("team", id).unwrap();
+        assert_eq!(watch.try_next(), Some(Change::Left(after)));
+        assert_eq!(merged.known("team"), None);
+        first.deregister("team", id).unwrap();
+        assert_eq!(watch.try_next(), None);
+        // Agents are there as long as anybody knows them.
+        let agent = Registration::new("arm", Incarnation::from_u64(8), Vec::new());
+        first.register(agent).unwrap();
+        assert!(merged.known("arm").is_some());
     }
 }

@@ -4,7 +4,8 @@ use std::fmt;
 
 use regex::{Regex, RegexBuilder};
 
-use crate::{Entry, MAX_NAME};
+use crate::entry::{millis_of_time, time_of_millis};
+use crate::{Entry, MAX_NAME, Role};
 
 /// Whether a name that nobody has is a pattern: it contains one of `* + ? [ ( { | ^ $ \`.
 ///
@@ -134,6 +135,13 @@ pub struct Query {
     pub location: Option<Matcher>,
     /// Matches [`Entry::description`].
     pub description: Option<Matcher>,
+    /// Matches the name of the message transport service in [`Entry::mts`].
+    pub mts: Option<Matcher>,
+    /// Matches [`Entry::registered`], written in UTC with milliseconds as RFC 3339 has it:
+    /// `2026-03-01T09:30:00.000Z`.
+    pub registered: Option<Matcher>,
+    /// Matches one of the [`Members`](crate::Members) of a coalition; nobody else has any.
+    pub member: Option<Matcher>,
 }
 
 impl Query {
@@ -166,6 +174,21 @@ impl Query {
                     matcher.matches(&format!("{}://{}", location.kind(), location.address()))
                 })
             })
+            && matches(&self.mts, &entry.mts.name)
+            && self.registered.as_ref().is_none_or(|matcher| {
+                // Within the years that can be written.
+                let time = time_of_millis(millis_of_time(entry.registered));
+                matcher.matches(&humantime::format_rfc3339_millis(time).to_string())
+            })
+            && self
+                .member
+                .as_ref()
+                .is_none_or(|matcher| match &entry.role {
+                    Role::Coalition(members) => {
+                        members.names().iter().any(|name| matcher.matches(name))
+                    }
+                    _ => false,
+                })
     }
 }
 

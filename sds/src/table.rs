@@ -156,21 +156,28 @@ impl<O: Clone + Eq + Hash> Table<O> {
         true
     }
 
-    /// Puts in what an origin of one entry says now, in place of what it said before.
+    /// Puts in what origins of one entry each say now, in place of what they said before, in one
+    /// go.
     #[cfg(feature = "mdns")]
-    pub(crate) fn replace(&self, origin: &O, entry: Option<Arc<Entry>>) {
+    pub(crate) fn replace(&self, updates: impl IntoIterator<Item = (O, Option<Arc<Entry>>)>) {
         let mut index = self.index.write();
-        let before = index.origins.get(origin).cloned();
-        if let Some(name) = before
-            && entry.as_ref().is_none_or(|entry| entry.name != name)
-        {
-            self.apply(&mut index, origin.clone(), name, None);
-            index.origins.remove(origin);
+        let mut together = Vec::new();
+        for (origin, entry) in updates {
+            let before = index.origins.remove(&origin);
+            if let Some(name) = before
+                && entry.as_ref().is_none_or(|entry| entry.name != name)
+            {
+                let change = index.change(origin.clone(), name, None);
+                self.tell_or_keep(change, &mut together);
+            }
+            if let Some(entry) = entry {
+                let name = entry.name.clone();
+                index.origins.insert(origin.clone(), name.clone());
+                let change = index.change(origin, name, Some(entry));
+                self.tell_or_keep(change, &mut together);
+            }
         }
-        if let Some(entry) = entry {
-            index.origins.insert(origin.clone(), entry.name.clone());
-            self.apply(&mut index, origin.clone(), entry.name.clone(), Some(entry));
-        }
+        self.tell(Change::together(together));
     }
 
     /// Whether the origin has said anything, by [`replace`](Self::replace).
@@ -197,15 +204,20 @@ impl<O: Clone + Eq + Hash> Table<O> {
         updates: impl IntoIterator<Item = (O, Arc<str>, Option<Arc<Entry>>)>,
     ) {
         let mut index = self.index.write();
-        // Coalitions that change together are told together: a merger has no state in between.
         let mut together = Vec::new();
         for (origin, name, entry) in updates {
-            match index.change(origin, name, entry) {
-                Some(change) if change.of_coalition() => together.push(change),
-                change => self.tell(change),
-            }
+            let change = index.change(origin, name, entry);
+            self.tell_or_keep(change, &mut together);
         }
         self.tell(Change::together(together));
+    }
+
+    /// Coalitions that change together are told together: a merger has no state in between.
+    fn tell_or_keep(&self, change: Option<Change>, together: &mut Vec<Change>) {
+        match change {
+            Some(change) if change.of_coalition() => together.push(change),
+            change => self.tell(change),
+        }
     }
 
     /// Watchers are told under the lock, so that they are told in the order in which it happened.

@@ -5,11 +5,15 @@
 
 mod common;
 
-use std::net::UdpSocket;
+use std::collections::BTreeMap;
+use std::net::{Ipv4Addr, UdpSocket};
 use std::time::{Duration, UNIX_EPOCH};
 
 use common::{conforms, eventually, next, registration};
-use fipa_sds::{Change, Directory, MdnsConfig, MdnsDirectory, Mts, Reach, RegisterError, Source};
+use fipa_sds::{
+    Change, Directory, MdnsConfig, MdnsDirectory, Members, Mts, Reach, RegisterError, Role, Source,
+};
+use fipa_testbed::{Ghost, Running};
 use fipa_transport::{Incarnation, Location};
 
 /// A port that nobody else uses, so that tests do not see each other.
@@ -130,6 +134,64 @@ async fn different_names_may_share_a_label() {
     assert_eq!((one.status().announced, two.status().announced), (1, 1));
 }
 
+/// A gateway that splits a coalition and merges the parts, over and over, as the other one tells it
+/// to those who watch: all members belong to exactly one coalition all the time.
+#[tokio::test(flavor = "multi_thread")]
+async fn mergers_and_splits_are_seen_in_one_go() {
+    let port = free_port();
+    let (one, two) = (open(port, "one"), open(port, "two"));
+    let mut watch = two.watch();
+    let ids = [Incarnation::random(), Incarnation::random()];
+    let coalition = |name: &str, id, members: &[&str]| {
+        let mut coalition = registration(name);
+        coalition.incarnation = id;
+        coalition.role = Role::Coalition(Members::new(members.iter().copied(), None).unwrap());
+        coalition
+    };
+    let whole = coalition("Whole", ids[0], &["a", "b", "c"]);
+    let registered = one.update(&[], vec![whole.clone()]);
+    assert!(registered.joined[0].is_ok());
+    let mut seen: BTreeMap<String, Vec<String>> = BTreeMap::new();
+    let mut look = async |until: usize| {
+        while seen.len() != until {
+            let change = next(&mut watch).await;
+            for single in change.single() {
+                match single {
+                    Change::Joined(entry) | Change::Changed { after: entry, .. } => {
+                        let Role::Coalition(members) = &entry.role else {
+                            continue;
+                        };
+                        let names = members.names().iter().map(ToString::to_string);
+                        seen.insert(entry.name.to_string(), names.collect());
+                    }
+                    Change::Left(entry) => drop(seen.remove(&*entry.name)),
+                    other => panic!("{other:?}"),
+                }
+            }
+            let mut members: Vec<&str> = seen.values().flatten().map(String::as_str).collect();
+            members.sort_unstable();
+            assert_eq!(members, ["a", "b", "c"], "{seen:?}");
+        }
+    };
+    look(1).await;
+    for round in 0..2 {
+        // The part has another name each time: a label that was just given up rests.
+        let part = format!("Part {round}");
+        let rest = coalition("Whole", ids[0], &["b", "c"]);
+        let parting = coalition(&part, ids[1], &["a"]);
+        let split = one.update(&[], vec![rest, parting]);
+        assert!(split.joined.iter().all(Result::is_ok), "{split:?}");
+        look(2).await;
+        let merged = one.update(&[(part.into(), ids[1])], vec![whole.clone()]);
+        assert!(merged.left[0].is_ok() && merged.joined[0].is_ok());
+        look(1).await;
+    }
+    // Its end is seen at once, though it comes without a beacon of its own to follow.
+    one.close();
+    assert!(matches!(next(&mut watch).await, Change::Left(_)));
+    assert_eq!(two.entries().len(), 0);
+}
+
 #[tokio::test]
 async fn large_entries_are_announced_and_too_large_ones_refused() {
     let port = free_port();
@@ -157,23 +219,41 @@ async fn large_entries_are_announced_and_too_large_ones_refused() {
     }
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread")]
 async fn a_gateway_that_vanished_is_noticed_by_verification() {
     let port = free_port();
     let two = open(port, "two");
-    // Announced by hand, by somebody who then ends without a goodbye.
-    let mut peer = std::process::Command::new(std::env::current_exe().unwrap())
-        .args(["--exact", "announcing_process", "--ignored", "-q"])
-        .env("FIPA_SDS_TEST_PORT", port.to_string())
-        .spawn()
-        .unwrap();
-    let found = eventually("the other process", || two.lookup("Arm")).await;
-    assert_eq!(&*found.mts.name, "elsewhere");
-    peer.kill().unwrap();
-    peer.wait().unwrap();
+    let (peer, gateway) = announcing(port, &two).await;
+    // Its beacons go on, so that they cannot be what is noticed.
+    let mut ghost = Ghost::of(&gateway, Ipv4Addr::LOCALHOST, port);
+    drop(peer);
+    ghost.speak();
     assert!(two.lookup("Arm").is_some());
     two.verify("Arm");
     eventually("gone", || two.lookup("Arm").is_none().then_some(())).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_gateway_that_vanished_is_noticed_by_its_silence() {
+    let port = free_port();
+    let two = open(port, "two");
+    let (peer, _) = announcing(port, &two).await;
+    drop(peer);
+    // Nobody asks for it, and its record is good for two minutes.
+    eventually("gone", || two.lookup("Arm").is_none().then_some(())).await;
+}
+
+/// A process that announces an agent, has been found, and ends without a goodbye when dropped; and
+/// the label of its beacons.
+async fn announcing(port: u16, by: &MdnsDirectory) -> (Running, String) {
+    let mut process = std::process::Command::new(std::env::current_exe().unwrap());
+    let process = process
+        .args(["--exact", "announcing_process", "--ignored", "-q"])
+        .env("FIPA_SDS_TEST_PORT", port.to_string());
+    let peer = Running::start(process);
+    let found = eventually("the other process", || by.lookup("Arm")).await;
+    assert_eq!(&*found.mts.name, "elsewhere");
+    (peer, format!("{}\x0d_fipa_gateway", found.mts.incarnation))
 }
 
 #[test]

@@ -121,10 +121,13 @@ impl Keeper {
         let (agents, _) = own_agents(&self.publisher.host, &*self.publisher.known);
         let mine: HashMap<&Arc<str>, &Arc<Entry>> =
             agents.iter().map(|entry| (&entry.name, entry)).collect();
+        // Who is the same agent changes in place, without having been away.
+        let mut leaving = Vec::new();
         self.announced.retain(|name, entry| {
-            let stays = mine.get(name).is_some_and(|now| ***now == **entry);
-            if !stays && let Err(error) = network.deregister(name, entry.incarnation) {
-                tracing::debug!(%name, %error, "was not announced any more");
+            let now = mine.get(name);
+            let stays = now.is_some_and(|now| now.incarnation == entry.incarnation);
+            if !stays {
+                leaving.push((Arc::clone(name), entry.incarnation));
             }
             stays
         });
@@ -134,23 +137,39 @@ impl Keeper {
             .filter(|location| location.kind() != Kind::Shm)
             .cloned()
             .collect();
-        for (name, entry) in mine {
-            if self.announced.contains_key(name) {
-                continue;
+        let mut joining: Vec<(&Arc<str>, &Arc<Entry>)> = mine.into_iter().collect();
+        joining.retain(|(name, entry)| self.announced.get(*name) != Some(*entry));
+        if leaving.is_empty() && joining.is_empty() {
+            return;
+        }
+        let registrations = joining.iter().map(|(name, entry)| Registration {
+            agent_type: entry.agent_type.clone(),
+            description: entry.description.clone(),
+            registered: entry.registered,
+            role: entry.role.clone(),
+            ..Registration::new(Arc::clone(name), entry.incarnation, locations.clone())
+        });
+        // In one go, so that coalitions among them are seen to change together.
+        let updated = network.update(&leaving, registrations.collect());
+        for ((name, _), left) in leaving.iter().zip(updated.left) {
+            if let Err(error) = left {
+                tracing::debug!(%name, %error, "was not announced any more");
             }
-            let registration = Registration {
-                agent_type: entry.agent_type.clone(),
-                description: entry.description.clone(),
-                registered: entry.registered,
-                role: entry.role.clone(),
-                ..Registration::new(Arc::clone(name), entry.incarnation, locations.clone())
-            };
-            match network.register(registration) {
+        }
+        for ((name, entry), joined) in joining.into_iter().zip(updated.joined) {
+            match joined {
                 Ok(_) => {
                     self.announced.insert(Arc::clone(name), Arc::clone(entry));
                     self.refused.remove(name);
                 }
                 Err(error) => {
+                    // What was announced of it before is not true any more.
+                    let was = self.announced.remove(name);
+                    if let Some(was) = was
+                        && let Err(error) = network.deregister(name, was.incarnation)
+                    {
+                        tracing::debug!(%name, %error, "was not announced any more");
+                    }
                     let before = self.refused.insert(Arc::clone(name), entry.incarnation);
                     if before != Some(entry.incarnation) {
                         tracing::warn!(%name, %error, "an agent is not announced to other hosts");

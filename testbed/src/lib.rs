@@ -32,12 +32,14 @@
 #![allow(clippy::unwrap_used, clippy::print_stderr)]
 
 mod avahi;
+mod ghost;
 mod network;
 
 use std::path::PathBuf;
 use std::process::{Child, Command};
 
 pub use avahi::Avahi;
+pub use ghost::Ghost;
 pub use network::{Host, Network};
 
 /// Tells the process in the namespaces that it is there.

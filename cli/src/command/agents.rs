@@ -66,6 +66,18 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "TEXT", value_parser = Matcher::parse)]
     description: Option<Matcher>,
 
+    /// Only those that this message transport service delivers to
+    #[arg(long, value_name = "NAME", value_parser = Matcher::parse)]
+    mts: Option<Matcher>,
+
+    /// Only those registered at this time, in UTC, such as '2026-03-01T09:.*'
+    #[arg(long, value_name = "TIME", value_parser = Matcher::parse)]
+    registered: Option<Matcher>,
+
+    /// Only coalitions with this member
+    #[arg(long, value_name = "NAME", value_parser = Matcher::parse)]
+    member: Option<Matcher>,
+
     /// Only those on this host
     #[arg(long)]
     local: bool,
@@ -108,6 +120,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             agent_type: arguments.agent_type,
             location: arguments.location,
             description: arguments.description,
+            mts: arguments.mts,
+            registered: arguments.registered,
+            member: arguments.member,
         },
         local: arguments.local,
         remote: arguments.remote,

@@ -109,4 +109,9 @@ impl ExchangeDirectory {
 
 impl Directory for ExchangeDirectory {
     reads_its_table!(table);
+
+    /// What a gateway tells in letters comes at once and is all there is.
+    fn speaks_for(&self, mts: Incarnation) -> bool {
+        self.told.lock().contains_key(&mts)
+    }
 }

@@ -3,9 +3,11 @@
 //! An announcement or a goodbye is said once or twice. Who was out of range then never hears of
 //! it: the next question is asked within the hour, and a record that is gone is believed in for
 //! minutes. So every gateway says every two seconds how many agents it announces and a digest of
-//! them, in a packet of 100 bytes that old peers pass over:
+//! them, and the same of the coalitions among them, in a packet of 130 bytes that old peers pass
+//! over:
 //!
-//! `<incarnation>._fipa_gateway._udp.local. TXT "agents=500" "digest=0123456789abcdef"`
+//! `<incarnation>._fipa_gateway._udp.local. TXT "agents=500" "digest=0123456789abcdef"
+//! "coalitions=2:0123456789abcdef"`
 //!
 //! Whoever holds something else of that gateway asks the network, first for what it has not got,
 //! then for what it should not have any more. Who is not heard for some seconds is asked, too.
@@ -29,7 +31,7 @@ pub(super) const INTERVAL: Duration = Duration::from_secs(2);
 /// For how long it counts; no more than that is remembered by others' caches.
 const TTL: u32 = 10;
 /// How long a gateway that said something is silent before it is asked.
-const SILENCE: Duration = Duration::from_secs(8);
+pub(super) const SILENCE: Duration = Duration::from_secs(8);
 /// How long what is held of a gateway has to be unchanged before it is compared: what is under
 /// way need not be asked for.
 const QUIET: Duration = Duration::from_secs(1);
@@ -71,6 +73,15 @@ impl Digest {
         self.agents = self.agents.saturating_sub(other.agents);
         self.digest ^= other.digest;
     }
+}
+
+/// What a beacon says that its gateway announces.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(super) struct Announced {
+    /// All of it.
+    pub(super) all: Digest,
+    /// The coalitions, which are seen to change [together](super::together).
+    pub(super) coalitions: Digest,
 }
 
 /// What is held of one gateway, and since when.
@@ -165,19 +176,23 @@ impl Beacons {
 }
 
 /// The packet with the beacon of a gateway.
-pub(super) fn packet(gateway: Incarnation, digest: Digest) -> Option<Vec<u8>> {
+pub(super) fn packet(gateway: Incarnation, announced: Announced) -> Option<Vec<u8>> {
     let label = gateway.to_string();
     let mut labels = vec![Label::new(label.as_bytes()).ok()?];
     labels.extend(TYPE_LABELS.map(|label| Label::new_unchecked(label.as_bytes())));
-    let (agents, digest) = (
-        format!("agents={}", digest.agents),
-        format!("digest={:016x}", digest.digest),
-    );
-    let txt = TXT::new()
-        .with_string(&agents)
-        .ok()?
-        .with_string(&digest)
-        .ok()?;
+    let Announced { all, coalitions } = announced;
+    let strings = [
+        format!("agents={}", all.agents),
+        format!("digest={:016x}", all.digest),
+        format!(
+            "coalitions={}:{:016x}",
+            coalitions.agents, coalitions.digest
+        ),
+    ];
+    let mut txt = TXT::new();
+    for string in &strings {
+        txt.add_string(string).ok()?;
+    }
     let name = Name::new_with_labels(&labels);
     let record = ResourceRecord::new(name, CLASS::IN, TTL, RData::TXT(txt));
     let mut packet = Packet::new_reply(0);
@@ -187,7 +202,7 @@ pub(super) fn packet(gateway: Incarnation, digest: Digest) -> Option<Vec<u8>> {
 }
 
 /// The beacon that a packet is, if it is one.
-pub(super) fn read(packet: &[u8]) -> Option<(Incarnation, Digest)> {
+pub(super) fn read(packet: &[u8]) -> Option<(Incarnation, Announced)> {
     // Nearly all packets are none: that is seen without reading them.
     memchr::memmem::find(packet, TYPE_LABELS[0].as_bytes())?;
     if !is_plausible(packet) {
@@ -212,11 +227,18 @@ pub(super) fn read(packet: &[u8]) -> Option<(Incarnation, Digest)> {
         let found = pairs.find(|(key, _)| *key == wanted.as_bytes());
         std::str::from_utf8(found?.1?).ok()
     };
-    let digest = Digest {
-        agents: text("agents")?.parse().ok()?,
-        digest: u64::from_str_radix(text("digest")?, 16).ok()?,
+    let digest = |agents: &str, digest: &str| {
+        Some(Digest {
+            agents: agents.parse().ok()?,
+            digest: u64::from_str_radix(digest, 16).ok()?,
+        })
     };
-    (same && gateway.is_known()).then_some((gateway, digest))
+    let (coalitions, of_coalitions) = text("coalitions")?.split_once(':')?;
+    let announced = Announced {
+        all: digest(text("agents")?, text("digest")?)?,
+        coalitions: digest(coalitions, of_coalitions)?,
+    };
+    (same && gateway.is_known()).then_some((gateway, announced))
 }
 
 /// Packets that ask for all records of our type but those with these labels (RFC 6762 clause 7.1).
@@ -284,9 +306,13 @@ mod tests {
     #[test]
     fn beacons_are_read_as_they_were_written() {
         for numbers in [&[][..], &[7], &[1, 2, 3]] {
-            let written = packet(gateway(0xab), digest(numbers)).unwrap();
-            assert!(written.len() < 120, "{}", written.len());
-            assert_eq!(read(&written), Some((gateway(0xab), digest(numbers))));
+            let announced = Announced {
+                all: digest(numbers),
+                coalitions: digest(&numbers[numbers.len() / 2..]),
+            };
+            let written = packet(gateway(0xab), announced).unwrap();
+            assert!(written.len() < 150, "{}", written.len());
+            assert_eq!(read(&written), Some((gateway(0xab), announced)));
         }
         assert_eq!(read(b""), None);
         assert_eq!(read(&question([].into_iter())[0]), None);
@@ -376,8 +402,8 @@ mod tests {
 
     proptest! {
         #[test]
-        fn broken_beacons_do_no_harm(at in 0_usize..100, byte: u8) {
-            let mut written = packet(gateway(1), digest(&[1])).unwrap();
+        fn broken_beacons_do_no_harm(at in 0_usize..140, byte: u8) {
+            let mut written = packet(gateway(1), Announced::default()).unwrap();
             if let Some(broken) = written.get_mut(at) {
                 *broken = byte;
             }

@@ -3,6 +3,7 @@
 
 use std::collections::HashMap;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use super::Shared;
@@ -13,6 +14,8 @@ use super::whole::{self, QUESTIONS, Reader, Sockets};
 
 /// Up to how much is added to the time between two beacons, so that not all speak at once.
 const JITTER: Duration = Duration::from_millis(500);
+/// Least time between two beacons, however fast coalitions change.
+const BREATH: Duration = Duration::from_millis(200);
 
 pub(super) struct Ear {
     sockets: Sockets,
@@ -21,6 +24,8 @@ pub(super) struct Ear {
     known: HashMap<Arc<str>, (Properties, Option<Properties>)>,
     beacons: Beacons,
     next_beacon: Instant,
+    /// When one may be said that cannot wait until then.
+    next_urgent: Instant,
 }
 
 impl Ear {
@@ -31,6 +36,7 @@ impl Ear {
             known: HashMap::new(),
             beacons: Beacons::default(),
             next_beacon: Instant::now(),
+            next_urgent: Instant::now(),
         }
     }
 
@@ -63,13 +69,18 @@ impl Ear {
     /// Says and asks what is due, and says when there is more.
     pub(super) fn speak(&mut self, shared: &Shared) -> Option<Instant> {
         let now = Instant::now();
+        if shared.coalitions_changed.swap(false, Ordering::Relaxed) {
+            // Others wait for it.
+            self.next_beacon = self.next_beacon.min(self.next_urgent.max(now));
+        }
         if now >= self.next_beacon {
             self.next_beacon = now + beacon::INTERVAL + JITTER.mul_f64(fastrand::f64());
+            self.next_urgent = now + BREATH;
             // Interfaces come and go.
             if let Err(error) = self.sockets.refresh(&shared.config) {
                 shared.failed(format!("cannot open a multicast socket: {error}"));
             }
-            let beacon = beacon::packet(shared.config.mts.incarnation, shared.digest());
+            let beacon = beacon::packet(shared.config.mts.incarnation, shared.announced());
             self.send(beacon);
             for silent in self.beacons.silent(now) {
                 self.repair(shared, silent);
@@ -102,12 +113,13 @@ impl Ear {
     pub(super) async fn listen(&mut self, shared: &Shared) -> Vec<(Arc<str>, Properties)> {
         let packet = self.sockets.receive().await;
         let whole = self.reader.handle_packet(packet);
-        if let Some((gateway, digest)) = beacon::read(packet)
+        if let Some((gateway, said)) = beacon::read(packet)
             && gateway != shared.config.mts.incarnation
         {
             let now = Instant::now();
+            shared.show(|together| together.said(now, gateway, said.coalitions));
             let held = shared.held.lock().of(gateway);
-            if let Some(repair) = self.beacons.handle(now, gateway, digest, held) {
+            if let Some(repair) = self.beacons.handle(now, gateway, said.all, held) {
                 self.repair(shared, repair);
             }
         }

@@ -17,10 +17,12 @@ mod pace;
 mod probe;
 mod record;
 mod task;
+mod together;
 mod whole;
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use fipa_transport::Incarnation;
@@ -32,9 +34,11 @@ use self::beacon::Digest;
 use self::held::Holdings;
 use self::pace::Pace;
 pub use self::probe::{Multicast, probe};
+use self::together::{Together, Updates};
 use crate::table::Table;
 use crate::{
-    DeregisterError, Directory, Entry, Mts, RegisterError, Registration, Source, Subscriber,
+    DeregisterError, Directory, Entry, Mts, RegisterError, Registration, Role, Source, Subscriber,
+    Updated,
 };
 
 /// The type of the records, 22 characters long.
@@ -126,6 +130,8 @@ impl MdnsDirectory {
             config,
             table: Table::new(),
             held: Mutex::default(),
+            together: Mutex::default(),
+            coalitions_changed: AtomicBool::new(false),
             own: Mutex::default(),
             withdrawals: broadcast::channel(64).0,
             status: Mutex::new(MdnsStatus {
@@ -192,6 +198,14 @@ impl MdnsDirectory {
             own.agents.clear();
         }
         self.task.abort();
+        // Whose coalitions are gone, too, says so: others wait for that.
+        let (config, nothing) = (&self.shared.config, beacon::Announced::default());
+        if self.shared.daemon.is_some()
+            && let Some(beacon) = beacon::packet(config.mts.incarnation, nothing)
+            && let Err(error) = whole::send_once(config, &beacon)
+        {
+            tracing::debug!(%error, "the last beacon was not sent");
+        }
         let Ok(Some(ended)) = self.shared.ask(ServiceDaemon::shutdown) else {
             return;
         };
@@ -213,11 +227,29 @@ impl Directory for MdnsDirectory {
     /// Announces the agent. Its locations are those at which this gateway takes letters for it.
     fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {
         let entry = registration.into_entry(&self.shared.config.mts, Source::Mdns)?;
-        self.shared.register(entry)
+        self.shared.register(&mut self.shared.own.lock(), entry)
     }
 
     fn deregister(&self, name: &str, incarnation: Incarnation) -> Result<(), DeregisterError> {
-        self.shared.deregister(name, incarnation)
+        let mut own = self.shared.own.lock();
+        self.shared.deregister(&mut own, name, incarnation)
+    }
+
+    /// All in one go: coalitions among them are seen to change together.
+    fn update(&self, leaving: &[(Arc<str>, Incarnation)], joining: Vec<Registration>) -> Updated {
+        let mut own = self.shared.own.lock();
+        let left = leaving
+            .iter()
+            .map(|(name, incarnation)| self.shared.deregister(&mut own, name, *incarnation))
+            .collect();
+        let joining = joining.into_iter().map(|registration| {
+            let entry = registration.into_entry(&self.shared.config.mts, Source::Mdns)?;
+            self.shared.register(&mut own, entry)
+        });
+        Updated {
+            joined: joining.collect(),
+            left,
+        }
     }
 }
 
@@ -239,6 +271,10 @@ struct Shared {
     table: Table<Arc<str>>,
     /// The same records, by the gateways that announce them.
     held: Mutex<Holdings>,
+    /// What of that is not in the table yet.
+    together: Mutex<Together>,
+    /// Whether others are to be told at once what coalitions there are.
+    coalitions_changed: AtomicBool,
     own: Mutex<Own>,
     withdrawals: broadcast::Sender<Withdrawal>,
     status: Mutex<MdnsStatus>,
@@ -277,10 +313,17 @@ struct Announced {
     host: Incarnation,
     /// How many labels have been tried.
     attempt: u32,
-    /// When it is to be announced, if it is not yet.
+    /// When this is to be announced, if it is not yet.
     due: Option<Instant>,
     digest: Digest,
+    /// What the daemon has been told last, and when.
+    told: Option<(Instant, Digest)>,
 }
+
+/// How long a record stays as it is before it is changed again (RFC 6762 clause 8.4). It is probed
+/// for most of a second, announced twice a second apart, and only a second after that has the record
+/// before left the caches: one that came back earlier would be taken for the one that leaves.
+const SETTLING: Duration = Duration::from_secs(3);
 
 /// How long a full name rests after a goodbye.
 const REST: Duration = Duration::from_secs(1);
@@ -289,8 +332,7 @@ const REST: Duration = Duration::from_secs(1);
 const MAX_SPOILT: usize = 1024;
 
 impl Shared {
-    fn register(&self, entry: Entry) -> Result<Arc<Entry>, RegisterError> {
-        let mut own = self.own.lock();
+    fn register(&self, own: &mut Own, entry: Entry) -> Result<Arc<Entry>, RegisterError> {
         if own.closed {
             return Err(RegisterError::Closed);
         }
@@ -311,7 +353,7 @@ impl Shared {
         }
         let entry = Arc::new(entry);
         let attempt = announced.map_or(0, |announced| announced.attempt);
-        self.announce(&mut own, &entry, attempt)
+        self.announce(own, &entry, attempt)
             .map_err(|error| RegisterError::Failed(Arc::new(error)))?;
         Ok(entry)
     }
@@ -336,16 +378,22 @@ impl Shared {
         let rested = own.resting.get(&fullname).copied();
         let before = own.agents.get(&entry.name);
         let before = before.filter(|announced| announced.fullname == fullname);
-        // What is announced already is changed at once, and taken back at once.
+        let now = Instant::now();
         let turn = match before {
-            Some(_) => None,
-            None => own.pace.turn(Instant::now(), fastrand::f64()),
+            // What is announced already is changed when it has settled.
+            Some(Announced {
+                told: Some((when, _)),
+                ..
+            }) => Some(*when + SETTLING).filter(|settled| *settled > now),
+            Some(waiting) => waiting.due,
+            None => own.pace.turn(now, fastrand::f64()),
         };
-        let announced = Announced {
+        let mut announced = Announced {
             entry: Arc::clone(entry),
             digest: Digest::of(&record::encode(entry)),
             host: before.map_or_else(Incarnation::random, |announced| announced.host),
             due: rested.max(turn),
+            told: before.and_then(|announced| announced.told),
             fullname,
             attempt,
         };
@@ -353,8 +401,10 @@ impl Shared {
             self.postponed.notify_one();
         } else {
             self.tell_daemon(&announced)?;
+            announced.told = Some((now, announced.digest));
         }
         own.agents.insert(entry.name.clone(), announced);
+        self.coalition_changed(entry);
         Ok(())
     }
 
@@ -378,6 +428,7 @@ impl Shared {
         for announced in own.agents.values_mut() {
             if announced.due.is_some_and(|due| due <= now) {
                 announced.due = None;
+                announced.told = Some((now, announced.digest));
                 if let Err(error) = self.tell_daemon(announced) {
                     let name = &announced.entry.name;
                     self.failed(format!("cannot announce {name:?}: {error}"));
@@ -394,17 +445,23 @@ impl Shared {
         };
         let now = Instant::now();
         own.resting.retain(|_, until| *until > now);
-        if announced.due.is_none() {
+        if announced.told.is_some() {
             self.ask(|daemon| daemon.unregister(&announced.fullname))?;
             own.resting
                 .insert(Arc::clone(&announced.fullname), now + REST);
         }
-        own.agents.remove(name);
+        if let Some(gone) = own.agents.remove(name) {
+            self.coalition_changed(&gone.entry);
+        }
         Ok(())
     }
 
-    fn deregister(&self, name: &str, incarnation: Incarnation) -> Result<(), DeregisterError> {
-        let mut own = self.own.lock();
+    fn deregister(
+        &self,
+        own: &mut Own,
+        name: &str,
+        incarnation: Incarnation,
+    ) -> Result<(), DeregisterError> {
         if own.closed {
             return Err(DeregisterError::Closed);
         }
@@ -412,7 +469,7 @@ impl Shared {
         if announced.is_none_or(|one| one.entry.incarnation != incarnation) {
             return Err(DeregisterError::NotRegistered(name.into()));
         }
-        self.take_back(&mut own, name)
+        self.take_back(own, name)
             .map_err(|error| DeregisterError::Failed(Arc::new(error)))
     }
 
@@ -440,7 +497,17 @@ impl Shared {
     fn put(&self, fullname: &Arc<str>, entry: Option<Arc<Entry>>) {
         let now = Instant::now();
         self.held.lock().put(now, fullname, entry.as_deref());
-        self.table.replace(fullname, entry);
+        self.show(|together| together.put(now, fullname, entry));
+    }
+
+    /// Shows what is to be shown now, in one go.
+    fn show(&self, what: impl FnOnce(&mut Together) -> Updates) {
+        // Held until it is done, so that nothing overtakes.
+        let mut together = self.together.lock();
+        let updates = what(&mut together);
+        if !updates.is_empty() {
+            self.table.replace(updates);
+        }
     }
 
     /// Asks for a record, which leaves if nobody answers.
@@ -452,14 +519,28 @@ impl Shared {
         }
     }
 
-    /// What this gateway announces.
-    fn digest(&self) -> Digest {
-        let mut digest = Digest::default();
+    /// What this gateway announces; of the coalitions also what it will in a moment, because
+    /// others are to wait for that.
+    fn announced(&self) -> beacon::Announced {
+        let mut announced = beacon::Announced::default();
         let own = self.own.lock();
-        for announced in own.agents.values().filter(|one| one.due.is_none()) {
-            digest.add(announced.digest);
+        for one in own.agents.values() {
+            if let Some((_, told)) = one.told {
+                announced.all.add(told);
+            }
+            if matches!(one.entry.role, Role::Coalition(_)) {
+                announced.coalitions.add(one.digest);
+            }
         }
-        digest
+        announced
+    }
+
+    /// Others are told at once, if this is about a coalition.
+    fn coalition_changed(&self, entry: &Entry) {
+        if matches!(entry.role, Role::Coalition(_)) {
+            self.coalitions_changed.store(true, Ordering::Relaxed);
+            self.postponed.notify_one();
+        }
     }
 
     fn failed(&self, error: String) {

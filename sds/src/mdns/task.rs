@@ -52,7 +52,10 @@ async fn listen(
 ) {
     let give_up = Instant::now() + Duration::from_secs(5);
     loop {
-        let due = [shared.announce_due(), ear.speak(shared)];
+        let now = std::time::Instant::now();
+        shared.show(|together| together.handle_timeout(now));
+        let waiting = shared.together.lock().poll_timeout();
+        let due = [shared.announce_due(), ear.speak(shared), waiting];
         let due = due.into_iter().flatten().min();
         tokio::select! {
             () = shared.postponed.notified() => {}

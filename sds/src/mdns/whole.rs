@@ -270,6 +270,27 @@ impl Sockets {
     }
 }
 
+/// Sends one packet on all interfaces, for who has no sockets any more. One that fails is no reason
+/// not to send on the others.
+pub(super) fn send_once(config: &MdnsConfig, packet: &[u8]) -> io::Result<()> {
+    let mut indices = Vec::new();
+    let mut last_error = None;
+    for interface in interfaces(config)? {
+        let index = interface.index.unwrap_or_default();
+        let opened = match interface.ip() {
+            IpAddr::V4(address) => group_v4(address, config.port),
+            IpAddr::V6(_) if indices.contains(&index) => continue,
+            IpAddr::V6(_) => {
+                indices.push(index);
+                group_v6(index, config.port)
+            }
+        };
+        let sent = opened.and_then(|(socket, group)| socket.send_to(packet, group));
+        last_error = sent.err().or(last_error);
+    }
+    last_error.map_or(Ok(()), Err)
+}
+
 /// The addresses of those that are up and that the configuration names.
 pub(super) fn interfaces(config: &MdnsConfig) -> io::Result<Vec<Interface>> {
     let mut interfaces = if_addrs::get_if_addrs()?;

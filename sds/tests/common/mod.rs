@@ -5,11 +5,11 @@
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, UNIX_EPOCH};
 
 use fipa_sds::{
-    Change, DeregisterError, Directory, Entry, Matcher, Query, RegisterError, Registration, Role,
-    Watch, resolve,
+    Change, DeregisterError, Directory, Entry, Matcher, Members, Query, RegisterError,
+    Registration, Role, Watch, resolve,
 };
 use fipa_transport::Incarnation;
 
@@ -208,6 +208,9 @@ async fn searches_find(writer: &dyn Directory, reader: &dyn Directory) {
     agents[2].agent_type = "sensor".to_owned();
     agents[2].description = "sees".to_owned();
     agents[2].locations = vec!["tcp://192.0.2.7:1".parse().unwrap()];
+    agents[2].registered = UNIX_EPOCH + Duration::from_millis(1_800_000_000_120);
+    let members = Members::new(["arm_left", "camera"], None).unwrap();
+    agents[1].role = Role::Coalition(members);
     for agent in &agents {
         writer.register(agent.clone()).unwrap();
     }
@@ -218,6 +221,7 @@ async fn searches_find(writer: &dyn Directory, reader: &dyn Directory) {
         .await;
     }
     let matcher = |text| Some(Matcher::parse(text).unwrap());
+    let mts = reader.lookup("camera").unwrap().mts.name.clone();
     let all = Query::all();
     for (query, expected) in [
         (all.clone(), "arm_left arm_right camera"),
@@ -251,6 +255,55 @@ async fn searches_find(writer: &dyn Directory, reader: &dyn Directory) {
         ),
         (
             Query {
+                description: matcher("sees"),
+                ..all.clone()
+            },
+            "camera",
+        ),
+        (
+            Query {
+                location: matcher("tcp://192.0.2.7:1"),
+                ..all.clone()
+            },
+            "camera",
+        ),
+        (
+            Query {
+                registered: matcher("2027-01-15T08:00:00.120Z"),
+                ..all.clone()
+            },
+            "camera",
+        ),
+        (
+            Query {
+                registered: matcher("2027-01-15T.*"),
+                ..all.clone()
+            },
+            "camera",
+        ),
+        (
+            Query {
+                mts: Some(Matcher::Exact(mts.to_string())),
+                ..all.clone()
+            },
+            "arm_left arm_right camera",
+        ),
+        (
+            Query {
+                mts: matcher("nobody.*"),
+                ..all.clone()
+            },
+            "",
+        ),
+        (
+            Query {
+                member: matcher("arm_l.*"),
+                ..all.clone()
+            },
+            "arm_right",
+        ),
+        (
+            Query {
                 name: matcher("arm.*"),
                 agent_type: matcher("sensor"),
                 ..all
@@ -262,9 +315,10 @@ async fn searches_find(writer: &dyn Directory, reader: &dyn Directory) {
         let names: Vec<&str> = found.iter().map(|entry| &*entry.name).collect();
         assert_eq!(names.join(" "), expected);
     }
-    let multicast = resolve(reader, "arm_.*", "arm_left").unwrap();
-    let right = reader.lookup("arm_right").unwrap();
-    assert_eq!(multicast, fipa_sds::Resolution::Multicast(vec![right]));
+    // Neither the sender nor a coalition.
+    let multicast = resolve(reader, "arm_.*|camera", "arm_left").unwrap();
+    let camera = reader.lookup("camera").unwrap();
+    assert_eq!(multicast, fipa_sds::Resolution::Multicast(vec![camera]));
     for agent in &agents {
         writer.deregister(&agent.name, agent.incarnation).unwrap();
     }
