@@ -26,6 +26,8 @@
 //! listen = ["127.0.0.1:0"]            # loopback unless the owner opens it
 //! [transport.udp]
 //! listen = ["127.0.0.1:0"]            # as for tcp; letters that fit one datagram
+//! [transport.quic]
+//! listen = ["127.0.0.1:0"]            # as for tcp; always encrypted, needs security.keys
 //! [discovery]
 //! mdns = true
 //! interfaces = []                     # empty: all that listen; names or addresses otherwise
@@ -126,6 +128,8 @@ pub struct Transports {
     pub tcp: Listen,
     /// `[transport.udp]`.
     pub udp: Listen,
+    /// `[transport.quic]`; needs [`Security::keys`].
+    pub quic: Listen,
 }
 
 /// `[transport.shm]`: shared memory.
@@ -141,7 +145,7 @@ pub struct Shm {
     pub spin: Duration,
 }
 
-/// `[transport.tcp]` and `[transport.udp]`: where a network transport listens.
+/// `[transport.tcp]`, `[transport.udp]` and `[transport.quic]`: where a network transport listens.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Listen {
@@ -282,7 +286,8 @@ impl Config {
                     spin: Duration::from_micros(50),
                 },
                 tcp: loopback.clone(),
-                udp: loopback,
+                udp: loopback.clone(),
+                quic: loopback,
             },
             discovery: Discovery {
                 mdns: true,

@@ -253,6 +253,12 @@ fn transports(
             Kind::Tcp => tcp(config, role, place, incarnation, handle),
             #[cfg(feature = "net")]
             Kind::Udp => udp(config, role, place, incarnation, handle),
+            #[cfg(feature = "quic")]
+            Kind::Quic => match &role.security {
+                Some(security) => quic(config, role, security, place, incarnation, handle),
+                // On this host other processes have no keys, and no need for them.
+                None => continue,
+            },
             // One configuration serves all processes of a robot, whatever they were built with.
             other => {
                 tracing::debug!(kind = %other, "this program was built without it");
@@ -305,17 +311,11 @@ fn tcp(
     incarnation: Incarnation,
     handle: &Handle,
 ) -> Result<Arc<dyn Transport>, String> {
-    use fipa_transport_net::{Limits, TcpConfig, TcpTransport};
-    let max_letter = usize::try_from(config.transport.shm.max_letter).unwrap_or(usize::MAX);
-    let limits = Limits {
-        max_letter,
-        keep_alive: KEEP_ALIVE,
-        ..Limits::default()
-    };
+    use fipa_transport_net::{TcpConfig, TcpTransport};
     let config = TcpConfig {
         listen: listen(&config.transport.tcp, role),
         identity: identity(config, role, place, incarnation)?,
-        limits,
+        limits: stream_limits(config),
         #[cfg(feature = "secure")]
         security: role.security.clone(),
     };
@@ -337,6 +337,35 @@ fn udp(
         limits: UdpLimits::default(),
     };
     Ok(Arc::new(UdpTransport::new(config, handle.clone())))
+}
+
+#[cfg(feature = "quic")]
+fn quic(
+    config: &Config,
+    role: &Role<'_>,
+    security: &fipa_transport_net::secure::Security,
+    place: &Place,
+    incarnation: Incarnation,
+    handle: &Handle,
+) -> Result<Arc<dyn Transport>, String> {
+    use fipa_transport_net::{QuicConfig, QuicTransport};
+    let config = QuicConfig {
+        listen: listen(&config.transport.quic, role),
+        identity: identity(config, role, place, incarnation)?,
+        limits: stream_limits(config),
+        security: security.clone(),
+    };
+    Ok(Arc::new(QuicTransport::new(config, handle.clone())))
+}
+
+/// The limits of transports that carry letters of any size.
+#[cfg(feature = "net")]
+fn stream_limits(config: &Config) -> fipa_transport_net::Limits {
+    fipa_transport_net::Limits {
+        max_letter: usize::try_from(config.transport.shm.max_letter).unwrap_or(usize::MAX),
+        keep_alive: KEEP_ALIVE,
+        ..fipa_transport_net::Limits::default()
+    }
 }
 
 /// A gateway listens where its owner wants it, other processes for their own host.

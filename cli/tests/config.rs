@@ -104,6 +104,9 @@ listen = [\"127.0.0.1:0\"]             # default
 [transport.udp]
 listen = [\"127.0.0.1:0\"]             # default
 
+[transport.quic]
+listen = [\"127.0.0.1:0\"]             # default
+
 [discovery]
 mdns = true                          # default
 interfaces = []                      # default

@@ -83,6 +83,50 @@ on_a_network!(addresses_change, inside_addresses_change, || {
     });
 });
 
+on_a_network!(
+    /// Nothing is lost when the host that dialled has another address.
+    a_quic_peer_moves,
+    inside_a_quic_peer_moves,
+    || {
+        let fleet = Fleet::new(&Plan {
+            // Nothing stands in for it.
+            transports: &["shm", "quic"],
+            dials: Some(1),
+            ..Plan::default()
+        });
+        fleet.through(6_000, |fleet| {
+            let host = fleet.network.host(1);
+            for (from, to) in [("10.99.0.2", "10.99.0.52"), ("10.99.0.52", "10.99.0.2")] {
+                fleet.until_delivered(&[0, 1, 2]);
+                host.ip(&format!("addr del {from}/24 dev eth0"));
+                host.ip(&format!("addr add {to}/24 dev eth0"));
+                fleet.until_delivered(&[0, 1, 2]);
+            }
+            assert!(fleet.went_by(Kind::Quic), "nothing went by QUIC");
+            for (from, to) in [(0, 1), (1, 0), (1, 2), (2, 1)] {
+                assert_eq!(fleet.failed(from, to), 0, "{from} to {to}");
+            }
+        });
+    }
+);
+
+on_a_network!(quic_then_tcp_fails, inside_quic_then_tcp_fails, || {
+    let fleet = Fleet::new(&Plan {
+        transports: &["shm", "quic", "tcp"],
+        ..Plan::default()
+    });
+    fleet.through(3_000, |fleet| {
+        fleet.until_delivered(&[0, 1, 2]);
+        assert!(fleet.went_by(Kind::Quic), "nothing went by QUIC");
+        fleet.pull("udp");
+        fleet.until_delivered(&[0, 1, 2]);
+        assert!(fleet.went_by(Kind::Tcp), "nothing went by TCP");
+        fleet.lose_nothing();
+        fleet.pull("tcp");
+        fleet.until_delivered(&[0, 1, 2]);
+    });
+});
+
 on_a_network!(tcp_loses_packets, inside_tcp_loses_packets, || {
     let fleet = Fleet::new(&Plan::default());
     for of_a_hundred in [1, 10, 30] {

@@ -44,9 +44,6 @@ const MAX_OLD_PEERS: usize = 64;
 /// Most files with protocols.
 const MAX_PROTOCOLS: usize = 128;
 
-/// The transports this version of fipa has.
-const BUILT: [Kind; 3] = [Kind::Shm, Kind::Tcp, Kind::Udp];
-
 /// A value that is not allowed.
 #[derive(Debug)]
 pub(super) struct Finding {
@@ -80,6 +77,10 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
     found.listen(
         &["transport", "udp", "listen"],
         &config.transport.udp.listen,
+    );
+    found.listen(
+        &["transport", "quic", "listen"],
+        &config.transport.quic.listen,
     );
     found.interfaces(&config.discovery.interfaces);
     found.peers(&config.discovery.peers);
@@ -133,7 +134,14 @@ impl Findings {
             self.add(
                 &["mts", "transports"],
                 "lists udp, which is not encrypted, and there are keys",
-                "take udp out; tcp is encrypted when there are keys",
+                "take udp out; tcp and quic are encrypted when there are keys",
+            );
+        }
+        if !has_keys && config.mts.transports.contains(&Kind::Quic) {
+            self.add(
+                &["mts", "transports"],
+                "lists quic, which is never spoken without keys",
+                "make keys (`fipa keys init`) and set security.keys, or take quic out",
             );
         }
         if has_keys || security.insecure {
@@ -213,7 +221,10 @@ impl Findings {
             self.add(
                 path,
                 "is empty",
-                format!("list at least one of {}", built()),
+                format!(
+                    "list at least one of {}",
+                    Kind::ALL.map(Kind::name).join(", ")
+                ),
             );
         }
         if let Some(kind) = repeated(kinds) {
@@ -221,13 +232,6 @@ impl Findings {
                 path,
                 format_args!("lists {kind} twice"),
                 "list each transport once",
-            );
-        }
-        for kind in kinds.iter().filter(|kind| !BUILT.contains(kind)) {
-            self.add(
-                path,
-                format_args!("lists {kind}, which is not built yet"),
-                format!("take it out; this version of fipa has {}", built()),
             );
         }
         self.0.len() == before
@@ -386,12 +390,6 @@ impl Findings {
                 format_args!("lists {location}, which leads to no other host"),
                 "write for example tcp://10.0.0.2:7788",
             );
-        } else if !BUILT.contains(&kind) {
-            self.add(
-                path,
-                format_args!("lists {location}, but {kind} is not built yet"),
-                "write for example tcp://10.0.0.2:7788",
-            );
         } else if !has_port(location.address()) {
             self.add(
                 path,
@@ -432,10 +430,6 @@ fn has_port(address: &str) -> bool {
 fn repeated<T: Eq + Hash + Clone>(all: impl IntoIterator<Item = T>) -> Option<T> {
     let mut seen = HashSet::new();
     all.into_iter().find(|one| !seen.insert(one.clone()))
-}
-
-fn built() -> String {
-    BUILT.map(Kind::name).join(", ")
 }
 
 /// Errors of `regex` draw a picture over several lines; the last line says what is wrong.

@@ -129,6 +129,13 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::list(&config.transport.udp.listen),
     },
     Key {
+        path: &["transport", "quic", "listen"],
+        shape: Shape::List,
+        expected: ADDRESSES,
+        write: |config, value| addresses(value).map(|all| config.transport.quic.listen = all),
+        read: |config| Value::list(&config.transport.quic.listen),
+    },
+    Key {
         path: &["discovery", "mdns"],
         shape: Shape::Plain,
         expected: "true or false",

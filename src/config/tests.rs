@@ -86,6 +86,7 @@ fn every_key_is_read() {
         shm.spin = 0
         tcp.listen = ["[fe80::1%eth0]:7788", "0.0.0.0:7788"]
         udp.listen = []
+        quic.listen = ["[::1]:7789"]
         [discovery]
         mdns = false
         interfaces = ["wlan0", "10.0.0.7", "fe80::1"]
@@ -122,6 +123,7 @@ fn every_key_is_read() {
         ["[fe80::1%eth0]:7788", "0.0.0.0:7788"]
     );
     assert!(config.transport.udp.listen.is_empty());
+    assert_eq!(config.transport.quic.listen, ["[::1]:7789"]);
     assert!(!config.discovery.mdns);
     assert_eq!(config.security.keys, "/etc/fipa/keys");
     assert!(config.security.loopback && !config.security.insecure);
@@ -269,6 +271,9 @@ spin = "50us"                        # default
 listen = ["127.0.0.1:0"]             # default
 
 [transport.udp]
+listen = ["127.0.0.1:0"]             # default
+
+[transport.quic]
 listen = ["127.0.0.1:0"]             # default
 
 [discovery]

@@ -3,6 +3,8 @@
 //! * [`TcpTransport`] carries parcels in frames over one persistent connection per peer, and takes
 //!   the unframed letters of old peers on the same port.
 //! * [`UdpTransport`] carries parcels that fit one datagram, acknowledged.
+//! * [`QuicTransport`] (feature `quic`) carries parcels in the same frames over QUIC, each in a
+//!   stream of its own.
 //!
 //! Each has a module tree of its own. Beside them stands what they share: who is there
 //! ([`Identity`]) and how they introduce themselves (`hello`), addresses as text (`address`), how
@@ -16,6 +18,8 @@ mod answer;
 mod end;
 mod hello;
 mod identity;
+#[cfg(feature = "quic")]
+mod quic;
 #[cfg(feature = "secure")]
 pub mod secure;
 mod seldom;
@@ -23,5 +27,7 @@ mod tcp;
 mod udp;
 
 pub use identity::Identity;
+#[cfg(feature = "quic")]
+pub use quic::{QuicConfig, QuicTransport};
 pub use tcp::{Counters, Limits, TcpConfig, TcpTransport};
 pub use udp::{UdpConfig, UdpCounters, UdpLimits, UdpTransport};

@@ -1,4 +1,4 @@
-//! The rules of every transport, kept by TCP and UDP on loopback, over IPv4 and IPv6.
+//! The rules of every transport, kept by TCP, UDP and QUIC on loopback, over IPv4 and IPv6.
 #![allow(
     clippy::unwrap_used,
     reason = "a test or bench that cannot go on may panic"
@@ -140,6 +140,66 @@ mod tls {
     }
 
     fipa_transport::conformance_tests!(Tls::new("127.0.0.1:0"));
+}
+
+/// Between endpoints with one certificate.
+#[cfg(feature = "quic")]
+mod quic {
+    use std::net::UdpSocket;
+    use std::sync::Arc;
+
+    use fipa_transport::conformance::Fixture;
+    use fipa_transport::{Kind, Location, Transport};
+    use fipa_transport_net::QuicTransport;
+    use tokio::runtime::Runtime;
+
+    use super::common;
+
+    pub(super) struct Quic {
+        runtime: Runtime,
+        address: &'static str,
+        /// Connected to itself: whatever others send is refused, and nobody else gets the port.
+        nowhere: UdpSocket,
+        host: common::certificates::Host,
+    }
+
+    impl Quic {
+        pub(super) fn new(address: &'static str) -> Self {
+            let nowhere = UdpSocket::bind(address).unwrap();
+            nowhere.connect(nowhere.local_addr().unwrap()).unwrap();
+            Self {
+                runtime: common::runtime(),
+                address,
+                nowhere,
+                host: common::certificates::Host::new(common::NAME, &[]),
+            }
+        }
+    }
+
+    impl Fixture for Quic {
+        fn endpoint(&self) -> Arc<dyn Transport> {
+            let security = self.host.security(&[&self.host]);
+            let config = common::quic_config(&[self.address], security);
+            Arc::new(QuicTransport::new(config, self.runtime.handle().clone()))
+        }
+
+        fn nowhere(&self) -> Location {
+            let address = self.nowhere.local_addr().unwrap().to_string();
+            Location::new(Kind::Quic, &address).unwrap()
+        }
+    }
+}
+
+#[cfg(feature = "quic")]
+mod quic_ipv4 {
+    use super::quic::Quic;
+    fipa_transport::conformance_tests!(Quic::new("127.0.0.1:0"));
+}
+
+#[cfg(feature = "quic")]
+mod quic_ipv6 {
+    use super::quic::Quic;
+    fipa_transport::conformance_tests!(Quic::new("[::1]:0"));
 }
 
 mod tcp_ipv6 {

@@ -14,25 +14,81 @@ use std::time::{Duration, SystemTime};
 use common::certificates::Host;
 use common::{NAME, Party, accepted, config, letter_parcel, parcel, until};
 use fipa_acl::{AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter};
-use fipa_transport::{Answer, Conclusion, FailureReason, WayFault};
+use fipa_transport::{Answer, Conclusion, FailureReason, Transport, WayFault};
 use fipa_transport_net::secure::{Rules, Security};
+use fipa_transport_net::{Counters, TcpTransport};
+
+/// A transport over which peers prove who they are.
+trait Proving: Transport + Sized {
+    fn party(security: Security) -> Party<Self>;
+
+    fn counters(&self) -> Counters;
+}
+
+impl Proving for TcpTransport {
+    fn party(security: Security) -> Party {
+        let mut config = config(&["127.0.0.1:0"]);
+        config.security = Some(security);
+        Party::with(config)
+    }
+
+    fn counters(&self) -> Counters {
+        self.counters()
+    }
+}
+
+#[cfg(feature = "quic")]
+impl Proving for fipa_transport_net::QuicTransport {
+    fn party(security: Security) -> Party<Self> {
+        let config = common::quic_config(&["127.0.0.1:0"], security);
+        Party::over(common::Recorder::default(), |runtime| {
+            Self::new(config, runtime)
+        })
+    }
+
+    fn counters(&self) -> Counters {
+        self.counters()
+    }
+}
+
+/// Each of these is a test over TCP and over QUIC.
+macro_rules! over_both {
+    ($($name:ident,)*) => {
+        mod tcp {
+            $(#[test] fn $name() { super::$name::<fipa_transport_net::TcpTransport>(); })*
+        }
+
+        #[cfg(feature = "quic")]
+        mod quic {
+            $(#[test] fn $name() { super::$name::<fipa_transport_net::QuicTransport>(); })*
+        }
+    };
+}
+
+over_both! {
+    peers_that_trust_each_other_exchange_letters_of_any_size,
+    strangers_are_refused_on_either_side,
+    certificates_that_do_not_hold_now_are_refused,
+    who_proved_one_name_cannot_take_another,
+    a_peer_speaks_for_its_own_agents_only,
+    withdrawn_trust_ends_the_connection,
+    a_new_key_takes_over_while_letters_pass,
+}
 
 fn party(security: Security) -> Party {
-    let mut config = config(&["127.0.0.1:0"]);
-    config.security = Some(security);
-    Party::with(config)
+    TcpTransport::party(security)
 }
 
 /// Both know each other.
-fn friends(left: &Host, right: &Host) -> (Party, Party) {
+fn friends<T: Proving>(left: &Host, right: &Host) -> (Party<T>, Party<T>) {
     (
-        party(left.security(&[right])),
-        party(right.security(&[left])),
+        T::party(left.security(&[right])),
+        T::party(right.security(&[left])),
     )
 }
 
 /// No letter gets from the one to the other, and nothing has arrived.
-fn assert_refused(from: &Party, to: &Party) -> String {
+fn assert_refused<T: Transport>(from: &Party<T>, to: &Party<T>) -> String {
     from.send(1, to.location(), parcel(1, "let me in")).unwrap();
     let Conclusion::NotSent(error) = from.conclusion(1) else {
         panic!("it was sent: {:?}", from.conclusion(1));
@@ -57,10 +113,9 @@ fn letter_from(sender: &str) -> Letter {
     Letter::new(envelope.encode_standard().unwrap(), message)
 }
 
-#[test]
-fn peers_that_trust_each_other_exchange_letters_of_any_size() {
+fn peers_that_trust_each_other_exchange_letters_of_any_size<T: Proving>() {
     let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
-    let (from, to) = friends(&rover, &crex);
+    let (from, to) = friends::<T>(&rover, &crex);
     from.assert_reaches(1, &to);
     let large = vec![7; 5 << 20];
     from.send(2, to.location(), parcel(2, large.clone()))
@@ -72,19 +127,18 @@ fn peers_that_trust_each_other_exchange_letters_of_any_size() {
     assert_eq!(from.transport.counters().dialled, 1);
 }
 
-#[test]
-fn strangers_are_refused_on_either_side() {
+fn strangers_are_refused_on_either_side<T: Proving>() {
     let (rover, crex, stranger) = (
         Host::new(NAME, &[]),
         Host::new(NAME, &[]),
         Host::new(NAME, &[]),
     );
     // Nobody vouched for this certificate.
-    let to = party(crex.security(&[&rover]));
-    let from = party(stranger.security(&[&crex]));
+    let to = T::party(crex.security(&[&rover]));
+    let from = T::party(stranger.security(&[&crex]));
     assert_refused(&from, &to);
     // Whoever listens there is somebody else.
-    let from = party(rover.security(&[&stranger]));
+    let from = T::party(rover.security(&[&stranger]));
     let told = assert_refused(&from, &to);
     assert!(told.contains("UnknownIssuer"), "{told}");
     until("it was counted", || {
@@ -92,8 +146,7 @@ fn strangers_are_refused_on_either_side() {
     });
 }
 
-#[test]
-fn certificates_that_do_not_hold_now_are_refused() {
+fn certificates_that_do_not_hold_now_are_refused<T: Proving>() {
     let day = Duration::from_secs(86_400);
     let now = SystemTime::now();
     let rover = Host::new(NAME, &[]);
@@ -102,7 +155,7 @@ fn certificates_that_do_not_hold_now_are_refused() {
         (now + day, now + 2 * day, "NotValidYet"),
     ] {
         let crex = Host::valid(NAME, &[], from, until);
-        let (from, to) = friends(&rover, &crex);
+        let (from, to) = friends::<T>(&rover, &crex);
         let told = assert_refused(&from, &to);
         assert!(told.contains(what), "{told}");
         assert_refused(&to, &from);
@@ -121,19 +174,17 @@ fn a_certificate_without_its_key_is_of_no_use() {
     );
 }
 
-#[test]
-fn who_proved_one_name_cannot_take_another() {
+fn who_proved_one_name_cannot_take_another<T: Proving>() {
     let (rover, crex) = (Host::new(NAME, &[]), Host::new("somebody-else", &[]));
-    let (from, to) = friends(&rover, &crex);
+    let (from, to) = friends::<T>(&rover, &crex);
     let told = assert_refused(&from, &to);
     assert!(told.contains("somebody-else"), "{told}");
 }
 
-#[test]
-fn a_peer_speaks_for_its_own_agents_only() {
+fn a_peer_speaks_for_its_own_agents_only<T: Proving>() {
     let rover = Host::new(NAME, &["rover", "rover_*"]);
     let crex = Host::new(NAME, &["crex", "arm_1"]);
-    let (from, to) = friends(&rover, &crex);
+    let (from, to) = friends::<T>(&rover, &crex);
     for (attempt, sender) in [(1, "rover"), (2, "rover_arm")] {
         let letter = letter_parcel(attempt, letter_from(sender));
         from.send(attempt, to.location(), letter).unwrap();
@@ -153,7 +204,7 @@ fn a_peer_speaks_for_its_own_agents_only() {
     let refused = from.send(4, to.location(), stray.clone()).unwrap_err();
     assert_eq!(refused.fault, WayFault::Refused);
     // Also when the connection is only opened for it.
-    let later = party(rover.security(&[&crex]));
+    let later = T::party(rover.security(&[&crex]));
     later.send(1, to.location(), stray).unwrap();
     let Conclusion::NotSent(refused) = later.conclusion(1) else {
         panic!("{:?}", later.conclusion(1));
@@ -161,12 +212,11 @@ fn a_peer_speaks_for_its_own_agents_only() {
     assert_eq!(refused.fault, WayFault::Refused);
 }
 
-#[test]
-fn withdrawn_trust_ends_the_connection() {
+fn withdrawn_trust_ends_the_connection<T: Proving>() {
     let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
     let security = crex.security(&[&rover]);
-    let to = party(security.clone());
-    let from = party(rover.security(&[&crex]));
+    let to = T::party(security.clone());
+    let from = T::party(rover.security(&[&crex]));
     from.assert_reaches(1, &to);
     security.replace(crex.credentials(&[])).unwrap();
     until("the connection ends", || {
@@ -182,16 +232,15 @@ fn withdrawn_trust_ends_the_connection() {
     from.assert_reaches(3, &to);
 }
 
-#[test]
-fn a_new_key_takes_over_while_letters_pass() {
+fn a_new_key_takes_over_while_letters_pass<T: Proving>() {
     let (rover, crex, renewed) = (
         Host::new(NAME, &[]),
         Host::new(NAME, &[]),
         Host::new(NAME, &[]),
     );
     let security = crex.security(&[&rover]);
-    let to = party(security.clone());
-    let from = party(rover.security(&[&crex, &renewed]));
+    let to = T::party(security.clone());
+    let from = T::party(rover.security(&[&crex, &renewed]));
     from.assert_reaches(1, &to);
     security.replace(renewed.credentials(&[&rover])).unwrap();
     from.assert_reaches(2, &to);

@@ -16,6 +16,7 @@ use std::task::Poll;
 use std::time::{Duration, Instant};
 
 use fipa::config::Sources;
+use fipa::keys::{Keys, VALID};
 use fipa::{
     Agent, AgentId, Config, Deliveries, Domain, FailureReason, Kind, Outcome, Performative,
 };
@@ -41,6 +42,8 @@ pub(crate) struct Plan {
     pub(crate) transports: &'static [&'static str],
     /// `mts.deadline` of every letter.
     pub(crate) deadline: Duration,
+    /// A host of which the others are not told where it is, so that it dials them.
+    pub(crate) dials: Option<usize>,
 }
 
 impl Default for Plan {
@@ -48,7 +51,31 @@ impl Default for Plan {
         Self {
             transports: &["shm", "tcp"],
             deadline: Duration::from_secs(3),
+            dials: None,
         }
+    }
+}
+
+impl Plan {
+    /// QUIC is not spoken without.
+    fn has_keys(&self) -> bool {
+        self.transports.contains(&"quic")
+    }
+}
+
+/// The keys of a host, in the `/tmp` of this test alone.
+fn keys(at: usize) -> Keys {
+    Keys::at(format!("/tmp/keys{at}"))
+}
+
+/// Everybody trusts everybody.
+fn make_keys() {
+    for at in 0..3 {
+        keys(at).init(&format!("gateway{at}"), &[], VALID).unwrap();
+    }
+    for (at, other) in pairs() {
+        let pem = std::fs::read(keys(other).own_file()).unwrap();
+        keys(at).trust(&pem).unwrap();
     }
 }
 
@@ -91,6 +118,9 @@ impl Fleet {
         // What killed processes leave behind goes with the test.
         fipa_testbed::run("mount -t tmpfs tmpfs /tmp");
         fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
+        if plan.has_keys() {
+            make_keys();
+        }
         let network = Network::new(3);
         let accounts = Arc::new(Accounts::default());
         let parties = (0..3).map(|at| Party::new(&network, at, plan)).collect();
@@ -364,7 +394,8 @@ impl Account {
 impl Party {
     fn new(network: &Network, at: usize, plan: &Plan) -> Self {
         let host = network.host(at);
-        let peers = (0..3).filter(|other| *other != at).map(|other| {
+        let known = (0..3).filter(|other| *other != at && plan.dials != Some(*other));
+        let peers = known.map(|other| {
             let address = network.host(other).ipv4();
             let ways = plan.transports.iter().filter(|kind| **kind != "shm");
             let ways: Vec<String> = ways
@@ -377,7 +408,10 @@ impl Party {
         let mut settings = vec![
             format!("domain=host{at}"),
             "discovery.mdns=false".to_owned(),
-            "security.insecure=true".to_owned(),
+            match plan.has_keys() {
+                true => format!("security.keys={}", keys(at).dir().display()),
+                false => "security.insecure=true".to_owned(),
+            },
             format!("mts.name=gateway{at}"),
             format!("mts.transports={transports}"),
             format!("mts.deadline={}ms", plan.deadline.as_millis()),

@@ -26,8 +26,8 @@ fn mistakes_are_named_with_line_and_key() {
              (known at the top: domain, mts, transport, discovery, security, monitor, routes)",
         ),
         (
-            "[transport.quic]\nlisten = []\n",
-            "fipa.toml:1: unknown key `transport.quic`; known in [transport]: shm, tcp, udp",
+            "[transport.serial]\nlisten = []\n",
+            "fipa.toml:1: unknown key `transport.serial`; known in [transport]: shm, tcp, udp, quic",
         ),
         (
             "[mts]\nname.first = \"x\"\n",
@@ -157,7 +157,7 @@ fn mistakes_are_named_with_line_and_key() {
         ),
         (
             "[mts]\ntransports = []\n",
-            "fipa.toml:2: `mts.transports` is empty; list at least one of shm, tcp, udp",
+            "fipa.toml:2: `mts.transports` is empty; list at least one of shm, tcp, udp, quic",
         ),
         (
             "[mts]\ntransports = [\"tcp\", \"shm\", \"tcp\"]\n",
@@ -165,8 +165,8 @@ fn mistakes_are_named_with_line_and_key() {
         ),
         (
             "[mts]\ntransports = [\"shm\", \"quic\", \"tcp\"]\n",
-            "fipa.toml:2: `mts.transports` lists quic, which is not built yet; \
-             take it out; this version of fipa has shm, tcp, udp",
+            "fipa.toml:2: `mts.transports` lists quic, which is never spoken without keys; \
+             make keys (`fipa keys init`) and set security.keys, or take quic out",
         ),
         (
             "[mts]\ndeadline = \"0s\"\n",
@@ -197,13 +197,11 @@ fn mistakes_are_named_with_line_and_key() {
         ),
         (
             "[routes]\na = []\n",
-            "fipa.toml:2: `routes.a` is empty; list at least one of shm, tcp, udp",
+            "fipa.toml:2: `routes.a` is empty; list at least one of shm, tcp, udp, quic",
         ),
         (
             "[routes]\na = [\"shm\", \"quic\", \"shm\"]\n",
-            "fipa.toml:2: `routes.a` lists shm twice; list each transport once\n\
-             fipa.toml:2: `routes.a` lists quic, which is not built yet; \
-             take it out; this version of fipa has shm, tcp, udp",
+            "fipa.toml:2: `routes.a` lists shm twice; list each transport once",
         ),
         (
             "[routes]\na = [\"tcp\"]\n[mts]\ntransports = [\"shm\"]\n",
@@ -251,11 +249,6 @@ fn mistakes_are_named_with_line_and_key() {
             "[discovery.static]\ncrex = [\"shm://1\"]\n",
             "fipa.toml:2: `discovery.static.crex` lists shm://1, which leads to no other host; \
              write for example tcp://10.0.0.2:7788",
-        ),
-        (
-            "[discovery.static]\ncrex = [\"quic://10.0.0.2:7788\"]\n",
-            "fipa.toml:2: `discovery.static.crex` lists quic://10.0.0.2:7788, but quic is not built \
-             yet; write for example tcp://10.0.0.2:7788",
         ),
         (
             "[discovery.static]\ncrex = [\"tcp://10.0.0.2\"]\n",
@@ -350,8 +343,8 @@ fn mistakes_in_set_name_it() {
     );
     assert_eq!(
         error("", &["mts.transports=shm,quic"]),
-        "--set mts.transports=shm,quic: `mts.transports` lists quic, which is not built yet; \
-         take it out; this version of fipa has shm, tcp, udp"
+        "--set mts.transports=shm,quic: `mts.transports` lists quic, which is never spoken without \
+         keys; make keys (`fipa keys init`) and set security.keys, or take quic out"
     );
     assert_eq!(
         error("", &["mts=5"]),

@@ -101,13 +101,26 @@ pub(crate) async fn open(
     limits: &Limits,
     address: &str,
 ) -> Result<(TcpStream, SocketAddr), Unreachable> {
+    first(limits, address, connect).await
+}
+
+/// Has `connect` try the addresses that are meant, until one answers.
+pub(crate) async fn first<T, F>(
+    limits: &Limits,
+    address: &str,
+    connect: impl Fn(SocketAddr) -> F,
+) -> Result<T, Unreachable>
+where
+    T: Send + 'static,
+    F: Future<Output = io::Result<T>> + Send + 'static,
+{
     let target = address::target(address).map_err(|error| Unreachable(error.to_string()))?;
     let connecting = async {
         match target {
-            Target::Numeric(address) => race(vec![address]).await,
+            Target::Numeric(address) => race(vec![address], connect).await,
             Target::Named(name, port) => {
                 let found = lookup_host((name.as_str(), port)).await?;
-                race(alternating(found.take(MAX_ADDRESSES).collect())).await
+                race(alternating(found.take(MAX_ADDRESSES).collect()), connect).await
             }
         }
     };
@@ -122,7 +135,11 @@ pub(crate) async fn open(
 
 /// Connects to whichever address answers first. The next is tried when the one before has failed or
 /// has not answered for a while (RFC 8305 section 5).
-async fn race(addresses: Vec<SocketAddr>) -> io::Result<(TcpStream, SocketAddr)> {
+async fn race<T, F>(addresses: Vec<SocketAddr>, connect: impl Fn(SocketAddr) -> F) -> io::Result<T>
+where
+    T: Send + 'static,
+    F: Future<Output = io::Result<T>> + Send + 'static,
+{
     let mut last = io::Error::new(io::ErrorKind::NotFound, "the name has no address");
     let mut waiting = addresses.into_iter();
     let mut racing = JoinSet::new();
@@ -204,9 +221,11 @@ mod tests {
         let refusing = tokio::net::TcpSocket::new_v4().unwrap();
         refusing.bind("127.0.0.1:0".parse().unwrap()).unwrap();
         let refusing_at = refusing.local_addr().unwrap();
-        let (_, reached) = race(vec![silent, refusing_at, there]).await.unwrap();
+        let (_, reached) = race(vec![silent, refusing_at, there], connect)
+            .await
+            .unwrap();
         assert_eq!(reached, there);
-        assert!(race(vec![refusing_at]).await.is_err());
-        assert!(race(Vec::new()).await.is_err());
+        assert!(race(vec![refusing_at], connect).await.is_err());
+        assert!(race(Vec::new(), connect).await.is_err());
     }
 }

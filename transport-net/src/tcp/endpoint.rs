@@ -13,13 +13,15 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
-use fipa_transport::{Hop, Incarnation, Kind, Location, Sink, Ticket, WayError, WayFault};
+use fipa_transport::{
+    AttemptId, Hop, Incarnation, Kind, Location, Parcel, Sink, Ticket, WayError, WayFault,
+};
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
-use tokio::task::AbortHandle;
+use tokio::task::{AbortHandle, JoinHandle};
 
 use super::config::{Limits, TcpConfig};
-use super::connection::{Connection, Role};
+use super::connection::{Connection, Role, SendError, letter_len};
 use super::counters::{Tally, count};
 use super::courier::{self, Couriers};
 use super::link::{Link, MAX_LINKS, of_ticket};
@@ -31,6 +33,7 @@ use crate::seldom::warn_seldom;
 
 #[derive(Debug)]
 pub(crate) struct Endpoint {
+    kind: Kind,
     pub(crate) config: TcpConfig,
     pub(crate) runtime: Handle,
     /// Letters to old peers.
@@ -80,7 +83,7 @@ struct Inbound {
 }
 
 /// The connection for a location.
-pub(crate) enum Way {
+enum Way {
     /// It is there.
     There(Arc<Link>),
     /// It has just been made up and is still to be opened.
@@ -99,8 +102,10 @@ impl std::fmt::Debug for Registry {
 }
 
 impl Endpoint {
-    pub(crate) fn new(config: TcpConfig, runtime: Handle) -> Arc<Self> {
+    /// An endpoint of this kind of transport; what has been opened, it does not ask.
+    pub(crate) fn new(kind: Kind, config: TcpConfig, runtime: Handle) -> Arc<Self> {
         Arc::new(Self {
+            kind,
             config,
             runtime,
             couriers: Couriers::default(),
@@ -174,8 +179,62 @@ impl Endpoint {
         }
     }
 
+    /// Whether a parcel can be taken at all for this location.
+    pub(crate) fn check(&self, to: &Location, parcel: &Parcel) -> Result<(), WayError> {
+        if to.kind() != self.kind {
+            let detail = format!("{to} is no {} location", self.kind);
+            return Err(WayError::new(WayFault::Unreachable, detail));
+        }
+        if parcel.receiver.is_empty() || parcel.receiver.len() > Parcel::MAX_NAME {
+            let detail = "the receiver's name is empty or too long";
+            return Err(WayError::new(WayFault::Refused, detail));
+        }
+        let (len, max) = (letter_len(parcel), self.limits().max_letter);
+        if len > max as u64 {
+            let detail = format!("{len} bytes; at most {max} are taken (max_letter)");
+            return Err(WayError::new(WayFault::TooLarge, detail));
+        }
+        Ok(())
+    }
+
+    /// Sends a parcel over the connection that leads to a location. When there is none, `dial` is
+    /// to start the task of one.
+    pub(crate) fn dispatch(
+        &self,
+        attempt: AttemptId,
+        to: &Location,
+        parcel: &Parcel,
+        dial: impl Fn(Arc<Link>, Arc<dyn Sink>) -> JoinHandle<()>,
+    ) -> Result<(), WayError> {
+        loop {
+            let (link, fresh) = match self.way_to(to)? {
+                Way::There(link) => (link, None),
+                Way::ToDial(link, sink) => (link, Some(sink)),
+            };
+            let sent = link.send(attempt, parcel);
+            if let Some(sink) = fresh {
+                let task = dial(link.clone(), sink);
+                if task.is_finished() && !link.has_begun() {
+                    self.forget(&link);
+                    let detail = "the runtime of this endpoint has been shut down";
+                    return Err(WayError::new(WayFault::Closed, detail));
+                }
+                return sent.map_err(|error| match error {
+                    SendError::Way(error) => error,
+                    SendError::Ended => End::Closed.after(),
+                });
+            }
+            match sent {
+                Ok(()) => return Ok(()),
+                Err(SendError::Way(error)) => return Err(error),
+                // It ended in this moment: the next turn makes up another.
+                Err(SendError::Ended) => self.forget(&link),
+            }
+        }
+    }
+
     /// The connection that leads to a location, made up when there is none.
-    pub(crate) fn way_to(&self, to: &Location) -> Result<Way, WayError> {
+    fn way_to(&self, to: &Location) -> Result<Way, WayError> {
         let mut registry = self.registry.lock();
         let sink = match (registry.phase, &registry.sink) {
             (Phase::Open, Some(sink)) => sink.clone(),
@@ -304,7 +363,7 @@ impl Endpoint {
         }
         let remote = self.config.identity.is_remote(&peer.identity);
         let back = address::way_back(&peer.listening, from).to_string();
-        let location = Location::new(Kind::Tcp, &back)
+        let location = Location::new(self.kind, &back)
             .map_err(|error| End::Nonsense(error.to_string()))?
             .with_incarnation(incarnation);
         Ok(Hop { location, remote })
@@ -379,6 +438,12 @@ impl Endpoint {
             endpoint: self.clone(),
             number,
         })
+    }
+
+    /// Whether so many have not introduced themselves yet that one should be slow to take more.
+    #[cfg(feature = "quic")]
+    pub(crate) fn is_crowded(&self) -> bool {
+        self.registry.lock().strangers.len() * 2 >= self.limits().max_strangers
     }
 
     /// The stranger with this number is served by this task.

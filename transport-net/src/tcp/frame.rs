@@ -92,6 +92,15 @@ pub(crate) enum FrameError {
     Parcel(#[from] WireError),
 }
 
+/// Whether a frame of ours whose first bytes are these is a parcel, and how long it is with its
+/// header.
+#[cfg(feature = "quic")]
+pub(crate) fn begun(bytes: &[u8]) -> Option<(bool, u64)> {
+    let (header, _) = FrameHeader::read_from_prefix(bytes).ok()?;
+    let len = header.body_len.get().checked_add(HEADER_LEN as u64)?;
+    Some((header.kind == PARCEL, len))
+}
+
 /// A hello, ready to be written.
 pub(crate) fn hello(hello: &Hello) -> Bytes {
     let body = hello.encode();

@@ -23,7 +23,7 @@ use super::endpoint::Endpoint;
 use super::frame::{FrameReader, Placed};
 use super::place::Place;
 use super::proof::Proof;
-use super::wire::{Reading, Writing};
+use super::wire::{Beside, Reading, Writing};
 use crate::end::End;
 use crate::seldom::warn_seldom;
 
@@ -258,17 +258,24 @@ impl Running {
         greeted: impl FnOnce() + Send,
     ) {
         let mut read = read;
+        let mut beside = read.take_beside();
         let writer = Arc::new(writer);
         self.link.proved(&proof);
         self.link.state.lock().writer = Some(writer.clone());
         let mut greeted = Some(greeted);
-        let exchange = self.exchange(&mut read, &writer, &mut reader, from, &mut greeted);
+        let exchange = self.exchange(
+            (&mut read, &mut beside),
+            &writer,
+            &mut reader,
+            from,
+            &mut greeted,
+        );
         let end = tokio::select! {
             end = exchange => end,
             () = proof.withdrawn() => End::Distrusted,
         };
         self.end = end;
-        drop(writer);
+        drop((writer, beside));
         let (link, patience) = (self.link.clone(), self.endpoint.limits().handshake_timeout);
         let orderly = self.end.is_orderly();
         drop(self);
@@ -281,7 +288,7 @@ impl Running {
 
     async fn exchange(
         &mut self,
-        read: &mut Reading,
+        (read, beside): (&mut Reading, &mut Beside),
         writer: &Writing,
         reader: &mut FrameReader,
         from: SocketAddr,
@@ -290,7 +297,7 @@ impl Running {
         let timer = sleep_until(Instant::now().into());
         tokio::pin!(timer);
         let link = self.link.clone();
-        if let Err(end) = self.take_frames(reader, 0, from, greeted).await {
+        if let Err(end) = self.take_frames(reader, 0, false, from, greeted).await {
             return end;
         }
         loop {
@@ -321,7 +328,21 @@ impl Running {
                         Ok(bytes) => bytes,
                         Err(error) => return End::Broken(error.to_string()),
                     };
-                    if let Err(end) = self.take_frames(reader, arrived, from, greeted).await {
+                    let other = beside.is_partial();
+                    if let Err(end) = self.take_frames(reader, arrived, other, from, greeted).await {
+                        return end;
+                    }
+                }
+                // What the peer sends after its hello may overtake it.
+                arrived = beside.read(), if self.peer.is_some() => {
+                    let arrived = match arrived {
+                        Ok(bytes) => bytes,
+                        Err(error) => return End::Nonsense(error.to_string()),
+                    };
+                    let other = reader.is_partial();
+                    if let Some(letters) = beside.reader()
+                        && let Err(end) = self.take_frames(letters, arrived, other, from, greeted).await
+                    {
                         return end;
                     }
                 }
@@ -341,11 +362,13 @@ impl Running {
         }
     }
 
-    /// Hands on what has arrived in whole frames, and answers.
+    /// Hands on what has arrived in whole frames, and answers. `other_partial` is whether a frame is
+    /// half arrived elsewhere on this link.
     async fn take_frames(
         &mut self,
         reader: &mut FrameReader,
         arrived: usize,
+        other_partial: bool,
         from: SocketAddr,
         greeted: &mut Option<impl FnOnce() + Send>,
     ) -> Result<(), End> {
@@ -384,7 +407,8 @@ impl Running {
             add(&tally.placed_moved_bytes, placed.moved);
         }
         let mut state = link.state.lock();
-        state.connection.received(arrived, reader.is_partial(), now);
+        let partial = reader.is_partial() || other_partial;
+        state.connection.received(arrived, partial, now);
         Ok(())
     }
 

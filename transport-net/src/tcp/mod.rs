@@ -7,23 +7,23 @@
 //! * [`unframed`]: letters of old peers, on the same port.
 //! * [`courier`]: letters to old peers, in their [`dialect`].
 
-mod accept;
-mod config;
+pub(crate) mod accept;
+pub(crate) mod config;
 mod connection;
-mod counters;
+pub(crate) mod counters;
 mod courier;
-mod dial;
+pub(crate) mod dial;
 mod dialect;
-mod endpoint;
-mod frame;
-mod link;
+pub(crate) mod endpoint;
+pub(crate) mod frame;
+pub(crate) mod link;
 mod outbox;
 mod place;
-mod proof;
+pub(crate) mod proof;
 #[cfg(feature = "secure")]
 mod tls;
 mod unframed;
-mod wire;
+pub(crate) mod wire;
 
 use std::sync::Arc;
 
@@ -35,10 +35,8 @@ use tokio::net::TcpListener;
 use tokio::runtime::Handle;
 
 pub use self::config::{Limits, TcpConfig};
-use self::connection::{SendError, letter_len};
 pub use self::counters::Counters;
-use self::endpoint::{Endpoint, Way};
-use self::link::Link;
+use self::endpoint::Endpoint;
 use crate::address;
 use crate::end::End;
 
@@ -68,7 +66,7 @@ impl TcpTransport {
     #[must_use]
     pub fn new(config: TcpConfig, runtime: Handle) -> Self {
         Self {
-            endpoint: Endpoint::new(config, runtime),
+            endpoint: Endpoint::new(Kind::Tcp, config, runtime),
         }
     }
 
@@ -76,18 +74,6 @@ impl TcpTransport {
     #[must_use]
     pub fn counters(&self) -> Counters {
         self.endpoint.tally().read()
-    }
-
-    /// Starts the task of a connection that was made up.
-    fn start(&self, link: Arc<Link>, sink: Arc<dyn Sink>, to: &Location) -> Result<(), WayError> {
-        let dialling = dial::dial(self.endpoint.clone(), link.clone(), sink, to.clone());
-        let task = self.endpoint.runtime.spawn(dialling);
-        if task.is_finished() && !link.has_begun() {
-            self.endpoint.forget(&link);
-            let detail = "the runtime of this endpoint has been shut down";
-            return Err(WayError::new(WayFault::Closed, detail));
-        }
-        Ok(())
     }
 
     /// Hands a letter to who takes those for an old peer.
@@ -103,23 +89,6 @@ impl TcpTransport {
                 let detail = "the runtime of this endpoint has been shut down";
                 return Err(WayError::new(WayFault::Closed, detail));
             }
-        }
-        Ok(())
-    }
-
-    fn check(&self, to: &Location, parcel: &Parcel) -> Result<(), WayError> {
-        if to.kind() != Kind::Tcp {
-            let detail = format!("{to} is no TCP location");
-            return Err(WayError::new(WayFault::Unreachable, detail));
-        }
-        if parcel.receiver.is_empty() || parcel.receiver.len() > Parcel::MAX_NAME {
-            let detail = "the receiver's name is empty or too long";
-            return Err(WayError::new(WayFault::Refused, detail));
-        }
-        let (len, max) = (letter_len(parcel), self.max_letter());
-        if len > max as u64 {
-            let detail = format!("{len} bytes; at most {max} are taken (max_letter)");
-            return Err(WayError::new(WayFault::TooLarge, detail));
         }
         Ok(())
     }
@@ -182,30 +151,14 @@ impl Transport for TcpTransport {
     }
 
     fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
-        self.check(to, &parcel)?;
+        self.endpoint.check(to, &parcel)?;
         if to.signature() != Signature::Frames {
             return self.hand(attempt, to, parcel);
         }
-        loop {
-            let (link, fresh) = match self.endpoint.way_to(to)? {
-                Way::There(link) => (link, None),
-                Way::ToDial(link, sink) => (link, Some(sink)),
-            };
-            let sent = link.send(attempt, &parcel);
-            if let Some(sink) = fresh {
-                self.start(link, sink, to)?;
-                return sent.map_err(|error| match error {
-                    SendError::Way(error) => error,
-                    SendError::Ended => End::Closed.after(),
-                });
-            }
-            match sent {
-                Ok(()) => return Ok(()),
-                Err(SendError::Way(error)) => return Err(error),
-                // It ended in this moment: the next turn makes up another.
-                Err(SendError::Ended) => self.endpoint.forget(&link),
-            }
-        }
+        self.endpoint.dispatch(attempt, to, &parcel, |link, sink| {
+            let dialling = dial::dial(self.endpoint.clone(), link, sink, to.clone());
+            self.endpoint.runtime.spawn(dialling)
+        })
     }
 
     fn abandon(&self, attempt: AttemptId) {

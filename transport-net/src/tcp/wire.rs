@@ -1,4 +1,4 @@
-//! What a link reads from and writes to: a socket, or TLS over one.
+//! What a link reads from and writes to: a socket, TLS over one, or the streams of QUIC.
 //!
 //! Frames know nothing of it. What has been handed to TLS counts as begun, as what has been handed
 //! to the kernel does: it may arrive.
@@ -11,15 +11,20 @@ use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
 use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
 
-use super::frame::Space;
+use super::frame::{FrameReader, Space};
 #[cfg(feature = "secure")]
 use super::tls::{Incoming, Session};
+#[cfg(feature = "quic")]
+use crate::quic::streams as quic;
 
 /// The end that is read.
 pub(crate) enum Reading {
     Plain(OwnedReadHalf),
     #[cfg(feature = "secure")]
     Tls(OwnedReadHalf, Incoming),
+    /// The stream of everything but letters; those have streams of their own.
+    #[cfg(feature = "quic")]
+    Quic(quic::Control, Option<Box<quic::Letters>>),
 }
 
 /// The end that is written.
@@ -28,6 +33,8 @@ pub(crate) enum Writing {
     Plain(OwnedWriteHalf),
     #[cfg(feature = "secure")]
     Tls(OwnedWriteHalf, Arc<Session>),
+    #[cfg(feature = "quic")]
+    Quic(quic::Outgoing),
 }
 
 /// Both ends of a socket, as it is.
@@ -36,7 +43,51 @@ pub(crate) fn plain(stream: TcpStream) -> (Reading, Writing) {
     (Reading::Plain(read), Writing::Plain(write))
 }
 
+/// What arrives beside the one stream of a link: letters, where each has a stream of its own.
+#[derive(Default)]
+pub(crate) struct Beside {
+    #[cfg(feature = "quic")]
+    letters: Option<Box<quic::Letters>>,
+}
+
+impl Beside {
+    /// Reads what has arrived; for ever, when there are no such streams. Nothing is lost when this
+    /// is dropped.
+    pub(crate) async fn read(&mut self) -> io::Result<usize> {
+        #[cfg(feature = "quic")]
+        if let Some(letters) = &mut self.letters {
+            return letters.read().await;
+        }
+        std::future::pending().await
+    }
+
+    /// What was read, as frames.
+    pub(crate) fn reader(&mut self) -> Option<&mut FrameReader> {
+        #[cfg(feature = "quic")]
+        if let Some(letters) = &mut self.letters {
+            return Some(letters.reader());
+        }
+        None
+    }
+
+    /// Whether a letter has begun to arrive and is not complete.
+    pub(crate) fn is_partial(&mut self) -> bool {
+        self.reader().is_some_and(|reader| reader.is_partial())
+    }
+}
+
 impl Reading {
+    /// Takes out what is to be read beside the one stream.
+    pub(crate) fn take_beside(&mut self) -> Beside {
+        match self {
+            #[cfg(feature = "quic")]
+            Self::Quic(_, letters) => Beside {
+                letters: letters.take(),
+            },
+            _ => Beside::default(),
+        }
+    }
+
     /// Reads what is there, as far as there is space. Nothing is lost when this is dropped.
     pub(crate) async fn read(&mut self, space: &mut Space<'_>) -> io::Result<usize> {
         match self {
@@ -46,6 +97,8 @@ impl Reading {
             },
             #[cfg(feature = "secure")]
             Self::Tls(socket, incoming) => incoming.read(socket, space).await,
+            #[cfg(feature = "quic")]
+            Self::Quic(control, _) => control.read(space).await,
         }
     }
 
@@ -56,6 +109,8 @@ impl Reading {
             Self::Plain(socket) => socket,
             #[cfg(feature = "secure")]
             Self::Tls(socket, _) => socket,
+            #[cfg(feature = "quic")]
+            Self::Quic(control, _) => return control.drain().await,
         };
         while matches!(socket.read(&mut ignored).await, Ok(1..)) {}
     }
@@ -68,6 +123,8 @@ impl Writing {
             Self::Plain(socket) => socket.try_write_vectored(slices),
             #[cfg(feature = "secure")]
             Self::Tls(socket, session) => session.write(socket, slices),
+            #[cfg(feature = "quic")]
+            Self::Quic(outgoing) => outgoing.write(slices),
         }
     }
 
@@ -78,6 +135,8 @@ impl Writing {
             Self::Plain(_) => Ok(()),
             #[cfg(feature = "secure")]
             Self::Tls(socket, session) => session.push(socket),
+            #[cfg(feature = "quic")]
+            Self::Quic(_) => Ok(()),
         }
     }
 
@@ -87,6 +146,8 @@ impl Writing {
             Self::Plain(socket) => socket.writable().await,
             #[cfg(feature = "secure")]
             Self::Tls(socket, _) => socket.writable().await,
+            #[cfg(feature = "quic")]
+            Self::Quic(outgoing) => outgoing.writable().await,
         }
     }
 }

@@ -19,7 +19,7 @@ use fipa_transport::{
 };
 use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport, UdpConfig, UdpLimits};
 use parking_lot::Mutex;
-use tokio::runtime::Runtime;
+use tokio::runtime::{Handle, Runtime};
 use zerocopy::IntoBytes as _;
 
 pub(crate) fn runtime() -> Runtime {
@@ -67,6 +67,24 @@ pub(crate) fn config(listen: &[&str]) -> TcpConfig {
         },
         #[cfg(feature = "secure")]
         security: None,
+    }
+}
+
+#[cfg(feature = "quic")]
+pub(crate) fn quic_config(
+    listen: &[&str],
+    security: fipa_transport_net::secure::Security,
+) -> fipa_transport_net::QuicConfig {
+    let config = config(listen);
+    fipa_transport_net::QuicConfig {
+        listen: config.listen,
+        identity: config.identity,
+        limits: Limits {
+            // Nobody says that nobody is there.
+            connect_timeout: Duration::from_secs(3),
+            ..config.limits
+        },
+        security,
     }
 }
 
@@ -158,8 +176,8 @@ impl Sink for Recorder {
 }
 
 /// An endpoint that listens.
-pub(crate) struct Party {
-    pub(crate) transport: TcpTransport,
+pub(crate) struct Party<T = TcpTransport> {
+    pub(crate) transport: T,
     pub(crate) sink: Arc<Recorder>,
     pub(crate) locations: Vec<Location>,
     pub(crate) runtime: Runtime,
@@ -175,35 +193,27 @@ impl Party {
     }
 
     pub(crate) fn judging(config: TcpConfig, verdict: Verdict) -> Self {
-        Self::telling(
-            config,
-            Recorder {
-                verdict,
-                ..Recorder::default()
-            },
-        )
+        let sink = Recorder {
+            verdict,
+            ..Recorder::default()
+        };
+        Self::over(sink, |runtime| TcpTransport::new(config, runtime))
     }
 
     /// One whose sink lends memory for contents.
     pub(crate) fn lending(config: TcpConfig) -> Self {
-        Self::telling(
-            config,
-            Recorder {
-                lent: Some(Arc::default()),
-                ..Recorder::default()
-            },
-        )
+        let sink = Recorder {
+            lent: Some(Arc::default()),
+            ..Recorder::default()
+        };
+        Self::over(sink, |runtime| TcpTransport::new(config, runtime))
     }
+}
 
-    /// Bytes that its sink lends now, and lent at most.
-    pub(crate) fn lent(&self) -> (usize, usize) {
-        let lent = self.sink.lent.as_ref();
-        lent.map(|lent| *lent.lock()).unwrap_or_default()
-    }
-
-    fn telling(config: TcpConfig, sink: Recorder) -> Self {
+impl<T: Transport> Party<T> {
+    pub(crate) fn over(sink: Recorder, make: impl FnOnce(Handle) -> T) -> Self {
         let runtime = runtime();
-        let transport = TcpTransport::new(config, runtime.handle().clone());
+        let transport = make(runtime.handle().clone());
         let sink = Arc::new(sink);
         let locations = transport.listen(sink.clone()).unwrap();
         Self {
@@ -212,6 +222,12 @@ impl Party {
             locations,
             runtime,
         }
+    }
+
+    /// Bytes that its sink lends now, and lent at most.
+    pub(crate) fn lent(&self) -> (usize, usize) {
+        let lent = self.sink.lent.as_ref();
+        lent.map(|lent| *lent.lock()).unwrap_or_default()
     }
 
     pub(crate) fn location(&self) -> &Location {
@@ -235,7 +251,7 @@ impl Party {
     }
 
     /// A letter gets through to there and back.
-    pub(crate) fn assert_reaches(&self, attempt: u64, to: &Party) {
+    pub(crate) fn assert_reaches(&self, attempt: u64, to: &Self) {
         self.send(attempt, to.location(), parcel(1, "still there?"))
             .unwrap();
         assert_eq!(self.conclusion(attempt), accepted());

@@ -44,6 +44,15 @@ pub(crate) enum Space<'a> {
 
 #[cfg(feature = "secure")]
 impl Space<'_> {
+    /// How many bytes there is room for.
+    #[cfg(feature = "quic")]
+    pub(crate) fn room(&self) -> usize {
+        match self {
+            Self::Buffer(buffer) => buffer.remaining_mut(),
+            Self::Content(content) => content.len(),
+        }
+    }
+
     /// Puts there what there is room for, and says how much that was.
     pub(crate) fn fill(&mut self, bytes: &[u8]) -> usize {
         match self {

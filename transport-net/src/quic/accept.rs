@@ -1,0 +1,92 @@
+//! The listening side: handshakes, and who is refused.
+
+use std::io;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+use bytes::BytesMut;
+use quinn::{Connection, Incoming, RecvStream, SendStream};
+use tokio::time::timeout;
+
+use super::dial::ends;
+use super::sockets::Sockets;
+use crate::seldom::warn_seldom;
+use crate::tcp::endpoint::{Endpoint, Stranger};
+use crate::tcp::frame::FrameReader;
+use crate::tcp::link::Running;
+use crate::tcp::proof::Proof;
+
+/// Accepts connections until it is aborted.
+pub(super) async fn accept(
+    endpoint: Arc<Endpoint>,
+    sockets: Arc<Sockets>,
+    socket: quinn::Endpoint,
+) {
+    while let Some(incoming) = socket.accept().await {
+        // When many knock, whoever gives a false address is sent away without memory being taken
+        // (RFC 9000 section 8.1.2).
+        if endpoint.is_crowded() && !incoming.remote_address_validated() {
+            if let Err(error) = incoming.retry() {
+                tracing::debug!(%error, "a handshake that cannot be begun again");
+            }
+            continue;
+        }
+        let Some(place) = endpoint.receive_stranger() else {
+            return;
+        };
+        let number = place.number;
+        let task = receive(endpoint.clone(), sockets.clone(), place, incoming);
+        let task = tokio::spawn(task).abort_handle();
+        endpoint.stranger_started(number, task);
+    }
+}
+
+async fn receive(
+    endpoint: Arc<Endpoint>,
+    sockets: Arc<Sockets>,
+    place: Stranger,
+    incoming: Incoming,
+) {
+    let from = incoming.remote_address();
+    let patience = endpoint.limits().handshake_timeout;
+    let shaken = match timeout(patience, shake(&sockets, incoming)).await {
+        Ok(Ok((connection, send, receive))) => match sockets.certificate(&connection) {
+            Some(certificate) => Ok((connection, send, receive, certificate)),
+            None => Err("the peer's certificate is not trusted any more".to_owned()),
+        },
+        Ok(Err(error)) => Err(error.to_string()),
+        Err(_) => Err(format!(
+            "no handshake within {patience:?} (handshake_timeout)"
+        )),
+    };
+    let (connection, send, receive, certificate) = match shaken {
+        Ok(shaken) => shaken,
+        Err(why) => {
+            let counter = &endpoint.tally().refused_unproved;
+            let before = counter.fetch_add(1, Ordering::Relaxed);
+            warn_seldom(before, format_args!("{from}: connection refused: {why}"));
+            return;
+        }
+    };
+    let Some((link, sink)) = endpoint.accepted() else {
+        return;
+    };
+    let max_letter = endpoint.limits().max_letter;
+    let proof = Proof::of(&sockets.security, certificate);
+    let reader = FrameReader::new(max_letter, BytesMut::new());
+    let ends = ends(&connection, send, receive, max_letter);
+    drop(connection);
+    Running::new(endpoint, link, sink, None)
+        .serve(ends, proof, reader, from, || drop(place))
+        .await;
+}
+
+/// The handshake, and the stream that the peer opens first.
+async fn shake(
+    sockets: &Sockets,
+    incoming: Incoming,
+) -> io::Result<(Connection, SendStream, RecvStream)> {
+    let connection = sockets.accept(incoming)?.await?;
+    let (send, receive) = connection.accept_bi().await?;
+    Ok((connection, send, receive))
+}

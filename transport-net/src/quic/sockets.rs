@@ -1,0 +1,112 @@
+//! The sockets of an endpoint: those it listens on, and one per family from which it dials.
+//!
+//! The latter are bound to no address, so that packets leave from whichever the host has: after a
+//! change of address connections go on.
+
+use std::io;
+use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
+use std::sync::Arc;
+
+use fipa_transport::ListenError;
+use parking_lot::Mutex;
+use quinn::{
+    Connecting, Endpoint, EndpointConfig, Incoming, ServerConfig, TokioRuntime, TransportConfig,
+};
+use rustls::pki_types::CertificateDer;
+use socket2::{Domain, Protocol, Socket, Type};
+
+use super::settings;
+use crate::secure::{Certificate, Security};
+use crate::{Limits, address};
+
+#[derive(Debug)]
+pub(super) struct Sockets {
+    pub(super) security: Security,
+    transport: Arc<TransportConfig>,
+    /// Over IPv4 and over IPv6, once they are needed.
+    dialling: Mutex<[Option<Endpoint>; 2]>,
+}
+
+impl Sockets {
+    pub(super) fn new(security: Security, limits: &Limits) -> Self {
+        Self {
+            security,
+            transport: settings::transport(limits),
+            dialling: Mutex::default(),
+        }
+    }
+
+    /// Listens on an address of the configuration. Says where that is reached.
+    pub(super) fn listen(&self, text: &str) -> Result<(Endpoint, Vec<SocketAddr>), ListenError> {
+        let unavailable = |error: String| ListenError::Unavailable(error);
+        let bind = address::numeric(text).map_err(|error| unavailable(error.to_string()))?;
+        let socket = open(bind).map_err(|error| address::cannot_bind(text, &error))?;
+        let failed = |source| ListenError::Bind {
+            address: text.to_owned(),
+            source,
+        };
+        let bound = socket.local_addr().map_err(failed)?;
+        let server = settings::server(&self.security, &self.transport).map_err(unavailable)?;
+        let socket = endpoint(Some(server), socket).map_err(failed)?;
+        let reachable =
+            address::reachable(bound).map_err(|error| unavailable(error.to_string()))?;
+        Ok((socket, reachable))
+    }
+
+    /// Goes on with the handshake of a peer.
+    pub(super) fn accept(&self, incoming: Incoming) -> io::Result<Connecting> {
+        let server = settings::server(&self.security, &self.transport).map_err(io::Error::other)?;
+        incoming
+            .accept_with(Arc::new(server))
+            .map_err(io::Error::from)
+    }
+
+    /// Begins a handshake with whoever is there.
+    pub(super) fn dial(&self, to: SocketAddr) -> io::Result<Connecting> {
+        let client = settings::client(&self.security, &self.transport).map_err(io::Error::other)?;
+        let socket = {
+            let mut dialling = self.dialling.lock();
+            let [v4, v6] = &mut *dialling;
+            let (place, any) = match to {
+                SocketAddr::V4(_) => (v4, SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0))),
+                SocketAddr::V6(_) => (v6, SocketAddr::from((Ipv6Addr::UNSPECIFIED, 0))),
+            };
+            match place {
+                Some(socket) => socket.clone(),
+                None => place.insert(endpoint(None, open(any)?)?).clone(),
+            }
+        };
+        // Neither told to the peer nor compared with anything: who is there says the certificate.
+        let name = to.ip().to_string();
+        socket
+            .connect_with(client, to, &name)
+            .map_err(io::Error::other)
+    }
+
+    /// What a peer has proved.
+    pub(super) fn certificate(&self, connection: &quinn::Connection) -> Option<Certificate> {
+        let presented = connection.peer_identity()?;
+        let presented = presented.downcast::<Vec<CertificateDer<'static>>>().ok()?;
+        self.security.peer(Some(&presented))
+    }
+
+    /// Lets go of the sockets; connections that are ending keep them for that long.
+    pub(super) fn close(&self) {
+        *self.dialling.lock() = [None, None];
+    }
+}
+
+fn open(address: SocketAddr) -> io::Result<UdpSocket> {
+    let domain = Domain::for_address(address);
+    let socket = Socket::new(domain, Type::DGRAM.nonblocking(), Some(Protocol::UDP))?;
+    if address.is_ipv6() {
+        socket.set_only_v6(true)?;
+    }
+    socket.bind(&address.into())?;
+    Ok(socket.into())
+}
+
+fn endpoint(server: Option<ServerConfig>, socket: UdpSocket) -> io::Result<Endpoint> {
+    let config = EndpointConfig::default();
+    Endpoint::new(config, server, socket, Arc::new(TokioRuntime))
+}

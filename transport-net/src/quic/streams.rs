@@ -1,0 +1,270 @@
+//! The streams of one connection.
+//!
+//! The side that dialled opens one stream in both directions, for hello, answers, signs of life and
+//! goodbye. Every parcel goes in a stream of its own, in the order in which the streams are opened,
+//! and is read in that order: letters to one location have to arrive so. Streams that have arrived
+//! and are not read yet wait in the windows of [`super::settings`]. So an answer never waits behind
+//! a letter on the wire, and of one that is lost nothing is sent again but itself.
+
+use std::future::{pending, poll_fn};
+use std::io::{self, IoSlice};
+use std::pin::Pin;
+use std::task::{Context, Poll, Waker};
+
+use bytes::BytesMut;
+use parking_lot::Mutex;
+use quinn::{Connection, ReadError, RecvStream, SendStream, VarInt};
+
+use crate::tcp::frame::{self, FrameReader, Space};
+
+/// Answers go before letters.
+const URGENT: i32 = 1;
+
+/// The stream of everything but letters, as it is read.
+pub(crate) struct Control {
+    connection: Connection,
+    stream: RecvStream,
+}
+
+impl Control {
+    pub(super) fn new(connection: &Connection, stream: RecvStream) -> Self {
+        let connection = connection.clone();
+        Self { connection, stream }
+    }
+
+    pub(crate) async fn read(&mut self, space: &mut Space<'_>) -> io::Result<usize> {
+        match fill(&mut self.stream, space).await {
+            Ok(Some(len)) => Ok(len),
+            Ok(None)
+            | Err(ReadError::ConnectionLost(quinn::ConnectionError::ApplicationClosed(_))) => Ok(0),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    /// Waits until the peer has closed the connection.
+    pub(crate) async fn drain(&mut self) {
+        self.connection.closed().await;
+    }
+}
+
+impl Drop for Control {
+    fn drop(&mut self) {
+        // Whoever was to read what is still on its way has had the time.
+        self.connection.close(VarInt::from_u32(0), b"");
+    }
+}
+
+/// The streams of the peer's letters.
+pub(crate) struct Letters {
+    connection: Connection,
+    stream: Option<RecvStream>,
+    reader: FrameReader,
+}
+
+impl Letters {
+    pub(super) fn new(connection: &Connection, max_letter: usize) -> Self {
+        Self {
+            connection: connection.clone(),
+            stream: None,
+            reader: FrameReader::new(max_letter, BytesMut::new()),
+        }
+    }
+
+    /// The frames that are read.
+    pub(crate) fn reader(&mut self) -> &mut FrameReader {
+        &mut self.reader
+    }
+
+    /// Reads what has arrived of the letter whose turn it is. Waits for ever when the connection is
+    /// lost: why is read from the other stream, with what the peer said before.
+    pub(crate) async fn read(&mut self) -> io::Result<usize> {
+        loop {
+            let stream = match &mut self.stream {
+                Some(stream) => stream,
+                none => match self.connection.accept_uni().await {
+                    Ok(stream) => none.insert(stream),
+                    Err(_lost) => return pending().await,
+                },
+            };
+            match fill(stream, &mut self.reader.space()).await {
+                Ok(Some(len)) => return Ok(len),
+                Ok(None) if self.reader.is_partial() => {
+                    let what = "a stream that ended in the middle of a letter";
+                    return Err(io::Error::new(io::ErrorKind::InvalidData, what));
+                }
+                Ok(None) => self.stream = None,
+                Err(ReadError::ConnectionLost(_)) => return pending().await,
+                Err(error) => return Err(error.into()),
+            }
+        }
+    }
+}
+
+/// Puts what has arrived into the space; nothing more comes after `None`.
+async fn fill(stream: &mut RecvStream, space: &mut Space<'_>) -> Result<Option<usize>, ReadError> {
+    let chunk = stream.read_chunk(space.room(), true).await?;
+    Ok(chunk.map(|chunk| space.fill(&chunk.bytes)))
+}
+
+/// Where a link writes its frames, one after the other.
+#[derive(Debug)]
+pub(crate) struct Outgoing {
+    connection: Connection,
+    state: Mutex<State>,
+}
+
+#[derive(Debug)]
+struct State {
+    control: SendStream,
+    /// The stream of the letter that has begun, or one for the next.
+    letter: Option<SendStream>,
+    /// The number of the last of those.
+    latest: Option<u64>,
+    /// The frame that has begun.
+    begun: Option<Begun>,
+    /// What the next byte waits for.
+    blocked: Lane,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Begun {
+    lane: Lane,
+    /// Bytes that are missing.
+    left: u64,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Lane {
+    Control,
+    Letter,
+}
+
+impl Outgoing {
+    pub(super) fn new(connection: &Connection, control: SendStream) -> Self {
+        // An error would mean that the connection is lost, which the next write finds out.
+        let _ = control.set_priority(URGENT);
+        Self {
+            connection: connection.clone(),
+            state: Mutex::new(State {
+                control,
+                letter: None,
+                latest: None,
+                begun: None,
+                blocked: Lane::Control,
+            }),
+        }
+    }
+
+    /// Takes what there is room for.
+    pub(crate) fn write(&self, slices: &[IoSlice<'_>]) -> io::Result<usize> {
+        let mut state = self.state.lock();
+        let mut taken = 0;
+        for slice in slices {
+            let mut rest: &[u8] = slice;
+            while !rest.is_empty() {
+                match self.put(&mut state, rest) {
+                    Ok(len) => {
+                        taken += len;
+                        rest = rest.get(len..).unwrap_or_default();
+                    }
+                    Err(_) if taken > 0 => return Ok(taken),
+                    Err(error) => return Err(error),
+                }
+            }
+        }
+        Ok(taken)
+    }
+
+    /// Takes some of these bytes, which are of one frame, and perhaps of those behind it.
+    fn put(&self, state: &mut State, bytes: &[u8]) -> io::Result<usize> {
+        let begun = match state.begun {
+            Some(begun) => begun,
+            None => {
+                // Frames of ours begin with their whole header in one piece.
+                let (is_parcel, left) = frame::begun(bytes).ok_or(io::ErrorKind::InvalidInput)?;
+                let lane = if is_parcel {
+                    Lane::Letter
+                } else {
+                    Lane::Control
+                };
+                Begun { lane, left }
+            }
+        };
+        state.blocked = begun.lane;
+        let mut context = Context::from_waker(Waker::noop());
+        if begun.lane == Lane::Letter && state.letter.is_none() {
+            let opening = std::pin::pin!(self.connection.open_uni());
+            match opening.poll(&mut context) {
+                Poll::Ready(opened) => state.keep(opened?),
+                Poll::Pending => return Err(io::ErrorKind::WouldBlock.into()),
+            }
+        }
+        let most = usize::try_from(begun.left).map_or(bytes.len(), |left| left.min(bytes.len()));
+        let stream = state
+            .stream(begun.lane)
+            .ok_or(io::ErrorKind::NotConnected)?;
+        let wanted = bytes.get(..most).unwrap_or(bytes);
+        let taken = match Pin::new(stream).poll_write(&mut context, wanted) {
+            Poll::Ready(taken) => taken?,
+            // Another frame may come before this one, if it has not begun.
+            Poll::Pending => return Err(io::ErrorKind::WouldBlock.into()),
+        };
+        let left = begun.left.saturating_sub(taken as u64);
+        state.begun = (left > 0).then_some(Begun { left, ..begun });
+        if left == 0
+            && begun.lane == Lane::Letter
+            && let Some(mut letter) = state.letter.take()
+        {
+            letter.finish().map_err(io::Error::other)?;
+        }
+        Ok(taken)
+    }
+
+    /// Waits until there is room for what was not taken.
+    pub(crate) async fn writable(&self) -> io::Result<()> {
+        let opens = {
+            let state = self.state.lock();
+            state.blocked == Lane::Letter && state.letter.is_none()
+        };
+        if opens {
+            let opened = self.connection.open_uni().await?;
+            let mut state = self.state.lock();
+            // Another thread may have had a later one meanwhile. Then this one ends without a byte,
+            // which its reader passes over: letters are read in the order of their streams.
+            state.keep(opened);
+            return Ok(());
+        }
+        poll_fn(|context| {
+            let mut state = self.state.lock();
+            let lane = state.blocked;
+            match state.stream(lane) {
+                // Nothing is written: what is asked is whether something could be.
+                Some(stream) => match Pin::new(stream).poll_write(context, &[]) {
+                    Poll::Ready(Ok(_)) => Poll::Ready(Ok(())),
+                    Poll::Ready(Err(error)) => Poll::Ready(Err(error.into())),
+                    Poll::Pending => Poll::Pending,
+                },
+                None => Poll::Ready(Ok(())),
+            }
+        })
+        .await
+    }
+}
+
+impl State {
+    /// Takes a stream for the next letter, if no later one has been taken yet.
+    fn keep(&mut self, opened: SendStream) {
+        let number = opened.id().index();
+        if self.letter.is_none() && self.latest.is_none_or(|latest| latest < number) {
+            self.latest = Some(number);
+            self.letter = Some(opened);
+        }
+    }
+
+    fn stream(&mut self, lane: Lane) -> Option<&mut SendStream> {
+        match lane {
+            Lane::Control => Some(&mut self.control),
+            Lane::Letter => self.letter.as_mut(),
+        }
+    }
+}
