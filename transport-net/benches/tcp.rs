@@ -1,5 +1,5 @@
 //! The acknowledged round trip of a letter on loopback, beside raw TCP that moves as many bytes
-//! one way and one byte back: what this transport adds, and what TLS adds to it.
+//! one way and one byte back: what this transport adds, what TLS adds to it, and what QUIC takes.
 #![allow(
     clippy::unwrap_used,
     reason = "a test or bench that cannot go on may panic"
@@ -59,10 +59,11 @@ fn runtime() -> Runtime {
         .unwrap()
 }
 
-type Party = (TcpTransport, Location, Receiver<Conclusion>);
+type Party = (Arc<dyn Transport>, Location, Receiver<Conclusion>);
 
 fn endpoint(runtime: &Runtime) -> Party {
-    listening(runtime, config())
+    let transport = TcpTransport::new(config(), runtime.handle().clone());
+    listening(Arc::new(transport))
 }
 
 fn config() -> TcpConfig {
@@ -90,13 +91,41 @@ fn secured(client: &Runtime, server: &Runtime) -> (Party, Party) {
             security,
             ..config()
         };
-        listening(runtime, config)
+        listening(Arc::new(TcpTransport::new(
+            config,
+            runtime.handle().clone(),
+        )))
     });
     (near, far)
 }
 
-fn listening(runtime: &Runtime, config: TcpConfig) -> Party {
-    let transport = TcpTransport::new(config, runtime.handle().clone());
+/// Two that know each other, over QUIC.
+#[cfg(feature = "quic")]
+fn quic(client: &Runtime, server: &Runtime) -> (Party, Party) {
+    use fipa_transport_net::{QuicConfig, QuicTransport};
+    let host = certificates::Host::new("bench", &[]);
+    let [near, far] = [client, server].map(|runtime| {
+        let TcpConfig {
+            listen,
+            identity,
+            limits,
+            ..
+        } = config();
+        let config = QuicConfig {
+            listen,
+            identity,
+            limits,
+            security: host.security(&[&host]),
+        };
+        listening(Arc::new(QuicTransport::new(
+            config,
+            runtime.handle().clone(),
+        )))
+    });
+    (near, far)
+}
+
+fn listening(transport: Arc<dyn Transport>) -> Party {
     let (sender, receiver) = channel();
     let sink = Arc::new(Accepting(Mutex::new(sender)));
     let location = transport.listen(sink).unwrap().remove(0);
@@ -183,6 +212,8 @@ fn round_trip(criterion: &mut Criterion) {
             ("letter", (endpoint(&client), endpoint(&server))),
             #[cfg(feature = "secure")]
             ("letter_tls", secured(&client, &server)),
+            #[cfg(feature = "quic")]
+            ("letter_quic", quic(&client, &server)),
         ];
         let parcel = parcel(content.clone());
         for (name, ((sender, _, conclusions), (_receiver, there, _))) in kinds {

@@ -13,7 +13,9 @@ use std::time::{Duration, SystemTime};
 
 use common::certificates::Host;
 use common::{NAME, Party, accepted, config, letter_parcel, parcel, until};
-use fipa_acl::{AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter};
+use fipa_acl::{
+    AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter, Message, Performative,
+};
 use fipa_transport::{Answer, Conclusion, FailureReason, Transport, WayFault};
 use fipa_transport_net::secure::{Rules, Security};
 use fipa_transport_net::{Counters, TcpTransport};
@@ -98,6 +100,11 @@ fn assert_refused<T: Transport>(from: &Party<T>, to: &Party<T>) -> String {
 }
 
 fn letter_from(sender: &str) -> Letter {
+    letter_signed(sender, sender)
+}
+
+/// A letter whose envelope is from one agent, and whose message says it is from another.
+fn letter_signed(sender: &str, signed: &str) -> Letter {
     let base = EnvelopeParams {
         to: vec![AgentId::new("arm_1").unwrap()],
         from: Some(AgentId::new(sender).unwrap()),
@@ -109,8 +116,13 @@ fn letter_from(sender: &str) -> Letter {
         base,
         extensions: Vec::new(),
     };
-    let message = bytes::Bytes::from_static(b"message");
-    Letter::new(envelope.encode_standard().unwrap(), message)
+    let message = Message::builder(Performative::Inform)
+        .sender(AgentId::new(signed).unwrap())
+        .receiver(AgentId::new("arm_1").unwrap())
+        .content("hello")
+        .build()
+        .unwrap();
+    Letter::new(envelope.encode_standard().unwrap(), message.to_payload())
 }
 
 fn peers_that_trust_each_other_exchange_letters_of_any_size<T: Proving>() {
@@ -196,8 +208,16 @@ fn a_peer_speaks_for_its_own_agents_only<T: Proving>() {
         panic!("{:?}", from.conclusion(3));
     };
     assert_eq!(reason, FailureReason::Refused);
+    // Nor in the message, behind an envelope of its own.
+    let disguised = letter_parcel(5, letter_signed("rover", "crex"));
+    from.send(5, to.location(), disguised).unwrap();
+    let Conclusion::Answered(Answer::Failed { reason, detail }) = from.conclusion(5) else {
+        panic!("{:?}", from.conclusion(5));
+    };
+    assert_eq!(reason, FailureReason::Refused);
+    assert!(detail.contains("its message from crex"), "{detail}");
     assert_eq!(to.arrivals(), 2);
-    assert_eq!(to.transport.counters().refused_senders, 1);
+    assert_eq!(to.transport.counters().refused_senders, 2);
     // Nor does it get letters for agents of others, whatever the directory says.
     let mut stray = letter_parcel(4, letter_from("rover"));
     stray.receiver = "sherpa".into();

@@ -9,7 +9,7 @@ use std::io::IoSlice;
 use std::sync::Arc;
 use std::time::Instant;
 
-use fipa_acl::{EnvelopeView, Letter};
+use fipa_acl::{EnvelopeView, Letter, MessageView};
 use fipa_transport::{
     Answer, AttemptId, Body, Conclusion, Incarnation, Parcel, WayError, WayFault,
 };
@@ -159,7 +159,7 @@ impl Connection {
     }
 
     /// Whether the peer may send this letter: whoever has proved who it is speaks for its agents
-    /// only.
+    /// only, in the envelope and in the message.
     ///
     /// # Errors
     /// Why not.
@@ -170,10 +170,19 @@ impl Connection {
         let envelope = letter.envelope();
         let view = EnvelopeView::parse(&envelope);
         let view = view.map_err(|error| format!("its envelope cannot be read: {error}"))?;
-        match view.from_name() {
-            Some(name) if self.proof.speaks_for(&name.to_string()) => Ok(()),
-            Some(name) => Err(format!("the peer's certificate does not speak for {name}")),
-            None => Err("it names no sender".to_owned()),
+        let from = view.from_name().ok_or("it names no sender")?;
+        if !self.proof.speaks_for(&from.to_string()) {
+            return Err(format!("the peer's certificate does not speak for {from}"));
+        }
+        // Agents go by whom the message calls its sender.
+        let message = MessageView::parse_payload(letter.payload());
+        let message = message.map_err(|error| format!("its message cannot be read: {error}"))?;
+        match message.sender() {
+            Some(sender) if sender.name().as_str() != from.as_str() => Err(format!(
+                "its envelope is from {from}, and its message from {}",
+                sender.name()
+            )),
+            _ => Ok(()),
         }
     }
 
