@@ -31,6 +31,11 @@ impl Deadlines {
         self.heap.peek().map(|Reverse(deadline)| deadline.due)
     }
 
+    #[cfg(test)]
+    pub(crate) fn len(&self) -> usize {
+        self.heap.len()
+    }
+
     /// The earliest, if it is before this time.
     pub(crate) fn pop_before(&mut self, now: u64) -> Option<Deadline> {
         if self.next()? >= now {

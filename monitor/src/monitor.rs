@@ -615,3 +615,34 @@ impl Monitor {
         self.deadlines.keep_few(counts);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use fipa_acl::{Performative, Time};
+
+    use super::*;
+
+    #[test]
+    fn deadlines_that_were_met_do_not_pile_up() {
+        let mut monitor = Monitor::observer(Arc::new(Library::standard()));
+        let now = UNIX_EPOCH + Duration::from_secs(1_700_000_000);
+        let due = Time::from_system_time(now + Duration::from_secs(3_600));
+        let due = due.expect("a time of this century");
+        for number in 0..5_000 {
+            let say = |act, from: &'static str, to: &'static str| {
+                let header = Header::new(act).sender(from).receivers([to]);
+                let header = header.protocol("fipa-contract-net");
+                header.conversation_id(number.to_string())
+            };
+            let call = say(Performative::Cfp, "ann", "ben").reply_by(due);
+            assert!(monitor.check(&call, now).is_accepted());
+            let answer = say(Performative::Refuse, "ben", "ann");
+            assert!(monitor.check(&answer, now).is_accepted());
+        }
+        assert!(
+            monitor.deadlines.len() < 1_100,
+            "{:?}",
+            monitor.deadlines.len()
+        );
+    }
+}

@@ -313,6 +313,22 @@ fn optional_steps_must_not_make_two_meanings() {
 }
 
 #[test]
+fn of_transitions_that_are_alike_the_right_line_is_told() {
+    let step = |act: &str, target: &str| {
+        format!(r#"<transition performative="{act}" from="a" to="b" target="{target}"/>"#)
+    };
+    let steps = [step("inform", "2"), step("agree", "1"), step("inform", "1")];
+    let text = with(&steps.join("\n"));
+    let (line, Problem::Ambiguous(both)) = only(&text) else {
+        panic!("{text}");
+    };
+    assert_eq!((line, both.other_line), (5, 3));
+    // A byte order mark is no part of the text.
+    let (line, _) = only(&format!("\u{feff}{text}"));
+    assert_eq!(line, 5);
+}
+
+#[test]
 fn hostile_files_end_in_errors() {
     let is = |text: &str, words: &str| {
         let error = Machine::read("f", text).unwrap_err().to_string();

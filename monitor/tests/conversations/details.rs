@@ -163,3 +163,77 @@ fn of_many_deadlines_those_that_count_are_kept() {
         .collect();
     assert_eq!(ids, ["c"]);
 }
+
+#[test]
+fn so_many_get_replies_instead_of_the_initiator() {
+    let mut stage = Stage::observer();
+    let names = (1..=65).map(|number| format!("d{number}"));
+    stage.right(request("request ann>ben").reply_to(names));
+    let too_many = stage.wrong(request("agree ben>d65"));
+    assert_eq!(too_many.kind, Kind::WrongReceiver);
+    stage.right(request("agree ben>d64"));
+}
+
+#[test]
+fn nothing_is_cancelled_with_who_was_told_nothing() {
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben"));
+    for words in ["cancel ann>cid", "not-understood ann>cid"] {
+        assert_eq!(
+            stage.wrong(request(words)).kind,
+            Kind::Unexpected,
+            "{words}"
+        );
+    }
+    assert_eq!(stage.right(request("cancel ann>ben")), "cancelling");
+}
+
+#[test]
+fn what_one_side_asked_is_not_what_the_other_did() {
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben").reply_with("q"));
+    stage.right(request("agree ben>ann").in_reply_to("q").reply_with("a"));
+    let inform = request("inform ben>ann").in_reply_to("q");
+    let Verdict::Accepted(accepted) = stage.check(&inform) else {
+        panic!("it answers the request");
+    };
+    assert!(accepted.over && !accepted.void);
+}
+
+#[test]
+fn among_three_nobody_knows_what_an_answer_is_to() {
+    let mut stage = stage_of(
+        r#"<scxml initial="1">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="propagate" from="b" to="c" target="3"/></state>
+        <state id="3"><transition performative="inform" from="c" to="a" target="4"/></state>
+        <state id="4" final="yes"/></scxml>"#,
+    );
+    stage.right(own("request ann>ben").reply_with("q"));
+    stage.right(own("propagate ben>cid").reply_with("p"));
+    assert_eq!(stage.right(own("inform cid>ann").in_reply_to("p")), "4");
+}
+
+#[test]
+fn who_has_cancelled_waits() {
+    let mut stage = Stage::observer();
+    let ask = || request("request ann>ben").reply_with("q");
+    stage.right(ask());
+    stage.right(request("cancel ann>ben"));
+    assert_eq!(stage.wrong(ask()).kind, Kind::Repeated);
+    let other = stage.wrong(request("confirm ann>ben"));
+    assert_eq!(other.kind, Kind::Unexpected);
+}
+
+#[test]
+fn a_member_of_a_multicast_is_brought_in_by_its_answer() {
+    let mut stage = Stage::observer();
+    let mut opens = |words| match stage.check(&say(words)) {
+        Verdict::Accepted(accepted) => accepted.opened,
+        other => panic!("{words}: {other:?}"),
+    };
+    assert!(opens("cfp ann>arm_.*"));
+    assert!(opens("propose arm_1>ann"));
+    assert!(opens("refuse arm_2>ann"));
+    assert!(!opens("accept-proposal ann>arm_1"));
+}
