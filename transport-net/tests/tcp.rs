@@ -6,6 +6,7 @@
 
 mod common;
 
+use std::net::{Ipv4Addr, SocketAddr, TcpStream};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -279,4 +280,45 @@ fn a_runtime_that_is_gone_is_told() {
         .dispatch(fipa_transport::AttemptId(1), b.location(), parcel(1, "x"))
         .unwrap_err();
     assert_eq!(error.fault, WayFault::Closed, "{error}");
+}
+
+/// An address at which the system answers no more, as long as what it returns is kept.
+fn silent() -> (socket2::Socket, TcpStream, String) {
+    let full = socket2::Socket::new(socket2::Domain::IPV4, socket2::Type::STREAM, None).unwrap();
+    full.bind(&SocketAddr::from((Ipv4Addr::LOCALHOST, 0)).into())
+        .unwrap();
+    // A queue of one, and it is taken.
+    full.listen(0).unwrap();
+    let address = full.local_addr().unwrap().as_socket().unwrap();
+    let first = TcpStream::connect(address).unwrap();
+    (full, first, address.to_string())
+}
+
+#[test]
+fn the_addresses_of_a_service_are_raced_and_its_letters_are_not() {
+    let (near, far, other) = (Party::new(), Party::new(), Party::new());
+    let (_full, _first, silent) = silent();
+    let here = far.location();
+    let to = Location::new(Kind::Tcp, &silent).unwrap();
+    let to = to.with_incarnation(here.incarnation());
+    // Other services are not asked, whatever is said of them.
+    *near.sink.also_at.lock() = vec![other.location().clone(), here.clone()];
+    for attempt in 0..20 {
+        near.send(attempt, &to, parcel(attempt + 1, "x")).unwrap();
+    }
+    // Long before anybody gives the silent address up.
+    for attempt in 0..20 {
+        assert_eq!(near.conclusion(attempt), accepted());
+    }
+    let arrived: Vec<u64> = {
+        let record = far.sink.record.lock();
+        let arrivals = record.arrivals.iter();
+        arrivals.map(|(parcel, _, _)| parcel.sequence).collect()
+    };
+    assert_eq!(arrived, (1..=20).collect::<Vec<_>>());
+    assert_eq!(other.transport.counters().accepted, 0);
+    assert_eq!(far.transport.counters().accepted, 1);
+    // The other address leads there by the same connection.
+    near.assert_reaches(100, &far);
+    assert_eq!(far.transport.counters().accepted, 1);
 }

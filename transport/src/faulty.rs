@@ -230,6 +230,10 @@ impl Sink for Filter {
         self.sink.memory_for(arriving)
     }
 
+    fn also_at(&self, location: &Location) -> Vec<Location> {
+        self.sink.also_at(location)
+    }
+
     fn introduced(&self, peer: &Introduction) {
         self.sink.introduced(peer);
     }

@@ -142,6 +142,14 @@ pub trait Sink: Send + Sync {
         None
     }
 
+    /// Other locations at which the service of this location is to be found as well, if any are
+    /// known: a transport that opens a connection may race them. May take longer than other calls;
+    /// asked when a connection is opened only.
+    fn also_at(&self, location: &Location) -> Vec<Location> {
+        let _ = location;
+        Vec::new()
+    }
+
     /// A service has introduced itself on a connection that was opened: parcels can go both ways
     /// from now on. Transports without connections say nothing; nor need a sink listen.
     fn introduced(&self, peer: &Introduction) {

@@ -399,6 +399,12 @@ impl Core {
         self.desk.choose(now.instant, &entry, &[])
     }
 
+    /// Where receivers are looked up.
+    #[must_use]
+    pub fn directory(&self) -> &Arc<dyn Directory> {
+        &self.desk.directory
+    }
+
     /// The first way that a letter of others, for this life of an agent with this name, would take
     /// from here now, if this service passes it on within its host; and the bytes that its stamp
     /// takes.

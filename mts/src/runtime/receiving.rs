@@ -1,13 +1,13 @@
 //! The side of the runtime that transports see: what they tell is handed to the core.
 
 use std::net::IpAddr;
-use std::sync::Weak;
 use std::sync::atomic::Ordering;
+use std::sync::{Arc, Weak};
 
 use fipa_acl::Letter;
 use fipa_transport::{
     Answer, Arrival, Arriving, AttemptId, Conclusion, FailureReason, Introduction, Kind,
-    LoanedContent, Sink, Verdict,
+    LoanedContent, Location, Sink, Verdict,
 };
 
 use super::Shared;
@@ -62,6 +62,25 @@ impl Sink for Receiving {
 
     fn memory_for(&self, arriving: &Arriving<'_>) -> Option<Box<dyn LoanedContent>> {
         self.shared.upgrade()?.memory_for(arriving)
+    }
+
+    fn also_at(&self, location: &Location) -> Vec<Location> {
+        let Some(shared) = self.shared.upgrade() else {
+            return Vec::new();
+        };
+        let directory = Arc::clone(shared.state.lock().core.directory());
+        // All that is behind one service is at the same places.
+        let entries = directory.entries();
+        let mut entries = entries.iter();
+        let Some(entry) = entries.find(|entry| entry.locations.contains(location)) else {
+            return Vec::new();
+        };
+        let others = entry.locations.iter().filter(|other| {
+            *other != location
+                && other.kind() == location.kind()
+                && other.incarnation() == location.incarnation()
+        });
+        others.cloned().collect()
     }
 
     fn introduced(&self, peer: &Introduction) {

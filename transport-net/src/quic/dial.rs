@@ -12,7 +12,7 @@ use quinn::{Connection, RecvStream, SendStream};
 use super::sockets::Sockets;
 use super::streams::{Control, Letters, Outgoing};
 use crate::end::End;
-use crate::tcp::dial::{Unreachable, first};
+use crate::tcp::dial::{Unreachable, addresses, first};
 use crate::tcp::endpoint::Endpoint;
 use crate::tcp::frame::FrameReader;
 use crate::tcp::link::{Link, Running};
@@ -28,13 +28,15 @@ pub(super) async fn dial(
     to: Location,
 ) {
     let limits = endpoint.limits().clone();
+    let addresses = addresses(&*sink, &to);
     let running = Running::new(endpoint, link.clone(), sink, Some(to.clone()));
     let unreachable = |what: &dyn std::fmt::Display| {
         let detail = format!("{}: {what}", to.address());
         End::NotOpened(WayError::new(WayFault::Unreachable, detail))
     };
-    let connecting = first(&limits, to.address(), |address| {
-        connect(sockets.clone(), address)
+    let by = sockets.clone();
+    let connecting = first(&limits, addresses, move |address| {
+        connect(by.clone(), address)
     });
     let connected = tokio::select! {
         connected = connecting => connected,

@@ -259,14 +259,15 @@ async fn deliver(round: &Round, errand: &Errand, begun: &Mutex<bool>) -> Conclus
         Ok(letter) => letter,
         Err(not_sent) => return not_sent,
     };
-    let (mut stream, peer) = match dial::open(endpoint.limits(), to.address()).await {
-        Ok(opened) => opened,
-        Err(Unreachable(what)) => {
-            count(&endpoint.tally().dial_failures);
-            let detail = format!("{}: {what}", to.address());
-            return Conclusion::NotSent(WayError::new(WayFault::Unreachable, detail));
-        }
-    };
+    let (mut stream, peer) =
+        match dial::open(endpoint.limits(), vec![to.address().to_owned()]).await {
+            Ok(opened) => opened,
+            Err(Unreachable(what)) => {
+                count(&endpoint.tally().dial_failures);
+                let detail = format!("{}: {what}", to.address());
+                return Conclusion::NotSent(WayError::new(WayFault::Unreachable, detail));
+            }
+        };
     if !endpoint.config.gives_old_peers_at(peer.ip()) {
         let detail = format!("{peer} cannot prove who it is, and is no exception");
         return Conclusion::NotSent(WayError::new(WayFault::Refused, detail));

@@ -26,7 +26,7 @@ use crate::end::End;
 /// How long one address is waited for before the next is tried as well.
 const STAGGER: Duration = Duration::from_millis(250);
 
-/// Most addresses of one name that are tried.
+/// Most addresses of one name, or of one service, that are tried.
 const MAX_ADDRESSES: usize = 8;
 
 /// Opens the connection of a link that has been made up, and serves it.
@@ -37,13 +37,14 @@ pub(crate) async fn dial(
     to: Location,
 ) {
     let limits = endpoint.limits().clone();
+    let addresses = addresses(&*sink, &to);
     let running = Running::new(endpoint, link.clone(), sink, Some(to.clone()));
     let unreachable = |what: &dyn std::fmt::Display| {
         let detail = format!("{}: {what}", to.address());
         End::NotOpened(WayError::new(WayFault::Unreachable, detail))
     };
     let connected = tokio::select! {
-        connected = open(&limits, to.address()) => connected,
+        connected = open(&limits, addresses) => connected,
         end = link.leaving() => return running.fail(end),
     };
     let (stream, peer) = match connected {
@@ -63,6 +64,23 @@ pub(crate) async fn dial(
     link.connected(Instant::now());
     let reader = FrameReader::new(limits.max_letter, BytesMut::new());
     running.serve(ends, proof, reader, peer, || {}).await;
+}
+
+/// The address of a location, and those at which the same service is as well. Only where the peer
+/// says that it is this service: at another's address there may be somebody else by now.
+pub(crate) fn addresses(sink: &dyn Sink, to: &Location) -> Vec<String> {
+    let mut addresses = vec![to.address().to_owned()];
+    if to.incarnation().is_known() {
+        let same = |other: &Location| {
+            other.kind() == to.kind()
+                && other.signature() == to.signature()
+                && other.incarnation() == to.incarnation()
+        };
+        let others = sink.also_at(to).into_iter().filter(same);
+        addresses.extend(others.map(|other| other.address().to_owned()));
+        addresses.truncate(MAX_ADDRESSES);
+    }
+    addresses
 }
 
 /// Has the peer prove who it is, where it has to.
@@ -96,36 +114,37 @@ async fn prove(
 /// Why no connection could be opened.
 pub(crate) struct Unreachable(pub(crate) String);
 
-/// Opens a connection to an address.
+/// Opens a connection to whichever of these addresses answers first.
 pub(crate) async fn open(
     limits: &Limits,
-    address: &str,
+    addresses: Vec<String>,
 ) -> Result<(TcpStream, SocketAddr), Unreachable> {
-    first(limits, address, connect).await
+    first(limits, addresses, connect).await
 }
 
-/// Has `connect` try the addresses that are meant, until one answers.
+/// Has `connect` try these addresses, until one answers.
 pub(crate) async fn first<T, F>(
     limits: &Limits,
-    address: &str,
-    connect: impl Fn(SocketAddr) -> F,
+    addresses: Vec<String>,
+    connect: impl Fn(SocketAddr) -> F + Clone + Send + Sync + 'static,
 ) -> Result<T, Unreachable>
 where
     T: Send + 'static,
     F: Future<Output = io::Result<T>> + Send + 'static,
 {
-    let target = address::target(address).map_err(|error| Unreachable(error.to_string()))?;
-    let connecting = async {
-        match target {
-            Target::Numeric(address) => race(vec![address], connect).await,
-            Target::Named(name, port) => {
-                let found = lookup_host((name.as_str(), port)).await?;
-                race(alternating(found.take(MAX_ADDRESSES).collect()), connect).await
-            }
+    let several = addresses.len() > 1;
+    let attempts = addresses.into_iter().map(|address| {
+        let connect = connect.clone();
+        async move {
+            let connected = target(&address, connect).await;
+            connected.map_err(|error| match several {
+                true => io::Error::new(error.kind(), format!("{address}: {error}")),
+                false => error,
+            })
         }
-    };
+    });
     let patience = limits.connect_timeout;
-    match timeout(patience, connecting).await {
+    match timeout(patience, race(attempts)).await {
         Ok(connected) => connected.map_err(|error| Unreachable(error.to_string())),
         Err(_) => Err(Unreachable(format!(
             "no connection within {patience:?} (connect_timeout)"
@@ -133,23 +152,40 @@ where
     }
 }
 
-/// Connects to whichever address answers first. The next is tried when the one before has failed or
-/// has not answered for a while (RFC 8305 section 5).
-async fn race<T, F>(addresses: Vec<SocketAddr>, connect: impl Fn(SocketAddr) -> F) -> io::Result<T>
+/// Has `connect` try what an address means.
+async fn target<T, F>(address: &str, connect: impl Fn(SocketAddr) -> F) -> io::Result<T>
+where
+    T: Send + 'static,
+    F: Future<Output = io::Result<T>> + Send + 'static,
+{
+    let target = address::target(address);
+    match target.map_err(|error| io::Error::new(io::ErrorKind::InvalidInput, error))? {
+        Target::Numeric(address) => connect(address).await,
+        Target::Named(name, port) => {
+            let found = lookup_host((name.as_str(), port)).await?;
+            let addresses = alternating(found.take(MAX_ADDRESSES).collect());
+            race(addresses.into_iter().map(connect)).await
+        }
+    }
+}
+
+/// What the first of these attempts to succeed yields. The next is begun when the one before has
+/// failed or has not answered for a while (RFC 8305 section 5).
+async fn race<T, F>(attempts: impl IntoIterator<Item = F>) -> io::Result<T>
 where
     T: Send + 'static,
     F: Future<Output = io::Result<T>> + Send + 'static,
 {
     let mut last = io::Error::new(io::ErrorKind::NotFound, "the name has no address");
-    let mut waiting = addresses.into_iter();
+    let mut waiting = attempts.into_iter().peekable();
     let mut racing = JoinSet::new();
     loop {
-        if let Some(address) = waiting.next() {
-            racing.spawn(connect(address));
+        if let Some(attempt) = waiting.next() {
+            racing.spawn(attempt);
         } else if racing.is_empty() {
             return Err(last);
         }
-        let is_last = waiting.len() == 0;
+        let is_last = waiting.peek().is_none();
         tokio::select! {
             Some(ended) = racing.join_next() => match ended {
                 Ok(Ok(connected)) => return Ok(connected),
@@ -221,11 +257,10 @@ mod tests {
         let refusing = tokio::net::TcpSocket::new_v4().unwrap();
         refusing.bind("127.0.0.1:0".parse().unwrap()).unwrap();
         let refusing_at = refusing.local_addr().unwrap();
-        let (_, reached) = race(vec![silent, refusing_at, there], connect)
-            .await
-            .unwrap();
+        let all = [silent, refusing_at, there].map(connect);
+        let (_, reached) = race(all).await.unwrap();
         assert_eq!(reached, there);
-        assert!(race(vec![refusing_at], connect).await.is_err());
-        assert!(race(Vec::new(), connect).await.is_err());
+        assert!(race([connect(refusing_at)]).await.is_err());
+        assert!(race(Vec::new().into_iter().map(connect)).await.is_err());
     }
 }

@@ -100,6 +100,8 @@ pub(crate) struct Recorder {
     verdict: Verdict,
     /// Bytes of memory for contents that are lent now, and were at most, if any is.
     lent: Option<Arc<Mutex<(usize, usize)>>>,
+    /// Where every service is as well.
+    pub(crate) also_at: Mutex<Vec<Location>>,
 }
 
 impl Default for Recorder {
@@ -108,6 +110,7 @@ impl Default for Recorder {
             record: Mutex::default(),
             verdict: Verdict::Now(Answer::Accepted),
             lent: None,
+            also_at: Mutex::default(),
         }
     }
 }
@@ -155,6 +158,10 @@ impl Sink for Recorder {
         drop(lent);
         let memory = vec![0; arriving.len];
         Some(Box::new(Lent { memory, of }))
+    }
+
+    fn also_at(&self, _: &Location) -> Vec<Location> {
+        self.also_at.lock().clone()
     }
 
     fn arrived_unframed(&self, letter: Letter, via: Kind, from: IpAddr) {
