@@ -1,14 +1,18 @@
 //! What is heard on the network beside what the mDNS library tells, and what is asked there beside
-//! what it asks: whole records of old peers ([`super::whole`]), and beacons ([`super::beacon`]).
+//! what it asks: whole records of old peers ([`super::whole`]), what would
+//! expire ([`super::refresh`]), and beacons ([`super::beacon`]).
 
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
+use simple_dns::TYPE;
+
 use super::Shared;
 use super::beacon::{self, Beacons, Repair};
 use super::record::Properties;
+use super::refresh::Refresh;
 use super::task::label_of;
 use super::whole::{self, QUESTIONS, Reader, Sockets};
 
@@ -23,6 +27,7 @@ pub(super) struct Ear {
     /// What the daemon has told of an old peer's record, and what the whole of it was then.
     known: HashMap<Arc<str>, (Properties, Option<Properties>)>,
     beacons: Beacons,
+    refresh: Refresh,
     next_beacon: Instant,
     /// When one may be said that cannot wait until then.
     next_urgent: Instant,
@@ -35,6 +40,7 @@ impl Ear {
             reader: Reader::default(),
             known: HashMap::new(),
             beacons: Beacons::default(),
+            refresh: Refresh::default(),
             next_beacon: Instant::now(),
             next_urgent: Instant::now(),
         }
@@ -50,6 +56,11 @@ impl Ear {
         whole.clone().filter(|_| before == told)
     }
 
+    /// The daemon knows this record.
+    pub(super) fn known(&mut self, fullname: &str) {
+        self.refresh.put(Instant::now(), &label_of(fullname));
+    }
+
     /// That is all that is known of an old peer's record so far.
     pub(super) fn told(&mut self, fullname: Arc<str>, told: Properties) {
         self.known.insert(fullname, (told, None));
@@ -62,7 +73,9 @@ impl Ear {
     }
 
     pub(super) fn forget(&mut self, fullname: &str) {
-        self.reader.forget(&label_of(fullname));
+        let label = label_of(fullname);
+        self.reader.forget(&label);
+        self.refresh.forget(&label);
         self.known.remove(fullname);
     }
 
@@ -97,9 +110,17 @@ impl Ear {
             .iter()
             .map(|fullname| label_of(fullname).into_bytes())
             .collect();
-        self.send(labels.chunks(QUESTIONS).filter_map(whole::question));
+        let packets = labels.chunks(QUESTIONS);
+        self.send(packets.filter_map(|labels| whole::question(labels, TYPE::TXT)));
+        let questions = self.refresh.handle_timeout(now, fastrand::f64());
+        self.send(questions);
         let later = shared.held.lock().poll_timeout(now);
-        let due = [Some(self.next_beacon), self.reader.poll_timeout(), later];
+        let due = [
+            Some(self.next_beacon),
+            self.reader.poll_timeout(),
+            self.refresh.poll_timeout(),
+            later,
+        ];
         due.into_iter().flatten().min()
     }
 
@@ -113,6 +134,7 @@ impl Ear {
     pub(super) async fn listen(&mut self, shared: &Shared) -> Vec<(Arc<str>, Properties)> {
         let packet = self.sockets.receive().await;
         let whole = self.reader.handle_packet(packet);
+        self.refresh.handle_packet(Instant::now(), packet);
         if let Some((gateway, said)) = beacon::read(packet)
             && gateway != shared.config.mts.incarnation
         {

@@ -16,6 +16,7 @@ mod held;
 mod pace;
 mod probe;
 mod record;
+mod refresh;
 mod task;
 mod together;
 mod whole;

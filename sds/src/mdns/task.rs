@@ -68,6 +68,7 @@ async fn listen(
             event = found.recv_async() => match event {
                 Ok(ServiceEvent::ServiceResolved(service)) => {
                     unconfirmed.remove(service.get_fullname());
+                    ear.known(service.get_fullname());
                     resolved(shared, ear, &service);
                 }
                 Ok(ServiceEvent::ServiceRemoved(_, fullname)) => {

@@ -107,7 +107,10 @@ impl Reader {
             labels.push(wanted.label.clone());
             true
         });
-        labels.chunks(QUESTIONS).filter_map(question).collect()
+        let packets = labels.chunks(QUESTIONS);
+        packets
+            .filter_map(|labels| question(labels, TYPE::TXT))
+            .collect()
     }
 
     /// The records that a packet has and that were asked for, whole. What is no answer has none.
@@ -142,7 +145,7 @@ impl Reader {
 }
 
 /// The label of a record of our type, in lower case.
-fn label_of(name: &Name<'_>) -> Option<Vec<u8>> {
+pub(super) fn label_of(name: &Name<'_>) -> Option<Vec<u8>> {
     let (label, rest) = name.get_labels().split_first()?;
     let same =
         |(one, other): (&Label<'_>, &str)| one.as_ref().eq_ignore_ascii_case(other.as_bytes());
@@ -155,15 +158,15 @@ fn service_labels() -> impl Iterator<Item = &'static str> {
     SERVICE_TYPE.split_terminator('.')
 }
 
-/// One packet that asks for the TXT records of these labels. None when a label is none.
-pub(super) fn question(labels: &[Vec<u8>]) -> Option<Vec<u8>> {
+/// One packet that asks for the records of this kind with these labels. None when a label is none.
+pub(super) fn question(labels: &[Vec<u8>], kind: TYPE) -> Option<Vec<u8>> {
     let mut packet = Packet::new_query(0);
     for label in labels {
         let mut name = vec![Label::new(label.as_slice()).ok()?];
         name.extend(service_labels().map(|label| Label::new_unchecked(label.as_bytes())));
         packet.questions.push(Question::new(
             Name::new_with_labels(&name),
-            QTYPE::TYPE(TYPE::TXT),
+            QTYPE::TYPE(kind),
             QCLASS::CLASS(CLASS::IN),
             false,
         ));
