@@ -108,6 +108,7 @@ fn our_additions_are_read() {
     );
     let state = &machine.states()[1];
     assert!(state.transitions()[0].is_optional());
+    assert!(!machine.states()[0].transitions()[0].is_optional());
     let timeout = state.timeout().unwrap();
     assert_eq!(timeout.after(), After::Span(Duration::from_secs(30)));
     assert_eq!(machine.timeout_target(timeout), "f");
