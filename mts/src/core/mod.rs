@@ -37,7 +37,7 @@ use fipa_acl::Letter;
 use fipa_sds::{Directory, Entry, Pattern, Reach, Resolution, Role};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind, Location,
-    Outcome, Parcel, Report, Stream, Verdict,
+    Outcome, Parcel, Report, Stream, Verdict, WayFault,
 };
 
 pub use config::{CoreConfig, MAX_DEADLINE};
@@ -549,8 +549,14 @@ impl Core {
         match self.desk.attempts.remove(&attempt) {
             Some(Purpose::Letter { stream, sequence }) => {
                 let mut way = None;
+                // What found no room has made none: told that it had, it would try again at once,
+                // and in vain, until the way counts as broken.
+                let made_room = !matches!(
+                    &conclusion,
+                    Conclusion::NotSent(error) if error.fault == WayFault::Congested
+                );
                 self.with_lane(now, stream, |lane, desk, moved| {
-                    way = lane.way_of(sequence).cloned();
+                    way = lane.way_of(sequence).filter(|_| made_room).cloned();
                     lane.concluded(now.instant, sequence, attempt, conclusion, desk, moved);
                 });
                 // Whatever has ended has made room.

@@ -1,0 +1,82 @@
+//! A mailbox that takes only so many letters at a time, and more receivers behind it than that.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use fipa_acl::{AgentId, Message, Performative};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
+use fipa_mts::letter_for;
+use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+use fipa_transport::{
+    Answer, AttemptId, Conclusion, Incarnation, Kind, Outcome, WayError, WayFault,
+};
+
+const RECEIVERS: usize = 40;
+const WINDOW: usize = 16;
+
+#[test]
+fn only_what_has_ended_makes_room() {
+    let own = Incarnation::from_u64(1);
+    let directory = MemoryDirectory::new(Mts::new("mts", own));
+    let location: fipa_transport::Location =
+        "shm://0000000000000009#0000000000000009".parse().unwrap();
+    for number in 0..RECEIVERS {
+        let incarnation = Incarnation::from_u64(100 + number as u64);
+        let agent = Registration::new(format!("arm_{number}"), incarnation, vec![location.clone()]);
+        directory.register(agent).unwrap();
+    }
+    let config = CoreConfig::new("mts", own, vec![Kind::Shm]);
+    let mut core = Core::new(config, Arc::new(directory));
+    let now = Now {
+        instant: Instant::now(),
+        utc: SystemTime::UNIX_EPOCH,
+    };
+    let rover = Incarnation::from_u64(2);
+    core.register("rover".into(), rover);
+    let message = Message::builder(Performative::Inform)
+        .sender(AgentId::new("rover").unwrap())
+        .receiver(AgentId::new("arm_.*").unwrap())
+        .build()
+        .unwrap();
+    let submission = Submission {
+        sender: rover,
+        letter: letter_for(&message, now.utc).unwrap(),
+        receivers: vec!["arm_.*".into()],
+        deadline: Duration::from_secs(5),
+    };
+    let (_, expected) = core.send(now, submission);
+    assert_eq!(expected, RECEIVERS);
+
+    let mut under_way: VecDeque<AttemptId> = VecDeque::new();
+    let (mut tries, mut delivered) = (0, 0);
+    // No time passes: whoever waits for room is told by those who make it.
+    loop {
+        while let Some(action) = core.poll_action() {
+            match action {
+                Action::Dispatch { attempt, .. } => {
+                    tries += 1;
+                    assert!(tries <= 2 * RECEIVERS, "tried again and again");
+                    if under_way.len() < WINDOW {
+                        under_way.push_back(attempt);
+                    } else {
+                        let full = WayError::new(WayFault::Congested, "the window is full");
+                        core.handle_conclusion(now, attempt, Conclusion::NotSent(full));
+                    }
+                }
+                Action::Outcome { outcome, .. } => {
+                    assert!(matches!(outcome, Outcome::Delivered { .. }), "{outcome:?}");
+                    delivered += 1;
+                }
+                _ => {}
+            }
+        }
+        let Some(first) = under_way.pop_front() else {
+            break;
+        };
+        core.handle_conclusion(now, first, Conclusion::Answered(Answer::Accepted));
+    }
+    assert_eq!(delivered, RECEIVERS);
+    // Everybody once, and those for whom there was no room once more.
+    assert_eq!(tries, RECEIVERS + (RECEIVERS - WINDOW));
+}
