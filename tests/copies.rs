@@ -4,121 +4,23 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
-use std::path::Path;
-use std::sync::Arc;
+mod services;
+
 use std::time::{Duration, SystemTime};
 
-use fipa::{AgentId, Message, Performative};
-use fipa_mts::core::{CoreConfig, Received, Submission};
-use fipa_mts::{Mts, RuntimeConfig, Started, letter_around};
-use fipa_sds::{Directory as _, MemoryDirectory, Registration};
-use fipa_transport::{Incarnation, Kind, Location, Transport};
-use fipa_transport_net::{Counters, Identity, Limits, TcpConfig, TcpTransport};
-use fipa_transport_shm::{ShmConfig, ShmCounters, ShmTransport};
-use tempfile::TempDir;
-use tokio::runtime::Handle;
+use fipa::{AgentId, Kind, Message, Performative};
+use fipa_mts::core::{Received, Submission};
+use fipa_mts::letter_around;
+use fipa_transport_net::Counters;
+use fipa_transport_shm::ShmCounters;
 use tokio::time::timeout;
 
-const ROVER: Incarnation = Incarnation::from_u64(0x50e4);
-const ARM: Incarnation = Incarnation::from_u64(0xa53);
+use services::{ARM, Place, ROVER, host};
+
+const BOTH: [Kind; 2] = [Kind::Shm, Kind::Tcp];
 const LETTERS: usize = 24;
 /// With every letter of another length.
 const LEN: usize = 1 << 20;
-
-/// A service: a robot process, or a gateway.
-struct Place {
-    mts: Mts,
-    directory: Arc<MemoryDirectory>,
-    shm: Arc<ShmTransport>,
-    tcp: Option<Arc<TcpTransport>>,
-    locations: Vec<Location>,
-}
-
-impl Place {
-    fn process(host: &Path, name: &str) -> Self {
-        Self::start(host, name, false)
-    }
-
-    fn gateway(host: &Path, name: &str) -> Self {
-        Self::start(host, name, true)
-    }
-
-    fn start(host: &Path, name: &str, forwards: bool) -> Self {
-        let incarnation = Incarnation::random();
-        let handle = Handle::current();
-        let mark = host.file_name().unwrap().to_str().unwrap();
-        let prefix = format!("fipa_{}_{}", mark, std::process::id());
-        let config = ShmConfig::new(host.join("shm"), prefix, incarnation);
-        let shm = Arc::new(ShmTransport::new(config, handle.clone()).unwrap());
-        let tcp = forwards.then(|| {
-            let config = TcpConfig {
-                listen: vec!["127.0.0.1:0".to_owned()],
-                identity: Identity {
-                    name: name.into(),
-                    incarnation,
-                    domain: mark.into(),
-                    host: mark.into(),
-                },
-                limits: Limits::default(),
-                #[cfg(feature = "secure")]
-                security: None,
-            };
-            Arc::new(TcpTransport::new(config, handle.clone()))
-        });
-        let mut transports: Vec<Arc<dyn Transport>> = vec![shm.clone()];
-        transports.extend(tcp.clone().map(|tcp| tcp as Arc<dyn Transport>));
-        let directory = Arc::new(MemoryDirectory::new(fipa_sds::Mts::new(name, incarnation)));
-        let core = CoreConfig {
-            forwards,
-            ..CoreConfig::new(name, incarnation, vec![Kind::Shm, Kind::Tcp])
-        };
-        let runtime = RuntimeConfig {
-            spin: Duration::ZERO,
-            unframed_deadline: Duration::from_secs(5),
-            contacts: None,
-            tap: None,
-        };
-        let Started {
-            mts,
-            locations,
-            failed,
-        } = Mts::start(core, runtime, directory.clone(), transports, &handle);
-        assert!(failed.is_empty(), "{failed:?}");
-        Self {
-            mts,
-            directory,
-            shm,
-            tcp,
-            locations,
-        }
-    }
-
-    /// Where this is by this kind of transport.
-    fn at(&self, kind: Kind) -> Location {
-        let mut locations = self.locations.iter();
-        locations.find(|it| it.kind() == kind).unwrap().clone()
-    }
-
-    /// Letters for the arm go from here to there.
-    fn knows_arm_at(&self, there: Location) {
-        let arm = Registration::new("arm", ARM, vec![there]);
-        self.directory.register(arm).unwrap();
-    }
-
-    fn shm(&self) -> ShmCounters {
-        self.shm.counters()
-    }
-
-    fn tcp(&self) -> Counters {
-        self.tcp.as_ref().unwrap().counters()
-    }
-}
-
-/// The directory of a host that no other test has.
-fn host() -> TempDir {
-    let mut builder = tempfile::Builder::new();
-    builder.prefix("copies-").tempdir().unwrap()
-}
 
 /// What is sent; the content is filled in place.
 fn message() -> Message {
@@ -138,17 +40,17 @@ async fn received(place: &Place) -> Received {
 async fn large_content_is_touched_by_the_kernel_alone() {
     let (here, there) = (host(), host());
     let (rovers, near) = (
-        Place::process(here.path(), "rovers"),
-        Place::gateway(here.path(), "near"),
+        Place::start(here.path(), "rovers", &[Kind::Shm], false),
+        Place::start(here.path(), "near", &BOTH, true),
     );
     let (far, arms) = (
-        Place::gateway(there.path(), "far"),
-        Place::process(there.path(), "arms"),
+        Place::start(there.path(), "far", &BOTH, true),
+        Place::start(there.path(), "arms", &[Kind::Shm], false),
     );
-    rovers.knows_arm_at(near.at(Kind::Shm));
-    near.knows_arm_at(far.at(Kind::Tcp));
-    far.knows_arm_at(arms.at(Kind::Shm));
-    arms.knows_arm_at(arms.at(Kind::Shm));
+    rovers.knows_arm_at(vec![near.at(Kind::Shm)]);
+    near.knows_arm_at(vec![far.at(Kind::Tcp)]);
+    far.knows_arm_at(vec![arms.at(Kind::Shm)]);
+    arms.knows_arm_at(vec![arms.at(Kind::Shm)]);
     rovers.mts.register("rover".into(), ROVER);
     arms.mts.register("arm".into(), ARM);
 

@@ -1,0 +1,144 @@
+//! Services that tests put together themselves, to look at their transports or take these away.
+#![allow(dead_code, reason = "each test file uses a part of it")]
+
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use fipa::Kind;
+use fipa_mts::core::CoreConfig;
+use fipa_mts::{Mts, RuntimeConfig, Started};
+use fipa_sds::{Directory as _, MemoryDirectory, Registration};
+use fipa_transport::{Incarnation, Location, Transport};
+use fipa_transport_net::{
+    Counters, Identity, Limits, TcpConfig, TcpTransport, UdpConfig, UdpLimits, UdpTransport,
+};
+use fipa_transport_shm::{ShmConfig, ShmCounters, ShmTransport};
+use tempfile::TempDir;
+use tokio::runtime::Handle;
+
+/// The life of the agent that sends, and of the one that receives.
+pub(crate) const ROVER: Incarnation = Incarnation::from_u64(0x50e4);
+pub(crate) const ARM: Incarnation = Incarnation::from_u64(0xa53);
+
+/// A service: a robot process, or a gateway.
+pub(crate) struct Place {
+    pub(crate) mts: Mts,
+    directory: Arc<MemoryDirectory>,
+    shm: Option<Arc<ShmTransport>>,
+    tcp: Option<Arc<TcpTransport>>,
+    udp: Option<Arc<UdpTransport>>,
+    locations: Vec<Location>,
+}
+
+impl Place {
+    /// A service of this host with these transports, in this order of preference.
+    pub(crate) fn start(host: &Path, name: &str, order: &[Kind], forwards: bool) -> Self {
+        let incarnation = Incarnation::random();
+        let handle = Handle::current();
+        let mark = host.file_name().unwrap().to_str().unwrap();
+        let identity = Identity {
+            name: name.into(),
+            incarnation,
+            domain: mark.into(),
+            host: mark.into(),
+        };
+        let listen = vec!["127.0.0.1:0".to_owned()];
+        let has = |kind| order.contains(&kind);
+        let shm = has(Kind::Shm).then(|| {
+            let prefix = format!("fipa_{mark}_{}", std::process::id());
+            let config = ShmConfig::new(host.join("shm"), prefix, incarnation);
+            Arc::new(ShmTransport::new(config, handle.clone()).unwrap())
+        });
+        let tcp = has(Kind::Tcp).then(|| {
+            let config = TcpConfig {
+                listen: listen.clone(),
+                identity: identity.clone(),
+                limits: Limits::default(),
+                #[cfg(feature = "secure")]
+                security: None,
+            };
+            Arc::new(TcpTransport::new(config, handle.clone()))
+        });
+        let udp = has(Kind::Udp).then(|| {
+            let config = UdpConfig {
+                listen: listen.clone(),
+                identity: identity.clone(),
+                limits: UdpLimits::default(),
+            };
+            Arc::new(UdpTransport::new(config, handle.clone()))
+        });
+        let transports = [
+            shm.clone().map(|it| it as Arc<dyn Transport>),
+            tcp.clone().map(|it| it as Arc<dyn Transport>),
+            udp.clone().map(|it| it as Arc<dyn Transport>),
+        ];
+        let directory = Arc::new(MemoryDirectory::new(fipa_sds::Mts::new(name, incarnation)));
+        let core = CoreConfig {
+            forwards,
+            ..CoreConfig::new(name, incarnation, order.to_vec())
+        };
+        let runtime = RuntimeConfig {
+            spin: Duration::ZERO,
+            unframed_deadline: Duration::from_secs(5),
+            contacts: None,
+            tap: None,
+        };
+        let transports = transports.into_iter().flatten().collect();
+        let Started {
+            mts,
+            locations,
+            failed,
+        } = Mts::start(core, runtime, directory.clone(), transports, &handle);
+        assert!(failed.is_empty(), "{failed:?}");
+        Self {
+            mts,
+            directory,
+            shm,
+            tcp,
+            udp,
+            locations,
+        }
+    }
+
+    /// Where this is by this kind of transport.
+    pub(crate) fn at(&self, kind: Kind) -> Location {
+        let mut locations = self.locations.iter();
+        locations.find(|it| it.kind() == kind).unwrap().clone()
+    }
+
+    /// Letters for the arm go from here to one of these places.
+    pub(crate) fn knows_arm_at(&self, there: Vec<Location>) {
+        let arm = Registration::new("arm", ARM, there);
+        self.directory.register(arm).unwrap();
+    }
+
+    /// Everywhere that this is.
+    pub(crate) fn everywhere(&self) -> Vec<Location> {
+        self.locations.clone()
+    }
+
+    /// One of its transports.
+    pub(crate) fn transport(&self, kind: Kind) -> Arc<dyn Transport> {
+        let found = match kind {
+            Kind::Shm => self.shm.clone().map(|it| it as Arc<dyn Transport>),
+            Kind::Tcp => self.tcp.clone().map(|it| it as Arc<dyn Transport>),
+            _ => self.udp.clone().map(|it| it as Arc<dyn Transport>),
+        };
+        found.unwrap()
+    }
+
+    pub(crate) fn shm(&self) -> ShmCounters {
+        self.shm.as_ref().unwrap().counters()
+    }
+
+    pub(crate) fn tcp(&self) -> Counters {
+        self.tcp.as_ref().unwrap().counters()
+    }
+}
+
+/// The directory of a host that no other test has.
+pub(crate) fn host() -> TempDir {
+    let mut builder = tempfile::Builder::new();
+    builder.prefix("services-").tempdir().unwrap()
+}
