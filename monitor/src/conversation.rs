@@ -278,18 +278,14 @@ fn while_cancelling(machine: &Machine, party: &Party, said: &Said<'_>) -> Result
             _ => Lead::to(AFTER_NOT_UNDERSTOOD),
         });
     }
-    crossing.map(|lead| {
-        let resume = match lead.state {
-            AFTER_NOT_UNDERSTOOD => return lead,
-            CANCELLING | FAILED => party.resume,
-            state => state,
-        };
-        Lead {
+    // Where it leads to is where the conversation goes on if it is not cancelled.
+    crossing.map(|lead| match lead.state {
+        AFTER_NOT_UNDERSTOOD => lead,
+        _ => Lead {
             state: CANCELLING,
-            resume,
             crossed: true,
             ..lead
-        }
+        },
     })
 }
 

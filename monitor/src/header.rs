@@ -180,3 +180,43 @@ impl<'a> From<&MessageView<'a>> for Header<'a> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use fipa_acl::{AgentId, Time};
+
+    use super::*;
+
+    #[test]
+    fn a_message_and_its_view_say_the_same() {
+        let id = |name| AgentId::new(name).unwrap();
+        let now = SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000);
+        let message = Message::builder(Performative::Cfp)
+            .sender(id("ann"))
+            .receiver(id("ben"))
+            .receiver(id("cid"))
+            .reply_to(id("dan"))
+            .protocol("p")
+            .conversation_id("c")
+            .reply_with("w")
+            .in_reply_to("r")
+            .reply_by(Time::from_system_time(now).unwrap())
+            .build()
+            .unwrap();
+        let payload = message.to_payload();
+        let view = MessageView::parse_payload(&payload).unwrap();
+        for header in [Header::from(&message), Header::from(&view)] {
+            assert_eq!(header.act().name(), "cfp");
+            assert_eq!(header.sender_name(), Some("ann"));
+            assert_eq!(header.receiver_names(), ["ben", "cid"]);
+            assert_eq!(header.reply_to_names(), ["dan"]);
+            assert_eq!(header.protocol_name(), Some("p"));
+            assert_eq!(header.conversation(), Some("c"));
+            assert_eq!(header.reply_with_text(), Some("w"));
+            assert_eq!(header.in_reply_to_text(), Some("r"));
+            assert_eq!(header.reply_by_time(now), Some(now));
+        }
+    }
+}
