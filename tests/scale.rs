@@ -1,11 +1,12 @@
 //! A thousand agents in fifty processes of one host: all are found, and no process takes more than
-//! its share of descriptors and memory.
+//! its share of descriptors and memory. How long that took and what they take is printed
+//! (`--nocapture`).
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::process::{Child, Command, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use fipa::config::Sources;
 use fipa::{Config, Domain, Matcher, Query};
@@ -118,7 +119,9 @@ fn a_thousand_agents_in_fifty_processes() {
     let directory = tempfile::tempdir().unwrap();
     let domain = format!("scale-{}", std::process::id());
     let place = directory.path().join("run");
+    let began = Instant::now();
     let mut processes = start(&domain, &place);
+    let registered = began.elapsed();
 
     // A process like the others, that looks for all of them.
     let looking = Command::new(std::env::current_exe().unwrap())
@@ -130,7 +133,9 @@ fn a_thousand_agents_in_fifty_processes() {
     let said = String::from_utf8_lossy(&looking.stdout).into_owned();
     assert!(looking.status.success(), "{said}");
     assert!(said.contains("found 1000 of 1000"), "{said}");
+    let found = began.elapsed();
 
+    let (mut most_open, mut most_taken) = (0, 0);
     for process in &processes {
         let pid = process.child.id();
         let open = std::fs::read_dir(format!("/proc/{pid}/fd"))
@@ -139,6 +144,7 @@ fn a_thousand_agents_in_fifty_processes() {
         assert!(open <= DESCRIPTORS, "{open} descriptors");
         let taken = private_memory(pid).saturating_sub(process.before);
         assert!(taken <= MEMORY, "{taken} bytes of memory");
+        (most_open, most_taken) = (most_open.max(open), most_taken.max(taken));
     }
     let prefix = format!("fipa_{domain}_");
     let shared = || {
@@ -152,6 +158,13 @@ fn a_thousand_agents_in_fifty_processes() {
     assert!(
         bytes <= MEMORY * PROCESSES as u64,
         "{bytes} bytes of shared memory"
+    );
+    println!(
+        "{PROCESSES} processes with {AGENTS} agents each: started and registered after \
+         {registered:.2?}, all found by one more after {found:.2?}; at most {most_open} \
+         descriptors and {} KiB of private memory per process, {} KiB of shared memory on average",
+        most_taken >> 10,
+        (bytes / PROCESSES as u64) >> 10,
     );
 
     for process in &mut processes {
@@ -177,7 +190,7 @@ async fn one_who_looks() {
             .count()
     };
     let all = Query::by_name(Matcher::parse("agent-.*").unwrap());
-    let began = std::time::Instant::now();
+    let began = Instant::now();
     while (exact(), directory.search(&all).len()) != (total, total) {
         // Ends a test that hangs.
         assert!(

@@ -1,6 +1,7 @@
 //! The service directory: with 10,000 entries, looking up, searching, watching, each beside the
-//! standard library's map or the bare channel that it stands on; then two hosts with 500 agents
-//! each on a network of their own, which takes root (`crowd`).
+//! standard library's map or the bare channel that it stands on; looking up and searching among the
+//! 1,000 agents of a host, as each of its processes does; then two hosts with 500 agents each on a
+//! network of their own, which takes root (`crowd`).
 #![allow(
     clippy::unwrap_used,
     clippy::print_stdout,
@@ -15,12 +16,13 @@ use std::sync::Arc;
 
 use criterion::{Criterion, criterion_group};
 use fipa_sds::{
-    Change, Directory, Exchange, MemoryDirectory, MergedDirectory, Mts, Query, Registration,
-    StaticDirectory, resolve,
+    Change, Directory, Exchange, HostConfig, HostDirectory, MemoryDirectory, MergedDirectory, Mts,
+    Query, Registration, StaticDirectory, resolve,
 };
 use fipa_transport::Incarnation;
 
 const ENTRIES: usize = 10_000;
+const ON_ONE_HOST: usize = 1000;
 
 fn name(number: usize) -> String {
     format!("robot-{}.arm_{number:05}", number % 20)
@@ -88,6 +90,52 @@ fn searching(criterion: &mut Criterion) {
     });
 }
 
+/// What a process knows of another one's agents on the same host.
+fn on_one_host(criterion: &mut Criterion) {
+    let place = tempfile::tempdir().unwrap();
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build()
+        .unwrap();
+    let _within = runtime.enter();
+    let [other, own] = ["other", "own"].map(|mts| {
+        let config = HostConfig {
+            dir: place.path().join("run"),
+            mts: Mts::new(mts, Incarnation::random()),
+            gateway: false,
+        };
+        HostDirectory::open(config).unwrap()
+    });
+    let agents = (0..ON_ONE_HOST).map(registration).collect();
+    other.replace(agents, &[]).unwrap();
+    own.refresh();
+    assert_eq!(own.search(&Query::all()).len(), ON_ONE_HOST);
+    let names: Vec<String> = (0..ON_ONE_HOST)
+        .map(|number| name(number * 7 % ON_ONE_HOST))
+        .collect();
+    let map: HashMap<&str, usize> = names.iter().map(String::as_str).zip(0..).collect();
+    let pattern = r"robot-.*\.arm_.*";
+    let compiled = regex::Regex::new(&format!(r"\A(?:{pattern})\z")).unwrap();
+    let mut group = criterion.benchmark_group("1,000 agents of one host");
+    let mut next = names.iter().cycle();
+    group.bench_function("raw HashMap", |bench| {
+        bench.iter(|| map.get(black_box(next.next().unwrap().as_str())));
+    });
+    group.bench_function("exact lookup", |bench| {
+        bench.iter(|| own.lookup(black_box(next.next().unwrap())));
+    });
+    group.bench_function("raw regex over a list", |bench| {
+        bench.iter(|| names.iter().filter(|name| compiled.is_match(name)).count());
+    });
+    group.bench_function("pattern that all match", |bench| {
+        bench.iter(|| resolve(&own, black_box(pattern), "sender").unwrap());
+    });
+    group.bench_function("pattern that 50 match", |bench| {
+        bench.iter(|| resolve(&own, black_box(r"robot-7\.arm_.*"), "sender").unwrap());
+    });
+}
+
 fn watching(criterion: &mut Criterion) {
     let (memory, merged) = directory();
     let mut watch = merged.watch();
@@ -115,7 +163,7 @@ fn watching(criterion: &mut Criterion) {
     });
 }
 
-criterion_group!(benches, looking_up, searching, watching);
+criterion_group!(benches, looking_up, searching, on_one_host, watching);
 
 fn main() {
     // The same program again, in namespaces of its own.

@@ -93,6 +93,13 @@ const LONGEST: Duration = Duration::from_secs(60);
 /// How long a process that does not take its turn holds up the others.
 const SKIPPED: Duration = Duration::from_secs(1);
 
+/// How long to wait before asking for the lock again, of whoever has the turn.
+const FIRST_PAUSE: Duration = Duration::from_micros(200);
+
+/// The same, of the others, who ask less and less often: fifty of them would otherwise take more of
+/// the processor than those they wait for.
+const LAST_PAUSE: Duration = Duration::from_millis(8);
+
 /// How long a turn lasts, in which a process may take the lock more than once: after each turn of
 /// another there is something to read, which takes longer than to register.
 const TURN: Duration = Duration::from_millis(20);
@@ -215,6 +222,7 @@ impl Place {
             });
         }
         let mut turn = None;
+        let mut pause = FIRST_PAUSE;
         let (mut seen, mut moved) = (None, Instant::now());
         loop {
             if turn.is_none() {
@@ -238,10 +246,13 @@ impl Place {
             if began.elapsed() > LONGEST {
                 return Err(busy());
             }
-            std::thread::sleep(match turn {
-                Some(_) => Duration::from_micros(200),
-                None => Duration::from_millis(2),
-            });
+            match turn {
+                Some(_) => std::thread::sleep(FIRST_PAUSE),
+                None => {
+                    std::thread::sleep(pause);
+                    pause = (pause * 2).min(LAST_PAUSE);
+                }
+            }
         }
     }
 

@@ -45,6 +45,10 @@ impl Watcher {
     }
 
     /// Keeps the view up to date, for ever.
+    ///
+    /// The first change is read at once, and what follows it together after a pause: a process that
+    /// registers a hundred agents replaces its file a hundred times, and everybody who read it each
+    /// time would read for as long as the square of that.
     pub(super) async fn run(mut self, shared: Arc<Shared>) {
         let mut ending = Ending::default();
         loop {
@@ -52,6 +56,7 @@ impl Watcher {
                 news = self.news() => news,
                 () = ending.due() => Ok(News::default()),
             };
+            let began = Instant::now();
             let handled = news
                 .map_err(|source| HostError::Watch {
                     path: shared.place.path().to_owned(),
@@ -64,6 +69,7 @@ impl Watcher {
                 tokio::time::sleep(Duration::from_millis(100)).await;
                 ending.rescan = true;
             }
+            tokio::time::sleep(pause_after(began.elapsed())).await;
         }
     }
 
@@ -88,6 +94,15 @@ impl Watcher {
         })
         .await
     }
+}
+
+/// How long to let changes gather, after those before took so long to read: where there are many of
+/// them, or little of the processor, reading leaves most of it to those who make them. Whoever
+/// looks for a name that is not there yet does not wait for this.
+fn pause_after(reading: Duration) -> Duration {
+    const LEAST: Duration = Duration::from_millis(5);
+    const MOST: Duration = Duration::from_millis(100);
+    (reading * 8).clamp(LEAST, MOST)
 }
 
 /// What has happened, each thing once however often it did.

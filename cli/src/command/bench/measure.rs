@@ -6,6 +6,7 @@ use std::time::Duration;
 use hdrhistogram::Histogram;
 use serde::Serialize;
 
+use super::many::Many;
 use super::part::{Fill, Letters, Wait};
 use super::stage::Stage;
 use super::way::{Sort, Turn, Way};
@@ -46,7 +47,7 @@ impl Effort {
 const LEAST: usize = 8;
 const MOST: usize = 2000;
 /// Letters at the beginning of a turn that do not count: whoever slept is awake after them.
-const WARMING: usize = 3;
+pub(super) const WARMING: usize = 3;
 /// A throughput turn takes this many times as long.
 const RATE_TURN: u32 = 3;
 
@@ -100,6 +101,7 @@ pub(super) struct Limit {
 #[derive(Debug, Default)]
 pub(super) struct Measured {
     pub(super) rows: Vec<Row>,
+    pub(super) many: Option<Many>,
     pub(super) notes: Vec<String>,
 }
 
@@ -274,18 +276,18 @@ impl Cell {
 }
 
 /// In nanoseconds. What counts begins after the warming letters.
-fn times(from: &[u64], until: &[u64]) -> Vec<f64> {
+pub(super) fn times(from: &[u64], until: &[u64]) -> Vec<f64> {
     let pairs = from.iter().zip(until).skip(WARMING);
     pairs
         .map(|(from, until)| until.saturating_sub(*from) as f64)
         .collect()
 }
 
-fn median(values: &[f64]) -> f64 {
+pub(super) fn median(values: &[f64]) -> f64 {
     quantile(values, 0.5)
 }
 
-fn quantile(values: &[f64], at: f64) -> f64 {
+pub(super) fn quantile(values: &[f64], at: f64) -> f64 {
     let mut values = values.to_vec();
     values.sort_by(f64::total_cmp);
     let last = values.len().saturating_sub(1);

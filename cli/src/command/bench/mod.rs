@@ -7,12 +7,14 @@
 //!
 //! * [`way`] has the ways, [`part`] what a process of one does.
 //! * [`stage`] starts, tells and ends the processes.
-//! * [`measure`] takes the turns and makes rows of them.
+//! * [`measure`] takes the turns and makes rows of them; [`many`] does so with large content for
+//!   many receivers.
 //! * [`report`] and [`plot`] show them; [`machine`] says on what machine that was.
 //! * [`paper`] is another measurement, of encodings, with [`bars`] to show it.
 
 mod bars;
 mod machine;
+mod many;
 mod measure;
 mod paper;
 mod part;
@@ -241,7 +243,8 @@ async fn measure(
     if arguments.zenoh.is_some() {
         wanted.extend(zenoh(arguments.what));
     }
-    let progress = progress(wanted.len() + effort.sizes.len() * 3);
+    let many = wanted.contains(&(Sort::Agents(Kind::Shm), Wait::Spin));
+    let progress = progress(wanted.len() + effort.sizes.len() * 3 + usize::from(many));
     let told = |what: &str| {
         progress.inc(1);
         progress.set_message(what.to_owned());
@@ -256,6 +259,13 @@ async fn measure(
         }
     }
     let mut measured = measure::all(&mut stage, &mut ways, effort, &told).await;
+    if many {
+        told("content for many");
+        match many::measure(&mut stage, effort).await {
+            Ok(many) => measured.many = Some(many),
+            Err(why) => notes.push(format!("content for many: cannot be measured: {why}")),
+        }
+    }
     progress.set_message("ending");
     drop(stage);
     progress.finish_and_clear();

@@ -14,7 +14,7 @@ use fipa::Config;
 use fipa_transport_shm::raw::Wait as RawWait;
 use serde::{Deserialize, Serialize};
 
-pub(super) use self::orders::{End, Event, Fill, Letters, Order};
+pub(super) use self::orders::{End, Event, Fill, Letters, Order, Spread};
 
 /// What a process is in a measurement; the argument of `--part`.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -22,6 +22,8 @@ pub(super) use self::orders::{End, Event, Fill, Letters, Order};
 pub(super) enum Part {
     /// An agent of this name; the configuration says in which domain.
     Agent { end: End, name: String },
+    /// So many agents that receive; their address is a pattern.
+    Crowd { count: usize },
     /// The gateway of the configured domain.
     Gateway,
     /// Bare iceoryx2.
@@ -39,6 +41,7 @@ impl Part {
             Self::Agent { end, .. } | Self::Iceoryx { end, .. } | Self::Socket { end, .. } => {
                 Some(*end)
             }
+            Self::Crowd { .. } => Some(End::Receiver),
             Self::Gateway | Self::Relay { .. } => None,
         }
     }
@@ -73,7 +76,12 @@ impl From<Wait> for RawWait {
 /// Plays a part until standard input ends.
 pub(super) fn play(part: Part, config: &Config) -> Result<(), String> {
     match part {
-        Part::Agent { name, .. } => agent::Agent::play(config, &name),
+        Part::Agent { name, .. } => agent::Agent::play(config, &[&name], &name),
+        Part::Crowd { count } => {
+            let names: Vec<String> = (0..count).map(|number| format!("one-{number}")).collect();
+            let names: Vec<&str> = names.iter().map(String::as_str).collect();
+            agent::Agent::play(config, &names, "one-.*")
+        }
         Part::Gateway => agent::gateway(config),
         Part::Iceoryx { end, wait } => iceoryx::play(config, end, wait.into()),
         Part::Socket { end, kind } => socket::play(end, kind),

@@ -4,6 +4,7 @@ use comfy_table::{CellAlignment, Table, presets};
 use serde_json::{Value, json};
 
 use super::machine::Machine;
+use super::many::Many;
 use super::measure::{Effort, Measured, Row, name_of};
 use super::part::Wait;
 
@@ -16,6 +17,7 @@ pub(super) fn json(machine: &Machine, effort: &Effort, measured: &Measured) -> V
             "letters_in_flight_for_rate": { "copied": 16, "loaned": 8, "filled": 8 },
         },
         "rows": measured.rows,
+        "multicast": measured.many,
         "notes": measured.notes,
     })
 }
@@ -33,6 +35,9 @@ pub(super) fn text(machine: &Machine, effort: &Effort, measured: &Measured) -> S
     ));
     text.push_str(&table(&measured.rows).to_string());
     text.push_str(LEGEND);
+    if let Some(many) = &measured.many {
+        text.push_str(&of_many(many));
+    }
     for note in &measured.notes {
         text.push_str(&format!("note: {note}\n"));
     }
@@ -49,6 +54,23 @@ cpu      of all processes of the way together, one letter at a time
 x limit  the one way, in units of the same bytes through the bare mechanism in the same rounds (the
          middle half of the rounds), and the same of round trip, rate and cpu
 ";
+
+fn of_many(many: &Many) -> String {
+    let [low, high] = many.ratio_spread;
+    format!(
+        "\n{} filled, to {} receivers: {} until all have it; writing it {}, a small message to all \
+         {}, so {:.2} ({low:.2}-{high:.2}) of their sum; {} with a copy for each, {:.1} times as \
+         long\n",
+        size(many.size),
+        many.receivers,
+        micro(many.together_us),
+        micro(many.fill_us),
+        micro(many.small_us),
+        many.ratio,
+        micro(many.copies_us),
+        many.copies_ratio,
+    )
+}
 
 fn table(rows: &[Row]) -> Table {
     let mut table = Table::new();

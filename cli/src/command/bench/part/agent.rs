@@ -7,17 +7,23 @@ use std::collections::VecDeque;
 use std::pin::Pin;
 
 use bytes::{Bytes, BytesMut};
-use fipa::{AgentId, Config, Deliveries, Domain, Gateway, MessageBuilder, Performative, SendError};
+use fipa::{
+    AgentId, Config, Deliveries, Domain, Gateway, Matcher, MessageBuilder, Performative, Query,
+    SendError,
+};
 use tokio::io::{AsyncBufReadExt, BufReader, Lines, Stdin};
 use tokio::runtime::{Builder, Runtime};
 
-use super::orders::{Fill, Letters, Peer, Sent, byte_of, check, now_ns, obey, told};
+use super::orders::{Fill, Letters, Peer, Sent, Spread, byte_of, check, now_ns, obey, told};
 
-/// One agent.
+/// One agent, or several that only receive.
 pub(super) struct Agent {
     agent: fipa::Agent,
+    others: Vec<fipa::Agent>,
     /// A message to the other end, without content.
     message: Option<MessageBuilder>,
+    /// The same to each that the other end consists of.
+    each: Vec<MessageBuilder>,
     orders: Lines<BufReader<Stdin>>,
     /// Content that is ready to be sent, used again and again.
     ready: Bytes,
@@ -32,14 +38,18 @@ struct Running {
 }
 
 impl Agent {
-    pub(super) fn play(config: &Config, name: &str) -> Result<(), String> {
+    pub(super) fn play(config: &Config, names: &[&str], address: &str) -> Result<(), String> {
         let runtime = runtime()?;
         let domain = runtime.block_on(Domain::open(config)).map_err(told)?;
-        let agent = domain.register(name).map_err(told)?;
+        let agents = names.iter().map(|name| domain.register(name));
+        let mut agents = agents.collect::<Result<Vec<_>, _>>().map_err(told)?;
+        let agent = agents.pop().ok_or("nobody to play")?;
         let orders = runtime.block_on(async { orders() });
         let agent = Self {
             agent,
+            others: agents,
             message: None,
+            each: Vec::new(),
             orders,
             ready: Bytes::new(),
         };
@@ -47,7 +57,7 @@ impl Agent {
             agent: Some(agent),
             runtime,
         };
-        obey(&mut running, name.to_owned());
+        obey(&mut running, address.to_owned());
         let Running { agent, runtime } = running;
         drop(agent);
         runtime.block_on(domain.close());
@@ -57,26 +67,73 @@ impl Agent {
     }
 
     async fn find(&mut self, to: &str) -> Result<(), String> {
+        let all = Query::by_name(Matcher::parse(to).map_err(told)?);
         let directory = self.agent.domain().directory();
         let mut changes = directory.watch();
-        while directory.lookup(to).is_none() {
+        let found = loop {
+            // Has what is new looked for, which a search does not.
+            let _one = directory.lookup(to);
+            let found = directory.search(&all);
+            if !found.is_empty() {
+                break found;
+            }
             changes.next().await.ok_or("the directory was closed")?;
-        }
-        let receiver = AgentId::new(to).map_err(told)?;
-        let message = self.agent.message(Performative::Inform);
-        self.message = Some(message.receiver(receiver));
+        };
+        let message = |to: &str| {
+            let message = self.agent.message(Performative::Inform);
+            Ok::<_, String>(message.receiver(AgentId::new(to).map_err(told)?))
+        };
+        let each = found.iter().map(|entry| message(&entry.name));
+        let each = each.collect::<Result<_, _>>()?;
+        self.message = Some(message(to)?);
+        self.each = each;
         Ok(())
     }
 
     async fn receive(&mut self, letters: &Letters) -> Result<Vec<u64>, String> {
         let mut at = Vec::with_capacity(letters.count);
         for number in 0..letters.count {
+            for other in &self.others {
+                let incoming = other.receive().await.map_err(told)?;
+                let content = incoming.message.content().ok_or("no content")?;
+                check(content, letters, number)?;
+            }
             let incoming = self.agent.receive().await.map_err(told)?;
             at.push(now_ns());
             let content = incoming.message.content().ok_or("no content")?;
             check(content, letters, number)?;
         }
         Ok(at)
+    }
+
+    async fn spread(&mut self, what: Spread, letters: &Letters) -> Result<Sent, String> {
+        let mut sent = Sent::with_room(letters);
+        for number in 0..letters.count {
+            let byte = byte_of(number);
+            if what == Spread::Copies {
+                let content = self.content(letters.size, byte);
+                let each = self.each.iter().cloned();
+                let messages = each.map(|message| message.content(content.clone()).build());
+                let messages = messages.collect::<Result<Vec<_>, _>>().map_err(told)?;
+                sent.began.push(now_ns());
+                let sending = messages.into_iter().map(|one| self.agent.send(one));
+                let sending: Vec<_> = sending.collect();
+                for one in sending {
+                    delivered(one.await)?;
+                }
+            } else {
+                let message = self.message.clone().ok_or("nobody to send to")?;
+                let message = message.build().map_err(told)?;
+                sent.began.push(now_ns());
+                let mut loan = self.agent.loan(message, letters.size).map_err(told)?;
+                loan.content_mut().fill(byte);
+                if what == Spread::Together {
+                    delivered(self.agent.send_loan(loan).await)?;
+                }
+            }
+            sent.ended.push(now_ns());
+        }
+        Ok(sent)
     }
 
     async fn send(&mut self, letters: &Letters) -> Result<Sent, String> {
@@ -188,6 +245,14 @@ impl Peer for Running {
         let letters = *letters;
         self.run(move |mut agent| async move {
             let sent = agent.send(&letters).await;
+            (agent, sent)
+        })?
+    }
+
+    fn spread(&mut self, what: Spread, letters: &Letters) -> Result<Sent, String> {
+        let letters = *letters;
+        self.run(move |mut agent| async move {
+            let sent = agent.spread(what, &letters).await;
             (agent, sent)
         })?
     }

@@ -40,6 +40,18 @@ pub(crate) struct Letters {
     pub(crate) window: usize,
 }
 
+/// What of a multicast is done.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Spread {
+    /// Memory for all receivers is loaned, written and given back.
+    Fill,
+    /// It is loaned, written and sent to all.
+    Together,
+    /// Each receiver is sent a message of its own, with the content copied.
+    Copies,
+}
+
 /// What a part is told to do.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(tag = "do", rename_all = "snake_case")]
@@ -50,6 +62,8 @@ pub(crate) enum Order {
     Receive(Letters),
     /// Send letters.
     Send(Letters),
+    /// Send letters to all that were found, one after the other.
+    Spread { what: Spread, letters: Letters },
     /// Say how much processor time this process has used.
     Cpu,
 }
@@ -114,6 +128,10 @@ pub(crate) trait Peer {
     fn send(&mut self, _letters: &Letters) -> Result<Sent, String> {
         Err("this part sends nothing".to_owned())
     }
+
+    fn spread(&mut self, _what: Spread, _letters: &Letters) -> Result<Sent, String> {
+        Err("this part sends to one only".to_owned())
+    }
 }
 
 /// Obeys until there are no more orders.
@@ -139,17 +157,19 @@ fn follow(peer: &mut impl Peer, line: &str) -> Result<Event, String> {
             let cpu_ns = cpu_ns() - before;
             Event::Received { at, cpu_ns }
         }
-        Order::Send(letters) => {
-            let Sent { began, ended } = peer.send(&letters)?;
-            let cpu_ns = cpu_ns() - before;
-            Event::Sent {
-                began,
-                ended,
-                cpu_ns,
-            }
-        }
+        Order::Send(letters) => sent(peer.send(&letters)?, before),
+        Order::Spread { what, letters } => sent(peer.spread(what, &letters)?, before),
         Order::Cpu => Event::Cpu { ns: before },
     })
+}
+
+fn sent(sent: Sent, cpu_before: u64) -> Event {
+    let Sent { began, ended } = sent;
+    Event::Sent {
+        began,
+        ended,
+        cpu_ns: cpu_ns() - cpu_before,
+    }
 }
 
 pub(crate) fn say(event: &Event) {

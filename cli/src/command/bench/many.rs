@@ -1,0 +1,118 @@
+//! A large content for many receivers, beside what it should cost: being written once, and a small
+//! letter to each.
+
+use serde::Serialize;
+
+use super::measure::{Effort, WARMING, median, quantile, times};
+use super::part::{End, Event, Fill, Letters, Order, Part, Spread};
+use super::stage::{Stage, Who};
+
+/// How many agents there are to receive.
+const RECEIVERS: usize = 32;
+/// How long the content is.
+const SIZE: usize = 1 << 20;
+/// What a small letter has.
+const SMALL: usize = 100;
+/// How many times each is done in a round.
+const TIMES: usize = 8;
+
+/// What it cost, in microseconds, until the sender has all outcomes; medians.
+#[derive(Debug, Clone, Serialize)]
+pub(super) struct Many {
+    pub(super) receivers: usize,
+    pub(super) size: usize,
+    /// The memory loaned, written and given back.
+    pub(super) fill_us: f64,
+    /// One small message to all.
+    pub(super) small_us: f64,
+    /// One message to all, its content loaned and written.
+    pub(super) together_us: f64,
+    /// The same content in a message of its own for each.
+    pub(super) copies_us: f64,
+    /// `together` to the sum of the first two: the median over all rounds.
+    pub(super) ratio: f64,
+    /// The middle half of those.
+    pub(super) ratio_spread: [f64; 2],
+    /// `copies` to `together`, the same way.
+    pub(super) copies_ratio: f64,
+}
+
+/// Measures it, through shared memory between two processes that spin.
+pub(super) async fn measure(stage: &mut Stage, effort: &Effort) -> Result<Many, String> {
+    let settings = [
+        "transport.shm.spin=1s",
+        "mts.transports=shm",
+        "transport.shm.capacity=1GiB",
+    ]
+    .map(str::to_owned);
+    let crowd = Part::Crowd { count: RECEIVERS };
+    let (receiver, pattern) = stage.start(&crowd, "many", &settings).await?;
+    let part = Part::Agent {
+        end: End::Sender,
+        name: "sender".to_owned(),
+    };
+    let (sender, _) = stage.start(&part, "many", &settings).await?;
+    let find = Order::Find { to: pattern };
+    stage.tell(sender, &find).await?;
+    stage.event(sender).await?;
+    let all = [
+        (Spread::Fill, SIZE),
+        (Spread::Together, SMALL),
+        (Spread::Together, SIZE),
+        (Spread::Copies, SIZE),
+    ];
+    let mut rounds: [Vec<f64>; 4] = Default::default();
+    for _ in 0..effort.rounds {
+        for ((what, size), medians) in all.iter().zip(&mut rounds) {
+            medians.push(turn(stage, (sender, receiver), *what, *size).await?);
+        }
+    }
+    let [fill, small, together, copies] = &rounds;
+    let sums = fill.iter().zip(small).map(|(fill, small)| fill + small);
+    let pairs = together.iter().zip(sums);
+    let ratios: Vec<f64> = pairs.map(|(together, sum)| together / sum).collect();
+    let pairs = copies.iter().zip(together);
+    let saved: Vec<f64> = pairs.map(|(copies, together)| copies / together).collect();
+    let [fill_us, small_us, together_us, copies_us] =
+        [fill, small, together, copies].map(|medians| median(medians) / 1e3);
+    Ok(Many {
+        receivers: RECEIVERS,
+        size: SIZE,
+        fill_us,
+        small_us,
+        together_us,
+        copies_us,
+        ratio: median(&ratios),
+        ratio_spread: [0.25, 0.75].map(|at| quantile(&ratios, at)),
+        copies_ratio: median(&saved),
+    })
+}
+
+/// The median of one turn, in nanoseconds.
+async fn turn(
+    stage: &mut Stage,
+    (sender, receiver): (Who, Who),
+    what: Spread,
+    size: usize,
+) -> Result<f64, String> {
+    let letters = Letters {
+        count: TIMES + WARMING,
+        size,
+        fill: Fill::Filled,
+        window: 1,
+    };
+    let receives = what != Spread::Fill;
+    if receives {
+        stage.tell(receiver, &Order::Receive(letters)).await?;
+        stage.event(receiver).await?;
+    }
+    stage.tell(sender, &Order::Spread { what, letters }).await?;
+    let sent = stage.event(sender).await?;
+    if receives {
+        stage.event(receiver).await?;
+    }
+    match sent {
+        Event::Sent { began, ended, .. } => Ok(median(&times(&began, &ended))),
+        other => Err(format!("instead of times there was {other:?}")),
+    }
+}
