@@ -76,20 +76,24 @@ fn what_is_expected_is_listed_by_who_says_it_to_whom() {
 
 #[test]
 fn the_initiator_need_not_be_the_first_role_of_the_file() {
-    let mut stage = stage_of(
-        r#"<scxml initial="start" xmlns:fipa="urn:fipa-rs:protocol" fipa:scope="participant">
+    let text = r#"<scxml initial="start" xmlns:fipa="urn:fipa-rs:protocol" fipa:scope="participant">
         <state id="asked">
             <transition performative="inform" from="arm" to="rover" target="done"/>
         </state>
         <state id="start">
             <transition performative="request" from="rover" to="arm" target="asked"/>
         </state>
-        <state id="done" final="yes"/></scxml>"#,
-    );
+        <state id="done" final="yes"/></scxml>"#;
+    let mut stage = stage_of(text);
     stage.right(own("request ann>ben,cid"));
     assert_eq!(stage.wrong(own("inform ann>ben")).kind, Kind::WrongSender);
     stage.right(own("inform ben>ann"));
     assert_eq!(stage.right(own("inform cid>ann")), "done");
+    let mut library = Library::standard();
+    library.add(Machine::read("own", text).unwrap()).unwrap();
+    let mut stage = Stage::new(Monitor::agent(Arc::new(library), "dan"));
+    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
+    assert_eq!(stage.check(&own("inform ben>dan")), elsewhere);
 }
 
 #[test]
