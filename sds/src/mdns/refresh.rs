@@ -2,8 +2,8 @@
 //!
 //! Where a record is (SRV, A and AAAA) is good for two minutes. The mDNS library asks for it after
 //! 80 % of that (RFC 6762 clause 5.2), for each record in packets of its own; with a thousand
-//! records that is most of what an idle network carries and most of what an idle gateway does. So
-//! they are asked for a little earlier, many in one packet. The answers go to all, and whoever has
+//! records that is much of what an idle network carries and an idle gateway does. So they are
+//! asked for a little earlier, many in one packet. The answers go to all, and whoever has
 //! heard one need not ask (RFC 6762 clause 7.3).
 
 use std::collections::HashMap;
