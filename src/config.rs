@@ -37,6 +37,10 @@
 //! insecure = false                    # open to the network without keys
 //! loopback = false                    # with keys: peers on this host prove who they are, too
 //! old_peers = []                      # with keys: addresses of old peers, which cannot
+//! [access]
+//! rate = 0                            # letters a second of one sender; 0: any number
+//! allow = { "rover_.*" = ["arm performative=request"] }   # nothing else passes (none by default)
+//! deny = { ".*" = ["brake"] }         # comes before what is allowed (none by default)
 //! [monitor]
 //! check = "off"                       # or warn, enforce: whether agents keep to their protocols
 //! answer = false                      # whether what breaks one is answered with not-understood
@@ -87,6 +91,8 @@ pub struct Config {
     pub discovery: Discovery,
     /// `[security]`: who is let in from other hosts.
     pub security: Security,
+    /// `[access]`: who may send what to whom through the gateway.
+    pub access: Access,
     /// `[monitor]`: whether agents keep to their protocols.
     pub monitor: Monitor,
 }
@@ -196,6 +202,31 @@ pub struct Security {
     pub old_peers: Vec<IpAddr>,
 }
 
+/// `[access]`: who may send what to whom through the gateway, hence between hosts; what agents of one
+/// host send each other does not come there. A rule that denies comes before those that allow; when
+/// there are any that allow, nothing else passes.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Access {
+    /// `rate`: letters a second that one sender may send, as many of which may come at once; 0: any
+    /// number. At most 1,000,000.
+    pub rate: usize,
+    /// `allow`: what may be sent, by sender. At most 256 lines.
+    pub allow: Vec<AccessRule>,
+    /// `deny`: what may not be sent. At most 256 lines.
+    pub deny: Vec<AccessRule>,
+}
+
+/// One line of `access.allow` or `access.deny`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct AccessRule {
+    /// The sender's name, or a pattern matched against the whole of it.
+    pub sender: String,
+    /// Receivers: a name or pattern each, and behind it perhaps `performative=NAME,…` and
+    /// `protocol=NAME,…`, when the rule is about those only.
+    pub receivers: Vec<String>,
+}
+
 /// `[monitor]`: whether agents keep to their protocols. Without the feature `monitor` nothing is
 /// checked.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -300,6 +331,7 @@ impl Config {
                 loopback: false,
                 old_peers: Vec::new(),
             },
+            access: Access::default(),
             monitor: Monitor {
                 check: Check::Off,
                 answer: false,

@@ -75,6 +75,9 @@ pub enum OpenError {
     /// The socket of a watcher cannot be used.
     #[error("cannot listen to the processes of the domain: {0}")]
     Watch(std::io::Error),
+    /// The rules for who may send to whom cannot be used.
+    #[error("access: {0}")]
+    Access(String),
     /// The keys that the configuration names cannot be used.
     #[error("security.keys: {0}")]
     Keys(String),
@@ -114,6 +117,7 @@ impl Domain {
                 gateway: false,
                 // Another way than shared memory between processes of this host; never further.
                 contacts: None,
+                gate: None,
                 // What stays on this host needs no proof.
                 #[cfg(feature = "secure")]
                 security: None,

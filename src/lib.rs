@@ -38,6 +38,7 @@
 #[cfg(not(any(feature = "shm", feature = "net")))]
 compile_error!("fipa needs a transport: enable the feature \"shm\" or \"net\"");
 
+mod access;
 mod agent;
 pub mod blocking;
 #[cfg(feature = "monitor")]

@@ -46,6 +46,8 @@ pub(crate) struct Role<'a> {
     pub(crate) gateway: bool,
     /// Who is told of agents of other hosts that have written.
     pub(crate) contacts: Option<Arc<dyn Contacts>>,
+    /// Who says which letters are taken.
+    pub(crate) gate: Option<Arc<dyn fipa_mts::Gate>>,
     /// What peers have to prove to it.
     #[cfg(feature = "secure")]
     pub(crate) security: Option<fipa_transport_net::secure::Security>,
@@ -87,6 +89,7 @@ impl Service {
                 unframed_deadline: config.mts.deadline,
                 contacts: role.contacts.clone(),
                 tap: Some(Arc::clone(&taps) as Arc<dyn fipa_mts::Tap>),
+                gate: role.gate.clone(),
             },
             view,
             transports,

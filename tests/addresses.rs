@@ -48,6 +48,7 @@ fn service(name: &str) -> (Mts, Arc<MemoryDirectory>, Location) {
             unframed_deadline: patient,
             contacts: None,
             tap: None,
+            gate: None,
         },
         directory.clone(),
         vec![transport as Arc<dyn Transport>],

@@ -117,6 +117,9 @@ insecure = false                     # default
 loopback = false                     # default
 old_peers = []                       # default
 
+[access]
+rate = 0                             # default
+
 [monitor]
 check = \"off\"                        # default
 answer = false                       # default

@@ -17,4 +17,4 @@ pub mod watch;
 type Map<K, V> = std::collections::HashMap<K, V, foldhash::fast::RandomState>;
 
 pub use post::{PostError, letter_around, letter_for};
-pub use runtime::{Contacts, Mts, RuntimeConfig, Sending, Started, Tap};
+pub use runtime::{Contacts, Gate, Mts, RuntimeConfig, Sending, Started, Tap};

@@ -16,6 +16,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
+use fipa_acl::Letter;
 use fipa_sds::{Change, Directory, Entry, Pattern};
 use fipa_transport::{
     Conclusion, Incarnation, Introduction, Kind, ListenError, Location, Outcome, Transport,
@@ -46,6 +47,18 @@ pub struct RuntimeConfig {
     pub contacts: Option<Arc<dyn Contacts>>,
     /// Whom to tell of the letters that pass, while the service is [watched](Mts::watch).
     pub tap: Option<Arc<dyn Tap>>,
+    /// Who says which letters are taken; all, without.
+    pub gate: Option<Arc<dyn Gate>>,
+}
+
+/// Who says which letters are taken.
+pub trait Gate: Send + Sync {
+    /// Whether a letter to the agent with this name is taken. Is called for every letter that a
+    /// transport brings, and must not wait nor call the service back.
+    ///
+    /// # Errors
+    /// Why not, as its sender is told.
+    fn admits(&self, receiver: &str, letter: &Letter) -> Result<(), String>;
 }
 
 /// Who is told of other hosts: of services that connections are open with, and of agents that

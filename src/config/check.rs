@@ -13,7 +13,7 @@ use fipa_transport::{Kind, Location};
 
 use super::keys::{is_interface_name, is_numeric_address};
 use super::reader::dotted;
-use super::{Config, Interface, Mistake, Origin, Peer, Route, Shm};
+use super::{Access, Config, Interface, Mistake, Origin, Peer, Route, Shm};
 
 /// Longest name of a domain, in bytes.
 const MAX_DOMAIN: usize = 32;
@@ -23,8 +23,10 @@ const MAX_MTS_NAME: usize = 255;
 const MAX_DEADLINE: Duration = MAX_REMAINING;
 /// Most letters in the queue of one agent.
 const MAX_QUEUE: usize = 65_536;
-/// Most lines of `[routes]`.
+/// Most lines of `[routes]`, `access.allow` and `access.deny`.
 const MAX_ROUTES: usize = 256;
+/// Most letters a second.
+const MAX_RATE: usize = 1_000_000;
 /// Shared memory of a domain, in bytes.
 const CAPACITY: RangeInclusive<u64> = 1 << 20..=1 << 40;
 /// Smallest largest letter, in bytes.
@@ -85,6 +87,7 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
     found.interfaces(&config.discovery.interfaces);
     found.peers(&config.discovery.peers);
     found.security(config);
+    found.access(&config.access);
     found.protocols(&config.monitor.protocols);
     found.0
 }
@@ -160,6 +163,29 @@ impl Findings {
                     format_args!("lists {open}, where everybody would be let in"),
                     "make keys (`fipa keys init`), or accept it with `security.insecure = true`",
                 );
+            }
+        }
+    }
+
+    fn access(&mut self, access: &Access) {
+        if access.rate > MAX_RATE {
+            let what = format_args!("cannot be {}", access.rate);
+            let help = format!("use 0 to {MAX_RATE} letters a second");
+            self.add(&["access", "rate"], what, help);
+        }
+        for (name, lines) in [("allow", &access.allow), ("deny", &access.deny)] {
+            if lines.len() > MAX_ROUTES {
+                self.too_many(&["access", name], lines.len(), MAX_ROUTES);
+                continue;
+            }
+            for line in lines {
+                if let Some(fault) = crate::access::fault(line) {
+                    self.add(
+                        &["access", name, &line.sender],
+                        fault,
+                        "write receivers such as \"arm_.* performative=request protocol=fipa-request\"",
+                    );
+                }
             }
         }
     }

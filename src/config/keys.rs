@@ -12,7 +12,7 @@ use fipa_transport::{Kind, Location};
 use toml_edit::Value as Toml;
 
 use super::effective::Value;
-use super::{Check, Config, Interface, Peer, Route};
+use super::{AccessRule, Check, Config, Interface, Peer, Route};
 
 /// A key with one place in the configuration.
 pub(super) struct Key {
@@ -54,6 +54,7 @@ pub(super) struct Wrong {
 
 const KINDS: &str = r#"a list of transports such as ["shm", "tcp"]"#;
 const SIZE: &str = r#"a size such as "64MiB""#;
+const ACCESS: &str = r#"a list of receivers such as ["arm_.* performative=request,cancel"]"#;
 const ADDRESSES: &str = r#"a list of numeric addresses with port such as ["127.0.0.1:0"]"#;
 
 /// Every key, in the order in which `fipa config show` prints them, before the [`MAPS`].
@@ -178,6 +179,13 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::list(&config.security.old_peers),
     },
     Key {
+        path: &["access", "rate"],
+        shape: Shape::Plain,
+        expected: "a number of letters a second such as 100, or 0 for any number",
+        write: |config, value| number(value).map(|rate| config.access.rate = rate),
+        read: |config| Value::Number(config.access.rate),
+    },
+    Key {
         path: &["monitor", "check"],
         shape: Shape::Text,
         expected: r#""off", "warn" or "enforce""#,
@@ -237,7 +245,36 @@ pub(super) const MAPS: &[Map] = &[
                 .collect()
         },
     },
+    Map {
+        path: &["access", "allow"],
+        expected: ACCESS,
+        write: |config, sender, value| {
+            access(sender, value).map(|rule| config.access.allow.push(rule))
+        },
+        read: |config| shown(&config.access.allow),
+    },
+    Map {
+        path: &["access", "deny"],
+        expected: ACCESS,
+        write: |config, sender, value| {
+            access(sender, value).map(|rule| config.access.deny.push(rule))
+        },
+        read: |config| shown(&config.access.deny),
+    },
 ];
+
+fn access(sender: &str, value: &Toml) -> Result<AccessRule, Wrong> {
+    let receivers = items(value, text)?;
+    let sender = sender.to_owned();
+    Ok(AccessRule { sender, receivers })
+}
+
+fn shown(rules: &[AccessRule]) -> Vec<(&str, Value)> {
+    let rules = rules.iter();
+    rules
+        .map(|rule| (rule.sender.as_str(), Value::list(&rule.receivers)))
+        .collect()
+}
 
 /// The default of `mts.name`: the host's name, with what a name cannot have replaced.
 pub(super) fn default_mts_name(host_name: &str) -> String {

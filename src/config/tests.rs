@@ -68,6 +68,10 @@ fn the_documented_file_is_the_default() {
     assert_eq!(documented.discovery.peers.len(), 1);
     documented.routes.clear();
     documented.discovery.peers.clear();
+    assert_eq!(documented.access.allow.len(), 1);
+    assert_eq!(documented.access.deny.len(), 1);
+    documented.access.allow.clear();
+    documented.access.deny.clear();
     assert_eq!(documented, Config::for_host("sherpa"));
 }
 
@@ -96,6 +100,10 @@ fn every_key_is_read() {
         keys = "/etc/fipa/keys"
         loopback = true
         old_peers = ["10.0.0.9", "::1"]
+        [access]
+        rate = 100
+        allow = { "rover_.*" = ["arm", "crex performative=request"] }
+        deny = { rover_1 = ["arm"] }
         [monitor]
         check = "enforce"
         answer = true
@@ -124,6 +132,13 @@ fn every_key_is_read() {
     );
     assert!(config.transport.udp.listen.is_empty());
     assert_eq!(config.transport.quic.listen, ["[::1]:7789"]);
+    assert_eq!(config.access.rate, 100);
+    assert_eq!(config.access.allow[0].sender, "rover_.*");
+    assert_eq!(
+        config.access.allow[0].receivers,
+        ["arm", "crex performative=request"]
+    );
+    assert_eq!(config.access.deny[0].receivers, ["arm"]);
     assert!(!config.discovery.mdns);
     assert_eq!(config.security.keys, "/etc/fipa/keys");
     assert!(config.security.loopback && !config.security.insecure);
@@ -285,6 +300,9 @@ keys = ""                            # default
 insecure = false                     # default
 loopback = false                     # default
 old_peers = []                       # default
+
+[access]
+rate = 0                             # default
 
 [monitor]
 check = "off"                        # default

@@ -83,6 +83,7 @@ impl Place {
             unframed_deadline: Duration::from_secs(5),
             contacts: None,
             tap: None,
+            gate: None,
         };
         let transports = transports.into_iter().flatten().collect();
         let Started {

@@ -18,12 +18,12 @@ fn mistakes_are_named_with_line_and_key() {
         (
             "deadline = \"5s\"\n",
             "fipa.toml:1: unknown key `deadline`; did you mean `mts.deadline`? \
-             (known at the top: domain, mts, transport, discovery, security, monitor, routes)",
+             (known at the top: domain, mts, transport, discovery, security, access, monitor, routes)",
         ),
         (
             "[discover]\nmdns = true\n",
             "fipa.toml:1: unknown key `discover`; did you mean `discovery`? \
-             (known at the top: domain, mts, transport, discovery, security, monitor, routes)",
+             (known at the top: domain, mts, transport, discovery, security, access, monitor, routes)",
         ),
         (
             "[transport.serial]\nlisten = []\n",
@@ -194,6 +194,16 @@ fn mistakes_are_named_with_line_and_key() {
             "[routes]\n\"camera_(\" = [\"shm\"]\n",
             "fipa.toml:2: `routes.\"camera_(\"` cannot be matched: unclosed group; \
              write the name of an agent, or a regular expression for whole names",
+        ),
+        (
+            "[access.deny]\nrover = [\"arm request\"]\n",
+            "fipa.toml:2: `access.deny.rover` has \"request\" behind a receiver; write receivers such \
+             as \"arm_.* performative=request protocol=fipa-request\"",
+        ),
+        (
+            "[access.allow]\nrover = []\n",
+            "fipa.toml:2: `access.allow.rover` has no receivers; write receivers such \
+             as \"arm_.* performative=request protocol=fipa-request\"",
         ),
         (
             "[routes]\na = []\n",

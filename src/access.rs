@@ -1,0 +1,323 @@
+//! Who may send what to whom through a gateway: the rules of `[access]`, and how often.
+//!
+//! A rule that denies comes before all that allow; when there are rules that allow, what none of
+//! them names is refused. Sans-I/O: what a letter claims and `now` go in, a judgement comes out.
+//!
+//! What must not live here: whether a sender is who it says (`fipa_transport_net::secure`).
+
+#![cfg_attr(
+    not(feature = "net"),
+    allow(dead_code, reason = "without gateways nothing is judged, only checked")
+)]
+
+use std::collections::HashMap;
+use std::time::{Duration, Instant};
+
+use fipa_sds::Matcher;
+
+use crate::config;
+
+/// Senders whose rate is remembered. When there are more who all send, new ones wait.
+const MAX_SENDERS: usize = 4096;
+
+/// What a letter says of itself.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Claim<'a> {
+    pub(crate) sender: &'a str,
+    pub(crate) receiver: &'a str,
+    pub(crate) performative: &'a str,
+    pub(crate) protocol: Option<&'a str>,
+}
+
+/// Why a letter does not pass.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum Refusal {
+    #[error("a rule denies it (access.deny)")]
+    Denied,
+    #[error("no rule allows it (access.allow)")]
+    NotAllowed,
+    #[error("its sender sends more letters a second than it may (access.rate)")]
+    TooMany,
+}
+
+/// A rule that cannot be understood; the text says what to write.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub(crate) struct RuleError(String);
+
+/// The rules, and what senders have sent lately.
+#[derive(Debug)]
+pub(crate) struct Access {
+    deny: Vec<Rule>,
+    allow: Vec<Rule>,
+    /// Letters a second; none: any number.
+    rate: Option<f64>,
+    senders: HashMap<String, Bucket>,
+}
+
+/// One receiver of one line.
+#[derive(Debug, Clone)]
+struct Rule {
+    sender: Matcher,
+    receiver: Matcher,
+    /// Any, when there are none.
+    performatives: Vec<String>,
+    protocols: Vec<String>,
+}
+
+/// Letters that a sender may still send at once.
+#[derive(Debug)]
+struct Bucket {
+    left: f64,
+    at: Instant,
+}
+
+impl Access {
+    /// The rules of a configuration; none, when it has none.
+    pub(crate) fn new(config: &config::Access) -> Result<Option<Self>, RuleError> {
+        let rules = |lines: &[config::AccessRule]| -> Result<Vec<Rule>, RuleError> {
+            let all = lines.iter().flat_map(|line| {
+                let receivers = line.receivers.iter();
+                receivers.map(|receiver| Rule::parse(&line.sender, receiver))
+            });
+            all.collect()
+        };
+        let (deny, allow) = (rules(&config.deny)?, rules(&config.allow)?);
+        if deny.is_empty() && allow.is_empty() && config.rate == 0 {
+            return Ok(None);
+        }
+        Ok(Some(Self {
+            deny,
+            allow,
+            rate: (config.rate > 0).then_some(config.rate as f64),
+            senders: HashMap::new(),
+        }))
+    }
+
+    /// Whether a letter may pass.
+    pub(crate) fn judge(&mut self, claim: &Claim<'_>, now: Instant) -> Result<(), Refusal> {
+        if self.deny.iter().any(|rule| rule.names(claim)) {
+            return Err(Refusal::Denied);
+        }
+        if !self.allow.is_empty() && !self.allow.iter().any(|rule| rule.names(claim)) {
+            return Err(Refusal::NotAllowed);
+        }
+        let Some(rate) = self.rate else {
+            return Ok(());
+        };
+        if let Some(bucket) = self.senders.get_mut(claim.sender) {
+            return bucket.take(rate, now);
+        }
+        if self.senders.len() >= MAX_SENDERS {
+            // Whoever has been silent for a second is as good as new.
+            self.senders
+                .retain(|_, it| now.saturating_duration_since(it.at) < Duration::from_secs(1));
+            if self.senders.len() >= MAX_SENDERS {
+                return Err(Refusal::TooMany);
+            }
+        }
+        let bucket = self.senders.entry(claim.sender.to_owned());
+        let bucket = bucket.or_insert(Bucket {
+            left: rate,
+            at: now,
+        });
+        bucket.take(rate, now)
+    }
+}
+
+impl Bucket {
+    /// A second's worth may come at once.
+    fn take(&mut self, rate: f64, now: Instant) -> Result<(), Refusal> {
+        let since = now.saturating_duration_since(self.at).as_secs_f64();
+        let left = (self.left + since * rate).min(rate);
+        if left < 1.0 {
+            return Err(Refusal::TooMany);
+        }
+        (self.left, self.at) = (left - 1.0, now);
+        Ok(())
+    }
+}
+
+impl Rule {
+    /// Reads `RECEIVER [performative=NAME,…] [protocol=NAME,…]`.
+    fn parse(sender: &str, receiver: &str) -> Result<Self, RuleError> {
+        let matcher = |text: &str| {
+            Matcher::parse(text).map_err(|error| {
+                let error = error.to_string();
+                let last = error.lines().last().unwrap_or_default().trim();
+                RuleError(format!("{text:?} cannot be matched: {last}"))
+            })
+        };
+        let mut words = receiver.split_whitespace();
+        let name = words.next().unwrap_or_default();
+        if name.is_empty() || sender.is_empty() {
+            return Err(RuleError("has a rule without a name".to_owned()));
+        }
+        let mut rule = Self {
+            sender: matcher(sender)?,
+            receiver: matcher(name)?,
+            performatives: Vec::new(),
+            protocols: Vec::new(),
+        };
+        for word in words {
+            let (list, names) = match word.split_once('=') {
+                Some(("performative", names)) => (&mut rule.performatives, names),
+                Some(("protocol", names)) => (&mut rule.protocols, names),
+                _ => return Err(RuleError(format!("has {word:?} behind a receiver"))),
+            };
+            list.extend(names.split(',').map(str::to_owned));
+            if list.iter().any(String::is_empty) {
+                return Err(RuleError(format!("has an empty name in {word:?}")));
+            }
+        }
+        Ok(rule)
+    }
+
+    /// Whether the rule is about such a letter.
+    fn names(&self, claim: &Claim<'_>) -> bool {
+        let among = |names: &[String], name: Option<&str>| {
+            names.is_empty()
+                || name.is_some_and(|name| names.iter().any(|it| it.eq_ignore_ascii_case(name)))
+        };
+        self.sender.matches(claim.sender)
+            && self.receiver.matches(claim.receiver)
+            && among(&self.performatives, Some(claim.performative))
+            && among(&self.protocols, claim.protocol)
+    }
+}
+
+/// What is wrong with a line of rules, if anything is.
+pub(crate) fn fault(line: &config::AccessRule) -> Option<RuleError> {
+    if line.receivers.is_empty() {
+        return Some(RuleError("has no receivers".to_owned()));
+    }
+    let mut rules = line.receivers.iter();
+    rules.find_map(|receiver| Rule::parse(&line.sender, receiver).err())
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::config::AccessRule;
+
+    fn access(deny: &[(&str, &[&str])], allow: &[(&str, &[&str])], rate: usize) -> Access {
+        let lines = |lines: &[(&str, &[&str])]| -> Vec<AccessRule> {
+            let lines = lines.iter().map(|(sender, receivers)| AccessRule {
+                sender: (*sender).to_owned(),
+                receivers: receivers.iter().map(|it| (*it).to_owned()).collect(),
+            });
+            lines.collect()
+        };
+        let config = config::Access {
+            deny: lines(deny),
+            allow: lines(allow),
+            rate,
+        };
+        Access::new(&config).unwrap().unwrap()
+    }
+
+    fn claim<'a>(sender: &'a str, receiver: &'a str) -> Claim<'a> {
+        Claim {
+            sender,
+            receiver,
+            performative: "inform",
+            protocol: None,
+        }
+    }
+
+    #[test]
+    fn what_is_denied_does_not_pass_whatever_is_allowed() {
+        let mut access = access(&[("rover_2", &["arm"])], &[("rover_.*", &["arm"])], 0);
+        let now = Instant::now();
+        assert_eq!(access.judge(&claim("rover_1", "arm"), now), Ok(()));
+        let denied = access.judge(&claim("rover_2", "arm"), now);
+        assert_eq!(denied, Err(Refusal::Denied));
+        for (sender, receiver) in [("rover_1", "arm_2"), ("crex", "arm")] {
+            let refused = access.judge(&claim(sender, receiver), now);
+            assert_eq!(refused, Err(Refusal::NotAllowed));
+        }
+    }
+
+    #[test]
+    fn a_rule_can_be_about_some_performatives_and_protocols_only() {
+        let only = ["arm performative=request,cancel protocol=fipa-request"];
+        let mut access = access(&[], &[(".*", &only)], 0);
+        let now = Instant::now();
+        for (performative, protocol, passes) in [
+            ("request", Some("fipa-request"), true),
+            ("CANCEL", Some("FIPA-Request"), true),
+            ("inform", Some("fipa-request"), false),
+            ("request", Some("fipa-query"), false),
+            ("request", None, false),
+        ] {
+            let claim = Claim {
+                performative,
+                protocol,
+                ..claim("rover", "arm")
+            };
+            assert_eq!(access.judge(&claim, now).is_ok(), passes, "{claim:?}");
+        }
+    }
+
+    #[test]
+    fn senders_that_are_remembered_are_bounded_and_forgotten() {
+        let mut access = access(&[], &[], 5);
+        let now = Instant::now();
+        for number in 0..MAX_SENDERS {
+            let name = format!("agent{number}");
+            assert_eq!(access.judge(&claim(&name, "arm"), now), Ok(()));
+        }
+        let one_more = claim("one more", "arm");
+        assert_eq!(access.judge(&one_more, now), Err(Refusal::TooMany));
+        let later = now + Duration::from_secs(1);
+        assert_eq!(access.judge(&one_more, later), Ok(()));
+        assert_eq!(access.senders.len(), 1);
+    }
+
+    #[test]
+    fn rules_that_cannot_be_understood_are_told() {
+        for wrong in [
+            "",
+            "arm_(",
+            "arm content=x",
+            "arm performative=,",
+            "arm request",
+        ] {
+            let line = AccessRule {
+                sender: "rover".to_owned(),
+                receivers: vec![wrong.to_owned()],
+            };
+            assert!(fault(&line).is_some(), "{wrong:?}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn no_sender_gets_more_through_than_a_second_s_worth_and_its_rate(
+            rate in 1_usize..50,
+            pauses in prop::collection::vec(0_u64..200, 1..200),
+        ) {
+            let mut access = access(&[], &[], rate);
+            let begun = Instant::now();
+            let (mut now, mut passed) = (begun, 0);
+            for pause in pauses {
+                now += Duration::from_millis(pause);
+                passed += usize::from(access.judge(&claim("rover", "arm"), now).is_ok());
+                let most = rate as f64 * (1.0 + (now - begun).as_secs_f64());
+                prop_assert!(passed as f64 <= most + 1e-6, "{passed} of {most}");
+            }
+            // Another one has noticed nothing.
+            prop_assert!(access.judge(&claim("crex", "arm"), now).is_ok());
+        }
+
+        #[test]
+        fn a_denied_pair_never_passes(sender in "[a-c]{1,2}", receiver in "[a-c]{1,2}") {
+            let mut access = access(&[("a.*", &["b.*"])], &[(".*", &[".*"])], 0);
+            let denied = sender.starts_with('a') && receiver.starts_with('b');
+            let judged = access.judge(&claim(&sender, &receiver), Instant::now());
+            prop_assert_eq!(judged.is_err(), denied);
+        }
+    }
+}
