@@ -10,7 +10,7 @@ use std::net::{Ipv4Addr, UdpSocket};
 use std::time::{Duration, Instant};
 
 use common::{eventually, registration};
-use fipa_sds::{Directory, MdnsConfig, MdnsDirectory, Mts};
+use fipa_sds::{Change, Directory, MdnsConfig, MdnsDirectory, Mts};
 use fipa_transport::Incarnation;
 use simple_dns::rdata::{A, PTR, RData, SRV, TXT};
 use simple_dns::{CLASS, CharacterString, Label, Name, Packet, PacketFlag, ResourceRecord};
@@ -194,6 +194,77 @@ async fn a_flood_of_records_is_bounded_and_others_are_found() {
     // Who was known stays known, and what is said directly still works.
     assert!(victim.lookup("before").is_some());
     assert!(honest.register(registration("after")).is_ok());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_the_library_keeps_is_bounded_and_nobody_leaves() {
+    let port = free_port();
+    let (victim, honest) = (open(port, "victim"), open(port, "honest"));
+    let entry = honest.register(registration("honest")).unwrap();
+    victim.register(registration("victim")).unwrap();
+    eventually("the honest agent", || victim.lookup("honest")).await;
+    eventually("the victim's agent", || honest.lookup("victim")).await;
+    let (mut seen_by_victim, mut seen_by_honest) = (victim.watch(), honest.watch());
+    let attacker = Attacker::new(port);
+    let before = memory();
+    // Addresses belong to no service, so that no bound of ours sees them.
+    let addresses = |of: u32| {
+        let mut packet = Packet::new_reply(0);
+        packet.set_flags(PacketFlag::AUTHORITATIVE_ANSWER);
+        for number in 0..250 {
+            let address = RData::A(A {
+                address: u32::from(Ipv4Addr::LOCALHOST),
+            });
+            let name = format!("h{of}-{number}.local");
+            let name = Name::new(&name).unwrap().into_owned();
+            let record = ResourceRecord::new(name, CLASS::IN, 4500, address);
+            packet.answers.push(record);
+        }
+        packet.build_bytes_vec_compressed().unwrap()
+    };
+    // Until both have had enough, as both hear it: the bound is reached, whatever was lost.
+    // `FIPA_FLOOD` goes on until so many were sent.
+    let flood = std::env::var("FIPA_FLOOD").map_or(0, |flood| flood.parse().unwrap());
+    let mut sent = 0;
+    let flooding = async {
+        let restarts = |of: &MdnsDirectory| of.status().restarts;
+        while restarts(&victim) == 0 || restarts(&honest) == 0 || sent * 250 < flood {
+            attacker.send(&addresses(sent));
+            sent += 1;
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    };
+    let watchdog = common::WATCHDOG + Duration::from_millis(u64::from(flood));
+    let flooded = tokio::time::timeout(watchdog, flooding).await;
+    let more = memory().saturating_sub(before) >> 20;
+    let restarts = victim.status().restarts;
+    println!(
+        "after {} addresses: {more} MiB more, {restarts} restarts",
+        sent * 250
+    );
+    flooded.expect("the library is started anew");
+    assert!(u64::from(sent) * 250 > MdnsDirectory::MAX_CACHED);
+    eventually("the flood is told", || {
+        let why = victim.status().last_error?;
+        why.contains("floods the network").then_some(())
+    })
+    .await;
+    // What is registered while there is no library, and after that, is found.
+    honest.register(registration("during")).unwrap();
+    eventually("who registered during it", || victim.lookup("during")).await;
+    victim.register(registration("after")).unwrap();
+    eventually("who registered after it", || honest.lookup("after")).await;
+    for watch in [&mut seen_by_victim, &mut seen_by_honest] {
+        while let Some(change) = watch.try_next() {
+            assert!(!matches!(change, Change::Left(_)), "{change:?}");
+        }
+    }
+    // What had been announced before is announced by the new library: it can say goodbye to it.
+    honest.deregister("honest", entry.incarnation).unwrap();
+    eventually("who left after it", || {
+        victim.lookup("honest").is_none().then_some(())
+    })
+    .await;
 }
 
 /// How many records of others were used or refused.

@@ -10,6 +10,7 @@
 //! label of a record, on the other hand, means nothing between us: if it is taken by another
 //! name, another one is used.
 
+mod anew;
 mod beacon;
 mod ear;
 mod held;
@@ -27,7 +28,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use fipa_transport::Incarnation;
-use mdns_sd::{IfKind, ServiceDaemon, ServiceInfo, TxtProperty};
+use mdns_sd::{DaemonStatus, IfKind, Receiver, ServiceDaemon, ServiceInfo, TxtProperty};
 use parking_lot::Mutex;
 use tokio::sync::{Notify, broadcast};
 
@@ -103,6 +104,8 @@ pub struct MdnsStatus {
     pub known: usize,
     /// How many records of others were not used: malformed, or too many.
     pub refused: u64,
+    /// How often the mDNS library was started anew because it kept too much of what it heard.
+    pub restarts: u64,
     /// What went wrong last, if anything did.
     pub last_error: Option<String>,
 }
@@ -110,6 +113,11 @@ pub struct MdnsStatus {
 impl MdnsDirectory {
     /// Most records of others that are kept.
     pub const MAX_RECORDS: usize = 20_000;
+    /// Most DNS records that the mDNS library keeps: an agent has three, and one for each address
+    /// of its host. It is looked at every two seconds. When there are more the library is started
+    /// anew: what was known of others stays for two minutes unless it is found again, and our own
+    /// agents are announced again without having said goodbye.
+    pub const MAX_CACHED: u64 = anew::MAX_CACHED;
 
     /// Starts to listen; a task of the current tokio runtime keeps the view up to date. That
     /// multicast does not work is not an error here but part of the [status](Self::status).
@@ -127,7 +135,7 @@ impl MdnsDirectory {
             ),
         };
         let shared = Arc::new(Shared {
-            daemon,
+            daemon: Mutex::new(daemon),
             config,
             table: Table::new(),
             held: Mutex::default(),
@@ -141,10 +149,8 @@ impl MdnsDirectory {
             }),
             postponed: Notify::new(),
         });
-        if let Some(daemon) = &shared.daemon
-            && let Err(error) = choose(daemon, &shared.config.interfaces)
-        {
-            shared.failed(format!("cannot choose the interfaces: {error}"));
+        if let Some(daemon) = &*shared.daemon.lock() {
+            shared.choose(daemon);
         }
         let task = runtime.spawn(task::run(Arc::clone(&shared)));
         Ok(Self { shared, task })
@@ -201,8 +207,7 @@ impl MdnsDirectory {
         self.task.abort();
         // Whose coalitions are gone, too, says so: others wait for that.
         let (config, nothing) = (&self.shared.config, beacon::Announced::default());
-        if self.shared.daemon.is_some()
-            && let Some(beacon) = beacon::packet(config.mts.incarnation, nothing)
+        if let Some(beacon) = beacon::packet(config.mts.incarnation, nothing)
             && let Err(error) = whole::send_once(config, &beacon)
         {
             tracing::debug!(%error, "the last beacon was not sent");
@@ -264,8 +269,8 @@ pub enum MdnsError {
 }
 
 struct Shared {
-    /// None when there was no socket to be had.
-    daemon: Option<ServiceDaemon>,
+    /// None when it could not be started, and while it rests after a flood.
+    daemon: Mutex<Option<ServiceDaemon>>,
     config: MdnsConfig,
     /// The others' entries, by the full name of their record, spelt as they spell it: the daemon
     /// knows it by that only.
@@ -480,17 +485,66 @@ impl Shared {
         &self,
         what: impl Fn(&ServiceDaemon) -> Result<T, mdns_sd::Error>,
     ) -> Result<Option<T>, mdns_sd::Error> {
-        let Some(daemon) = &self.daemon else {
+        let Some(daemon) = self.daemon.lock().clone() else {
             return Ok(None);
         };
         let deadline = Instant::now() + Duration::from_secs(5);
         loop {
-            match what(daemon) {
+            match what(&daemon) {
                 Err(mdns_sd::Error::Again) if Instant::now() < deadline => {
                     std::thread::sleep(Duration::from_millis(1));
                 }
                 done => return done.map(Some),
             }
+        }
+    }
+
+    /// Ends the daemon, without a goodbye for what is announced, and gives what tells when that
+    /// is done. Until another one is started nothing is announced or answered.
+    fn end_daemon(&self) -> Result<Option<Receiver<DaemonStatus>>, mdns_sd::Error> {
+        let Some(daemon) = self.daemon.lock().clone() else {
+            return Ok(None);
+        };
+        // It says goodbye on the interfaces that it has.
+        daemon.disable_interface(IfKind::All)?;
+        let ended = daemon.shutdown()?;
+        *self.daemon.lock() = None;
+        Ok(Some(ended))
+    }
+
+    /// Starts another daemon, and announces to it, at the usual pace, what was announced before.
+    /// Says whether there is one now.
+    fn start_daemon(&self) -> bool {
+        // Whoever closes meanwhile waits, and then ends the new one.
+        let mut own = self.own.lock();
+        let own = &mut *own;
+        if own.closed {
+            return false;
+        }
+        let daemon = match ServiceDaemon::new_with_port(self.config.port) {
+            Ok(daemon) => daemon,
+            Err(error) => {
+                self.failed(format!("cannot open a multicast socket again: {error}"));
+                return false;
+            }
+        };
+        self.choose(&daemon);
+        *self.daemon.lock() = Some(daemon);
+        let now = Instant::now();
+        let agents = own.agents.values_mut();
+        let mut before: Vec<_> = agents.filter(|one| one.told.is_some()).collect();
+        // Another flood may end this one before it has told all: the next begins with the rest.
+        before.sort_by_key(|one| one.told.map(|(when, _)| when));
+        for announced in before {
+            let turn = own.pace.turn(now, fastrand::f64());
+            announced.due = announced.due.max(Some(turn.unwrap_or(now)));
+        }
+        true
+    }
+
+    fn choose(&self, daemon: &ServiceDaemon) {
+        if let Err(error) = choose(daemon, &self.config.interfaces) {
+            self.failed(format!("cannot choose the interfaces: {error}"));
         }
     }
 

@@ -1,36 +1,106 @@
 //! The task that listens to the network.
 
-use std::collections::HashSet;
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
-use mdns_sd::{DaemonEvent, Receiver, ResolvedService, ServiceDaemon, ServiceEvent};
-use tokio::time::Instant;
+use mdns_sd::{
+    DaemonEvent, DaemonStatus, Error, Metrics, Receiver, ResolvedService, ServiceDaemon,
+    ServiceEvent,
+};
 
+use super::anew::{self, Pauses, Unconfirmed};
 use super::ear::Ear;
 use super::record::Properties;
 use super::{MAX_SPOILT, MdnsDirectory, SERVICE_TYPE, Shared, Withdrawal, record};
 use crate::Entry;
 
+/// For how long what was known is believed after events were lost: the daemon tells at once what
+/// it still knows.
+const BELIEF: Duration = Duration::from_secs(10);
+/// How long a daemon that is busy has until it is told again that it is to end.
+const RETRY: Duration = Duration::from_millis(50);
+
+/// What the daemon tells.
+struct Events {
+    found: Receiver<ServiceEvent>,
+    monitor: Receiver<DaemonEvent>,
+}
+
+/// Why there are no more events.
+enum Ended {
+    /// The daemon has dropped the listener, or is gone.
+    Lost,
+    /// The daemon keeps too much: that.
+    TooMuch(String),
+}
+
 /// Keeps the view up to date and our names unambiguous, for ever.
 pub(super) async fn run(shared: Arc<Shared>) {
-    let Some(monitor) = subscribe(&shared, ServiceDaemon::monitor) else {
-        return;
-    };
-    let mut unconfirmed = HashSet::new();
+    let mut unconfirmed = Unconfirmed::default();
     let mut ear = Ear::new();
-    // The daemon drops a listener who has fallen behind; then all is asked for again.
-    while let Some(found) = subscribe(&shared, |daemon| daemon.browse(SERVICE_TYPE)) {
-        listen(&shared, &found, &monitor, &mut unconfirmed, &mut ear).await;
-        shared.failed("events were lost; asking the network again".to_owned());
-        unconfirmed = shared.table.origins();
-        tokio::time::sleep(Duration::from_secs(1)).await;
+    let mut pauses = Pauses::new(Instant::now());
+    while let Some(monitor) = subscribe(&shared, ServiceDaemon::monitor)
+        && let Some(found) = subscribe(&shared, |daemon| daemon.browse(SERVICE_TYPE))
+    {
+        let events = Events { found, monitor };
+        let ended = listen(&shared, Some(&events), &mut unconfirmed, &mut ear).await;
+        // What it says from now on counts no more.
+        drop(events);
+        match ended {
+            // It drops a listener who has fallen behind; then all is asked for again.
+            Ended::Lost => {
+                shared.failed("events were lost; asking the network again".to_owned());
+                unconfirmed.add(shared.table.origins(), Instant::now() + BELIEF);
+                tokio::time::sleep(Duration::from_secs(1)).await;
+            }
+            Ended::TooMuch(kept) => {
+                let pause = pauses.ended(Instant::now());
+                shared.status.lock().restarts += 1;
+                shared.failed(format!(
+                    "the mDNS library kept {kept}, so somebody floods the network: it starts anew \
+                     in {pause:?}, and agents that are announced meanwhile are found a little \
+                     later. See who sends so much to UDP port {}",
+                    shared.config.port
+                ));
+                unconfirmed.add(shared.table.origins(), Instant::now() + anew::KEPT);
+                tokio::select! {
+                    () = start_anew(&shared, pause) => {}
+                    // Beacons are said, and heard, without a daemon.
+                    _ = listen(&shared, None, &mut unconfirmed, &mut ear) => {}
+                }
+                pauses.started(Instant::now());
+            }
+        }
+    }
+}
+
+/// Ends the daemon, and starts another one when the pause is over.
+async fn start_anew(shared: &Shared, pause: Duration) {
+    let ended = loop {
+        match shared.end_daemon() {
+            // Too busy to listen.
+            Err(Error::Again) => tokio::time::sleep(RETRY).await,
+            Err(error) => {
+                shared.failed(format!("cannot end the mDNS library: {error}"));
+                tokio::time::sleep(pause).await;
+            }
+            Ok(ended) => break ended,
+        }
+    };
+    tokio::time::sleep(pause).await;
+    if let Some(ended) = ended {
+        // While it reads it does not listen. Two of them would keep twice as much. That it has
+        // gone without a word is as good.
+        let _: Result<DaemonStatus, _> = ended.recv_async().await;
+    }
+    while !shared.start_daemon() {
+        tokio::time::sleep(pause).await;
     }
 }
 
 fn subscribe<T>(
     shared: &Shared,
-    what: impl Fn(&ServiceDaemon) -> Result<Receiver<T>, mdns_sd::Error>,
+    what: impl Fn(&ServiceDaemon) -> Result<Receiver<T>, Error>,
 ) -> Option<Receiver<T>> {
     match shared.ask(what) {
         Ok(receiver) => receiver,
@@ -41,22 +111,37 @@ fn subscribe<T>(
     }
 }
 
-/// Handles what happens until a channel ends. What was known before and has not been found again
-/// after a while is gone.
+/// Handles what happens until the daemon's events end, if there is a daemon. What was known before
+/// and has not been found again after a while is gone.
 async fn listen(
     shared: &Shared,
-    found: &Receiver<ServiceEvent>,
-    monitor: &Receiver<DaemonEvent>,
-    unconfirmed: &mut HashSet<Arc<str>>,
+    events: Option<&Events>,
+    unconfirmed: &mut Unconfirmed,
     ear: &mut Ear,
-) {
-    let give_up = Instant::now() + Duration::from_secs(5);
+) -> Ended {
+    let mut look = events.map(|_| Instant::now() + anew::INTERVAL);
+    let mut metrics: Option<Receiver<Metrics>> = None;
     loop {
-        let now = std::time::Instant::now();
+        let now = Instant::now();
         shared.show(|together| together.handle_timeout(now));
+        for fullname in unconfirmed.handle_timeout(now) {
+            ear.forget(&fullname);
+            removed(shared, &fullname);
+        }
+        if look.is_some_and(|look| look <= now) {
+            look = None;
+            // Whether it keeps too much. A daemon that is busy is asked again.
+            let daemon = shared.daemon.lock().clone();
+            metrics = daemon.and_then(|daemon| daemon.get_metrics().ok());
+            if metrics.is_none() {
+                look = Some(now + anew::INTERVAL);
+            }
+        }
         let waiting = shared.together.lock().poll_timeout();
-        let due = [shared.announce_due(), ear.speak(shared), waiting];
-        let due = due.into_iter().flatten().min();
+        let announcing = shared.announce_due();
+        let due = [announcing, ear.speak(shared), waiting, look];
+        let due = due.into_iter().chain([unconfirmed.poll_timeout()]);
+        let due = due.flatten().min();
         tokio::select! {
             () = shared.postponed.notified() => {}
             () = until(due), if due.is_some() => {}
@@ -65,35 +150,46 @@ async fn listen(
                     peer_read(shared, ear, &fullname, properties);
                 }
             }
-            event = found.recv_async() => match event {
-                Ok(ServiceEvent::ServiceResolved(service)) => {
-                    unconfirmed.remove(service.get_fullname());
+            event = next(events.map(|events| &events.found)) => match event {
+                Some(ServiceEvent::ServiceResolved(service)) => {
+                    unconfirmed.forget(service.get_fullname());
                     ear.known(service.get_fullname());
                     resolved(shared, ear, &service);
                 }
-                Ok(ServiceEvent::ServiceRemoved(_, fullname)) => {
+                Some(ServiceEvent::ServiceRemoved(_, fullname)) => {
+                    unconfirmed.forget(&fullname);
                     ear.forget(&fullname);
                     removed(shared, &fullname);
                 }
-                Ok(ServiceEvent::SearchStopped(_)) | Err(_) => return,
-                Ok(_) => {}
+                Some(ServiceEvent::SearchStopped(_)) | None => return Ended::Lost,
+                Some(_) => {}
             },
-            event = monitor.recv_async() => match event {
-                Ok(DaemonEvent::NameChange(change)) => renamed(shared, &change.original),
-                Ok(DaemonEvent::Error(error)) => shared.failed(error.to_string()),
-                Ok(_) => {}
-                Err(_) => return,
+            event = next(events.map(|events| &events.monitor)) => match event {
+                Some(DaemonEvent::NameChange(change)) => renamed(shared, &change.original),
+                Some(DaemonEvent::Error(error)) => shared.failed(error.to_string()),
+                Some(_) => {}
+                None => return Ended::Lost,
             },
-            () = tokio::time::sleep_until(give_up), if !unconfirmed.is_empty() => {
-                for fullname in unconfirmed.drain() {
-                    removed(shared, &fullname);
+            answer = next(metrics.as_ref()) => {
+                metrics = None;
+                look = Some(Instant::now() + anew::INTERVAL);
+                if let Some(kept) = answer.as_ref().and_then(anew::is_too_much) {
+                    return Ended::TooMuch(kept);
                 }
             }
         }
     }
 }
 
-async fn until(due: Option<std::time::Instant>) {
+/// The next that is told; none when there will not be any more. Without a teller it never comes.
+async fn next<T>(of: Option<&Receiver<T>>) -> Option<T> {
+    match of {
+        Some(receiver) => receiver.recv_async().await.ok(),
+        None => std::future::pending().await,
+    }
+}
+
+async fn until(due: Option<Instant>) {
     if let Some(due) = due {
         tokio::time::sleep_until(due.into()).await;
     }
