@@ -89,6 +89,7 @@ fn every_way_is_measured_beside_its_limit() {
         for fill in ["loaned", "filled", "copied"] {
             assert!(measured("shm", "spin", size, fill), "{report:#}");
             assert!(measured("shm", "block", size, fill), "{report:#}");
+            assert!(measured("shm, encoded", "spin", size, fill), "{report:#}");
         }
         assert!(measured("tcp", "block", size, "copied"), "{report:#}");
         assert!(

@@ -297,6 +297,7 @@ fn wanted(what: Option<What>, transports: &[Kind]) -> Vec<(Sort, Wait)> {
     let net = what != Some(What::Shm);
     if shm {
         add(Sort::Agents(Kind::Shm), Wait::Spin);
+        add(Sort::Letters, Wait::Spin);
         add(Sort::Agents(Kind::Shm), Wait::Block);
     }
     for kind in transports.iter().filter(|kind| **kind != Kind::Shm) {

@@ -6,6 +6,7 @@
 
 mod agent;
 mod iceoryx;
+mod letters;
 mod orders;
 mod relay;
 mod socket;
@@ -26,6 +27,8 @@ pub(super) enum Part {
     Crowd { count: usize },
     /// The gateway of the configured domain.
     Gateway,
+    /// The shared memory transport alone.
+    Letters { end: End },
     /// Bare iceoryx2.
     Iceoryx { end: End, wait: Wait },
     /// A bare socket; the address comes with the first order of the end that connects.
@@ -38,9 +41,10 @@ impl Part {
     /// Which end it is; none for what lies in between.
     pub(super) fn end(&self) -> Option<End> {
         match self {
-            Self::Agent { end, .. } | Self::Iceoryx { end, .. } | Self::Socket { end, .. } => {
-                Some(*end)
-            }
+            Self::Agent { end, .. }
+            | Self::Letters { end }
+            | Self::Iceoryx { end, .. }
+            | Self::Socket { end, .. } => Some(*end),
             Self::Crowd { .. } => Some(End::Receiver),
             Self::Gateway | Self::Relay { .. } => None,
         }
@@ -83,6 +87,7 @@ pub(super) fn play(part: Part, config: &Config) -> Result<(), String> {
             agent::Agent::play(config, &names, "one-.*")
         }
         Part::Gateway => agent::gateway(config),
+        Part::Letters { end } => letters::play(config, end),
         Part::Iceoryx { end, wait } => iceoryx::play(config, end, wait.into()),
         Part::Socket { end, kind } => socket::play(end, kind),
         Part::Relay { end } => relay::play(config, end),

@@ -38,7 +38,8 @@ pub(super) fn svg(rows: &[Row], subtitle: &str) -> Result<String, String> {
 }
 
 /// What is worth a line: of shared memory what is loaned and what is filled, of the network what
-/// lies in the application's memory; spinning where that was measured.
+/// lies in the application's memory; spinning where that was measured. Letters that nobody decodes
+/// have none.
 fn lines(rows: &[Row]) -> Vec<Line> {
     let spinning = |sort: Sort| {
         rows.iter()
@@ -51,7 +52,7 @@ fn lines(rows: &[Row]) -> Vec<Line> {
         } else {
             row.fill == Fill::Filled
         };
-        if !wanted {
+        if !wanted || row.sort == Sort::Letters {
             continue;
         }
         let (order, colour) = look(row.sort, row.fill);
@@ -82,7 +83,7 @@ fn look(sort: Sort, fill: Fill) -> (usize, RGBColor) {
         _ => RGBColor(0x1f, 0x6f, 0xd1),
     };
     match sort {
-        Sort::Agents(Kind::Shm) => (0, shm),
+        Sort::Agents(Kind::Shm) | Sort::Letters => (0, shm),
         Sort::Iceoryx => (1, shm),
         Sort::Agents(Kind::Tcp) => (2, RGBColor(0xc9, 0x5d, 0x12)),
         Sort::Socket(Socket::Tcp) => (3, RGBColor(0xc9, 0x5d, 0x12)),

@@ -48,6 +48,7 @@ const LEGEND: &str = "
 wait     spin: who waits looks again and again; block: it sleeps until it is woken
 content  loaned: memory loaned and not written; filled: loaned and written by the application, which
          counts; copied: in the application's own memory
+encoded  letters that are encoded already, through the transport alone, and not decoded
 one way  from before sending until the receiver has the decoded message; round trip: until the
          sender knows that it has arrived; rate: with 16 letters under way (8 when loaned)
 cpu      of all processes of the way together, one letter at a time

@@ -12,6 +12,8 @@ pub(super) enum Sort {
     Agents(Kind),
     /// Two agents on two hosts, and a gateway on each.
     Gateways(Kind),
+    /// Letters that are encoded already, through the shared memory transport alone.
+    Letters,
     /// Bare iceoryx2.
     Iceoryx,
     /// A bare socket.
@@ -26,7 +28,7 @@ impl Sort {
     /// What this is compared with: the least that moving the bytes so can cost.
     pub(super) fn limit(self) -> Option<Self> {
         match self {
-            Self::Agents(Kind::Shm) => Some(Self::Iceoryx),
+            Self::Agents(Kind::Shm) | Self::Letters => Some(Self::Iceoryx),
             Self::Agents(Kind::Udp) => Some(Self::Socket(Socket::Udp)),
             Self::Agents(_) => Some(Self::Socket(Socket::Tcp)),
             Self::Gateways(_) => Some(Self::Relay),
@@ -42,6 +44,7 @@ impl Sort {
         match self {
             Self::Agents(kind) => kind.to_string(),
             Self::Gateways(kind) => format!("gateways {kind}"),
+            Self::Letters => "shm, encoded".to_owned(),
             Self::Iceoryx => "raw iceoryx2".to_owned(),
             Self::Socket(Socket::Tcp) => "raw tcp".to_owned(),
             Self::Socket(Socket::Unix) => "raw unix socket".to_owned(),
@@ -59,6 +62,7 @@ impl Sort {
         matches!(
             self,
             Self::Agents(Kind::Shm)
+                | Self::Letters
                 | Self::Iceoryx
                 | Self::Zenoh {
                     shared_memory: true
@@ -156,6 +160,13 @@ impl Way {
                 let (receiver, name) = stage.start(&to, &own("2"), &settings).await?;
                 let (sender, _) = stage.start(&from, &own("1"), &settings).await?;
                 (sender, receiver, Some(name))
+            }
+            Sort::Letters => {
+                let settings = settings("shm");
+                let [from, to] = ends.map(|end| Part::Letters { end });
+                let (receiver, address) = stage.start(&to, &own(""), &settings).await?;
+                let (sender, _) = stage.start(&from, &own(""), &settings).await?;
+                (sender, receiver, Some(address))
             }
             Sort::Iceoryx => {
                 let settings = settings("shm");
@@ -291,6 +302,7 @@ fn short(sort: Sort, wait: Wait) -> String {
     match sort {
         Sort::Agents(kind) => format!("{kind}{wait}"),
         Sort::Gateways(kind) => format!("g{kind}{wait}"),
+        Sort::Letters => format!("let{wait}"),
         Sort::Iceoryx => format!("ice{wait}"),
         Sort::Socket(_) | Sort::Zenoh { .. } => "raw".to_owned(),
         Sort::Relay => format!("rel{wait}"),

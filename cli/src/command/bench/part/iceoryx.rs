@@ -35,23 +35,27 @@ pub(super) fn play(config: &Config, end: End, wait: Wait) -> Result<(), String> 
     Ok(())
 }
 
-/// A node in a place of its own below that of the measurement.
+/// A node in a place of its own.
 pub(super) fn node(config: &Config) -> Result<RawNode, String> {
+    RawNode::open(&place(config, "raw")?).map_err(told)
+}
+
+/// Shared memory of a way's own, below the place of the measurement.
+pub(super) fn place(config: &Config, what: &str) -> Result<ShmConfig, String> {
     let place = std::env::var_os("FIPA_RUNTIME_DIR")
         .filter(|place| place != OsStr::new(""))
         .ok_or("a part needs FIPA_RUNTIME_DIR")?;
-    let root = PathBuf::from(place).join(format!("raw-{}", config.domain));
+    let root = PathBuf::from(place).join(format!("{what}-{}", config.domain));
     let shm = &config.transport.shm;
-    let config = ShmConfig {
+    Ok(ShmConfig {
         capacity: shm.capacity,
         // A mark that those of real domains have too.
         ..ShmConfig::new(
             root,
-            format!("fipa_{}_raw", config.domain),
+            format!("fipa_{}_{what}", config.domain),
             Incarnation::random(),
         )
-    };
-    RawNode::open(&config).map_err(told)
+    })
 }
 
 struct Receiver {

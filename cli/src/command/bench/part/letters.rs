@@ -1,0 +1,197 @@
+//! Letters that are encoded already, through the shared memory transport alone: no directory, no
+//! delivery core, no agents. What it costs to be acknowledged, and bounded, and crash-safe.
+
+use std::collections::HashMap;
+use std::net::IpAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use fipa::Config;
+use fipa_acl::{Letter, Payload};
+use fipa_transport::{
+    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Kind, Location, Parcel, Sink,
+    Stream, Transport, Verdict,
+};
+use fipa_transport_shm::ShmTransport;
+use parking_lot::Mutex;
+use tokio::runtime::{Builder, Runtime};
+
+use super::iceoryx::{make_ready, place};
+use super::orders::{End, Fill, Letters, Peer, Sent, byte_of, check, now_ns, obey, told};
+
+/// What stands in front of the content and behind it, as long as agents' messages have it.
+const ENVELOPE: &[u8] = &[2; 80];
+const HEAD: &[u8] = &[1; 120];
+const TAIL: &[u8] = &[1; 1];
+/// Whom they are for.
+const NAME: &str = "arm_left";
+/// How long they may take.
+const REMAINING: Duration = Duration::from_secs(5);
+
+pub(super) fn play(config: &Config, end: End) -> Result<(), String> {
+    let runtime = Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build()
+        .map_err(told)?;
+    let config = place(config, "letters")?;
+    let endpoint = ShmTransport::new(config, runtime.handle().clone()).map_err(told)?;
+    let heard = Arc::new(Heard::default());
+    endpoint.listen(heard.clone()).map_err(told)?;
+    let mut both = Both {
+        endpoint,
+        heard,
+        to: None,
+        ready: Vec::new(),
+        next: 0,
+        _runtime: runtime,
+    };
+    let address = match end {
+        End::Receiver => both.endpoint.location().to_string(),
+        End::Sender => String::new(),
+    };
+    obey(&mut both, address);
+    both.endpoint.close();
+    Ok(())
+}
+
+/// What has come, and when, until it is looked at.
+#[derive(Default)]
+struct Heard {
+    arrived: Mutex<Vec<(u64, Bytes)>>,
+    concluded: Mutex<Vec<(u64, AttemptId, Conclusion)>>,
+}
+
+impl Sink for Heard {
+    fn arrived(&self, arrival: Arrival) -> Verdict {
+        if let Body::Letter(letter) = &arrival.parcel.body {
+            let content = letter.payload().content.clone();
+            self.arrived.lock().push((now_ns(), content));
+        }
+        Verdict::Now(Answer::Accepted)
+    }
+
+    fn arrived_unframed(&self, _letter: Letter, _via: Kind, _from: IpAddr) {}
+
+    fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {
+        self.concluded.lock().push((now_ns(), attempt, conclusion));
+    }
+}
+
+/// Either end.
+struct Both {
+    endpoint: ShmTransport,
+    heard: Arc<Heard>,
+    to: Option<Location>,
+    /// Content of the application's.
+    ready: Vec<u8>,
+    /// Of the next attempt.
+    next: u64,
+    // After the endpoint, which has tasks there.
+    _runtime: Runtime,
+}
+
+impl Both {
+    /// Dispatches one, and says when it was begun.
+    fn begin(&mut self, letters: &Letters, number: usize) -> Result<(AttemptId, u64), String> {
+        let to = self.to.as_ref().ok_or("no other end was found")?;
+        let byte = byte_of(number);
+        let ready = (letters.fill == Fill::Copied).then(|| {
+            make_ready(&mut self.ready, letters.size, byte);
+            Bytes::copy_from_slice(&self.ready)
+        });
+        let began = now_ns();
+        let content = match ready {
+            Some(content) => content,
+            None => {
+                let front = NAME.len() + ENVELOPE.len() + HEAD.len();
+                let loan = self.endpoint.loan(to, front, letters.size, TAIL.len());
+                let mut loan = loan.map_err(told)?.ok_or("no memory is loaned")?;
+                if letters.fill == Fill::Filled {
+                    loan.content_mut().fill(byte);
+                }
+                loan.freeze()
+            }
+        };
+        self.next += 1;
+        let attempt = AttemptId(self.next);
+        let dispatched = self.endpoint.dispatch(attempt, to, parcel(content));
+        dispatched.map_err(told)?;
+        Ok((attempt, began))
+    }
+
+    /// Looks for conclusions once.
+    fn collect(
+        &self,
+        open: &mut HashMap<AttemptId, usize>,
+        ended: &mut [u64],
+    ) -> Result<(), String> {
+        self.endpoint.drive();
+        for (at, attempt, conclusion) in self.heard.concluded.lock().drain(..) {
+            if conclusion != Conclusion::Answered(Answer::Accepted) {
+                return Err(format!("a letter ended as {conclusion:?}"));
+            }
+            let place = open.remove(&attempt).and_then(|one| ended.get_mut(one));
+            *place.ok_or("a letter ended twice")? = at;
+        }
+        Ok(())
+    }
+}
+
+impl Peer for Both {
+    fn find(&mut self, to: &str) -> Result<(), String> {
+        self.to = Some(to.parse().map_err(told)?);
+        Ok(())
+    }
+
+    fn receive(&mut self, letters: &Letters) -> Result<Vec<u64>, String> {
+        let mut at = Vec::with_capacity(letters.count);
+        while at.len() < letters.count {
+            self.endpoint.drive();
+            for (time, content) in self.heard.arrived.lock().drain(..) {
+                check(&content, letters, at.len())?;
+                at.push(time);
+            }
+        }
+        Ok(at)
+    }
+
+    fn send(&mut self, letters: &Letters) -> Result<Sent, String> {
+        let mut sent = Sent::with_room(letters);
+        sent.ended.resize(letters.count, 0);
+        let mut open = HashMap::with_capacity(letters.window);
+        for number in 0..letters.count {
+            while open.len() >= letters.window {
+                self.collect(&mut open, &mut sent.ended)?;
+            }
+            let (attempt, began) = self.begin(letters, number)?;
+            sent.began.push(began);
+            open.insert(attempt, number);
+        }
+        while !open.is_empty() {
+            self.collect(&mut open, &mut sent.ended)?;
+        }
+        Ok(sent)
+    }
+}
+
+fn parcel(content: Bytes) -> Parcel {
+    let payload = Payload {
+        head: Bytes::from_static(HEAD),
+        content,
+        tail: Bytes::from_static(TAIL),
+    };
+    Parcel {
+        receiver: NAME.into(),
+        stream: Stream {
+            sender: Incarnation::from_u64(1),
+            receiver: Incarnation::from_u64(2),
+        },
+        sequence: 1,
+        after: 0,
+        remaining: REMAINING,
+        hops: 0,
+        body: Body::Letter(Letter::new(Bytes::from_static(ENVELOPE), payload)),
+    }
+}
