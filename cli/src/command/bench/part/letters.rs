@@ -18,7 +18,7 @@ use parking_lot::Mutex;
 use tokio::runtime::{Builder, Runtime};
 
 use super::iceoryx::{make_ready, place};
-use super::orders::{End, Fill, Letters, Peer, Sent, byte_of, check, now_ns, obey, told};
+use super::orders::{End, Fill, Glimpse, Letters, Peer, Sent, byte_of, now_ns, obey, told};
 
 /// What stands in front of the content and behind it, as long as agents' messages have it.
 const ENVELOPE: &[u8] = &[2; 80];
@@ -59,15 +59,16 @@ pub(super) fn play(config: &Config, end: End) -> Result<(), String> {
 /// What has come, and when, until it is looked at.
 #[derive(Default)]
 struct Heard {
-    arrived: Mutex<Vec<(u64, Bytes)>>,
+    // Not the content, which nobody needs: what is held is lent, and little is.
+    arrived: Mutex<Vec<(u64, Glimpse)>>,
     concluded: Mutex<Vec<(u64, AttemptId, Conclusion)>>,
 }
 
 impl Sink for Heard {
     fn arrived(&self, arrival: Arrival) -> Verdict {
         if let Body::Letter(letter) = &arrival.parcel.body {
-            let content = letter.payload().content.clone();
-            self.arrived.lock().push((now_ns(), content));
+            let seen = Glimpse::of(&letter.payload().content);
+            self.arrived.lock().push((now_ns(), seen));
         }
         Verdict::Now(Answer::Accepted)
     }
@@ -149,8 +150,8 @@ impl Peer for Both {
         let mut at = Vec::with_capacity(letters.count);
         while at.len() < letters.count {
             self.endpoint.drive();
-            for (time, content) in self.heard.arrived.lock().drain(..) {
-                check(&content, letters, at.len())?;
+            for (time, seen) in self.heard.arrived.lock().drain(..) {
+                seen.check(letters, at.len())?;
                 at.push(time);
             }
         }

@@ -207,19 +207,37 @@ pub(crate) fn byte_of(number: usize) -> u8 {
 
 /// Whether content is what was sent, as far as that can be seen without reading all of it.
 pub(crate) fn check(content: &[u8], letters: &Letters, number: usize) -> Result<(), String> {
-    let byte = byte_of(number);
-    let whole = content.len() == letters.size;
-    let intact = letters.fill == Fill::Loaned
-        || [content.first(), content.last()]
-            .iter()
-            .all(|found| *found == Some(&byte));
-    if whole && intact {
-        return Ok(());
+    Glimpse::of(content).check(letters, number)
+}
+
+/// What can be seen of content without reading all of it, or keeping it.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Glimpse {
+    len: usize,
+    first: Option<u8>,
+    last: Option<u8>,
+}
+
+impl Glimpse {
+    pub(crate) fn of(content: &[u8]) -> Self {
+        Self {
+            len: content.len(),
+            first: content.first().copied(),
+            last: content.last().copied(),
+        }
     }
-    Err(format!(
-        "letter {number} of {} bytes came as {} bytes of {:?}",
-        letters.size,
-        content.len(),
-        content.first()
-    ))
+
+    /// Whether that is what was sent.
+    pub(crate) fn check(self, letters: &Letters, number: usize) -> Result<(), String> {
+        let Self { len, first, last } = self;
+        let byte = Some(byte_of(number));
+        let intact = letters.fill == Fill::Loaned || [first, last] == [byte, byte];
+        if len == letters.size && intact {
+            return Ok(());
+        }
+        Err(format!(
+            "letter {number} of {} bytes came as {len} bytes of {first:?}",
+            letters.size
+        ))
+    }
 }
