@@ -132,7 +132,8 @@ impl Lane {
                 reason: FailureReason::NoSuchAgent,
                 detail,
             } => {
-                // The directory may know by now that the agent was registered anew.
+                // The agent may have been registered anew, a moment ago.
+                desk.directory.refresh();
                 let gone = self.entry(desk).is_none();
                 if gone {
                     self.recovering = true;
@@ -240,6 +241,10 @@ impl Lane {
                 Some(kind)
             }
         };
+        let no_such_agent = FailureReason::NoSuchAgent;
+        if matches!(report.outcome, Outcome::Failed { reason, .. } if reason == no_such_agent) {
+            desk.directory.refresh();
+        }
         let here = self.entry(desk).is_some();
         let delivery = &mut self.letters[index];
         delivery.progress.state = State::Waiting;
