@@ -6,13 +6,12 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use bytes::BytesMut;
-use fipa_transport::{Location, Sink, WayError, WayFault};
+use fipa_transport::{Location, Sink};
 use quinn::{Connection, RecvStream, SendStream};
 
 use super::sockets::Sockets;
 use super::streams::{Control, Letters, Outgoing};
-use crate::end::End;
-use crate::tcp::dial::{Unreachable, addresses, first};
+use crate::tcp::dial::{addresses, reach, unreachable};
 use crate::tcp::endpoint::Endpoint;
 use crate::tcp::frame::FrameReader;
 use crate::tcp::link::{Link, Running};
@@ -30,26 +29,15 @@ pub(super) async fn dial(
     let limits = endpoint.limits().clone();
     let addresses = addresses(&*sink, &to);
     let running = Running::new(endpoint, link.clone(), sink, Some(to.clone()));
-    let unreachable = |what: &dyn std::fmt::Display| {
-        let detail = format!("{}: {what}", to.address());
-        End::NotOpened(WayError::new(WayFault::Unreachable, detail))
-    };
     let by = sockets.clone();
-    let connecting = first(&limits, addresses, move |address| {
-        connect(by.clone(), address)
-    });
-    let connected = tokio::select! {
-        connected = connecting => connected,
-        end = link.leaving() => return running.fail(end),
-    };
-    let (connection, send, receive) = match connected {
+    let connect = move |address| connect(by.clone(), address);
+    let (connection, send, receive) = match reach(&limits, &link, &to, addresses, connect).await {
         Ok(connected) => connected,
-        Err(Unreachable(what)) => return running.fail(unreachable(&what)),
+        Err(end) => return running.fail(end),
     };
     let Some(certificate) = sockets.certificate(&connection) else {
-        return running.fail(unreachable(
-            &"the peer's certificate is not trusted any more",
-        ));
+        let what = "the peer's certificate is not trusted any more";
+        return running.fail(unreachable(&to, &what));
     };
     link.connected(Instant::now());
     let from = connection.remote_address();

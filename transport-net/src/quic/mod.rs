@@ -104,37 +104,11 @@ impl Transport for QuicTransport {
     }
 
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
-        if !self.endpoint.is_new() {
-            return Err(ListenError::OpenedBefore);
-        }
-        let config = &self.endpoint.config;
-        if let Some(fault) = config.identity.fault() {
-            return Err(ListenError::Unavailable(fault));
-        }
-        let _inside = self.endpoint.runtime.enter();
-        let (mut sockets, mut listening) = (Vec::new(), Vec::new());
-        for text in &config.listen {
-            let (socket, addresses) = self.sockets.listen(text)?;
-            listening.extend(addresses.iter().map(ToString::to_string));
-            sockets.push(socket);
-        }
-        let locations = listening
-            .iter()
-            .map(|text| Location::new(Kind::Quic, text))
-            .map(|location| location.map(|it| it.with_incarnation(config.identity.incarnation)))
-            .collect::<Result<_, _>>()
-            .map_err(|error| ListenError::Unavailable(error.to_string()))?;
-        let start = || {
-            let accepting = sockets.into_iter().map(|socket| {
-                let accept = accept::accept(self.endpoint.clone(), self.sockets.clone(), socket);
-                self.endpoint.runtime.spawn(accept).abort_handle()
-            });
-            accepting.collect()
-        };
-        if !self.endpoint.open(sink, listening, start) {
-            return Err(ListenError::OpenedBefore);
-        }
-        Ok(locations)
+        let open = |text: &str| self.sockets.listen(text);
+        self.endpoint.listen(sink, open, |socket| {
+            let accept = accept::accept(self.endpoint.clone(), self.sockets.clone(), socket);
+            self.endpoint.runtime.spawn(accept)
+        })
     }
 
     fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
@@ -147,15 +121,11 @@ impl Transport for QuicTransport {
     }
 
     fn abandon(&self, attempt: AttemptId) {
-        for link in self.endpoint.links() {
-            link.abandon(attempt);
-        }
+        self.endpoint.abandon(attempt);
     }
 
     fn answer(&self, ticket: Ticket, answer: Answer) {
-        if let Some((link, id)) = self.endpoint.of_ticket(ticket) {
-            link.answer(id, &answer);
-        }
+        self.endpoint.answer(ticket, &answer);
     }
 
     fn close(&self) {

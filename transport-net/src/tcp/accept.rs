@@ -22,7 +22,7 @@ use super::proof::Proof;
 use super::tls;
 use super::unframed;
 use super::wire::{Reading, Writing};
-use crate::address;
+use crate::address::{self, AddressError};
 use crate::seldom::warn_seldom;
 
 /// Connections that the system holds until they are accepted.
@@ -34,11 +34,19 @@ const FIRST_READ: usize = 4096;
 /// How long accepting rests when the system has no descriptors left.
 const REST: Duration = Duration::from_millis(100);
 
-/// Opens a listening socket.
-pub(crate) fn bind(text: &str) -> Result<std::net::TcpListener, ListenError> {
-    let address =
-        address::numeric(text).map_err(|error| ListenError::Unavailable(error.to_string()))?;
-    open(address).map_err(|error| address::cannot_bind(text, &error))
+/// Opens a listening socket, and says where it is reached. To be called within a runtime.
+pub(crate) fn listen(text: &str) -> Result<(TcpListener, Vec<SocketAddr>), ListenError> {
+    let unavailable = |error: AddressError| ListenError::Unavailable(error.to_string());
+    let failed = |source| ListenError::Bind {
+        address: text.to_owned(),
+        source,
+    };
+    let address = address::numeric(text).map_err(unavailable)?;
+    let socket = open(address).map_err(|error| address::cannot_bind(text, &error))?;
+    let bound = socket.local_addr().map_err(failed)?;
+    let reachable = address::reachable(bound).map_err(unavailable)?;
+    let socket = TcpListener::from_std(socket).map_err(failed)?;
+    Ok((socket, reachable))
 }
 
 fn open(address: SocketAddr) -> io::Result<std::net::TcpListener> {

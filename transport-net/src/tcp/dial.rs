@@ -39,25 +39,17 @@ pub(crate) async fn dial(
     let limits = endpoint.limits().clone();
     let addresses = addresses(&*sink, &to);
     let running = Running::new(endpoint, link.clone(), sink, Some(to.clone()));
-    let unreachable = |what: &dyn std::fmt::Display| {
-        let detail = format!("{}: {what}", to.address());
-        End::NotOpened(WayError::new(WayFault::Unreachable, detail))
-    };
-    let connected = tokio::select! {
-        connected = open(&limits, addresses) => connected,
-        end = link.leaving() => return running.fail(end),
-    };
-    let (stream, peer) = match connected {
+    let (stream, peer) = match reach(&limits, &link, &to, addresses, connect).await {
         Ok(connected) => connected,
-        Err(Unreachable(what)) => return running.fail(unreachable(&what)),
+        Err(end) => return running.fail(end),
     };
     if let Err(error) = prepare(&stream, &limits) {
-        return running.fail(unreachable(&error));
+        return running.fail(unreachable(&to, &error));
     }
     let (ends, proof) = tokio::select! {
         proved = prove(&running, stream, peer) => match proved {
             Ok(proved) => proved,
-            Err(why) => return running.fail(unreachable(&why)),
+            Err(why) => return running.fail(unreachable(&to, &why)),
         },
         end = link.leaving() => return running.fail(end),
     };
@@ -81,6 +73,32 @@ pub(crate) fn addresses(sink: &dyn Sink, to: &Location) -> Vec<String> {
         addresses.truncate(MAX_ADDRESSES);
     }
     addresses
+}
+
+/// Has `connect` try these addresses of a location, until one answers or the link is left.
+pub(crate) async fn reach<T, F>(
+    limits: &Limits,
+    link: &Link,
+    to: &Location,
+    addresses: Vec<String>,
+    connect: impl Fn(SocketAddr) -> F + Clone + Send + Sync + 'static,
+) -> Result<T, End>
+where
+    T: Send + 'static,
+    F: Future<Output = io::Result<T>> + Send + 'static,
+{
+    tokio::select! {
+        connected = first(limits, addresses, connect) => {
+            connected.map_err(|Unreachable(what)| unreachable(to, &what))
+        }
+        end = link.leaving() => Err(end),
+    }
+}
+
+/// The end of a link for which no connection could be opened.
+pub(crate) fn unreachable(to: &Location, what: &dyn std::fmt::Display) -> End {
+    let detail = format!("{}: {what}", to.address());
+    End::NotOpened(WayError::new(WayFault::Unreachable, detail))
 }
 
 /// Has the peer prove who it is, where it has to.
@@ -123,7 +141,7 @@ pub(crate) async fn open(
 }
 
 /// Has `connect` try these addresses, until one answers.
-pub(crate) async fn first<T, F>(
+async fn first<T, F>(
     limits: &Limits,
     addresses: Vec<String>,
     connect: impl Fn(SocketAddr) -> F + Clone + Send + Sync + 'static,

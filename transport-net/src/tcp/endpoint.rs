@@ -14,7 +14,8 @@ use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use fipa_transport::{
-    AttemptId, Hop, Incarnation, Kind, Location, Parcel, Sink, Ticket, WayError, WayFault,
+    Answer, AttemptId, Hop, Incarnation, Kind, ListenError, Location, Parcel, Sink, Ticket,
+    WayError, WayFault,
 };
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
@@ -128,26 +129,47 @@ impl Endpoint {
         self.registry.lock().sink.clone()
     }
 
-    /// Begins to exist. Says whether it had not before.
-    pub(crate) fn open(
+    /// Begins to exist: opens a socket at every address of the configuration with `open`, which
+    /// says where it is reached too, and has `accept` start the task that serves it.
+    ///
+    /// # Errors
+    /// When it was opened before, or one of them cannot be.
+    pub(crate) fn listen<S>(
         &self,
         sink: Arc<dyn Sink>,
-        listening: Vec<String>,
-        listen: impl FnOnce() -> Vec<AbortHandle>,
-    ) -> bool {
+        open: impl Fn(&str) -> Result<(S, Vec<SocketAddr>), ListenError>,
+        accept: impl Fn(S) -> JoinHandle<()>,
+    ) -> Result<Vec<Location>, ListenError> {
+        if self.registry.lock().phase != Phase::New {
+            return Err(ListenError::OpenedBefore);
+        }
+        let identity = &self.config.identity;
+        if let Some(fault) = identity.fault() {
+            return Err(ListenError::Unavailable(fault));
+        }
+        let _inside = self.runtime.enter();
+        let (mut sockets, mut listening) = (Vec::new(), Vec::new());
+        for text in &self.config.listen {
+            let (socket, reachable) = open(text)?;
+            listening.extend(reachable.iter().map(ToString::to_string));
+            sockets.push(socket);
+        }
+        let locations = listening
+            .iter()
+            .map(|text| Location::new(self.kind, text))
+            .map(|location| location.map(|it| it.with_incarnation(identity.incarnation)))
+            .collect::<Result<_, _>>()
+            .map_err(|error| ListenError::Unavailable(error.to_string()))?;
         let mut registry = self.registry.lock();
         if registry.phase != Phase::New {
-            return false;
+            return Err(ListenError::OpenedBefore);
         }
         registry.phase = Phase::Open;
         registry.sink = Some(sink);
         registry.listening = listening;
-        registry.listeners = listen();
-        true
-    }
-
-    pub(crate) fn is_new(&self) -> bool {
-        self.registry.lock().phase == Phase::New
+        let tasks = sockets.into_iter().map(accept);
+        registry.listeners = tasks.map(|task| task.abort_handle()).collect();
+        Ok(locations)
     }
 
     /// Where others reach this endpoint at the address that a socket of it has, as a URL.
@@ -265,16 +287,22 @@ impl Endpoint {
         Ok(Way::ToDial(link, sink))
     }
 
-    /// The link with this ticket, and the parcel's number on it.
-    pub(crate) fn of_ticket(&self, ticket: Ticket) -> Option<(Arc<Link>, u64)> {
+    /// Answers a parcel on the connection that it came by, if that is still there.
+    pub(crate) fn answer(&self, ticket: Ticket, answer: &Answer) {
         let (number, id) = of_ticket(ticket);
-        let link = self.registry.lock().links.get(&number).cloned()?;
-        Some((link, id))
+        let link = self.registry.lock().links.get(&number).cloned();
+        if let Some(link) = link {
+            link.answer(id, answer);
+        }
     }
 
-    /// Every connection there is.
-    pub(crate) fn links(&self) -> Vec<Arc<Link>> {
-        self.registry.lock().links.values().cloned().collect()
+    /// Nobody waits for the end of this attempt any more.
+    pub(crate) fn abandon(&self, attempt: AttemptId) {
+        let links: Vec<_> = self.registry.lock().links.values().cloned().collect();
+        for link in links {
+            link.abandon(attempt);
+        }
+        self.couriers.abandon(attempt);
     }
 
     /// A link for a connection that was accepted, unless the endpoint has been closed.

@@ -31,13 +31,11 @@ use fipa_transport::{
     Answer, AttemptId, Kind, ListenError, Location, Parcel, Signature, Sink, Ticket, Transport,
     WayError, WayFault,
 };
-use tokio::net::TcpListener;
 use tokio::runtime::Handle;
 
 pub use self::config::{Limits, TcpConfig};
 pub use self::counters::Counters;
 use self::endpoint::Endpoint;
-use crate::address;
 use crate::end::End;
 
 /// Carries parcels over TCP.
@@ -108,46 +106,10 @@ impl Transport for TcpTransport {
     }
 
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
-        if !self.endpoint.is_new() {
-            return Err(ListenError::OpenedBefore);
-        }
-        let config = &self.endpoint.config;
-        if let Some(fault) = config.identity.fault() {
-            return Err(ListenError::Unavailable(fault));
-        }
-        let mut sockets = Vec::new();
-        let mut listening = Vec::new();
-        for text in &config.listen {
-            let failed = |source| ListenError::Bind {
-                address: text.clone(),
-                source,
-            };
-            let socket = accept::bind(text)?;
-            let bound = socket.local_addr().map_err(failed)?;
-            let reachable = address::reachable(bound)
-                .map_err(|error| ListenError::Unavailable(error.to_string()))?;
-            listening.extend(reachable.iter().map(ToString::to_string));
-            let _inside = self.endpoint.runtime.enter();
-            sockets.push(TcpListener::from_std(socket).map_err(failed)?);
-        }
-        let locations = listening
-            .iter()
-            .map(|text| Location::new(Kind::Tcp, text))
-            .map(|location| location.map(|it| it.with_incarnation(config.identity.incarnation)))
-            .collect::<Result<_, _>>()
-            .map_err(|error| ListenError::Unavailable(error.to_string()))?;
-        let start = || {
-            let runtime = &self.endpoint.runtime;
-            sockets
-                .into_iter()
-                .map(|socket| runtime.spawn(accept::accept(self.endpoint.clone(), socket)))
-                .map(|task| task.abort_handle())
-                .collect()
-        };
-        if !self.endpoint.open(sink, listening, start) {
-            return Err(ListenError::OpenedBefore);
-        }
-        Ok(locations)
+        let runtime = &self.endpoint.runtime;
+        self.endpoint.listen(sink, accept::listen, |socket| {
+            runtime.spawn(accept::accept(self.endpoint.clone(), socket))
+        })
     }
 
     fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
@@ -162,16 +124,11 @@ impl Transport for TcpTransport {
     }
 
     fn abandon(&self, attempt: AttemptId) {
-        for link in self.endpoint.links() {
-            link.abandon(attempt);
-        }
-        self.endpoint.couriers.abandon(attempt);
+        self.endpoint.abandon(attempt);
     }
 
     fn answer(&self, ticket: Ticket, answer: Answer) {
-        if let Some((link, id)) = self.endpoint.of_ticket(ticket) {
-            link.answer(id, &answer);
-        }
+        self.endpoint.answer(ticket, &answer);
     }
 
     fn close(&self) {
