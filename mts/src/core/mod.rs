@@ -34,7 +34,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::Letter;
-use fipa_sds::{Directory, Entry, Pattern, Reach, Resolution, Role};
+use fipa_sds::{Directory, Entry, Pattern, Resolution};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind, Location,
     Outcome, Parcel, Report, Stream, Verdict, WayFault,
@@ -49,7 +49,7 @@ pub use inbox::Received;
 use lane::{Delivery, Lane, Moved};
 pub use notice::{News, Notice};
 
-use crate::{Map, stamp};
+use crate::Map;
 use peers::Peers;
 pub use peers::{Peer, PeerState};
 pub use routes::{Route, Standing, Way, WayState};
@@ -377,82 +377,10 @@ impl Core {
         }
     }
 
-    /// How letters from here to the agent of this entry would go now.
-    #[must_use]
-    pub fn route(&self, now: Now, entry: &Entry) -> Route {
-        self.desk.route(now.instant, entry)
-    }
-
-    /// What has happened on each way so far, in the order of their locations.
-    #[must_use]
-    pub fn ways(&self, now: Now) -> Vec<WayState> {
-        self.desk.way_states(now.instant)
-    }
-
-    /// The first way that a letter from here to this receiver would take now; none to several.
-    #[must_use]
-    pub fn first_way(&self, now: Now, receiver: &str) -> Option<Location> {
-        let entry = self.desk.directory.lookup(receiver)?;
-        if matches!(entry.role, Role::Coalition(_)) {
-            return None;
-        }
-        self.desk.choose(now.instant, &entry, &[])
-    }
-
     /// Where receivers are looked up.
     #[must_use]
     pub fn directory(&self) -> &Arc<dyn Directory> {
         &self.desk.directory
-    }
-
-    /// The first way that a letter of others, for this life of an agent with this name, would take
-    /// from here now, if this service passes it on within its host; and the bytes that its stamp
-    /// takes.
-    #[must_use]
-    pub fn first_way_onwards(
-        &self,
-        now: Now,
-        life: Incarnation,
-        receiver: &str,
-    ) -> Option<(Location, usize)> {
-        let config = &self.desk.config;
-        if !config.forwards || self.agents.contains_key(&life) {
-            return None;
-        }
-        let entry = self.desk.receiver(life, receiver)?;
-        let here = entry.role == Role::Agent && entry.reach == Reach::Local;
-        let way = here.then(|| self.desk.choose(now.instant, &entry, &[]))?;
-        Some((way?, stamp::room(&config.name)))
-    }
-
-    /// The kind of transport by which a letter to these receivers would go first to two of them at
-    /// least, now; of several kinds, the one that most of them would be reached by.
-    #[must_use]
-    pub fn kind_for_many<'a>(
-        &self,
-        now: Now,
-        sender: Incarnation,
-        receivers: impl IntoIterator<Item = &'a str>,
-    ) -> Option<Kind> {
-        let directory = &*self.desk.directory;
-        let own = self.agents.get(&sender).map(|inbox| &*inbox.name);
-        let mut reached = Map::default();
-        for receiver in receivers {
-            let entries = match fipa_sds::resolve(directory, receiver, own.unwrap_or_default()) {
-                Ok(Resolution::Exact(entry)) => vec![entry],
-                Ok(Resolution::Multicast(entries)) => entries,
-                Ok(Resolution::Coalition { agents, .. }) => agents,
-                Ok(Resolution::None) | Err(_) => Vec::new(),
-            };
-            for entry in entries {
-                if let Some(way) = self.desk.choose(now.instant, &entry, &[]) {
-                    reached.insert(desk::life_of(&entry), way.kind());
-                }
-            }
-        }
-        let by = |kind: Kind| reached.values().filter(|other| **other == kind).count();
-        let most = Kind::ALL.into_iter().max_by_key(|kind| by(*kind))?;
-        (by(most) > 1).then_some(most)
     }
 
     /// Whether somebody watches: then [`Action::Notice`] tells of every letter, before what is to

@@ -1,17 +1,19 @@
 //! Routes and ways as people look at them: which way a letter to somebody would go now, and why;
-//! what has happened on each way so far.
+//! what has happened on each way so far. And as those do who loan memory for a letter before there
+//! is one.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use fipa_sds::{Entry, Reach};
-use fipa_transport::{Incarnation, Location};
+use fipa_sds::{Entry, Reach, Resolution, Role};
+use fipa_transport::{Incarnation, Kind, Location};
 use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
 
-use super::desk::Desk;
-use crate::Map;
+use super::desk::{self, Desk};
+use super::{Core, Now};
+use crate::{Map, stamp};
 
 /// How letters to one agent would go now.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -208,4 +210,78 @@ impl Desk {
 
 fn seconds(duration: Duration) -> u64 {
     duration.as_secs()
+}
+
+impl Core {
+    /// How letters from here to the agent of this entry would go now.
+    #[must_use]
+    pub fn route(&self, now: Now, entry: &Entry) -> Route {
+        self.desk.route(now.instant, entry)
+    }
+
+    /// What has happened on each way so far, in the order of their locations.
+    #[must_use]
+    pub fn ways(&self, now: Now) -> Vec<WayState> {
+        self.desk.way_states(now.instant)
+    }
+
+    /// The first way that a letter from here to this receiver would take now; none to several.
+    #[must_use]
+    pub fn first_way(&self, now: Now, receiver: &str) -> Option<Location> {
+        let entry = self.desk.directory.lookup(receiver)?;
+        if matches!(entry.role, Role::Coalition(_)) {
+            return None;
+        }
+        self.desk.choose(now.instant, &entry, &[])
+    }
+
+    /// The first way that a letter of others, for this life of an agent with this name, would take
+    /// from here now, if this service passes it on within its host; and the bytes that its stamp
+    /// takes.
+    #[must_use]
+    pub fn first_way_onwards(
+        &self,
+        now: Now,
+        life: Incarnation,
+        receiver: &str,
+    ) -> Option<(Location, usize)> {
+        let config = &self.desk.config;
+        if !config.forwards || self.agents.contains_key(&life) {
+            return None;
+        }
+        let entry = self.desk.receiver(life, receiver)?;
+        let here = entry.role == Role::Agent && entry.reach == Reach::Local;
+        let way = here.then(|| self.desk.choose(now.instant, &entry, &[]))?;
+        Some((way?, stamp::room(&config.name)))
+    }
+
+    /// The kind of transport by which a letter to these receivers would go first to two of them at
+    /// least, now; of several kinds, the one that most of them would be reached by.
+    #[must_use]
+    pub fn kind_for_many<'a>(
+        &self,
+        now: Now,
+        sender: Incarnation,
+        receivers: impl IntoIterator<Item = &'a str>,
+    ) -> Option<Kind> {
+        let directory = &*self.desk.directory;
+        let own = self.agents.get(&sender).map(|inbox| &*inbox.name);
+        let mut reached = Map::default();
+        for receiver in receivers {
+            let entries = match fipa_sds::resolve(directory, receiver, own.unwrap_or_default()) {
+                Ok(Resolution::Exact(entry)) => vec![entry],
+                Ok(Resolution::Multicast(entries)) => entries,
+                Ok(Resolution::Coalition { agents, .. }) => agents,
+                Ok(Resolution::None) | Err(_) => Vec::new(),
+            };
+            for entry in entries {
+                if let Some(way) = self.desk.choose(now.instant, &entry, &[]) {
+                    reached.insert(desk::life_of(&entry), way.kind());
+                }
+            }
+        }
+        let by = |kind: Kind| reached.values().filter(|other| **other == kind).count();
+        let most = Kind::ALL.into_iter().max_by_key(|kind| by(*kind))?;
+        (by(most) > 1).then_some(most)
+    }
 }

@@ -132,10 +132,7 @@ impl Lane {
                 reason: FailureReason::NoSuchAgent,
                 detail,
             } => {
-                // The agent may have been registered anew, a moment ago.
-                desk.directory.refresh();
-                let gone = self.entry(desk).is_none();
-                if gone {
+                if self.has_no_entry_any_more(desk) {
                     self.recovering = true;
                     self.receiver_left(index, desk, moved);
                 } else {
@@ -241,11 +238,6 @@ impl Lane {
                 Some(kind)
             }
         };
-        let no_such_agent = FailureReason::NoSuchAgent;
-        if matches!(report.outcome, Outcome::Failed { reason, .. } if reason == no_such_agent) {
-            desk.directory.refresh();
-        }
-        let here = self.entry(desk).is_some();
         let delivery = &mut self.letters[index];
         delivery.progress.state = State::Waiting;
         // The sender is told the way between the hosts, which only this side may have seen.
@@ -266,7 +258,7 @@ impl Lane {
             }
             Outcome::Failed { reason, .. } => {
                 delivery.progress.attempts = attempts;
-                if reason == FailureReason::NoSuchAgent && !here {
+                if reason == FailureReason::NoSuchAgent && self.has_no_entry_any_more(desk) {
                     self.receiver_left(index, desk, moved);
                 } else {
                     self.fail(index, reason, desk);

@@ -150,6 +150,13 @@ impl Lane {
         known.or_else(|| self.said.clone())
     }
 
+    /// Whether the receiver, of which others say that it is not there, is not in the directory
+    /// either: it may have been registered anew, a moment ago.
+    fn has_no_entry_any_more(&self, desk: &Desk) -> bool {
+        desk.directory.refresh();
+        self.entry(desk).is_none()
+    }
+
     /// The receiver is not in the directory, but has said where it can be reached.
     pub(crate) fn said(&mut self, entry: Arc<Entry>) {
         self.said = Some(entry);
