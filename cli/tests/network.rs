@@ -70,16 +70,21 @@ on_a_network!(gateways_are_killed, inside_gateways_are_killed, || {
     });
 });
 
+/// The second host has another address, and then its own again.
+fn change_address_twice(fleet: &Fleet) {
+    let host = fleet.network.host(1);
+    for (from, to) in [("10.99.0.2", "10.99.0.52"), ("10.99.0.52", "10.99.0.2")] {
+        fleet.until_delivered(&[0, 1, 2]);
+        host.ip(&format!("addr del {from}/24 dev eth0"));
+        host.ip(&format!("addr add {to}/24 dev eth0"));
+        fleet.until_delivered(&[0, 1, 2]);
+    }
+}
+
 on_a_network!(addresses_change, inside_addresses_change, || {
     let fleet = Fleet::new(&Plan::default());
     fleet.through(10_000, |fleet| {
-        let host = fleet.network.host(1);
-        for (from, to) in [("10.99.0.2", "10.99.0.52"), ("10.99.0.52", "10.99.0.2")] {
-            fleet.until_delivered(&[0, 1, 2]);
-            host.ip(&format!("addr del {from}/24 dev eth0"));
-            host.ip(&format!("addr add {to}/24 dev eth0"));
-            fleet.until_delivered(&[0, 1, 2]);
-        }
+        change_address_twice(fleet);
     });
 });
 
@@ -95,13 +100,7 @@ on_a_network!(
             ..Plan::default()
         });
         fleet.through(6_000, |fleet| {
-            let host = fleet.network.host(1);
-            for (from, to) in [("10.99.0.2", "10.99.0.52"), ("10.99.0.52", "10.99.0.2")] {
-                fleet.until_delivered(&[0, 1, 2]);
-                host.ip(&format!("addr del {from}/24 dev eth0"));
-                host.ip(&format!("addr add {to}/24 dev eth0"));
-                fleet.until_delivered(&[0, 1, 2]);
-            }
+            change_address_twice(fleet);
             assert!(fleet.went_by(Kind::Quic), "nothing went by QUIC");
             for (from, to) in [(0, 1), (1, 0), (1, 2), (2, 1)] {
                 assert_eq!(fleet.failed(from, to), 0, "{from} to {to}");
