@@ -74,6 +74,13 @@ fn every_way_is_measured_beside_its_limit() {
         assert!(number(&row["cpu_us_per_letter"]) > 0.0, "{row:#}");
         let is_limit = row["path"].as_str().unwrap().starts_with("raw ");
         assert_eq!(is_limit, row["limit"].is_null(), "{row:#}");
+        let encrypted = ["gateways tcp, tls", "gateways quic"];
+        let is_encrypted = encrypted.iter().any(|path| row["path"] == *path);
+        assert_eq!(is_encrypted, !row["plain"].is_null(), "{row:#}");
+        if is_encrypted {
+            assert_eq!(row["plain"]["name"], "gateways tcp");
+            assert!(number(&row["plain"]["round_trip_ratio"]) > 0.0, "{row:#}");
+        }
         if !is_limit {
             assert!(number(&row["ratio"]) > 0.0, "{row:#}");
             assert!(number(&row["limit"]["p50_us"]) > 0.0, "{row:#}");
@@ -92,10 +99,9 @@ fn every_way_is_measured_beside_its_limit() {
             assert!(measured("shm, encoded", "spin", size, fill), "{report:#}");
         }
         assert!(measured("tcp", "block", size, "copied"), "{report:#}");
-        assert!(
-            measured("gateways tcp", "block", size, "copied"),
-            "{report:#}"
-        );
+        for gateways in ["gateways tcp", "gateways tcp, tls", "gateways quic"] {
+            assert!(measured(gateways, "block", size, "copied"), "{report:#}");
+        }
         assert!(
             measured("raw unix socket", "block", size, "copied"),
             "{report:#}"

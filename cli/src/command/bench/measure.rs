@@ -83,6 +83,8 @@ pub(super) struct Row {
     pub(super) round_trip_ratio: Option<f64>,
     pub(super) rate_ratio: Option<f64>,
     pub(super) cpu_ratio: Option<f64>,
+    /// What a way that is encrypted costs beside the same without.
+    pub(super) plain: Option<Plain>,
     #[serde(skip)]
     pub(super) sort: Sort,
 }
@@ -95,6 +97,19 @@ pub(super) struct Limit {
     pub(super) round_trip_p50_us: f64,
     pub(super) rate_per_s: Option<f64>,
     pub(super) cpu_us_per_letter: f64,
+}
+
+/// A way that is encrypted, in units of one that is not: medians over all rounds of the ratio of
+/// medians, the rate's apart.
+#[derive(Debug, Clone, Serialize)]
+pub(super) struct Plain {
+    pub(super) name: String,
+    pub(super) ratio: f64,
+    pub(super) round_trip_ratio: f64,
+    /// The middle half of the rounds.
+    pub(super) round_trip_ratio_spread: [f64; 2],
+    pub(super) rate_ratio: Option<f64>,
+    pub(super) cpu_ratio: f64,
 }
 
 /// What all ways did, and what could not be measured.
@@ -301,30 +316,70 @@ fn rows(ways: &[Way], size: usize, fill: Fill, cells: &HashMap<usize, Cell>) -> 
         let Some(cell) = cells.get(&index) else {
             continue;
         };
-        let limit = way.sort.limit().and_then(|sort| {
+        let found = |sort: Sort| {
             let is_it = |other: &Way| other.sort == sort && other.wait == way.wait;
             let index = ways.iter().position(is_it)?;
             Some((sort, cells.get(&index)?))
-        });
-        rows.push(row(way, size, fill, cell, limit));
+        };
+        let limit = way.sort.limit().and_then(found);
+        let plain = way.sort.plain().and_then(found);
+        let plain = plain.map(|(sort, plain)| beside(cell, sort, plain));
+        rows.push(row(way, size, fill, cell, limit, plain));
     }
     rows
 }
 
-fn row(way: &Way, size: usize, fill: Fill, cell: &Cell, limit: Option<(Sort, &Cell)>) -> Row {
-    let ratios = limit.map(|(_, limit)| {
-        let ratio = |(own, least): (&f64, &f64)| own / least;
-        let pairs = cell.one_way_medians.iter().zip(&limit.one_way_medians);
-        let one_way: Vec<f64> = pairs.map(ratio).collect();
-        let pairs = cell
-            .round_trip_medians
-            .iter()
-            .zip(&limit.round_trip_medians);
-        let round_trip: Vec<f64> = pairs.map(ratio).collect();
-        let cpu: Vec<f64> = cell.cpu.iter().zip(&limit.cpu).map(ratio).collect();
-        (one_way, round_trip, cpu)
-    });
-    let rate_ratio = limit.and_then(|(_, limit)| Some(cell.rate()? / limit.rate()?));
+/// Of a round each.
+struct Ratios {
+    one_way: Vec<f64>,
+    round_trip: Vec<f64>,
+    cpu: Vec<f64>,
+}
+
+impl Ratios {
+    fn new(cell: &Cell, other: &Cell) -> Self {
+        let of = |own: &[f64], other: &[f64]| {
+            let pairs = own.iter().zip(other);
+            pairs.map(|(own, other)| own / other).collect()
+        };
+        Self {
+            one_way: of(&cell.one_way_medians, &other.one_way_medians),
+            round_trip: of(&cell.round_trip_medians, &other.round_trip_medians),
+            cpu: of(&cell.cpu, &other.cpu),
+        }
+    }
+}
+
+fn rate_ratio(cell: &Cell, other: &Cell) -> Option<f64> {
+    Some(cell.rate()? / other.rate()?)
+}
+
+/// The middle half.
+fn spread(ratios: &[f64]) -> [f64; 2] {
+    [0.25, 0.75].map(|at| quantile(ratios, at))
+}
+
+fn beside(cell: &Cell, sort: Sort, plain: &Cell) -> Plain {
+    let ratios = Ratios::new(cell, plain);
+    Plain {
+        name: sort.name(),
+        ratio: median(&ratios.one_way),
+        round_trip_ratio: median(&ratios.round_trip),
+        round_trip_ratio_spread: spread(&ratios.round_trip),
+        rate_ratio: rate_ratio(cell, plain),
+        cpu_ratio: median(&ratios.cpu),
+    }
+}
+
+fn row(
+    way: &Way,
+    size: usize,
+    fill: Fill,
+    cell: &Cell,
+    limit: Option<(Sort, &Cell)>,
+    plain: Option<Plain>,
+) -> Row {
+    let ratios = limit.map(|(_, limit)| Ratios::new(cell, limit));
     Row {
         path: way.sort.name(),
         wait: way.wait,
@@ -342,13 +397,12 @@ fn row(way: &Way, size: usize, fill: Fill, cell: &Cell, limit: Option<(Sort, &Ce
             rate_per_s: limit.rate(),
             cpu_us_per_letter: limit.cpu_us(),
         }),
-        ratio: ratios.as_ref().map(|(one_way, ..)| median(one_way)),
-        ratio_spread: ratios
-            .as_ref()
-            .map(|(one_way, ..)| [0.25, 0.75].map(|at| quantile(one_way, at))),
-        round_trip_ratio: ratios.as_ref().map(|(_, round_trip, _)| median(round_trip)),
-        rate_ratio,
-        cpu_ratio: ratios.map(|(.., cpu)| median(&cpu)),
+        ratio: ratios.as_ref().map(|it| median(&it.one_way)),
+        ratio_spread: ratios.as_ref().map(|it| spread(&it.one_way)),
+        round_trip_ratio: ratios.as_ref().map(|it| median(&it.round_trip)),
+        rate_ratio: limit.and_then(|(_, limit)| rate_ratio(cell, limit)),
+        cpu_ratio: ratios.map(|it| median(&it.cpu)),
+        plain,
         sort: way.sort,
     }
 }

@@ -44,7 +44,8 @@ use crate::{membership, output};
 ///
 /// Compares every configured transport: latency one way and round trip, throughput and processor
 /// time, for content from 100 bytes to 4 MB, each beside its limit (bare iceoryx2, TCP, UDP, Unix
-/// socket, a bare relay) measured in the same rounds, with the ratio. All traffic stays on this
+/// socket, a bare relay) measured in the same rounds, with the ratio. Gateways also speak TCP with
+/// TLS, and QUIC, with keys made for the measurement, beside TCP without. All traffic stays on this
 /// machine, and nothing is left behind.
 ///
 /// Times are worth little on a busy machine; ratios more.
@@ -287,7 +288,8 @@ fn progress(steps: usize) -> ProgressBar {
 fn wanted(what: Option<What>, transports: &[Kind]) -> Vec<(Sort, Wait)> {
     let mut wanted = Vec::new();
     let mut add = |sort: Sort, wait: Wait| {
-        for sort in [Some(sort), sort.limit()].into_iter().flatten() {
+        let all = [Some(sort), sort.plain(), sort.limit()];
+        for sort in all.into_iter().flatten() {
             if !wanted.contains(&(sort, wait)) {
                 wanted.push((sort, wait));
             }
@@ -300,11 +302,16 @@ fn wanted(what: Option<What>, transports: &[Kind]) -> Vec<(Sort, Wait)> {
         add(Sort::Letters, Wait::Spin);
         add(Sort::Agents(Kind::Shm), Wait::Block);
     }
-    for kind in transports.iter().filter(|kind| **kind != Kind::Shm) {
-        if net {
-            add(Sort::Agents(*kind), Wait::Block);
-            add(Sort::Gateways(*kind), Wait::Block);
+    if net {
+        for kind in transports {
+            if matches!(kind, Kind::Tcp | Kind::Udp) {
+                add(Sort::Agents(*kind), Wait::Block);
+                add(Sort::Gateways(*kind), Wait::Block);
+            }
         }
+        // Whatever is configured: they have keys of their own.
+        add(Sort::Secured(Kind::Tcp), Wait::Block);
+        add(Sort::Secured(Kind::Quic), Wait::Block);
     }
     // What people know.
     add(Sort::Socket(Socket::Unix), Wait::Block);

@@ -93,8 +93,10 @@ fn look(sort: Sort, fill: Fill) -> (usize, RGBColor) {
         Sort::Gateways(Kind::Udp) => (7, RGBColor(0xb0, 0x3a, 0x7a)),
         Sort::Gateways(_) => (8, RGBColor(0x7b, 0x3f, 0xb5)),
         Sort::Relay => (9, RGBColor(0x7b, 0x3f, 0xb5)),
+        Sort::Secured(Kind::Tcp) => (10, RGBColor(0x2f, 0x8f, 0x3f)),
+        Sort::Secured(_) => (11, RGBColor(0x4a, 0x4f, 0xc9)),
         Sort::Zenoh { shared_memory } => {
-            let order = if shared_memory { 10 } else { 11 };
+            let order = if shared_memory { 12 } else { 13 };
             (order, RGBColor(0x9a, 0x2a, 0x2a))
         }
     }

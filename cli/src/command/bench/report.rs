@@ -35,6 +35,7 @@ pub(super) fn text(machine: &Machine, effort: &Effort, measured: &Measured) -> S
     ));
     text.push_str(&table(&measured.rows).to_string());
     text.push_str(LEGEND);
+    text.push_str(&encrypted(&measured.rows));
     if let Some(many) = &measured.many {
         text.push_str(&of_many(many));
     }
@@ -55,6 +56,32 @@ cpu      of all processes of the way together, one letter at a time
 x limit  the one way, in units of the same bytes through the bare mechanism in the same rounds (the
          middle half of the rounds), and the same of round trip, rate and cpu
 ";
+
+/// What encryption costs, a line for each way and content.
+fn encrypted(rows: &[Row]) -> String {
+    let mut text = String::new();
+    for row in rows {
+        let Some(plain) = &row.plain else { continue };
+        let [low, high] = plain.round_trip_ratio_spread;
+        let rate = plain.rate_ratio.map(|ratio| format!(", rate {ratio:.2}"));
+        text.push_str(&format!(
+            "{} with {} {}, in units of {}: round trip {:.2} ({low:.2}-{high:.2}), one way {:.2}{}, \
+             cpu {:.2}\n",
+            row.path,
+            size(row.size),
+            name_of(row.fill),
+            plain.name,
+            plain.round_trip_ratio,
+            plain.ratio,
+            rate.unwrap_or_default(),
+            plain.cpu_ratio,
+        ));
+    }
+    if !text.is_empty() {
+        text.insert(0, '\n');
+    }
+    text
+}
 
 fn of_many(many: &Many) -> String {
     let [low, high] = many.ratio_spread;

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
+use fipa::keys::{Keys, KeysError, VALID};
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, Lines};
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 
@@ -62,6 +63,29 @@ impl Stage {
         format!("bench-{}-{which}", std::process::id())
     }
 
+    /// Makes keys for the gateways of these domains, who trust each other. Returns the setting that
+    /// names them, for each.
+    pub(super) fn keys(&self, domains: &[String]) -> Result<Vec<String>, String> {
+        let told = |error: KeysError| error.to_string();
+        let of = |domain: &String| Keys::at(self.place.join(format!("keys-{domain}")));
+        let all: Vec<Keys> = domains.iter().map(of).collect();
+        let mut certificates = Vec::new();
+        for (keys, domain) in all.iter().zip(domains) {
+            keys.init(&Self::domain(domain), &[], VALID).map_err(told)?;
+            let file = keys.own_file();
+            let read = std::fs::read(&file);
+            certificates.push(read.map_err(|error| format!("{}: {error}", file.display()))?);
+        }
+        let mut settings = Vec::new();
+        for keys in &all {
+            for certificate in &certificates {
+                keys.trust(certificate).map_err(told)?;
+            }
+            settings.push(format!("security.keys={}", keys.dir().display()));
+        }
+        Ok(settings)
+    }
+
     /// Starts a process and waits until it is there. Returns its address too.
     pub(super) async fn start(
         &mut self,
@@ -78,7 +102,8 @@ impl Stage {
             // Nothing leaves this machine.
             .args(["--set", "discovery.interfaces=lo"])
             .args(["--set", "transport.tcp.listen=127.0.0.1:0"])
-            .args(["--set", "transport.udp.listen=127.0.0.1:0"]);
+            .args(["--set", "transport.udp.listen=127.0.0.1:0"])
+            .args(["--set", "transport.quic.listen=127.0.0.1:0"]);
         if let Some(core) = core {
             command.args(["--core", &core.to_string()]);
         }

@@ -12,6 +12,8 @@ pub(super) enum Sort {
     Agents(Kind),
     /// Two agents on two hosts, and a gateway on each.
     Gateways(Kind),
+    /// The same between gateways that have proved to each other who they are: TCP with TLS, or QUIC.
+    Secured(Kind),
     /// Letters that are encoded already, through the shared memory transport alone.
     Letters,
     /// Bare iceoryx2.
@@ -31,7 +33,7 @@ impl Sort {
             Self::Agents(Kind::Shm) | Self::Letters => Some(Self::Iceoryx),
             Self::Agents(Kind::Udp) => Some(Self::Socket(Socket::Udp)),
             Self::Agents(_) => Some(Self::Socket(Socket::Tcp)),
-            Self::Gateways(_) => Some(Self::Relay),
+            Self::Gateways(_) | Self::Secured(_) => Some(Self::Relay),
             Self::Zenoh {
                 shared_memory: true,
             } => Some(Self::Iceoryx),
@@ -40,10 +42,17 @@ impl Sort {
         }
     }
 
+    /// What this is the safer way of: what encryption costs is told by both in the same rounds.
+    pub(super) fn plain(self) -> Option<Self> {
+        matches!(self, Self::Secured(_)).then_some(Self::Gateways(Kind::Tcp))
+    }
+
     pub(super) fn name(self) -> String {
         match self {
             Self::Agents(kind) => kind.to_string(),
             Self::Gateways(kind) => format!("gateways {kind}"),
+            Self::Secured(Kind::Tcp) => "gateways tcp, tls".to_owned(),
+            Self::Secured(kind) => format!("gateways {kind}"),
             Self::Letters => "shm, encoded".to_owned(),
             Self::Iceoryx => "raw iceoryx2".to_owned(),
             Self::Socket(Socket::Tcp) => "raw tcp".to_owned(),
@@ -72,7 +81,7 @@ impl Sort {
 
     /// What may be too large is tried before.
     fn is_ours(self) -> bool {
-        matches!(self, Self::Agents(_) | Self::Gateways(_))
+        matches!(self, Self::Agents(_) | Self::Gateways(_) | Self::Secured(_))
     }
 
     /// The largest content, where that is known.
@@ -146,12 +155,20 @@ impl Way {
                 let (sender, _) = stage.start(&from, &own(""), &settings).await?;
                 (sender, receiver, Some(name))
             }
-            Sort::Gateways(kind) => {
-                let settings = settings(&format!("shm,{kind}"));
-                for host in ["1", "2"] {
+            Sort::Gateways(kind) | Sort::Secured(kind) => {
+                let mut settings = settings(&format!("shm,{kind}"));
+                let hosts = ["1", "2"].map(own);
+                let mut keys = Vec::new();
+                if let Sort::Secured(_) = sort {
+                    // Without a key quic is refused; which one it is matters to gateways only.
+                    keys = stage.keys(&hosts)?;
+                    settings.extend(keys.first().cloned());
+                    settings.push("security.loopback=true".to_owned());
+                }
+                for (number, domain) in hosts.into_iter().enumerate() {
                     let mut settings = settings.clone();
-                    settings.push(format!("mts.name={}", Stage::domain(&own(host))));
-                    let domain = own(host);
+                    settings.push(format!("mts.name={}", Stage::domain(&domain)));
+                    settings.extend(keys.get(number).cloned());
                     let (who, _) = stage.start(&Part::Gateway, &domain, &settings).await?;
                     between.push(who);
                 }
@@ -302,6 +319,7 @@ fn short(sort: Sort, wait: Wait) -> String {
     match sort {
         Sort::Agents(kind) => format!("{kind}{wait}"),
         Sort::Gateways(kind) => format!("g{kind}{wait}"),
+        Sort::Secured(kind) => format!("s{kind}{wait}"),
         Sort::Letters => format!("let{wait}"),
         Sort::Iceoryx => format!("ice{wait}"),
         Sort::Socket(_) | Sort::Zenoh { .. } => "raw".to_owned(),
