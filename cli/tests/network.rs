@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use fipa::Kind;
 use fipa_testbed::{enter, isolated};
-use fleet::{Fleet, Plan};
+use fleet::{ADDRESSES, Fleet, Plan};
 
 const TOOLS: &[&str] = &["nft"];
 
@@ -73,7 +73,8 @@ on_a_network!(gateways_are_killed, inside_gateways_are_killed, || {
 /// The second host has another address, and then its own again.
 fn change_address_twice(fleet: &Fleet) {
     let host = fleet.network.host(1);
-    for (from, to) in [("10.99.0.2", "10.99.0.52"), ("10.99.0.52", "10.99.0.2")] {
+    let [usual, other] = ADDRESSES;
+    for (from, to) in [(usual, other), (other, usual)] {
         fleet.until_delivered(&[0, 1, 2]);
         host.ip(&format!("addr del {from}/24 dev eth0"));
         host.ip(&format!("addr add {to}/24 dev eth0"));
@@ -103,6 +104,29 @@ on_a_network!(
             change_address_twice(fleet);
             assert!(fleet.went_by(Kind::Quic), "nothing went by QUIC");
             for (from, to) in [(0, 1), (1, 0), (1, 2), (2, 1)] {
+                assert_eq!(fleet.failed(from, to), 0, "{from} to {to}");
+            }
+        });
+    }
+);
+
+on_a_network!(
+    /// QUIC does not follow a host that was dialled: it is dialled again where it is now, and what
+    /// it had not acknowledged is repeated.
+    a_dialled_quic_peer_moves,
+    inside_a_dialled_quic_peer_moves,
+    || {
+        let fleet = Fleet::new(&Plan {
+            transports: &["shm", "quic"],
+            // It takes four seconds to find out.
+            deadline: Duration::from_secs(20),
+            is_dialled: Some(1),
+            ..Plan::default()
+        });
+        fleet.through(6_000, |fleet| {
+            change_address_twice(fleet);
+            assert!(fleet.went_by(Kind::Quic), "nothing went by QUIC");
+            for (from, to) in [(0, 1), (1, 0), (1, 2), (2, 1), (0, 2), (2, 0)] {
                 assert_eq!(fleet.failed(from, to), 0, "{from} to {to}");
             }
         });
