@@ -4,7 +4,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use crate::Header;
 use crate::conversation::{
-    Bound, CANCELLING, Conversation, FAILED, NONE, Party, act_number, side_index,
+    Bound, CANCELLING, Conversation, FAILED, NONE, Party, Side, act_number, side_index,
 };
 use crate::deadlines::{Deadline, Deadlines};
 use crate::judge::{Heard, Move, Who, unbound};
@@ -148,9 +148,13 @@ impl Change<'_> {
         }
     }
 
-    /// Whether the message can say who gets the replies: the initiator's can.
-    pub(crate) fn names_designated(&self, conversation: &Conversation) -> bool {
-        self.names.is(conversation.initiator, self.heard.sender)
+    /// Whether the message can say who gets the replies: the initiator's can, and that of who goes
+    /// on instead.
+    pub(crate) fn names_designated(&self, conversation: &Conversation, moves: &[Move]) -> bool {
+        let sender = self.heard.sender;
+        self.names.is(conversation.initiator, sender)
+            || conversation.is_designated(self.names, sender)
+                && moves.iter().any(|made| made.side == Side::Initiator)
     }
 
     pub(crate) fn designate(&mut self, conversation: &mut Conversation, header: &Header<'_>) {

@@ -21,6 +21,8 @@ pub(crate) const CANCELLING: u16 = u16::MAX - 1;
 pub(crate) const CANCELLED: u16 = u16::MAX - 2;
 /// … and when the message transport service told of a failure.
 pub(crate) const FAILED: u16 = u16::MAX - 3;
+/// The state of which only others know: see [`crate::elsewhere`].
+pub(crate) const ELSEWHERE: u16 = u16::MAX - 4;
 
 /// The name of a state.
 pub(crate) fn state_name(machine: &Machine, state: u16) -> &str {
@@ -29,6 +31,7 @@ pub(crate) fn state_name(machine: &Machine, state: u16) -> &str {
         CANCELLING => "cancelling",
         CANCELLED => "cancelled",
         FAILED => "undelivered",
+        ELSEWHERE => "elsewhere",
         own => machine.state(own).map_or("", |state| state.id()),
     }
 }
@@ -133,7 +136,10 @@ pub(crate) struct Conversation {
     pub(crate) initiator: Name,
     pub(crate) parties: SmallVec<[Party; 1]>,
     pub(crate) bound: SmallVec<[Bound; 2]>,
-    /// Who gets replies instead of the initiator.
+    /// Whether it began between others, and the agent that watches itself came into it because a
+    /// `reply-to` names it. It stands for the initiator then.
+    pub(crate) joined: bool,
+    /// Who gets replies instead of the initiator, and may go on instead.
     pub(crate) reply_to: Vec<Name>,
     /// What the members of a multicast have been told, who are not known by name before they
     /// answer.
@@ -147,6 +153,18 @@ impl Conversation {
         let bound = self.bound.iter().map(|bound| bound.agent);
         let mut known = peers.chain(bound).chain([self.initiator]);
         known.any(|name| names.is(name, agent))
+    }
+
+    /// Whether a `reply-to` names the agent instead of the initiator.
+    pub(crate) fn is_designated(&self, names: &Names, agent: &str) -> bool {
+        self.reply_to.iter().any(|name| names.is(*name, agent))
+    }
+
+    /// Where there is one state for all: whether the agent began, or goes on instead and has no
+    /// part of its own.
+    pub(crate) fn speaks_for_initiator(&self, names: &Names, agent: &str) -> bool {
+        let has_part = || self.bound.iter().any(|bound| names.is(bound.agent, agent));
+        names.is(self.initiator, agent) || self.is_designated(names, agent) && !has_part()
     }
 }
 

@@ -105,21 +105,37 @@ impl Judge<'_> {
         if self.names.is(self.conversation.initiator, sender) {
             return self.by_initiator(moves);
         }
-        if let Some((at, party)) = self.party(sender) {
-            return self.by_participant(Who::Party(at), party, moves);
-        }
-        if let Some(unnamed) = &self.conversation.unnamed {
-            return self.by_participant(Who::Sender, unnamed, moves);
-        }
-        if self.heard.act == FAILURE && self.all_take_part() {
-            self.reported_failure(moves);
-            return Ok(());
-        }
-        Err(Fault::plain(Kind::Stranger))
+        let known = self.party(sender);
+        let known = known.map(|(at, party)| (Who::Party(at), party));
+        let unnamed = self.conversation.unnamed.as_deref();
+        let Some((who, party)) = known.or(unnamed.map(|party| (Who::Sender, party))) else {
+            if self.conversation.is_designated(self.names, sender) {
+                return self.by_initiator(moves);
+            }
+            if self.heard.act == FAILURE && self.all_take_part() {
+                self.reported_failure(moves);
+                return Ok(());
+            }
+            return Err(Fault::plain(Kind::Stranger));
+        };
+        self.by_participant(who, party, moves).or_else(|fault| {
+            // Who takes part himself may have been named in a `reply-to` as well.
+            if !self.conversation.is_designated(self.names, sender) {
+                return Err(fault);
+            }
+            self.by_initiator(moves).map_err(|other| match fault.kind {
+                Kind::WrongReceiver => other,
+                _ => fault,
+            })
+        })
     }
 
+    /// What the initiator says, or who goes on instead: with those who take part already.
     fn by_initiator(&self, moves: &mut Vec<Move>) -> Result<(), Fault> {
         let fresh = Party::new(NONE, self.machine.initial);
+        let conversation = self.conversation;
+        let began =
+            !conversation.joined && self.names.is(conversation.initiator, self.heard.sender);
         // Who watches himself does not know what others who are told the same have answered before.
         let told = self.heard.told.and_then(|at| self.heard.receivers.get(at));
         for (number, receiver) in self.heard.receivers.iter().enumerate() {
@@ -128,11 +144,12 @@ impl Judge<'_> {
             }
             let (who, party) = match self.party(receiver) {
                 Some((at, party)) => (Who::Party(at), party),
-                None if is_pattern(receiver) => {
-                    let unnamed = self.conversation.unnamed.as_deref();
+                None if is_pattern(receiver) && (began || conversation.unnamed.is_some()) => {
+                    let unnamed = conversation.unnamed.as_deref();
                     (Who::Unnamed, unnamed.unwrap_or(&fresh))
                 }
-                None => (Who::Receiver(number), &fresh),
+                None if began => (Who::Receiver(number), &fresh),
+                None => return Err(self.fault(Kind::WrongReceiver, &fresh, receiver)),
             };
             let said = self.said(Side::Initiator);
             let mut led = lead(self.machine, party, &said).map(|lead| (Side::Initiator, lead));
@@ -161,14 +178,8 @@ impl Judge<'_> {
     }
 
     fn by_participant(&self, who: Who, party: &Party, moves: &mut Vec<Move>) -> Result<(), Fault> {
-        let conversation = self.conversation;
-        let elsewhere = self.heard.receivers.iter().any(|receiver| {
-            let designated = || {
-                let mut designated = conversation.reply_to.iter();
-                designated.any(|agent| self.names.is(*agent, receiver))
-            };
-            !self.names.is(conversation.initiator, receiver) && !designated()
-        });
+        let mut receivers = self.heard.receivers.iter();
+        let elsewhere = receivers.any(|receiver| !self.gets_replies(receiver));
         let name = self.heard.sender;
         if elsewhere {
             return Err(self.fault(Kind::WrongReceiver, party, name));
@@ -188,13 +199,14 @@ impl Judge<'_> {
     /// not delivered. To whom is in the content: where it can be only one, the protocol has ended
     /// with that one.
     fn reported_failure(&self, moves: &mut Vec<Move>) {
-        let told_initiator = |receiver: &str| self.names.is(self.conversation.initiator, receiver);
         for receiver in self.heard.receivers {
+            let initiator = self.names.is(self.conversation.initiator, receiver);
+            let designated = self.conversation.is_designated(self.names, receiver);
             let concerns = |(_, party): &(usize, &Party)| {
-                let side = if told_initiator(receiver) {
-                    Side::Initiator
-                } else if self.names.is(party.peer, receiver) {
+                let side = if !initiator && self.names.is(party.peer, receiver) {
                     Side::Other
+                } else if initiator || designated {
+                    Side::Initiator
                 } else {
                     return false;
                 };
@@ -216,9 +228,14 @@ impl Judge<'_> {
     }
 
     fn all_take_part(&self) -> bool {
-        self.heard.receivers.iter().all(|receiver| {
-            self.names.is(self.conversation.initiator, receiver) || self.party(receiver).is_some()
-        })
+        let mut receivers = self.heard.receivers.iter();
+        receivers.all(|receiver| self.gets_replies(receiver) || self.party(receiver).is_some())
+    }
+
+    /// Whether what participants say may be for this agent.
+    fn gets_replies(&self, agent: &str) -> bool {
+        self.names.is(self.conversation.initiator, agent)
+            || self.conversation.is_designated(self.names, agent)
     }
 
     fn with_all(&self, moves: &mut Vec<Move>) -> Result<(), Fault> {
@@ -227,7 +244,7 @@ impl Judge<'_> {
             return Err(Fault::plain(Kind::NotOpened));
         };
         let sender = self.heard.sender;
-        let side = if self.names.is(conversation.initiator, sender) {
+        let side = if conversation.speaks_for_initiator(self.names, sender) {
             Side::Initiator
         } else {
             Side::Other
@@ -283,8 +300,7 @@ impl Judge<'_> {
         let bound = self.conversation.bound.iter();
         let held = bound.filter(|bound| self.names.is(bound.agent, agent));
         let roles = held.fold(0, |mask, bound| mask | (1 << bound.role));
-        let mut designated = self.conversation.reply_to.iter();
-        if designated.any(|name| self.names.is(*name, agent)) {
+        if self.conversation.is_designated(self.names, agent) {
             return roles | (1 << self.machine.initiator);
         }
         roles

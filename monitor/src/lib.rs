@@ -15,6 +15,7 @@ mod act;
 mod change;
 mod conversation;
 mod deadlines;
+mod elsewhere;
 mod header;
 mod judge;
 mod library;

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use regex::Regex;
 
-use crate::act::{Act, Acts, NOT_UNDERSTOOD};
+use crate::act::{Act, Acts, CANCEL, NOT_UNDERSTOOD};
 
 /// Most roles of a protocol.
 pub(crate) const MAX_ROLES: usize = 32;
@@ -189,6 +189,13 @@ impl Machine {
     #[must_use]
     pub fn timeout_target(&self, timeout: Timeout) -> &str {
         self.state(timeout.target).map_or("", State::id)
+    }
+
+    /// Whether the initiator may say this to somebody else, in whatever state.
+    pub(crate) fn is_said_by_initiator(&self, act: Act<'_>) -> bool {
+        let initiator = 1_u32 << self.initiator;
+        let says = |state: &State| step(&state.transitions, act, initiator, !initiator).is_some();
+        [CANCEL, NOT_UNDERSTOOD].contains(&act) || self.states.iter().any(says)
     }
 
     /// Whether somebody else may say this to the initiator, in whatever state.

@@ -24,12 +24,12 @@ use crate::{Header, Library, Limits};
 /// conversations in which a message is overdue, and forgets those that are over or abandoned.
 #[derive(Debug)]
 pub struct Monitor {
-    library: Arc<Library>,
-    limits: Limits,
+    pub(crate) library: Arc<Library>,
+    pub(crate) limits: Limits,
     /// The agent that watches its own conversations; none for an observer.
-    agent: Option<String>,
-    names: Names,
-    table: Table,
+    pub(crate) agent: Option<String>,
+    pub(crate) names: Names,
+    pub(crate) table: Table,
     deadlines: Deadlines,
     hasher: RandomState,
     /// Room that is used again.
@@ -79,6 +79,7 @@ struct Passed {
     complete: bool,
     late: bool,
     void: bool,
+    elsewhere: bool,
 }
 
 impl Monitor {
@@ -168,6 +169,7 @@ impl Monitor {
             complete: passed.complete,
             late: passed.late,
             void: passed.void,
+            elsewhere: passed.elsewhere,
         })
     }
 
@@ -218,7 +220,8 @@ impl Monitor {
         let machine = self.machine_of(&self.library, main);
         let follows = |name| machine.is_some_and(|machine: &Machine| machine.is_called(name));
         if header.protocol_name().is_none_or(follows) {
-            return self.go_on(main, header, &heard, now);
+            let passed = self.go_on(main, header, &heard, now);
+            return passed.map_err(|denied| self.elsewhere(main, &heard, denied, now));
         }
         let library = Arc::clone(&self.library);
         self.embedded(&library, main, header, &heard, now)
@@ -234,7 +237,7 @@ impl Monitor {
         now: SystemTime,
     ) -> Result<Passed, Denied> {
         let name = header.protocol_name().unwrap_or_default();
-        let mut denied = None;
+        let (mut denied, mut joined) = (None, None);
         let mut children = 0;
         let mut may_begin = self.may_begin(library, main, name, heard.sender);
         let mut child = self.table.slot(main).map_or(NONE, |slot| slot.child);
@@ -248,17 +251,29 @@ impl Monitor {
                         self.touch(main, millis(now));
                         return Ok(passed);
                     }
+                    Err(fault) if self.is_joined(child) => joined = Some((child, fault)),
                     Err(fault) => denied = denied.or(Some(fault)),
                 }
             }
             child = self.table.slot(child).map_or(NONE, |slot| slot.sibling);
         }
         if !may_begin {
-            if denied.is_none() && self.began_elsewhere(library, main, name, heard.sender) {
-                return Err(Denied::Unchecked(Unchecked::BegunElsewhere));
-            }
-            let fault = Fault::plain(Kind::WrongProtocol);
-            return Err(denied.unwrap_or(Denied::Fault(fault, main)));
+            return Err(match (denied, joined) {
+                (Some(denied), _) => denied,
+                (None, Some((child, fault))) => self.elsewhere(child, heard, fault, now),
+                (None, None) if self.began_elsewhere(library, main, name, heard.sender) => {
+                    let inner = library.index_of(name).filter(|_| !heard.own);
+                    if let Some(inner) = inner.filter(|_| children < self.limits.embedded) {
+                        let id = header.conversation().unwrap_or_default();
+                        self.join(id, main, inner, heard, now);
+                    }
+                    Denied::Unchecked(Unchecked::BegunElsewhere)
+                }
+                (None, None) if self.is_joined(main) => {
+                    Denied::Unchecked(Unchecked::BegunElsewhere)
+                }
+                (None, None) => Denied::Fault(Fault::plain(Kind::WrongProtocol), main),
+            });
         }
         let Some(machine) = library.index_of(name) else {
             return Err(Denied::Unchecked(Unchecked::UnknownProtocol));
@@ -345,6 +360,7 @@ impl Monitor {
             // Who asked may have named the agent in `reply-to`, without telling it.
             let named = parent == NONE && self.agent.is_some() && !heard.own;
             return Err(if named && protocol.is_answer(heard.act) {
+                self.join(id, parent, machine, heard, now);
                 Denied::Unchecked(Unchecked::BegunElsewhere)
             } else {
                 Denied::NotOpened(machine)
@@ -371,7 +387,7 @@ impl Monitor {
     }
 
     /// Forgets conversations until there is room for one more.
-    fn make_room(&mut self, keep: u32) {
+    pub(crate) fn make_room(&mut self, keep: u32) {
         while self.table.len() >= self.limits.conversations.max(1) {
             let other = |at: &u32| *at != keep;
             let ended = self.table.oldest(List::Ended).filter(other);
@@ -438,7 +454,7 @@ impl Monitor {
             }
             change.make(&mut slot.conversation, *made);
         }
-        if change.names_designated(&slot.conversation) {
+        if change.names_designated(&slot.conversation, &self.moves) {
             change.designate(&mut slot.conversation, header);
         }
         let (opened, moved) = (change.opened, change.state);
@@ -454,6 +470,7 @@ impl Monitor {
             complete,
             late,
             void,
+            elsewhere: slot.conversation.joined,
         };
         let is_main = slot.parent == NONE;
         if is_main {
@@ -464,7 +481,7 @@ impl Monitor {
     }
 
     /// Notes that something happened in a main conversation.
-    fn touch(&mut self, at: u32, now: u64) {
+    pub(crate) fn touch(&mut self, at: u32, now: u64) {
         let library = &self.library;
         let over = |slot: &crate::table::Slot| {
             let conversation = &slot.conversation;
@@ -526,7 +543,10 @@ impl Monitor {
                 let machine = self.library.machine(slot.conversation.machine);
                 let resting =
                     |party: &Party| machine.is_some_and(|machine| is_final(machine, party.state));
-                if list == List::Open && !slot.conversation.parties.iter().all(resting) {
+                let conversation = &slot.conversation;
+                // How far others have gone on elsewhere is not known.
+                let known = list == List::Open && !conversation.joined;
+                if known && !conversation.parties.iter().all(resting) {
                     events.push(Event::Abandoned {
                         protocol: machine.map_or("", Machine::name).to_owned(),
                         conversation_id: slot.conversation.id.clone(),

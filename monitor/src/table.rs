@@ -143,6 +143,7 @@ impl Table {
                 initiator: NONE,
                 parties: SmallVec::new(),
                 bound: SmallVec::new(),
+                joined: false,
                 reply_to: Vec::new(),
                 unnamed: None,
             },
@@ -197,6 +198,7 @@ impl Table {
             }
             conversation.parties = SmallVec::new();
             conversation.bound = SmallVec::new();
+            conversation.joined = false;
             conversation.reply_to = Vec::new();
             conversation.unnamed = None;
         }

@@ -55,6 +55,9 @@ pub struct Accepted<'m> {
     /// Whether it answers a message in whose place another had come before: it was too late, and
     /// changes nothing.
     pub void: bool,
+    /// Whether the conversation, or the protocol within it, began between others: the agent that
+    /// watches itself came into it because a `reply-to` names it.
+    pub elsewhere: bool,
 }
 
 /// A message that does not fit.
@@ -142,7 +145,9 @@ pub enum Unchecked {
     #[error("the message has no receiver")]
     NoReceiver,
     /// It belongs to a conversation, or a protocol within one, that began between others: the agent
-    /// that watches itself was not told. So are answers of the recruited to whom a `reply-to` names.
+    /// that watches itself was not told. So are the first answers of the recruited to whom a
+    /// `reply-to` names, and later ones that something must have come before which was not said
+    /// to it.
     #[error("the conversation, or the protocol within it, began between others")]
     BegunElsewhere,
     /// A conversation id or name is too long to be kept, or there are too many receivers.

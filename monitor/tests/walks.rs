@@ -13,7 +13,7 @@ use std::time::{Duration, SystemTime};
 
 use fastrand::Rng;
 use fipa_acl::{Performative, Time};
-use fipa_monitor::{Header, Library, Limits, Machine, Monitor, Verdict};
+use fipa_monitor::{Header, Library, Limits, Machine, Monitor, State, Verdict};
 use reference::{Reference, Says, Words, matches, options};
 
 static ACTS: LazyLock<Vec<&'static str>> = LazyLock::new(|| {
@@ -123,7 +123,7 @@ impl Walk<'_> {
         if self.rng.u8(..) < 60 {
             words.in_reply_to = Some(text(&mut self.rng, self.texts));
         }
-        if self.rng.u8(..) < 20 {
+        if self.rng.u8(..) < 40 {
             words.reply_to = vec![self.pick(&AGENTS[..5])];
         }
         if self.rng.u8(..) < 60 {
@@ -134,14 +134,28 @@ impl Walk<'_> {
 
     /// Mostly what a state allows, for else conversations would never go on.
     fn make_fitting(&mut self, words: &mut Words) {
-        let Some((machine, initiator, talks)) = self.reference.states(&words.id) else {
+        let Some((machine, initiators, talks)) = self.reference.states(&words.id) else {
             let machines: Vec<&Machine> = self.library.iter().collect();
             let machine = self.pick(&machines);
             words.protocol = Some(machine.name().to_owned());
-            let first = options(machine, machine.initial().id());
+            let mut first = options(machine, machine.initial().id());
+            // Now and then an answer in what others have begun.
+            if self.rng.u8(..) < 25 {
+                first = machine
+                    .states()
+                    .iter()
+                    .flat_map(State::transitions)
+                    .collect();
+                words.to = vec!["ann"];
+            }
             let first = self.pick(&first);
             words.act = self.act(first.performative());
             return;
+        };
+        // Who began, or somebody else to whom replies go.
+        let initiator = match self.rng.bool() {
+            true => initiators[0],
+            false => self.pick(&initiators),
         };
         if self.rng.u8(..) < 40
             && machine
@@ -149,8 +163,8 @@ impl Walk<'_> {
                 .iter()
                 .any(|state| !state.subprotocols().is_empty())
         {
-            // One of three protocols within, begun by whomever or going on.
-            let inner = self.pick(&["fipa-request", "fipa-query", "plain"]);
+            // One of some protocols within, begun by whomever or going on.
+            let inner = self.pick(&["fipa-request", "fipa-query", "fipa-contract-net", "plain"]);
             words.protocol = Some(inner.to_owned());
             let inner = self.library.find(inner).unwrap();
             let state = self.rng.usize(..inner.states().len());

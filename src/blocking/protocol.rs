@@ -4,7 +4,7 @@ use std::ops::Deref;
 use std::time::Duration;
 
 use bytes::Bytes;
-use fipa_acl::{Message, MessageBuilder};
+use fipa_acl::{Message, MessageBuilder, Performative};
 use tokio::runtime::Runtime;
 
 use super::Agent;
@@ -254,6 +254,12 @@ blocking! { Auction:
 
 blocking! { Proxied:
     fn next(patience: Duration) -> Message;
+    fn answer(
+        to: &Message,
+        act: Performative,
+        content: impl Into<Bytes>,
+        patience: Duration
+    ) -> ();
     #[last] fn cancel(patience: Duration) -> ();
 }
 

@@ -216,6 +216,19 @@ impl<'a> Dialogue<'a> {
         self.post(self.agent.reply(to, act).content(content), due)
     }
 
+    /// Answers a message of a protocol that runs within this one, in that protocol.
+    pub(super) async fn answer_within(
+        &mut self,
+        to: &Message,
+        act: Performative,
+        content: impl Into<bytes::Bytes>,
+        due: Option<Instant>,
+    ) -> Result<(), DialogueError> {
+        let answer = self.agent.reply(to, act).content(content);
+        let sending = self.post_within(answer, due)?;
+        only_delivered(&deliveries(sending).await)
+    }
+
     /// The next message, or none by then. What does not fit the protocol is an error, and so is what
     /// ends it for reasons of no protocol of its own.
     pub(super) async fn hear(&mut self, due: Option<Instant>) -> Result<Heard, DialogueError> {
@@ -319,6 +332,7 @@ impl<'a> Dialogue<'a> {
                 }
                 Ok(Meaning {
                     standing: match accepted.state {
+                        _ if accepted.elsewhere => Standing::Elsewhere,
                         _ if accepted.own => Standing::Own,
                         "not-understood" => Standing::NotUnderstood,
                         "cancelling" => Standing::Cancelling,

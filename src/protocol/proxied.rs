@@ -40,8 +40,8 @@ impl Agent {
     }
 
     /// The same with a recruiter (FIPA00034): those whom it asks answer directly, in this
-    /// conversation. Whether their answers fit what they were asked cannot be checked here, as only
-    /// they and the recruiter know that.
+    /// conversation. Whether their first answers fit what they were asked cannot be checked here, as
+    /// only they and the recruiter know that. Go on with [`Proxied::answer`].
     ///
     /// # Errors
     /// See [`brokering`](Self::brokering).
@@ -130,6 +130,37 @@ impl<'a> Proxied<'a> {
                 _ => return Ok(message),
             }
         }
+    }
+
+    /// Goes on with somebody who was recruited, in the protocol of its answer: accepts a proposal, for
+    /// example. What it says next comes with [`next`](Self::next).
+    ///
+    /// ```no_run
+    /// # use std::time::Duration;
+    /// # use fipa::Performative;
+    /// # use fipa::protocol::{DialogueError, Proxied};
+    /// # async fn example(mut answers: Proxied<'_>) -> Result<(), DialogueError> {
+    /// let patience = Duration::from_secs(5);
+    /// let proposal = answers.next(patience).await?;
+    /// let accept = Performative::AcceptProposal;
+    /// answers.answer(&proposal, accept, "", patience).await?;
+    /// println!("{}", answers.next(patience).await?);
+    /// # Ok(())
+    /// # }
+    /// ```
+    ///
+    /// # Errors
+    /// When that protocol does not allow it after this answer, as after those of a broker, or it does
+    /// not arrive.
+    pub async fn answer(
+        &mut self,
+        to: &Message,
+        act: Performative,
+        content: impl Into<bytes::Bytes>,
+        patience: Duration,
+    ) -> Result<(), DialogueError> {
+        let due = after(patience);
+        self.dialogue.answer_within(to, act, content, due).await
     }
 
     /// Cancels what was asked for, and waits until the broker or recruiter has confirmed that.

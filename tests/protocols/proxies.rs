@@ -120,6 +120,83 @@ async fn the_recruited_answer_directly() {
     tokio::join!(initiator, goes_between, recruited);
 }
 
+/// Passes a call for proposals on, to an arm that agrees to be told by others what to do.
+async fn recruit(recruiter: &Agent, reply_to: Option<&Agent>) {
+    let first = recruiter.receive().await.unwrap().message;
+    let mut task = recruiter.take_part(&first).unwrap();
+    task.agree("").await.unwrap();
+    let mut call = recruiter
+        .message(Performative::Cfp)
+        .receiver(AgentId::new("arm").unwrap())
+        .protocol("fipa-contract-net")
+        .content("lift?");
+    if let Some(agent) = reply_to {
+        call = call.reply_to(agent.id().clone());
+    }
+    task.pass_on(call, PATIENCE).await.unwrap();
+    task.inform("recruited").await.unwrap();
+}
+
+async fn propose(arm: &Agent) {
+    let first = arm.receive().await.unwrap().message;
+    respond(arm, &first, async |task| {
+        assert!(task.propose("20", PATIENCE).await?);
+        Ok(Reply::Inform(task.message().content().unwrap().clone()))
+    })
+    .await
+    .unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_has_others_recruited_accepts_their_proposal() {
+    let [rover, recruiter, arm] = three("recruiter").await;
+    let initiator = async {
+        let proxy = proxy(&rover, &recruiter);
+        let mut answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
+        let proposal = answers.next(PATIENCE).await.unwrap();
+        assert_eq!(*proposal.performative(), Performative::Propose);
+        let early = answers.answer(&proposal, Performative::Cfp, "", PATIENCE);
+        assert!(matches!(early.await, Err(DialogueError::WouldViolate(_))));
+        let accept = answers.answer(&proposal, Performative::AcceptProposal, "do", PATIENCE);
+        accept.await.unwrap();
+        let done = answers.next(PATIENCE).await.unwrap();
+        assert_eq!(*done.performative(), Performative::Inform);
+        assert_eq!(text(&done), "do");
+        let again = answers.answer(&proposal, Performative::AcceptProposal, "", PATIENCE);
+        assert!(matches!(again.await, Err(DialogueError::WouldViolate(_))));
+    };
+    tokio::join!(initiator, recruit(&recruiter, None), propose(&arm));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn whom_the_recruited_are_told_to_answer_accepts_a_proposal() {
+    let config = config(&["monitor.check=enforce"]);
+    let join = async |name: &str| {
+        let domain = Domain::open(&config).await.unwrap();
+        domain.register(name).unwrap()
+    };
+    let [rover, recruiter] = [join("rover").await, join("recruiter").await];
+    let [arm, base] = [join("arm").await, join("base").await];
+    let initiator = async {
+        let proxy = proxy(&rover, &recruiter);
+        let _answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
+    };
+    let designated = async {
+        let proposal = base.receive().await.unwrap().message;
+        assert_eq!(*proposal.performative(), Performative::Propose);
+        let accept = base.reply(&proposal, Performative::AcceptProposal);
+        let accept = accept.content("do").build().unwrap();
+        base.send(accept.clone()).await.unwrap();
+        // It is enforced as with those who began.
+        let again = base.send(accept).await;
+        assert!(matches!(again, Err(SendError::Violation(_))), "{again:?}");
+        let done = base.receive().await.unwrap().message;
+        assert_eq!(*done.performative(), Performative::Inform);
+    };
+    let goes_between = recruit(&recruiter, Some(&base));
+    tokio::join!(initiator, goes_between, propose(&arm), designated);
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn the_recruited_answer_whom_they_are_told_to() {
     let config = config(&["monitor.check=enforce"]);

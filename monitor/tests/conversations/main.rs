@@ -3,7 +3,9 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+mod designated;
 mod details;
+mod own;
 mod plain;
 
 use std::sync::Arc;
@@ -358,18 +360,6 @@ fn a_letter_that_was_not_delivered_can_be_sent_again() {
 }
 
 #[test]
-fn replies_go_to_whom_reply_to_names() {
-    let mut stage = Stage::observer();
-    stage.right(request("request ann>ben").reply_to(["zoe"]));
-    stage.right(request("agree ben>zoe"));
-    assert_eq!(
-        stage.wrong(request("inform ben>cid")).kind,
-        Kind::WrongReceiver
-    );
-    stage.right(request("inform ben>ann,zoe"));
-}
-
-#[test]
 fn an_agent_may_talk_to_itself() {
     let mut stage = Stage::observer();
     for words in ["request ann>ann", "agree ann>ann", "inform ann>ann"] {
@@ -496,19 +486,6 @@ fn brokers_run_protocols_within() {
 }
 
 #[test]
-fn the_recruited_answer_whom_they_are_told_to() {
-    let recruit = |words| say_in("fipa-recruiting", words);
-    let mut stage = Stage::observer();
-    stage.right(recruit("proxy ann>rec"));
-    stage.right(recruit("agree rec>ann"));
-    stage.right(say_in("fipa-query", "query-ref rec>ben").reply_to(["ann"]));
-    stage.right(recruit("inform rec>ann"));
-    stage.right(say_in("fipa-query", "agree ben>ann"));
-    stage.right(say_in("fipa-query", "inform ben>ann"));
-    stage.wrong(recruit("inform rec>ann"));
-}
-
-#[test]
 fn a_bid_that_crosses_the_next_call_is_late_and_no_violation() {
     let auction = |words| say_in("fipa-auction-english", words);
     let call = |text| auction("cfp auc>ben").reply_with(text);
@@ -542,85 +519,6 @@ fn a_bid_that_crosses_the_next_call_is_late_and_no_violation() {
     assert_eq!(stage.right(call("30")), "called");
     stage.right(bid("30"));
     assert_eq!(stage.right(auction("inform auc>ben")), "closed");
-}
-
-#[test]
-fn an_agent_knows_nothing_of_others_who_are_told_the_same() {
-    let iterated = |words| say_in("fipa-iterated-contract-net", words);
-    let mut stage = Stage::new(Monitor::agent(library(), "ben"));
-    stage.right(iterated("cfp ann>ben,cid"));
-    stage.right(iterated("propose ben>ann"));
-    // That cid has proposed, too, only ann can tell.
-    assert_eq!(stage.right(iterated("cfp ann>cid,ben")), "called");
-    assert_eq!(
-        stage.wrong(iterated("cfp ann>ben,cid")).kind,
-        Kind::OutOfOrder
-    );
-    let mut stage = Stage::observer();
-    stage.right(iterated("cfp ann>ben,cid"));
-    stage.right(iterated("propose ben>ann"));
-    assert_eq!(
-        stage.wrong(iterated("cfp ann>cid,ben")).kind,
-        Kind::OutOfOrder
-    );
-}
-
-#[test]
-fn who_had_others_recruited_cannot_check_their_answers() {
-    let recruit = |words| say_in("fipa-recruiting", words);
-    let mut stage = Stage::new(Monitor::agent(library(), "ann"));
-    stage.right(recruit("proxy ann>rec"));
-    let answer = || say_in("fipa-query", "inform ben>ann");
-    // Nobody can have been asked yet.
-    assert_eq!(stage.wrong(answer()).kind, Kind::WrongProtocol);
-    stage.right(recruit("agree rec>ann"));
-    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
-    assert_eq!(stage.check(&answer()), elsewhere);
-    stage.right(recruit("inform rec>ann"));
-    assert_eq!(stage.check(&answer()), elsewhere);
-    // Those who take part in the recruiting itself are no strangers.
-    let known = stage.wrong(say_in("fipa-query", "inform rec>ann"));
-    assert_eq!(known.kind, Kind::NotOpened);
-    let own = stage.wrong(say_in("fipa-query", "query-ref ann>ben"));
-    assert_eq!(own.kind, Kind::WrongProtocol);
-    // The recruiter has begun all there is itself.
-    let mut stage = Stage::new(Monitor::agent(library(), "rec"));
-    stage.right(recruit("proxy ann>rec"));
-    stage.right(recruit("agree rec>ann"));
-    let stranger = stage.wrong(say_in("fipa-query", "inform ben>rec"));
-    assert_eq!(stranger.kind, Kind::WrongProtocol);
-}
-
-#[test]
-fn who_is_named_in_reply_to_cannot_check_the_answers() {
-    // That dan gets them, only ann and ben know.
-    let mut stage = Stage::new(Monitor::agent(library(), "dan"));
-    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
-    for words in ["agree ben>dan", "inform ben>dan", "not-understood ben>dan"] {
-        assert_eq!(stage.check(&say_in("fipa-query", words)), elsewhere);
-    }
-    let bid = say_in("fipa-contract-net", "propose ben>dan");
-    assert_eq!(stage.check(&bid), elsewhere);
-    assert!(stage.monitor.is_empty());
-    // What is no answer, in no state; what only an initiator says; what dan says himself.
-    for (protocol, words) in [
-        ("fipa-query", "propose ben>dan"),
-        ("fipa-query", "cancel ben>dan"),
-        ("fipa-contract-net", "accept-proposal ben>dan"),
-        ("fipa-query", "inform dan>ben"),
-        ("fipa-query", "not-understood dan>ben"),
-    ] {
-        let wrong = stage.wrong(say_in(protocol, words));
-        assert_eq!(wrong.kind, Kind::NotOpened, "{words}");
-    }
-    // A conversation that does begin is one.
-    stage.right(say_in("fipa-query", "query-ref ben>dan"));
-    let wrong = stage.wrong(say_in("fipa-query", "inform ben>dan"));
-    assert_eq!(wrong.kind, Kind::WrongSender);
-    // An observer sees the beginning of everything.
-    let mut stage = Stage::observer();
-    let wrong = stage.wrong(say_in("fipa-query", "inform ben>dan"));
-    assert_eq!(wrong.kind, Kind::NotOpened);
 }
 
 #[test]

@@ -3,11 +3,11 @@
 
 use std::collections::HashMap;
 
-use fipa_monitor::{Library, Machine, Scope, Transition};
+use fipa_monitor::{Library, Machine, Scope};
 
 mod talk;
 
-use talk::{Spot, Step, Talk, View, judge, state};
+use talk::{Spot, Step, Talk, View, is_answered, judge, state};
 pub(crate) use talk::{matches, options};
 
 /// A message, in plain words.
@@ -33,8 +33,9 @@ pub(crate) enum Says {
     Nothing,
 }
 
-/// A conversation's machine, its initiator, and the state of each participant.
-pub(crate) type Overview<'l> = (&'l Machine, &'static str, Vec<(&'static str, String)>);
+/// A conversation's machine, its initiator and who may go on instead, and the state of each
+/// participant.
+pub(crate) type Overview<'l> = (&'l Machine, Vec<&'static str>, Vec<(&'static str, String)>);
 
 pub(crate) struct Reference<'l> {
     library: &'l Library,
@@ -53,6 +54,8 @@ struct Conversation<'l> {
     multicast: Option<Talk>,
     roles: Vec<(String, &'static str)>,
     designated: Vec<&'static str>,
+    /// Whether it began between others, who answer the agent that watches himself.
+    joined: bool,
     /// Conversations within, the latest first.
     inner: Vec<Self>,
 }
@@ -75,11 +78,9 @@ impl<'l> Reference<'l> {
         let conversation = self.talks.get(id)?;
         let talks = conversation.talks.iter();
         let states = talks.map(|(peer, talk)| (*peer, talk.name()));
-        Some((
-            conversation.machine,
-            conversation.initiator,
-            states.collect(),
-        ))
+        let designated = conversation.designated.iter().copied();
+        let initiators = [conversation.initiator].into_iter().chain(designated);
+        Some((conversation.machine, initiators.collect(), states.collect()))
     }
 
     pub(crate) fn hear(&mut self, words: &Words, now: u64) -> Says {
@@ -103,7 +104,13 @@ impl<'l> Reference<'l> {
                 says
             }
             Err(_) => match self.agent {
-                Some(agent) if agent != words.from && is_answer_only(machine, words.act) => {
+                Some(agent)
+                    if agent != words.from
+                        && is_answer(machine, words.act)
+                        && !begins(machine, words.act) =>
+                {
+                    let joined = Conversation::joined(machine, agent, words);
+                    self.talks.insert(words.id.clone(), joined);
                     Says::Nothing
                 }
                 _ => Says::Wrong("not-opened"),
@@ -112,24 +119,18 @@ impl<'l> Reference<'l> {
     }
 }
 
-/// Whether somebody may answer so in a conversation that he did not begin, and nobody begins one so.
-fn is_answer_only(machine: &Machine, act: &str) -> bool {
-    let begins = options(machine, machine.initial().id());
-    let begins = begins
-        .iter()
-        .any(|first| matches(first.performative(), act));
+fn begins(machine: &Machine, act: &str) -> bool {
+    let first = options(machine, machine.initial().id());
+    first.iter().any(|first| matches(first.performative(), act))
+}
+
+/// Whether somebody may answer so, in whatever state.
+fn is_answer(machine: &Machine, act: &str) -> bool {
     let mut all = machine
         .states()
         .iter()
         .flat_map(|state| state.transitions());
-    let answers = |transition: &Transition| {
-        let initiator = machine.initiator();
-        let mut others = machine.roles().iter().filter(|role| *role != initiator);
-        matches(transition.performative(), act)
-            && matches(transition.to(), initiator)
-            && others.any(|role| matches(transition.from(), role))
-    };
-    !begins && (act == "not-understood" || all.any(answers))
+    act == "not-understood" || all.any(|step| is_answered(machine, step, act))
 }
 
 impl<'l> Conversation<'l> {
@@ -146,7 +147,60 @@ impl<'l> Conversation<'l> {
             multicast: None,
             roles: Vec::new(),
             designated: Vec::new(),
+            joined: false,
             inner: Vec::new(),
+        }
+    }
+
+    fn joined(machine: &'l Machine, agent: &'static str, words: &Words) -> Self {
+        let mut conversation = Self::new(machine, agent, Some(agent));
+        conversation.joined = true;
+        conversation.learn(words);
+        conversation
+    }
+
+    fn learn(&mut self, words: &Words) {
+        let talk = Talk::joined(self.machine, words);
+        let peer = match self.machine.scope() {
+            Scope::Participant => words.from,
+            _ => "",
+        };
+        match self.talks.iter_mut().find(|(known, _)| *known == peer) {
+            Some(known) => known.1 = talk,
+            None => self.talks.push((peer, talk)),
+        }
+    }
+
+    /// Of what does not fit a conversation that began between others, some is not known to be wrong.
+    fn elsewhere(&mut self, words: &Words, wrong: &'static str) -> Result<Says, &'static str> {
+        let machine = self.machine;
+        let excused = if !self.joined {
+            false
+        } else if self.agent == Some(words.from) {
+            let mut unknown = self.talks.iter().filter(|(_, talk)| talk.is_unknown());
+            let mut all = machine
+                .states()
+                .iter()
+                .flat_map(|state| state.transitions());
+            let initiator = machine.initiator();
+            unknown.any(|(peer, _)| peer.is_empty() || words.to.contains(peer))
+                && (["cancel", "not-understood"].contains(&words.act)
+                    || all.any(|step| {
+                        let mut others = machine.roles().iter().filter(|role| *role != initiator);
+                        matches(step.performative(), words.act)
+                            && matches(step.from(), initiator)
+                            && others.any(|role| matches(step.to(), role))
+                    }))
+        } else if is_answer(machine, words.act) {
+            self.learn(words);
+            true
+        } else {
+            begins(machine, words.act)
+        };
+        if excused {
+            Ok(Says::Nothing)
+        } else {
+            Err(wrong)
         }
     }
 
@@ -159,30 +213,49 @@ impl<'l> Conversation<'l> {
     ) -> Result<Says, &'static str> {
         let name = match &words.protocol {
             Some(name) if !self.machine.is_called(name) => name,
-            _ => return self.hear(words, now),
+            _ => {
+                let says = self.hear(words, now);
+                return says.or_else(|wrong| self.elsewhere(words, wrong));
+            }
         };
         let may_begin = self.may_begin(library, name, words.from)
             || self
                 .inner
                 .iter()
                 .any(|inner| inner.may_begin(library, name, words.from));
-        let mut first_wrong = None;
-        for inner in &mut self.inner {
+        let (mut first_wrong, mut joined) = (None, None);
+        for (at, inner) in self.inner.iter_mut().enumerate() {
             if inner.machine.is_called(name) {
                 match inner.hear(words, now) {
                     Ok(says) => return Ok(says),
+                    Err(wrong) if inner.joined => joined = Some((at, wrong)),
                     Err(wrong) => first_wrong = first_wrong.or(Some(wrong)),
                 }
             }
         }
         if !may_begin {
-            if let (Some(agent), None) = (self.agent, first_wrong)
+            if let Some(wrong) = first_wrong {
+                return Err(wrong);
+            }
+            if let Some((at, wrong)) = joined {
+                return self.inner[at].elsewhere(words, wrong);
+            }
+            if let Some(agent) = self.agent
                 && !self.takes_part(words.from)
                 && self.others_may_begin(library, name, agent)
             {
+                let machine = library.find(name).filter(|_| words.from != agent);
+                let machine = machine.filter(|machine| is_answer(machine, words.act));
+                if let Some(machine) = machine.filter(|_| self.inner.len() < 64) {
+                    let joined = Conversation::joined(machine, agent, words);
+                    self.inner.insert(0, joined);
+                }
                 return Ok(Says::Nothing);
             }
-            return Err(first_wrong.unwrap_or("wrong-protocol"));
+            if self.joined {
+                return Ok(Says::Nothing);
+            }
+            return Err("wrong-protocol");
         }
         let Some(machine) = library.find(name) else {
             return Ok(Says::Nothing);
@@ -265,6 +338,10 @@ impl<'l> Conversation<'l> {
     }
 }
 
+fn place(talks: &[(&'static str, Talk)], name: &str) -> Option<usize> {
+    talks.iter().position(|(peer, _)| *peer == name)
+}
+
 impl Conversation<'_> {
     fn hear(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
         for (_, talk) in &mut self.talks {
@@ -301,31 +378,53 @@ impl Conversation<'_> {
     }
 
     fn hear_each(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
-        let place = |talks: &[(&'static str, Talk)], name: &str| {
-            talks.iter().position(|(peer, _)| *peer == name)
-        };
-        let machine = self.machine;
-        if words.from != self.initiator {
-            let known = place(&self.talks, words.from);
-            let fresh = known.is_none();
-            let talk = match (known, &self.multicast) {
-                (Some(at), _) => self.talks[at].1.clone(),
-                (None, Some(talk)) => talk.clone(),
-                (None, None) => return self.told_from_outside(words),
-            };
-            let addressed =
-                |name: &&&str| **name != self.initiator && !self.designated.contains(*name);
-            if words.to.iter().any(|name| addressed(&name)) {
-                return Err("wrong-receiver");
+        let designated = self.designated.contains(&words.from);
+        if words.from == self.initiator {
+            self.hear_initiator(words, now)
+        } else if self.multicast.is_some() || place(&self.talks, words.from).is_some() {
+            match self.hear_participant(words, now) {
+                // The other of his two parts may fit.
+                Err(wrong) if designated => {
+                    self.hear_initiator(words, now)
+                        .map_err(|other| match wrong {
+                            "wrong-receiver" => other,
+                            wrong => wrong,
+                        })
+                }
+                says => says,
             }
-            let step = judge(machine, &talk, &self.view(words, false))?;
-            let at = known.unwrap_or_else(|| {
-                self.talks.push((words.from, talk));
-                self.talks.len() - 1
-            });
-            let (opened, late) = self.talks[at].1.go(machine, words, false, step, now);
-            return Ok(self.says(Some(at), opened || fresh, late));
+        } else if designated {
+            self.hear_initiator(words, now)
+        } else {
+            self.told_from_outside(words)
         }
+    }
+
+    fn hear_participant(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
+        let machine = self.machine;
+        let known = place(&self.talks, words.from);
+        let talk = match (known, &self.multicast) {
+            (Some(at), _) => self.talks[at].1.clone(),
+            (None, Some(talk)) => talk.clone(),
+            (None, None) => return Err("stranger"),
+        };
+        let addressed = |name: &&str| *name != self.initiator && !self.designated.contains(name);
+        if words.to.iter().any(addressed) {
+            return Err("wrong-receiver");
+        }
+        let step = judge(machine, &talk, &self.view(words, false))?;
+        let at = known.unwrap_or_else(|| {
+            self.talks.push((words.from, talk));
+            self.talks.len() - 1
+        });
+        let (opened, late) = self.talks[at].1.go(machine, words, false, step, now);
+        Ok(self.says(Some(at), opened || known.is_none(), late))
+    }
+
+    /// What the initiator says, or somebody in his place, who brings nobody new in.
+    fn hear_initiator(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
+        let machine = self.machine;
+        let brings_in = words.from == self.initiator && !self.joined;
         // To everybody or to nobody.
         let mut steps: Vec<(&'static str, bool, Step)> = Vec::new();
         let witness = self
@@ -341,7 +440,8 @@ impl Conversation<'_> {
                 None if name.contains('*') && self.multicast.is_some() => {
                     self.multicast.clone().expect("there is one")
                 }
-                None => Talk::new(machine),
+                None if brings_in => Talk::new(machine),
+                None => return Err("wrong-receiver"),
             };
             let mut side = true;
             let mut step = judge(machine, &talk, &self.view(words, true));
@@ -358,6 +458,8 @@ impl Conversation<'_> {
             }
         }
         let (mut opened, mut late, mut first) = (false, false, None);
+        // Who goes on may only have talked to himself, as a participant.
+        let speaks = words.from == self.initiator || steps.iter().any(|(_, side, _)| *side);
         for (name, side, step) in steps {
             let known = place(&self.talks, name);
             if known.is_none() && name.contains('*') {
@@ -377,7 +479,9 @@ impl Conversation<'_> {
             (opened, late) = (opened | began, late | was_late);
             first = first.or(Some(self.talks[at].1.name()));
         }
-        self.designate(words);
+        if speaks {
+            self.designate(words);
+        }
         Ok(self.says_state(first, opened, late))
     }
 
@@ -391,8 +495,11 @@ impl Conversation<'_> {
 
     /// Somebody who takes no part: a message transport service that tells of a failure, or wrong.
     fn told_from_outside(&mut self, words: &Words) -> Result<Says, &'static str> {
-        let takes_part =
-            |name: &str| name == self.initiator || self.talks.iter().any(|(peer, _)| *peer == name);
+        let takes_part = |name: &str| {
+            name == self.initiator
+                || self.designated.contains(&name)
+                || place(&self.talks, name).is_some()
+        };
         if words.act != "failure" || !words.to.iter().all(|name| takes_part(name)) {
             return Err("stranger");
         }
@@ -402,10 +509,15 @@ impl Conversation<'_> {
             let concerned: Vec<usize> = (0..before.len())
                 .filter(|at| {
                     let (peer, talk) = &before[*at];
-                    let side = *name == self.initiator;
-                    if !side && peer != name {
+                    let side = if *name == self.initiator {
+                        true
+                    } else if peer == name {
+                        false
+                    } else if self.designated.contains(name) {
+                        true
+                    } else {
                         return false;
-                    }
+                    };
                     let asked = talk.last_of(side).and_then(|said| said.reply_with.clone());
                     let answers = words.in_reply_to.is_none()
                         || asked.is_none()
@@ -447,6 +559,9 @@ impl Conversation<'_> {
         for name in &words.to {
             to_roles.retain(|role| may(name).contains(role));
         }
+        let has_part = self.roles.iter().any(|(_, agent)| *agent == words.from);
+        let goes_on = self.designated.contains(&words.from) && !has_part;
+        let by_initiator = words.from == self.initiator || goes_on;
         let knows = |name: &str| !held(name).is_empty();
         let nobody = |name: &str| may(name).is_empty();
         let view = View {
@@ -454,7 +569,7 @@ impl Conversation<'_> {
             to: to_roles,
             known: knows(words.from) && words.to.iter().all(|name| knows(name)),
             compares: self.roles.len() == 2,
-            ..self.view(words, words.from == self.initiator)
+            ..self.view(words, by_initiator)
         };
         let strange = words.to.iter().any(|name| nobody(name));
         let step = match judge(machine, &self.talks[0].1, &view) {
@@ -504,7 +619,7 @@ impl Conversation<'_> {
             .unwrap_or_else(|| machine.initial().id().to_owned());
         let ended = match name.as_str() {
             "not-understood" | "cancelled" | "undelivered" => true,
-            "cancelling" => false,
+            "cancelling" | "elsewhere" => false,
             own => state(machine, own).is_final(),
         };
         let complete =

@@ -12,8 +12,12 @@ pub(super) enum Spot {
     At(String),
     NotUnderstood,
     Cancelling(String),
-    Cancelled { one_more: bool },
+    Cancelled {
+        one_more: bool,
+    },
     Undelivered(Box<Spot>),
+    /// Only others know.
+    Elsewhere,
 }
 
 #[derive(Debug, Clone)]
@@ -67,6 +71,15 @@ pub(crate) fn matches(pattern: &str, text: &str) -> bool {
 pub(super) fn state<'m>(machine: &'m Machine, id: &str) -> &'m State {
     let found = machine.states().iter().find(|state| state.id() == id);
     found.expect("a state of the machine")
+}
+
+/// Whether somebody else says this to the initiator so.
+pub(super) fn is_answered(machine: &Machine, step: &Transition, act: &str) -> bool {
+    let initiator = machine.initiator();
+    let mut others = machine.roles().iter().filter(|role| *role != initiator);
+    matches(step.performative(), act)
+        && matches(step.to(), initiator)
+        && others.any(|role| matches(step.from(), role))
 }
 
 /// The state's transitions and those behind optional ones.
@@ -124,6 +137,50 @@ impl Talk {
             && last.is_some_and(|said| said.act == words.act && said.reply_with == words.reply_with)
     }
 
+    /// Who came into the talk with an answer knows its state if only one can follow.
+    pub(super) fn joined(machine: &Machine, words: &Words) -> Self {
+        let mut in_time = vec![machine.initial().id()];
+        for at in 0.. {
+            let Some(id) = in_time.get(at) else { break };
+            for step in state(machine, id).transitions() {
+                if !in_time.contains(&machine.target(step)) {
+                    in_time.push(machine.target(step));
+                }
+            }
+        }
+        let all = in_time.iter().flat_map(|id| options(machine, id));
+        let mut targets: Vec<&str> = all
+            .filter(|step| is_answered(machine, step, words.act))
+            .map(|step| machine.target(step))
+            .collect();
+        targets.sort_unstable();
+        targets.dedup();
+        let spot = match targets[..] {
+            [only] if machine.scope() == Scope::Participant => Spot::At(only.to_owned()),
+            _ => Spot::Elsewhere,
+        };
+        Self {
+            previous: spot.clone(),
+            spot,
+            said: vec![Said {
+                by_initiator: false,
+                act: words.act,
+                reply_with: words.reply_with.clone(),
+                cancels: false,
+                crossed: false,
+            }],
+            due: None,
+        }
+    }
+
+    pub(super) fn is_unknown(&self) -> bool {
+        match &self.spot {
+            Spot::Elsewhere => true,
+            Spot::Undelivered(before) => **before == Spot::Elsewhere,
+            _ => false,
+        }
+    }
+
     pub(super) fn name(&self) -> String {
         match &self.spot {
             Spot::At(id) => id.clone(),
@@ -131,13 +188,14 @@ impl Talk {
             Spot::Cancelling(_) => "cancelling".into(),
             Spot::Cancelled { .. } => "cancelled".into(),
             Spot::Undelivered(_) => "undelivered".into(),
+            Spot::Elsewhere => "elsewhere".into(),
         }
     }
 
     pub(super) fn has_ended(&self, machine: &Machine) -> bool {
         match &self.spot {
             Spot::At(id) => state(machine, id).is_final(),
-            Spot::Cancelling(_) => false,
+            Spot::Cancelling(_) | Spot::Elsewhere => false,
             _ => true,
         }
     }
@@ -199,6 +257,7 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
             };
             at(before).or_else(|wrong| at(&talk.previous).map_err(|_| wrong))
         }
+        Spot::Elsewhere => Err("unexpected"),
         Spot::NotUnderstood => Err(if repeated { "repeated" } else { "ended" }),
         Spot::Cancelled { one_more } => {
             let canceller = talk.cancel().is_some_and(|cancel| cancel.by_initiator);
@@ -344,7 +403,7 @@ pub(super) fn comes_later(
 impl Talk {
     pub(super) fn fail(&mut self) {
         self.spot = match self.spot.clone() {
-            Spot::At(id) => Spot::Undelivered(Box::new(Spot::At(id))),
+            spot @ (Spot::At(_) | Spot::Elsewhere) => Spot::Undelivered(Box::new(spot)),
             // The cancel was not heard.
             Spot::Cancelling(back) => Spot::At(back),
             // What has ended, or failed already.

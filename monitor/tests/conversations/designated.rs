@@ -1,0 +1,322 @@
+//! Who gets replies instead of the initiator, because a `reply-to` names him, and goes on instead
+//! (FIPA00061, FIPA00034).
+
+use super::*;
+
+fn recruit(words: &'static str) -> Header<'static> {
+    say_in("fipa-recruiting", words)
+}
+
+#[test]
+fn replies_go_to_whom_reply_to_names() {
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben").reply_to(["zoe"]));
+    stage.right(request("agree ben>zoe"));
+    assert_eq!(
+        stage.wrong(request("inform ben>cid")).kind,
+        Kind::WrongReceiver
+    );
+    stage.right(request("inform ben>ann,zoe"));
+}
+
+#[test]
+fn the_recruited_answer_whom_they_are_told_to() {
+    let mut stage = Stage::observer();
+    stage.right(recruit("proxy ann>rec"));
+    stage.right(recruit("agree rec>ann"));
+    stage.right(say_in("fipa-query", "query-ref rec>ben").reply_to(["ann"]));
+    stage.right(recruit("inform rec>ann"));
+    stage.right(say_in("fipa-query", "agree ben>ann"));
+    stage.right(say_in("fipa-query", "inform ben>ann"));
+    stage.wrong(recruit("inform rec>ann"));
+}
+
+/// A recruited contract net up to its proposals, which go to dan.
+fn recruited(monitor: Monitor) -> Stage {
+    let mut stage = Stage::new(monitor);
+    stage.right(recruit("proxy ann>rec"));
+    stage.right(recruit("agree rec>ann"));
+    stage.right(say("cfp rec>ben,cid").reply_to(["dan"]));
+    stage.right(recruit("inform rec>ann"));
+    stage.right(say("propose ben>dan").reply_with("b"));
+    stage.right(say("propose cid>dan"));
+    stage
+}
+
+#[test]
+fn who_gets_the_proposals_of_the_recruited_accepts_one() {
+    let mut stage = recruited(Monitor::observer(library()));
+    assert_eq!(
+        stage.wrong(say("accept-proposal zoe>ben")).kind,
+        Kind::Stranger
+    );
+    let unasked = say("accept-proposal dan>ben").in_reply_to("x");
+    assert_eq!(stage.wrong(unasked).kind, Kind::WrongReply);
+    let accept = say("accept-proposal dan>ben").in_reply_to("b");
+    assert_eq!(stage.right(accept), "accepted");
+    assert_eq!(stage.right(say("reject-proposal dan>cid")), "rejected");
+    let again = stage.wrong(say("accept-proposal dan>ben"));
+    assert_eq!(again.kind, Kind::Unexpected);
+    assert_eq!(again.participant.as_deref(), Some("ben"));
+    assert_eq!(stage.right(say("inform ben>dan")), "done");
+}
+
+#[test]
+fn who_goes_on_brings_nobody_in() {
+    let mut stage = recruited(Monitor::observer(library()));
+    for words in ["cfp dan>eve", "cfp dan>eve,ben", "cfp dan>arm_.*"] {
+        assert_eq!(stage.wrong(say(words)).kind, Kind::WrongReceiver, "{words}");
+    }
+    // The recruiter does, and its multicast is one that dan may go on with.
+    stage.right(say("cfp rec>arm_.*"));
+    stage.right(say("cancel dan>arm_.*"));
+    stage.right(say("inform arm_1>dan"));
+}
+
+#[test]
+fn who_goes_on_cancels_and_hands_on() {
+    let mut stage = Stage::observer();
+    let subscribe = |words| say_in("fipa-subscribe", words);
+    stage.right(subscribe("subscribe ann>ben").reply_to(["dan"]));
+    stage.right(subscribe("inform ben>dan"));
+    assert_eq!(
+        stage.wrong(subscribe("inform ben>eve")).kind,
+        Kind::WrongReceiver
+    );
+    assert_eq!(
+        stage.right(subscribe("cancel dan>ben").reply_to(["eve"])),
+        "cancelling"
+    );
+    assert_eq!(stage.right(subscribe("failure ben>eve")), "active");
+    stage.right(subscribe("cancel eve>ben"));
+    assert_eq!(stage.right(subscribe("inform ben>eve")), "cancelled");
+    // Who takes part otherwise names nobody.
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben"));
+    stage.right(request("agree ben>ann").reply_to(["dan"]));
+    assert_eq!(stage.wrong(request("cancel dan>ben")).kind, Kind::Stranger);
+}
+
+#[test]
+fn who_takes_part_may_go_on_with_the_others() {
+    let mut stage = Stage::observer();
+    stage.right(say("cfp ann>ben,cid").reply_to(["ben"]));
+    stage.right(say("propose ben>ann"));
+    stage.right(say("propose cid>ben"));
+    assert_eq!(stage.right(say("accept-proposal ben>cid")), "accepted");
+    // Each part has faults of its own.
+    assert_eq!(
+        stage.wrong(say("accept-proposal ben>cid")).kind,
+        Kind::Unexpected
+    );
+    assert_eq!(stage.wrong(say("inform ben>ann")).kind, Kind::OutOfOrder);
+    stage.right(say("accept-proposal ann>ben"));
+    stage.right(say("inform cid>ben"));
+    stage.right(say("inform ben>ann"));
+}
+
+#[test]
+fn who_goes_on_is_told_of_what_was_not_delivered() {
+    let mut stage = Stage::observer();
+    stage.right(say("cfp ann>ben").reply_to(["dan"]));
+    stage.right(say("propose ben>dan").reply_with("b"));
+    stage.right(say("accept-proposal dan>ben").reply_with("d"));
+    let lost = say("failure host-mts>dan").in_reply_to("d");
+    assert_eq!(stage.right(lost), "undelivered");
+    assert_eq!(stage.right(say("accept-proposal dan>ben")), "accepted");
+    assert_eq!(
+        stage.wrong(say("failure host-mts>zoe")).kind,
+        Kind::Stranger
+    );
+}
+
+#[test]
+fn where_all_have_one_state_it_is_the_initiators_part() {
+    let text = r#"<scxml initial="1">
+        <state id="1"><transition performative="cfp" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="propose" from="b" to="a" target="3"/></state>
+        <state id="3"><transition performative="accept-proposal" from="a" to="b" target="4"/></state>
+        <state id="4" final="yes"/></scxml>"#;
+    let mut library = Library::standard();
+    library.add(Machine::read("own", text).unwrap()).unwrap();
+    let own = |words| say_in("own", words);
+    let library = Arc::new(library);
+    let mut stage = Stage::new(Monitor::observer(Arc::clone(&library)));
+    stage.right(own("cfp ann>ben").reply_to(["dan"]).reply_with("a"));
+    stage.right(own("propose ben>dan").in_reply_to("a").reply_with("b"));
+    let unasked = own("accept-proposal dan>ben").in_reply_to("a");
+    assert_eq!(stage.wrong(unasked).kind, Kind::WrongReply);
+    let accept = own("accept-proposal dan>ben").in_reply_to("b");
+    assert_eq!(stage.right(accept), "4");
+    // Who watches himself knows nobody's role here: nothing is wrong that the initiator may say.
+    let mut stage = Stage::new(Monitor::agent(library, "dan"));
+    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
+    for words in [
+        "propose ben>dan",
+        "accept-proposal dan>ben",
+        "cancel dan>ben",
+    ] {
+        assert_eq!(stage.check(&own(words)), elsewhere, "{words}");
+    }
+    assert_eq!(stage.wrong(own("inform dan>ben")).kind, Kind::Unexpected);
+}
+
+#[test]
+fn the_recruited_know_who_goes_on() {
+    let mut stage = Stage::new(Monitor::agent(library(), "ben"));
+    stage.right(say("cfp rec>ben,cid").reply_to(["dan"]));
+    stage.right(say("propose ben>dan"));
+    assert_eq!(
+        stage.wrong(say("accept-proposal zoe>ben")).kind,
+        Kind::Stranger
+    );
+    assert_eq!(stage.right(say("accept-proposal dan>ben")), "accepted");
+    assert_eq!(stage.right(say("inform ben>dan")), "done");
+}
+
+/// Dan knows nothing but what he is told.
+fn as_dan(with: impl FnOnce(&mut Stage)) -> Stage {
+    let mut stage = Stage::new(Monitor::agent(library(), "dan"));
+    with(&mut stage);
+    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
+    assert_eq!(stage.check(&say("propose ben>dan")), elsewhere);
+    stage
+}
+
+#[test]
+fn who_was_not_told_the_beginning_goes_on_by_the_rules() {
+    let mut stage = as_dan(|stage| {
+        // Not before he knows of a proposal.
+        assert_eq!(
+            stage.wrong(say("accept-proposal dan>ben")).kind,
+            Kind::NotOpened
+        );
+    });
+    for (words, kind) in [
+        ("cfp dan>eve", Kind::WrongReceiver),
+        ("accept-proposal dan>eve", Kind::WrongReceiver),
+        ("inform dan>ben", Kind::Unexpected),
+        ("subscribe dan>ben", Kind::Unexpected),
+    ] {
+        assert_eq!(stage.wrong(say(words)).kind, kind, "{words}");
+    }
+    let accept = say("accept-proposal dan>ben");
+    let Verdict::Accepted(accepted) = stage.check(&accept) else {
+        panic!();
+    };
+    assert_eq!((accepted.state, accepted.elsewhere), ("accepted", true));
+    assert_eq!(stage.wrong(accept).kind, Kind::Unexpected);
+    assert_eq!(stage.right(say("inform ben>dan")), "done");
+    assert_eq!(
+        stage.wrong(say("accept-proposal dan>ben")).kind,
+        Kind::Ended
+    );
+    stage.pass(61);
+    assert!(stage.monitor.is_empty(), "it was over");
+}
+
+#[test]
+fn who_was_not_told_the_beginning_learns_of_others_by_what_they_answer() {
+    let mut stage = as_dan(|_| {});
+    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
+    assert_eq!(stage.check(&say("propose cid>dan")), elsewhere);
+    stage.right(say("reject-proposal dan>cid"));
+    // That ann has called again, he was not told; nor that it was she who began.
+    assert_eq!(stage.check(&say("propose cid>dan")), elsewhere);
+    stage.right(say("accept-proposal dan>cid,ben"));
+    assert_eq!(stage.check(&say("cfp ann>dan")), elsewhere);
+    // What answers nothing in this protocol is wrong, whatever was said before.
+    assert_eq!(stage.wrong(say("agree ben>dan")).kind, Kind::Unexpected);
+    // Another protocol around this one is as unknown.
+    assert_eq!(stage.check(&recruit("inform rec>dan")), elsewhere);
+    assert_eq!(stage.monitor.len(), 1);
+    // How far it has come is not known: nothing is said about its end.
+    assert_eq!(stage.pass(10_000), []);
+    assert!(stage.monitor.is_empty());
+}
+
+#[test]
+fn what_may_lead_to_several_states_is_not_judged() {
+    let text = r#"<scxml initial="1" xmlns:f="urn:fipa-rs:protocol" f:scope="participant">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2"><transition performative="inform" from="b" to="a" target="3"/></state>
+        <state id="3"><transition performative="confirm" from="a" to="b" target="4"/></state>
+        <state id="4"><transition performative="inform" from="b" to="a" target="5"/></state>
+        <state id="5" final="yes"/></scxml>"#;
+    let mut library = Library::standard();
+    library.add(Machine::read("own", text).unwrap()).unwrap();
+    let own = |words| say_in("own", words);
+    let mut stage = Stage::new(Monitor::agent(Arc::new(library), "dan"));
+    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
+    assert_eq!(stage.check(&own("inform ben>dan")), elsewhere);
+    assert_eq!(stage.check(&own("confirm dan>ben")), elsewhere);
+    assert_eq!(
+        stage.wrong(own("disconfirm dan>ben")).kind,
+        Kind::Unexpected
+    );
+    let stranger = stage.wrong(own("confirm dan>cid"));
+    assert_eq!(stranger.kind, Kind::WrongReceiver);
+    // As little after something was not delivered.
+    assert_eq!(stage.right(own("failure host-mts>dan")), "elsewhere");
+    assert_eq!(stage.check(&own("confirm dan>ben")), elsewhere);
+}
+
+#[test]
+fn who_had_others_recruited_goes_on_with_them() {
+    let mut stage = Stage::new(Monitor::agent(library(), "ann"));
+    stage.right(recruit("proxy ann>rec"));
+    stage.right(recruit("agree rec>ann"));
+    let early = stage.wrong(say("accept-proposal ann>ben"));
+    assert_eq!(early.kind, Kind::WrongProtocol);
+    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
+    assert_eq!(stage.check(&say("propose ben>ann")), elsewhere);
+    stage.right(recruit("inform rec>ann"));
+    assert_eq!(stage.check(&say("propose cid>ann")), elsewhere);
+    assert_eq!(stage.right(say("accept-proposal ann>ben")), "accepted");
+    assert_eq!(stage.right(say("reject-proposal ann>cid")), "rejected");
+    assert_eq!(
+        stage.wrong(say("accept-proposal ann>cid")).kind,
+        Kind::Ended
+    );
+    assert_eq!(stage.right(say("inform ben>ann")), "done");
+    assert_eq!(stage.monitor.len(), 2, "both in one within the recruiting");
+    let again = stage.wrong(recruit("inform rec>ann"));
+    assert_eq!(again.kind, Kind::Unexpected);
+}
+
+#[test]
+fn what_began_elsewhere_is_bounded_like_all_else() {
+    let mut limits = Limits::default();
+    (limits.conversations, limits.participants, limits.embedded) = (4, 3, 1);
+    let monitor = Monitor::agent(library(), "dan").with_limits(limits);
+    let mut stage = Stage::new(monitor);
+    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
+    for number in 0..20 {
+        let answer = say("propose ben>dan").conversation_id(number.to_string());
+        assert_eq!(stage.check(&answer), elsewhere);
+    }
+    assert_eq!(stage.monitor.len(), 4);
+    // Participants: the fourth is not kept.
+    for words in [
+        "propose 1>dan",
+        "propose 2>dan",
+        "propose 3>dan",
+        "propose 4>dan",
+    ] {
+        assert_eq!(stage.check(&say(words)), elsewhere);
+    }
+    stage.right(say("accept-proposal dan>3"));
+    let fourth = stage.wrong(say("accept-proposal dan>4"));
+    assert_eq!(fourth.kind, Kind::WrongReceiver);
+    // Within another.
+    let monitor = Monitor::agent(library(), "ann").with_limits(limits);
+    let mut stage = Stage::new(monitor);
+    stage.right(recruit("proxy ann>rec"));
+    stage.right(recruit("agree rec>ann"));
+    assert_eq!(stage.check(&say("propose ben>ann")), elsewhere);
+    assert_eq!(
+        stage.check(&say_in("fipa-query", "inform ben>ann")),
+        elsewhere
+    );
+    assert_eq!(stage.monitor.len(), 2);
+}

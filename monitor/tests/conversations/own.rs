@@ -1,0 +1,90 @@
+//! Agents that watch their own conversations: what they cannot know is no violation.
+
+use super::*;
+
+#[test]
+fn an_agent_knows_nothing_of_others_who_are_told_the_same() {
+    let iterated = |words| say_in("fipa-iterated-contract-net", words);
+    let mut stage = Stage::new(Monitor::agent(library(), "ben"));
+    stage.right(iterated("cfp ann>ben,cid"));
+    stage.right(iterated("propose ben>ann"));
+    // That cid has proposed, too, only ann can tell.
+    assert_eq!(stage.right(iterated("cfp ann>cid,ben")), "called");
+    assert_eq!(
+        stage.wrong(iterated("cfp ann>ben,cid")).kind,
+        Kind::OutOfOrder
+    );
+    let mut stage = Stage::observer();
+    stage.right(iterated("cfp ann>ben,cid"));
+    stage.right(iterated("propose ben>ann"));
+    assert_eq!(
+        stage.wrong(iterated("cfp ann>cid,ben")).kind,
+        Kind::OutOfOrder
+    );
+}
+
+#[test]
+fn who_had_others_recruited_cannot_check_their_answers() {
+    let recruit = |words| say_in("fipa-recruiting", words);
+    let mut stage = Stage::new(Monitor::agent(library(), "ann"));
+    stage.right(recruit("proxy ann>rec"));
+    let answer = || say_in("fipa-query", "inform ben>ann");
+    // Nobody can have been asked yet.
+    assert_eq!(stage.wrong(answer()).kind, Kind::WrongProtocol);
+    stage.right(recruit("agree rec>ann"));
+    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
+    assert_eq!(stage.check(&answer()), elsewhere);
+    stage.right(recruit("inform rec>ann"));
+    assert_eq!(stage.check(&answer()), elsewhere);
+    // Those who take part in the recruiting itself are no strangers.
+    let known = stage.wrong(say_in("fipa-query", "inform rec>ann"));
+    assert_eq!(known.kind, Kind::NotOpened);
+    let own = stage.wrong(say_in("fipa-query", "query-ref ann>ben"));
+    assert_eq!(own.kind, Kind::Ended);
+    let own = stage.wrong(request("request ann>ben"));
+    assert_eq!(own.kind, Kind::WrongProtocol);
+    // The recruiter has begun all there is itself.
+    let mut stage = Stage::new(Monitor::agent(library(), "rec"));
+    stage.right(recruit("proxy ann>rec"));
+    stage.right(recruit("agree rec>ann"));
+    let stranger = stage.wrong(say_in("fipa-query", "inform ben>rec"));
+    assert_eq!(stranger.kind, Kind::WrongProtocol);
+}
+
+#[test]
+fn who_is_named_in_reply_to_cannot_check_the_answers() {
+    // That dan gets them, only ann and ben know.
+    let mut stage = Stage::new(Monitor::agent(library(), "dan"));
+    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
+    for words in ["agree ben>dan", "agree ben>dan", "not-understood cid>dan"] {
+        assert_eq!(stage.check(&say_in("fipa-query", words)), elsewhere);
+    }
+    let answer = say_in("fipa-query", "inform ben>dan");
+    let Verdict::Accepted(accepted) = stage.check(&answer) else {
+        panic!("it follows what ben has said before");
+    };
+    assert_eq!((accepted.state, accepted.elsewhere), ("answered", true));
+    let bid = say_in("fipa-contract-net", "propose ben>dan");
+    assert_eq!(stage.check(&bid.conversation_id("d")), elsewhere);
+    assert_eq!(stage.monitor.len(), 2);
+    let mut stage = Stage::new(Monitor::agent(library(), "dan"));
+    // What is no answer, in no state; what only an initiator says; what dan says himself.
+    for (protocol, words) in [
+        ("fipa-query", "propose ben>dan"),
+        ("fipa-query", "cancel ben>dan"),
+        ("fipa-contract-net", "accept-proposal ben>dan"),
+        ("fipa-query", "inform dan>ben"),
+        ("fipa-query", "not-understood dan>ben"),
+    ] {
+        let wrong = stage.wrong(say_in(protocol, words));
+        assert_eq!(wrong.kind, Kind::NotOpened, "{words}");
+    }
+    // A conversation that does begin is one.
+    stage.right(say_in("fipa-query", "query-ref ben>dan"));
+    let wrong = stage.wrong(say_in("fipa-query", "inform ben>dan"));
+    assert_eq!(wrong.kind, Kind::WrongSender);
+    // An observer sees the beginning of everything.
+    let mut stage = Stage::observer();
+    let wrong = stage.wrong(say_in("fipa-query", "inform ben>dan"));
+    assert_eq!(wrong.kind, Kind::NotOpened);
+}
