@@ -180,18 +180,6 @@ impl<O: Clone + Eq + Hash> Table<O> {
         self.tell(Change::together(together));
     }
 
-    /// Whether the origin has said anything, by [`replace`](Self::replace).
-    #[cfg(feature = "mdns")]
-    pub(crate) fn has_origin(&self, origin: &O) -> bool {
-        self.index.read().origins.contains_key(origin)
-    }
-
-    /// Who has said anything, by [`replace`](Self::replace).
-    #[cfg(feature = "mdns")]
-    pub(crate) fn origins(&self) -> std::collections::HashSet<O> {
-        self.index.read().origins.keys().cloned().collect()
-    }
-
     /// How many have said anything, by [`replace`](Self::replace).
     #[cfg(feature = "mdns")]
     pub(crate) fn len(&self) -> usize {

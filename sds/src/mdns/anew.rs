@@ -1,29 +1,23 @@
-//! When the mDNS library is started anew, and what is kept meanwhile.
+//! When the mDNS library is started anew.
 //!
-//! The library keeps whatever it hears until that expires, and what belongs to no service for
-//! ever. It has no bound, and no way to make it forget. So it is looked at every two seconds, and
-//! when it keeps too much it is ended, without a goodbye, and another one started, which is told
-//! of our own agents again. Between the two is a pause that grows while the flood goes on:
-//! what is bounded is the memory, and how often our agents are announced again.
-//!
-//! Others' agents stay known for as long as their records are good, though nobody asks for them.
+//! We do not browse with the library ([`super::browse`]), but it keeps what it hears all the same,
+//! if the packet introduces no service, and for ever. It has no bound, and no way to make it
+//! forget. So it is looked at every two seconds, and when it keeps too much it is ended, without a
+//! goodbye, and another one started, which is told of our own agents again. Between the two is a
+//! pause that grows while the flood goes on: what is bounded is the memory, and how often our
+//! agents are announced again. Others' agents have nothing to do with it.
 
 use std::collections::HashMap;
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// How often the library is asked how much it keeps.
 pub(super) const INTERVAL: Duration = Duration::from_secs(2);
-/// Most records that it may keep. An agent has three (PTR, SRV, TXT) and one for each address of
-/// its host.
+/// Most records that it may keep. None is longer than the packet it came in, which has at most
+/// [`MAX_PACKET`](super::packet::MAX_PACKET) bytes.
 pub(super) const MAX_CACHED: u64 = 40_000;
 /// Most times at which it has something to do; every record heard adds two, known or not, which
 /// stay for as long as the record says that it is good.
 const MAX_TIMERS: u64 = 1_000_000;
-/// For how long what was known is believed without being heard of again: for as long as others
-/// may (RFC 6762 clause 10).
-pub(super) const KEPT: Duration = Duration::from_secs(120);
-
 /// The first pause. What has been said goodbye to rests for as long.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 /// The longest: nobody's records of us expire in that time, and nobody asks for them twice.
@@ -76,45 +70,6 @@ impl Pauses {
     }
 }
 
-/// Records that were known before and have not been found again yet.
-#[derive(Debug, Default)]
-pub(super) struct Unconfirmed {
-    /// Until when each is believed.
-    records: HashMap<Arc<str>, Instant>,
-    next: Option<Instant>,
-}
-
-impl Unconfirmed {
-    /// These are believed until then. Those that wait already keep their time.
-    pub(super) fn add(&mut self, records: impl IntoIterator<Item = Arc<str>>, until: Instant) {
-        for record in records {
-            self.records.entry(record).or_insert(until);
-            self.next = Some(self.next.map_or(until, |next| next.min(until)));
-        }
-    }
-
-    /// The record was found again, or is gone.
-    pub(super) fn forget(&mut self, fullname: &str) {
-        self.records.remove(fullname);
-    }
-
-    /// Those that nobody has found again.
-    pub(super) fn handle_timeout(&mut self, now: Instant) -> Vec<Arc<str>> {
-        if self.next.is_none_or(|next| now < next) {
-            return Vec::new();
-        }
-        let gone = self.records.extract_if(|_, until| *until <= now);
-        let gone = gone.map(|(fullname, _)| fullname).collect();
-        self.next = self.records.values().min().copied();
-        gone
-    }
-
-    /// When some of them may be gone.
-    pub(super) fn poll_timeout(&self) -> Option<Instant> {
-        self.next
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -154,24 +109,5 @@ mod tests {
         }
         assert_eq!(seconds, [1, 2, 4, 8, 16, 30, 30, 30]);
         assert_eq!(pauses.ended(now + CALM), FIRST_PAUSE);
-    }
-
-    #[test]
-    fn what_is_not_found_again_is_gone_in_the_end() {
-        let mut unconfirmed = Unconfirmed::default();
-        let start = Instant::now();
-        let names = |names: &[&str]| names.iter().map(|name| (*name).into()).collect::<Vec<_>>();
-        unconfirmed.add(names(&["arm", "leg"]), start + KEPT);
-        // The flood goes on: that makes nothing good for longer.
-        let later = start + Duration::from_secs(60);
-        unconfirmed.add(names(&["arm", "leg", "eye"]), later + KEPT);
-        unconfirmed.forget("leg");
-        assert_eq!(unconfirmed.poll_timeout(), Some(start + KEPT));
-        assert!(unconfirmed.handle_timeout(later).is_empty());
-        assert_eq!(unconfirmed.handle_timeout(start + KEPT), names(&["arm"]));
-        assert_eq!(unconfirmed.poll_timeout(), Some(later + KEPT));
-        assert_eq!(unconfirmed.handle_timeout(later + KEPT), names(&["eye"]));
-        assert_eq!(unconfirmed.poll_timeout(), None);
-        assert!(unconfirmed.handle_timeout(later + KEPT).is_empty());
     }
 }

@@ -3,28 +3,28 @@
 //! An announcement or a goodbye is said once or twice. Who was out of range then never hears of
 //! it: the next question is asked within the hour, and a record that is gone is believed in for
 //! minutes. So every gateway says every two seconds how many agents it announces and a digest of
-//! them, and the same of the coalitions among them, in a packet of 130 bytes that old peers pass
+//! them, and the same of the coalitions among them, in a packet of 150 bytes that old peers pass
 //! over:
 //!
 //! `<incarnation>._fipa_gateway._udp.local. TXT "agents=500" "digest=0123456789abcdef"
 //! "coalitions=2:0123456789abcdef"`
 //!
+//! with a PTR record that introduces it.
+//!
 //! Whoever holds something else of that gateway asks the network, first for what it has not got,
 //! then for what it should not have any more. Who is not heard for some seconds is asked, too.
-//! Nothing is believed because of a beacon: it only makes others ask.
+//! Nothing new is believed because of a beacon: it makes others ask, or, when they hold just what
+//! it says, spares them asking whether that is still so.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
 use fipa_transport::Incarnation;
-use simple_dns::rdata::{RData, TXT};
-use simple_dns::{
-    CLASS, Label, Name, Packet, PacketFlag, QCLASS, QTYPE, Question, ResourceRecord, TYPE,
-};
+use simple_dns::rdata::{PTR, RData, TXT};
+use simple_dns::{CLASS, Label, Name, Packet, PacketFlag, ResourceRecord};
 
-use super::SERVICE_TYPE;
+use super::packet::parse_answer;
 use super::record::Properties;
-use super::whole::is_plausible;
 
 /// How often a gateway says what it has.
 pub(super) const INTERVAL: Duration = Duration::from_secs(2);
@@ -198,6 +198,12 @@ pub(super) fn packet(gateway: Incarnation, announced: Announced) -> Option<Vec<u
     let mut packet = Packet::new_reply(0);
     packet.set_flags(PacketFlag::AUTHORITATIVE_ANSWER);
     packet.answers.push(record.with_cache_flush(true));
+    // The mDNS library keeps what belongs to no service that is introduced, and every change of it,
+    // for ever.
+    let service = Name::new_with_labels(&labels[1..]);
+    let introduced = RData::PTR(PTR(Name::new_with_labels(&labels)));
+    let record = ResourceRecord::new(service, CLASS::IN, TTL, introduced);
+    packet.answers.push(record);
     packet.build_bytes_vec_compressed().ok()
 }
 
@@ -205,13 +211,9 @@ pub(super) fn packet(gateway: Incarnation, announced: Announced) -> Option<Vec<u
 pub(super) fn read(packet: &[u8]) -> Option<(Incarnation, Announced)> {
     // Nearly all packets are none: that is seen without reading them.
     memchr::memmem::find(packet, TYPE_LABELS[0].as_bytes())?;
-    if !is_plausible(packet) {
-        return None;
-    }
-    let packet = Packet::parse(packet).ok()?;
-    let [record] = packet.answers.as_slice() else {
-        return None;
-    };
+    let packet = parse_answer(packet)?;
+    let mut answers = packet.answers.iter();
+    let record = answers.find(|record| matches!(record.rdata, RData::TXT(_)))?;
     let (label, rest) = record.name.get_labels().split_first()?;
     let same = rest.len() == TYPE_LABELS.len()
         && rest
@@ -241,44 +243,11 @@ pub(super) fn read(packet: &[u8]) -> Option<(Incarnation, Announced)> {
     (same && gateway.is_known()).then_some((gateway, announced))
 }
 
-/// Packets that ask for all records of our type but those with these labels (RFC 6762 clause 7.1).
-pub(super) fn question<'a>(labels: impl Iterator<Item = &'a str>) -> Vec<Vec<u8>> {
-    /// Known answers in one packet: they fit the smallest packet every network carries.
-    const KNOWN: usize = 14;
-    /// More of them are not worth their packets; what is said again is recognised.
-    const MAX_KNOWN: usize = 50 * KNOWN;
-    let service = Name::new_unchecked(SERVICE_TYPE);
-    let labels: Vec<&str> = labels.take(MAX_KNOWN).collect();
-    let mut chunks = labels.chunks(KNOWN);
-    let first = chunks.next().unwrap_or_default();
-    let all = std::iter::once(first).chain(chunks);
-    let last = labels.len().div_ceil(KNOWN).max(1) - 1;
-    let packets = all.enumerate().filter_map(|(number, chunk)| {
-        let mut packet = Packet::new_query(0);
-        if number == 0 {
-            let (kind, class) = (QTYPE::TYPE(TYPE::PTR), QCLASS::CLASS(CLASS::IN));
-            let question = Question::new(service.clone(), kind, class, false);
-            packet.questions.push(question);
-        }
-        if number < last {
-            packet.set_flags(PacketFlag::TRUNCATION);
-        }
-        for label in chunk {
-            let mut name = vec![Label::new(label.as_bytes()).ok()?];
-            name.extend(service.get_labels().iter().cloned());
-            let pointer = RData::PTR(simple_dns::rdata::PTR(Name::new_with_labels(&name)));
-            let known = ResourceRecord::new(service.clone(), CLASS::IN, 4500, pointer);
-            packet.answers.push(known);
-        }
-        packet.build_bytes_vec_compressed().ok()
-    });
-    packets.collect()
-}
-
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
 
+    use super::super::packet::question_for_all;
     use super::*;
 
     fn digest(numbers: &[u64]) -> Digest {
@@ -311,11 +280,11 @@ mod tests {
                 coalitions: digest(&numbers[numbers.len() / 2..]),
             };
             let written = packet(gateway(0xab), announced).unwrap();
-            assert!(written.len() < 150, "{}", written.len());
+            assert!(written.len() < 160, "{}", written.len());
             assert_eq!(read(&written), Some((gateway(0xab), announced)));
         }
         assert_eq!(read(b""), None);
-        assert_eq!(read(&question([].into_iter())[0]), None);
+        assert_eq!(read(&question_for_all(&[])[0]), None);
     }
 
     #[test]
@@ -374,30 +343,6 @@ mod tests {
             beacons.handle(now, gateway(number + 1), digest(&[]), None);
         }
         assert_eq!(beacons.heard.len(), MAX_GATEWAYS);
-    }
-
-    #[test]
-    fn what_is_known_need_not_be_said() {
-        let labels: Vec<String> = (0..30).map(|number| format!("agent {number}")).collect();
-        let packets = question(labels.iter().map(String::as_str));
-        assert_eq!(packets.len(), 3);
-        let parsed: Vec<_> = packets
-            .iter()
-            .map(|packet| Packet::parse(packet).unwrap())
-            .collect();
-        assert_eq!(parsed[0].questions.len(), 1);
-        assert_eq!(parsed[1].questions.len(), 0);
-        assert!(parsed[1].has_flags(PacketFlag::TRUNCATION));
-        assert!(!parsed[2].has_flags(PacketFlag::TRUNCATION));
-        assert_eq!(
-            parsed
-                .iter()
-                .map(|packet| packet.answers.len())
-                .sum::<usize>(),
-            30
-        );
-        assert!(packets.iter().all(|packet| packet.len() < 1232));
-        assert_eq!(question([].into_iter()).len(), 1);
     }
 
     proptest! {

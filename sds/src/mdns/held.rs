@@ -23,6 +23,8 @@ pub(super) struct Holdings {
     records: HashMap<Arc<str>, (Incarnation, Digest)>,
     gateways: HashMap<Incarnation, Gateway>,
     queue: VecDeque<Arc<str>>,
+    /// Those in the queue that are of no gateway.
+    peers: HashSet<Arc<str>>,
     next: Option<Instant>,
 }
 
@@ -98,6 +100,13 @@ impl Holdings {
         true
     }
 
+    /// A record of an old peer, which has no gateway, is verified.
+    pub(super) fn verify(&mut self, fullname: &Arc<str>) {
+        if self.peers.insert(Arc::clone(fullname)) {
+            self.queue.push_front(Arc::clone(fullname));
+        }
+    }
+
     /// All that is held of this gateway is verified.
     pub(super) fn verify_all(&mut self, gateway: Incarnation) {
         // What waits already need not wait twice.
@@ -115,9 +124,11 @@ impl Holdings {
         }
         self.next = Some(now + PAUSE);
         let batch = self.queue.len().min(BATCH);
-        let records = &self.records;
+        let (records, peers) = (&self.records, &mut self.peers);
         let batch = self.queue.drain(..batch);
-        batch.filter(|name| records.contains_key(name)).collect()
+        batch
+            .filter(|name| peers.remove(name) || records.contains_key(name))
+            .collect()
     }
 
     /// When more is to be verified.

@@ -12,15 +12,16 @@
 
 mod anew;
 mod beacon;
+mod browse;
 mod ear;
 mod held;
 mod pace;
+mod packet;
 mod probe;
 mod record;
-mod refresh;
+mod sockets;
 mod task;
 mod together;
-mod whole;
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -113,10 +114,12 @@ pub struct MdnsStatus {
 impl MdnsDirectory {
     /// Most records of others that are kept.
     pub const MAX_RECORDS: usize = 20_000;
-    /// Most DNS records that the mDNS library keeps: an agent has three, and one for each address
-    /// of its host. It is looked at every two seconds. When there are more the library is started
-    /// anew: what was known of others stays for two minutes unless it is found again, and our own
-    /// agents are announced again without having said goodbye.
+    /// Most bytes that they say, all together.
+    pub const MAX_BYTES: usize = 16 << 20;
+    /// Most DNS records that the mDNS library keeps, each of at most 9,000 bytes. It keeps what
+    /// comes in packets that introduce no service, for ever. It is looked at every two seconds.
+    /// When there are more the library is started anew: our own agents are announced again without
+    /// having said goodbye.
     pub const MAX_CACHED: u64 = anew::MAX_CACHED;
 
     /// Starts to listen; a task of the current tokio runtime keeps the view up to date. That
@@ -180,7 +183,10 @@ impl MdnsDirectory {
             return;
         };
         match entry.mts.incarnation {
-            Incarnation::UNKNOWN => self.shared.verify(&fullname),
+            Incarnation::UNKNOWN => {
+                self.shared.held.lock().verify(&fullname);
+                self.shared.postponed.notify_one();
+            }
             gateway => self.verify_gateway(gateway),
         }
     }
@@ -208,7 +214,7 @@ impl MdnsDirectory {
         // Whose coalitions are gone, too, says so: others wait for that.
         let (config, nothing) = (&self.shared.config, beacon::Announced::default());
         if let Some(beacon) = beacon::packet(config.mts.incarnation, nothing)
-            && let Err(error) = whole::send_once(config, &beacon)
+            && let Err(error) = sockets::send_once(config, &beacon)
         {
             tracing::debug!(%error, "the last beacon was not sent");
         }
@@ -272,8 +278,7 @@ struct Shared {
     /// None when it could not be started, and while it rests after a flood.
     daemon: Mutex<Option<ServiceDaemon>>,
     config: MdnsConfig,
-    /// The others' entries, by the full name of their record, spelt as they spell it: the daemon
-    /// knows it by that only.
+    /// The others' entries, by the full name of their record, spelt as they spell it.
     table: Table<Arc<str>>,
     /// The same records, by the gateways that announce them.
     held: Mutex<Holdings>,
@@ -506,10 +511,14 @@ impl Shared {
             return Ok(None);
         };
         // It says goodbye on the interfaces that it has.
-        daemon.disable_interface(IfKind::All)?;
-        let ended = daemon.shutdown()?;
+        let ended = daemon.disable_interface(IfKind::All);
+        let ended = match ended.and_then(|()| daemon.shutdown()) {
+            // It has ended by itself.
+            Err(mdns_sd::Error::DaemonShutdown) => None,
+            ended => Some(ended?),
+        };
         *self.daemon.lock() = None;
-        Ok(Some(ended))
+        Ok(ended)
     }
 
     /// Starts another daemon, and announces to it, at the usual pace, what was announced before.
@@ -562,15 +571,6 @@ impl Shared {
         let updates = what(&mut together);
         if !updates.is_empty() {
             self.table.replace(updates);
-        }
-    }
-
-    /// Asks for a record, which leaves if nobody answers.
-    fn verify(&self, fullname: &Arc<str>) {
-        let patience = Duration::from_secs(2);
-        let asked = self.ask(|daemon| daemon.verify(fullname.to_string(), patience));
-        if let Err(error) = asked {
-            self.failed(format!("cannot verify the record {fullname}: {error}"));
         }
     }
 

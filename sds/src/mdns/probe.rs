@@ -14,7 +14,8 @@ use if_addrs::Interface;
 use simple_dns::{CLASS, Name, Packet, QCLASS, QTYPE, Question, TYPE};
 use socket2::{Domain, Protocol, Socket, Type};
 
-use super::whole::{self, group_v4, group_v6};
+use super::packet::{self, MAX_PACKET};
+use super::sockets::{group_v4, group_v6, interfaces};
 use super::{MdnsConfig, SERVICE_TYPE};
 
 /// Asked for beside our own type: anybody with any service answers (RFC 6763 clause 9).
@@ -59,7 +60,7 @@ pub struct Multicast {
 pub fn probe(config: &MdnsConfig) -> io::Result<Vec<Multicast>> {
     let mut own: Vec<IpAddr> = Vec::new();
     let mut probes: Vec<Probe> = Vec::new();
-    for interface in whole::interfaces(config)? {
+    for interface in interfaces(config)? {
         own.push(interface.ip());
         let named = !config.interfaces.is_empty();
         let same = |probe: &Probe| {
@@ -71,7 +72,7 @@ pub fn probe(config: &MdnsConfig) -> io::Result<Vec<Multicast>> {
         }
     }
     let question = question().map_err(io::Error::other)?;
-    let mut buffer = vec![0; whole::MAX_PACKET];
+    let mut buffer = vec![0; MAX_PACKET];
     let (started, mut asked) = (Instant::now(), 0);
     while started.elapsed() < PATIENCE && !probes.is_empty() {
         if ASKED
@@ -157,7 +158,7 @@ impl Probe {
         });
         receive(&sockets.direct, buffer, |packet, from| {
             if !own.contains(&from)
-                && whole::is_plausible(packet)
+                && packet::parse_answer(packet).is_some()
                 && found.answered.len() < MAX_OTHERS
             {
                 found.answered.insert(from);

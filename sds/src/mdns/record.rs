@@ -107,29 +107,19 @@ pub(super) fn encode(entry: &Entry) -> Properties {
 ///
 /// With `fipa-version` the record is one of ours, and has to be right. Without, it is a peer's,
 /// of which is taken what there is; `now` stands in for a time that it does not tell.
-///
-/// The peers spread a long value over several strings with one key. Without `whole`, only the
-/// first string of each key is there, and what may be cut is not used.
 pub(super) fn decode(
     label: &str,
-    properties: &[(&str, &[u8])],
-    whole: bool,
+    properties: &Properties,
     now: SystemTime,
 ) -> Result<Entry, RecordError> {
     let record = Record(properties);
     let entry = match record.text("fipa-version")? {
         Some(version) if version == "1" => ours(&record)?,
         Some(version) => return Err(RecordError::Version(version.chars().take(40).collect())),
-        None => theirs(label, &record, whole, now),
+        None => theirs(label, &record, now),
     };
     entry.check()?;
     Ok(entry)
-}
-
-/// Whether the record is one of ours.
-pub(super) fn is_ours(properties: &Properties) -> bool {
-    let mut keys = properties.iter().map(|(key, _)| key);
-    keys.any(|key| key.eq_ignore_ascii_case("fipa-version"))
 }
 
 /// The instance label of a name: at most 63 bytes, neither dots nor backslashes.
@@ -166,13 +156,13 @@ pub(super) enum RecordError {
 }
 
 /// Reads the strings of a record by key.
-struct Record<'a>(&'a [(&'a str, &'a [u8])]);
+struct Record<'a>(&'a Properties);
 
 impl Record<'_> {
     /// The first value of that key, whatever the case of its letters (RFC 6763 clause 6.4).
     fn value(&self, key: &str) -> Option<&[u8]> {
         let found = self.0.iter().find(|(k, _)| k.eq_ignore_ascii_case(key));
-        found.map(|(_, value)| *value)
+        found.map(|(_, value)| value.as_slice())
     }
 
     /// The value of one of our keys, with all its parts.
@@ -260,7 +250,7 @@ fn members(record: &Record<'_>) -> Result<Members, RecordError> {
     Members::new(names.split('\n'), leader).map_err(|_| RecordError::Value(key))
 }
 
-fn theirs(label: &str, record: &Record<'_>, whole: bool, now: SystemTime) -> Entry {
+fn theirs(label: &str, record: &Record<'_>, now: SystemTime) -> Entry {
     let name = label.replace('?', ".");
     let registered = record
         .value("TIMESTAMP")
@@ -268,15 +258,11 @@ fn theirs(label: &str, record: &Record<'_>, whole: bool, now: SystemTime) -> Ent
         .and_then(millis_of_timestamp)
         .unwrap_or_else(|| millis_of_time(now));
     let locator = record.joined("LOCATOR");
-    let mut locator = &*String::from_utf8_lossy(&locator);
-    if !whole {
-        // Half an address is a wrong one.
-        locator = &locator[..locator.rfind(';').map_or(0, |end| end + 1)];
-    }
+    let locator = String::from_utf8_lossy(&locator);
     Entry {
         agent_type: record.their_text("TYPE", Entry::MAX_TYPE),
         incarnation: Incarnation::UNKNOWN,
-        locations: locations_of_locator(locator),
+        locations: locations_of_locator(&locator),
         // Peers do not say which service it is; each agent might have its own.
         mts: Mts::new(name.as_str(), Incarnation::UNKNOWN),
         name: name.into(),
@@ -376,11 +362,14 @@ mod tests {
     const SIGNATURE: &str = Signature::FipaServices.signature_type();
 
     fn read(label: &str, properties: &Properties) -> Result<Entry, RecordError> {
-        let borrowed: Vec<(&str, &[u8])> = properties
-            .iter()
-            .map(|(key, value)| (key.as_str(), value.as_slice()))
-            .collect();
-        decode(label, &borrowed, true, UNIX_EPOCH)
+        decode(label, properties, UNIX_EPOCH)
+    }
+
+    fn said(pairs: &[(&str, &[u8])]) -> Properties {
+        let pairs = pairs.iter();
+        pairs
+            .map(|(key, value)| ((*key).to_owned(), value.to_vec()))
+            .collect()
     }
 
     fn example() -> Entry {
@@ -424,8 +413,8 @@ mod tests {
 
     #[test]
     fn what_peers_announce_is_read() {
-        let properties = [
-            ("timestamp", &b"20261120-11:00:00:123456"[..]),
+        let properties = said(&[
+            ("timestamp", b"20261120-11:00:00:123456"),
             (
                 "LOCATOR",
                 b"udt://10.0.0.2:1 fipa::services::transports::MessageTransport;\
@@ -433,8 +422,8 @@ mod tests {
                   tcp://10.0.0.3:6789 JadeProxyAgent;;;tcp://",
             ),
             ("TYPE", b"\xff\x00sensor"),
-        ];
-        let entry = decode("echo@192?0?2?2:1099/JADE", &properties, true, UNIX_EPOCH).unwrap();
+        ]);
+        let entry = read("echo@192?0?2?2:1099/JADE", &properties).unwrap();
         assert_eq!(&*entry.name, "echo@192.0.2.2:1099/JADE");
         assert_eq!(entry.agent_type, "\u{fffd}sensor");
         assert_eq!(
@@ -449,9 +438,9 @@ mod tests {
         assert!(!entry.incarnation.is_known());
 
         let now = UNIX_EPOCH + Duration::from_secs(5);
-        let bare = decode("bare", &[], true, now).unwrap();
+        let bare = decode("bare", &said(&[]), now).unwrap();
         assert_eq!(bare.registered, now);
-        assert!(decode("", &[], true, now).is_err());
+        assert!(decode("", &said(&[]), now).is_err());
     }
 
     /// As fipa_services splits it: at 200 bytes, wherever that is.
@@ -465,23 +454,14 @@ mod tests {
         let parts = locator.as_bytes().chunks(200 - "LOCATOR=".len());
         let mut properties: Vec<(&str, &[u8])> = parts.map(|part| ("LOCATOR", part)).collect();
         properties.insert(1, ("TYPE", b"arm"));
-        let addresses = |properties: &[(&str, &[u8])], whole| {
-            let entry = decode("arm", properties, whole, UNIX_EPOCH).unwrap();
-            assert_eq!(entry.agent_type, "arm");
-            let addresses = entry.locations.iter();
-            addresses
-                .map(|one| one.address().to_owned())
-                .collect::<Vec<_>>()
-                .join(" ")
-        };
+        let entry = read("arm", &said(&properties)).unwrap();
+        assert_eq!(entry.agent_type, "arm");
+        let addresses = entry.locations.iter().map(|one| one.address().to_owned());
+        let addresses: Vec<String> = addresses.collect();
         assert_eq!(
-            addresses(&properties, true),
+            addresses.join(" "),
             "10.0.0.1:7788 10.0.0.2:7788 10.0.0.3:7788 10.0.0.4:7788"
         );
-        // Of the first string alone, what is cut is not used.
-        assert_eq!(addresses(&properties[..2], false), "10.0.0.1:7788");
-        let cut: [(&str, &[u8]); 2] = [("LOCATOR", b"tcp://10.0.0.1:77"), ("TYPE", b"arm")];
-        assert_eq!(addresses(&cut, false), "");
     }
 
     #[test]

@@ -1,0 +1,987 @@
+//! Who there is on the network: the records of our type, found, kept as long as they are good, and
+//! asked for when they might not be any more.
+//!
+//! This is the part of DNS-SD that browses. The mDNS library could do it, too, and only announces
+//! and answers for us, for three reasons. Of several strings with one key it keeps the first (RFC
+//! 6763 clause 6.4), but fipa_services splits long values so. It looks through all that it knows
+//! whenever a packet comes. And it asks for every record again before the record's two minutes are
+//! over, which is not needed among gateways: each says every two seconds what it announces
+//! ([`super::beacon`]), and as long as that is what is held of it, [all of it is
+//! good](Browser::confirm).
+//!
+//! A record is introduced by a PTR record, and known from when its SRV and its TXT record have been
+//! heard. These keep it alive; whether it has an address is no matter, locations stand in its text.
+//!
+//! No input or output, and no clock: packets and the time go in, packets and news come out.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use fipa_transport::Incarnation;
+use simple_dns::rdata::RData;
+use simple_dns::{CLASS, Name, Packet, PacketFlag, QTYPE, TYPE};
+
+use super::beacon::Digest;
+use super::packet::{self, KNOWN};
+use super::record::Properties;
+use super::{MdnsDirectory, SERVICE_TYPE};
+
+/// Most records that are introduced and not known yet. Each is asked for a few times.
+const MAX_UNKNOWN: usize = 4096;
+/// When what is missing of a record is asked for, each after the one before: who has just said it
+/// must not repeat it within a second (RFC 6762 clause 6).
+const MISSING: &[Duration] = &[
+    Duration::from_millis(20),
+    Duration::from_millis(1200),
+    Duration::from_secs(3),
+    Duration::from_secs(9),
+];
+/// For how long a record is introduced without being known: that, and time for the last answer.
+const INTRODUCED: Duration = Duration::from_secs(15);
+/// When a record that is in doubt is asked for, likewise, and how long it has to answer.
+const DOUBTED: &[Duration] = &[Duration::ZERO, Duration::from_millis(1100)];
+const PATIENCE: Duration = Duration::from_secs(2);
+/// For how long a record is still known after its goodbye, so that it can be taken back (RFC 6762
+/// clause 10.1).
+const GOODBYE: Duration = Duration::from_secs(1);
+/// Up to how much is added to the first pause, so that not all ask at the same moment.
+const JITTER: Duration = Duration::from_millis(100);
+
+/// At which part of its life a record is asked for again. The first comes earlier than others ask
+/// (RFC 6762 clause 5.2), because what is asked for together takes fewer packets; the others are
+/// theirs.
+const RENEWED: [f64; 4] = [0.55, 0.80, 0.90, 0.95];
+/// Up to how much is added to the first, so that one host asks and the others hear the answer.
+const RENEWED_JITTER: f64 = 0.12;
+/// What becomes due within that part of its life is asked for along with others.
+const ALONG: u32 = 24;
+/// A record is not believed in for longer than that, whatever it says.
+const MAX_LIFE: Duration = Duration::from_secs(4500);
+/// The shortest time between two looks at all records.
+const GRAIN: Duration = Duration::from_millis(20);
+
+/// The time between the first two questions for everything, by what each following one grows, and
+/// the longest (RFC 6762 clause 5.2 asks for at least twofold). Every gateway answers them in
+/// full.
+const FIRST_PAUSE: Duration = Duration::from_secs(1);
+const GROWTH: u32 = 4;
+const LONGEST_PAUSE: Duration = Duration::from_secs(3600);
+/// Most known answers to a question for everything that take packets of their own.
+const MAX_KNOWN: usize = 50 * KNOWN;
+
+/// The records on the network.
+#[derive(Debug)]
+pub(super) struct Browser {
+    /// Our gateway, whose records come back to us, and are no news.
+    own: Incarnation,
+    /// By label, as it is spelt: others are asked and answer by that.
+    records: HashMap<String, Record>,
+    /// How many of them are not known yet.
+    unknown: usize,
+    /// How many bytes the others say.
+    bytes: usize,
+    /// When the beacons of a gateway last said what is held of it.
+    confirmed: HashMap<Incarnation, Instant>,
+    everything: Everything,
+    /// The jitter of the next renewals, from 0 to 1.
+    share: f64,
+    /// When all records were looked at, and when they are to be looked at next.
+    looked: Option<Instant>,
+    next: Option<Instant>,
+}
+
+#[derive(Debug)]
+struct Record {
+    fullname: Arc<str>,
+    /// Who announces it, if that is one of our gateways.
+    gateway: Incarnation,
+    /// Its SRV record, and the host that says.
+    place: Option<Life>,
+    host: String,
+    /// Its TXT record, in short, and how long it is.
+    text: Option<Life>,
+    digest: Digest,
+    len: usize,
+    /// What it says and has not been told.
+    news: Option<Properties>,
+    /// Whether both have been heard.
+    known: bool,
+    /// When it is gone if it is not heard of again: it is not known yet, in doubt, or has said
+    /// goodbye.
+    ends: Option<Instant>,
+    questions: Option<Questions>,
+}
+
+/// Questions for all of a record.
+#[derive(Debug)]
+struct Questions {
+    pauses: &'static [Duration],
+    asked: usize,
+    due: Instant,
+}
+
+/// How long a DNS record is good.
+#[derive(Debug, Clone, Copy)]
+struct Life {
+    heard: Instant,
+    ttl: Duration,
+    /// How often it has been asked for since.
+    asked: usize,
+}
+
+/// What became of a record that was introduced.
+enum Introduced {
+    New,
+    Already,
+    Refused,
+}
+
+/// When the question for everything is asked.
+#[derive(Debug)]
+struct Everything {
+    last: Option<Instant>,
+    next: Instant,
+    pause: Duration,
+}
+
+/// What a packet said.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub(super) struct Heard {
+    /// Full names of records that are new or have changed, and all that they say.
+    pub(super) found: Vec<(Arc<str>, Properties)>,
+    /// How many found no room.
+    pub(super) refused: u64,
+}
+
+/// What there is to be done.
+#[derive(Debug, Default)]
+pub(super) struct Due {
+    /// Packets to be sent.
+    pub(super) packets: Vec<Vec<u8>>,
+    /// Full names of records that are gone.
+    pub(super) gone: Vec<Arc<str>>,
+}
+
+impl Browser {
+    /// Knows nothing, and asks for everything.
+    pub(super) fn new(now: Instant, own: Incarnation) -> Self {
+        Self {
+            own,
+            records: HashMap::new(),
+            unknown: 0,
+            bytes: 0,
+            confirmed: HashMap::new(),
+            everything: Everything::new(now),
+            share: 0.0,
+            looked: None,
+            next: None,
+        }
+    }
+
+    /// There is an interface on which nobody has been asked: everything is asked for, as in the
+    /// beginning.
+    pub(super) fn start_again(&mut self, now: Instant) {
+        self.everything = Everything::new(now);
+    }
+
+    /// A packet has been heard. `chance`, from 0 to 1, says how much jitter there is.
+    pub(super) fn handle_packet(&mut self, now: Instant, packet: &[u8], chance: f64) -> Heard {
+        let mut heard = Heard::default();
+        let Some(packet) = packet::parse(packet) else {
+            return heard;
+        };
+        if !packet.has_flags(PacketFlag::RESPONSE) {
+            self.handle_question(now, &packet);
+            return heard;
+        }
+        let all = packet.answers.iter().chain(&packet.additional_records);
+        let all = all.filter(|record| record.class == CLASS::IN);
+        let (goodbyes, there): (Vec<_>, Vec<_>) = all.partition(|record| record.ttl == 0);
+        let mut new = Vec::new();
+        for record in &there {
+            if let Some(label) = introduced(&record.name, &record.rdata) {
+                match self.introduce(now, label, chance) {
+                    Introduced::New => new.push(label),
+                    Introduced::Refused => heard.refused += 1,
+                    Introduced::Already => {}
+                }
+            }
+        }
+        for record in &there {
+            let label = packet::label_of(&record.name);
+            let Some(known) = label.and_then(|label| self.records.get_mut(label)) else {
+                continue;
+            };
+            let life = Life::new(now, record.ttl);
+            match &record.rdata {
+                RData::SRV(srv) => {
+                    known.host = srv.target.to_string();
+                    known.place = Some(life);
+                }
+                RData::TXT(txt) => {
+                    let said = packet::properties(txt);
+                    let digest = Digest::of(&said);
+                    if known.text.is_none() || known.digest != digest {
+                        let len = len_of(&said);
+                        let others = self.bytes - known.len;
+                        if others + len > MdnsDirectory::MAX_BYTES {
+                            heard.refused += 1;
+                            continue;
+                        }
+                        self.bytes = others + len;
+                        (known.digest, known.len) = (digest, len);
+                        known.news = Some(said);
+                    }
+                    known.text = Some(life);
+                }
+                _ => continue,
+            }
+            if known.place.is_none() || known.text.is_none() {
+                continue;
+            }
+            self.unknown -= usize::from(!known.known);
+            known.known = true;
+            known.is_there();
+            if let Some(news) = known.news.take() {
+                heard.found.push((Arc::clone(&known.fullname), news));
+            }
+            let due = known.due(self.share, self.own);
+            self.wake(due);
+        }
+        // What comes with all that it says is not waited for.
+        for label in new {
+            if self.unknown > MAX_UNKNOWN && self.records.get(label).is_some_and(|it| !it.known) {
+                self.remove(label);
+                heard.refused += 1;
+            }
+        }
+        for record in &goodbyes {
+            if let Some(label) = introduced(&record.name, &record.rdata) {
+                self.handle_goodbye(now, label, &goodbyes);
+            }
+        }
+        heard
+    }
+
+    /// There is such a record.
+    fn introduce(&mut self, now: Instant, label: &str, chance: f64) -> Introduced {
+        if let Some(known) = self.records.get_mut(label) {
+            if known.known {
+                known.is_there();
+            }
+            return Introduced::Already;
+        }
+        if self.records.len() >= MdnsDirectory::MAX_RECORDS {
+            return Introduced::Refused;
+        }
+        let jitter = JITTER.mul_f64(chance.clamp(0.0, 1.0));
+        let questions = Questions::new(now + jitter, MISSING);
+        let due = questions.due;
+        let record = Record {
+            fullname: format!("{label}.{SERVICE_TYPE}").into(),
+            gateway: Incarnation::UNKNOWN,
+            place: None,
+            host: String::new(),
+            text: None,
+            digest: Digest::default(),
+            len: 0,
+            news: None,
+            known: false,
+            ends: Some(now + INTRODUCED),
+            questions: Some(questions),
+        };
+        self.records.insert(label.to_owned(), record);
+        self.unknown += 1;
+        self.wake(due);
+        Introduced::New
+    }
+
+    fn remove(&mut self, label: &str) {
+        if let Some(gone) = self.records.remove(label) {
+            self.unknown -= usize::from(!gone.known);
+            self.bytes -= gone.len;
+        }
+    }
+
+    /// Its owner takes leave of it, unless that is another one than the one we know.
+    fn handle_goodbye(
+        &mut self,
+        now: Instant,
+        label: &str,
+        goodbyes: &[&simple_dns::ResourceRecord<'_>],
+    ) {
+        let Some(known) = self.records.get_mut(label) else {
+            return;
+        };
+        let of_another = goodbyes.iter().any(|record| match &record.rdata {
+            RData::SRV(srv) => {
+                let same = packet::label_of(&record.name) == Some(label);
+                same && known.place.is_some() && srv.target.to_string() != known.host
+            }
+            _ => false,
+        });
+        if !of_another {
+            known.ends_at(now + GOODBYE);
+            self.wake(now + GOODBYE);
+        }
+    }
+
+    /// Somebody asks. If it is what we would ask, the answers are for us as well (RFC 6762 clause
+    /// 7.3).
+    fn handle_question(&mut self, now: Instant, packet: &Packet<'_>) {
+        let mut questions = packet.questions.iter();
+        let for_all = questions.any(|one| {
+            !one.unicast_response
+                && one.qtype == QTYPE::TYPE(TYPE::PTR)
+                && packet::is_service(&one.qname)
+        });
+        let more_to_come = packet.has_flags(PacketFlag::TRUNCATION);
+        let is_known = |label: &str| {
+            let known = self.records.get(label);
+            known.is_some_and(|record| record.known)
+        };
+        let mut known_answers = packet.answers.iter();
+        let all_known = known_answers
+            .all(|answer| introduced(&answer.name, &answer.rdata).is_some_and(is_known));
+        if for_all && !more_to_come && all_known {
+            self.everything.asked_by_others(now);
+        }
+    }
+
+    /// The record with this full name is announced by that gateway.
+    pub(super) fn belongs(&mut self, fullname: &str, gateway: Incarnation) {
+        if let Some(known) = self.records.get_mut(label_of(fullname)) {
+            known.gateway = gateway;
+        }
+    }
+
+    /// The gateway has said that it announces what is held of it: so all of that is good.
+    pub(super) fn confirm(&mut self, now: Instant, gateway: Incarnation) {
+        // When its records are looked at next, this is seen.
+        self.confirmed.insert(gateway, now);
+    }
+
+    /// Asks whether these records are still there. Who does not answer is gone.
+    pub(super) fn doubt(&mut self, now: Instant, fullnames: &[Arc<str>]) {
+        for fullname in fullnames {
+            let Some(known) = self.records.get_mut(label_of(fullname)) else {
+                continue;
+            };
+            if known.known {
+                known.ends_at(now + PATIENCE);
+                known.questions = Some(Questions::new(now, DOUBTED));
+                self.wake(now);
+            }
+        }
+    }
+
+    /// Asks at once for what is not known, unless somebody just has.
+    pub(super) fn ask_for_missing(&mut self, now: Instant) -> Vec<Vec<u8>> {
+        if !self.everything.may_be_asked(now) {
+            return Vec::new();
+        }
+        self.everything.last = Some(now);
+        self.question_for_all()
+    }
+
+    fn question_for_all(&self) -> Vec<Vec<u8>> {
+        let known = self.records.iter();
+        let known = known.filter(|(_, record)| record.known && record.ends.is_none());
+        let (ours, peers): (Vec<_>, Vec<_>) =
+            known.partition(|(_, record)| record.gateway.is_known());
+        let mut labels: Vec<&str> = peers.iter().map(|(label, _)| label.as_str()).collect();
+        labels.truncate(MAX_KNOWN);
+        // The library regards what stands in the first packet of a question only, so more would
+        // be in vain.
+        let room = KNOWN.saturating_sub(labels.len());
+        labels.extend(ours.iter().take(room).map(|(label, _)| label.as_str()));
+        packet::question_for_all(&labels)
+    }
+
+    /// What is to be asked now, and who is gone. `chance`, from 0 to 1, says how much jitter there
+    /// is.
+    pub(super) fn handle_timeout(&mut self, now: Instant, chance: f64) -> Due {
+        let mut due = Due::default();
+        if self.everything.next <= now {
+            due.packets = self.question_for_all();
+            self.everything.asked(now, chance);
+        }
+        if self.next.is_none_or(|next| now < next) {
+            return due;
+        }
+        self.looked = Some(now);
+        self.next = None;
+        self.confirmed.retain(|_, at| now < *at + MAX_LIFE);
+        let (mut all, mut places, mut texts) = (Vec::new(), Vec::new(), Vec::new());
+        let mut next: Option<Instant> = None;
+        self.records.retain(|label, record| {
+            if let Some(at) = self.confirmed.get(&record.gateway) {
+                record.confirm(*at);
+            }
+            if record.end().is_some_and(|end| end <= now) {
+                self.unknown -= usize::from(!record.known);
+                self.bytes -= record.len;
+                if record.known {
+                    due.gone.push(Arc::clone(&record.fullname));
+                }
+                return false;
+            }
+            if record.ask(now) {
+                all.push(label.clone());
+            }
+            if record.is_renewed(self.own) {
+                for (life, labels) in [
+                    (&mut record.place, &mut places),
+                    (&mut record.text, &mut texts),
+                ] {
+                    if let Some(life) = life
+                        && life.renew(now, self.share)
+                    {
+                        labels.push(label.clone());
+                    }
+                }
+            }
+            let then = record.due(self.share, self.own);
+            next = next.min(Some(then)).or(Some(then));
+            true
+        });
+        if let Some(next) = next {
+            self.wake(next);
+        }
+        if !places.is_empty() {
+            self.share = chance.clamp(0.0, 1.0);
+        }
+        for (labels, kinds) in [
+            (&all, &[TYPE::SRV, TYPE::TXT][..]),
+            (&places, &[TYPE::SRV]),
+            (&texts, &[TYPE::TXT]),
+        ] {
+            due.packets.extend(packet::questions(labels, kinds));
+        }
+        due
+    }
+
+    /// When there is something to be done next.
+    pub(super) fn poll_timeout(&self) -> Instant {
+        let next = self.next.unwrap_or(self.everything.next);
+        next.min(self.everything.next)
+    }
+
+    fn wake(&mut self, at: Instant) {
+        let at = self.looked.map_or(at, |looked| at.max(looked + GRAIN));
+        self.next = Some(self.next.map_or(at, |next| next.min(at)));
+    }
+}
+
+impl Record {
+    /// Its gateway announced it then.
+    fn confirm(&mut self, at: Instant) {
+        for life in [&mut self.place, &mut self.text].into_iter().flatten() {
+            if at > life.heard {
+                (life.heard, life.asked) = (at, 0);
+            }
+        }
+    }
+
+    /// Somebody has said so.
+    fn is_there(&mut self) {
+        (self.ends, self.questions) = (None, None);
+    }
+
+    fn ends_at(&mut self, end: Instant) {
+        self.ends = Some(self.ends.map_or(end, |ends| ends.min(end)));
+    }
+
+    /// Whether all of it is to be asked for now.
+    fn ask(&mut self, now: Instant) -> bool {
+        let Some(questions) = self.questions.as_mut().filter(|it| it.due <= now) else {
+            return false;
+        };
+        questions.asked += 1;
+        match questions.pauses.get(questions.asked) {
+            Some(pause) => questions.due = now + *pause,
+            None => self.questions = None,
+        }
+        true
+    }
+
+    /// Whether it is asked for before it ends.
+    fn is_renewed(&self, own: Incarnation) -> bool {
+        self.known && self.gateway != own
+    }
+
+    /// When it is gone if nothing is heard of it.
+    fn end(&self) -> Option<Instant> {
+        let lives = [self.place, self.text].into_iter().flatten();
+        lives.map(Life::end).chain(self.ends).min()
+    }
+
+    /// When it is to be looked at.
+    fn due(&self, share: f64, own: Incarnation) -> Instant {
+        let lives = [self.place, self.text].into_iter().flatten();
+        let renewed = lives
+            .filter(|_| self.is_renewed(own))
+            .map(|life| life.due(share));
+        let asked = self.questions.as_ref().map(|it| it.due);
+        let due = renewed.chain(asked).chain(self.end()).min();
+        // There is always an end.
+        due.unwrap_or_else(Instant::now)
+    }
+}
+
+impl Questions {
+    fn new(from: Instant, pauses: &'static [Duration]) -> Self {
+        Self {
+            pauses,
+            asked: 0,
+            due: from + pauses.first().copied().unwrap_or_default(),
+        }
+    }
+}
+
+impl Life {
+    fn new(heard: Instant, ttl: u32) -> Self {
+        let ttl = Duration::from_secs(ttl.into()).min(MAX_LIFE);
+        Self {
+            heard,
+            ttl,
+            asked: 0,
+        }
+    }
+
+    fn end(self) -> Instant {
+        self.heard + self.ttl
+    }
+
+    /// When it is asked for next, or ends.
+    fn due(self, share: f64) -> Instant {
+        let jitter = if self.asked == 0 {
+            RENEWED_JITTER * share
+        } else {
+            0.0
+        };
+        let part = RENEWED.get(self.asked).map_or(1.0, |part| part + jitter);
+        self.heard + self.ttl.mul_f64(part)
+    }
+
+    /// Whether it is to be asked for now, or along with what is.
+    fn renew(&mut self, now: Instant, share: f64) -> bool {
+        let due = self.asked < RENEWED.len() && self.due(share) <= now + self.ttl / ALONG;
+        self.asked += usize::from(due);
+        due
+    }
+}
+
+impl Everything {
+    /// At once, but for the jitter that keeps hosts that start together apart.
+    fn new(now: Instant) -> Self {
+        Self {
+            last: None,
+            next: now + JITTER.mul_f64(fastrand::f64()),
+            pause: FIRST_PAUSE,
+        }
+    }
+
+    fn asked(&mut self, now: Instant, chance: f64) {
+        self.last = Some(now);
+        self.next = now + self.pause + (self.pause / 8).mul_f64(chance.clamp(0.0, 1.0));
+        self.pause = (self.pause * GROWTH).min(LONGEST_PAUSE);
+    }
+
+    /// That counts when we would have asked soon. Our own question, which comes back to us, does
+    /// not: we have just asked.
+    fn asked_by_others(&mut self, now: Instant) {
+        if let Some(last) = self.last
+            && now >= last + self.next.saturating_duration_since(last) / 2
+        {
+            self.asked(now, 0.0);
+        }
+    }
+
+    /// What has been asked a moment ago is being answered.
+    fn may_be_asked(&self, now: Instant) -> bool {
+        self.last.is_none_or(|last| now >= last + FIRST_PAUSE)
+    }
+}
+
+/// The label of the record that a PTR record introduces.
+fn introduced<'a>(name: &Name<'_>, data: &'a RData<'_>) -> Option<&'a str> {
+    match data {
+        RData::PTR(instance) if packet::is_service(name) => packet::label_of(&instance.0),
+        _ => None,
+    }
+}
+
+/// The label in a full name.
+pub(super) fn label_of(fullname: &str) -> &str {
+    let label = fullname.strip_suffix(SERVICE_TYPE);
+    label
+        .and_then(|label| label.strip_suffix('.'))
+        .unwrap_or(fullname)
+}
+
+fn len_of(said: &Properties) -> usize {
+    said.iter()
+        .map(|(key, value)| key.len() + value.len() + 2)
+        .sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::super::packet::tests::{Part, answer, asked};
+    use super::*;
+
+    const HOST: &str = "host.local";
+    const OWN: Incarnation = Incarnation::from_u64(1);
+    const OTHER: Incarnation = Incarnation::from_u64(7);
+
+    fn seconds(seconds: f64) -> Duration {
+        Duration::from_secs_f64(seconds)
+    }
+
+    fn announced(label: &str, text: &[u8], ttl: u32) -> Vec<u8> {
+        answer(
+            label,
+            &[Part::Ptr, Part::Srv(HOST), Part::Txt(&[text])],
+            ttl,
+        )
+    }
+
+    /// A browser that has heard these announced by nobody in particular.
+    fn browser(now: Instant, labels: &[&str]) -> Browser {
+        let mut browser = Browser::new(now, OWN);
+        for label in labels {
+            let heard = browser.handle_packet(now, &announced(label, b"TYPE=x", 120), 0.0);
+            assert_eq!(names(&heard), [*label]);
+        }
+        browser
+    }
+
+    fn names(heard: &Heard) -> Vec<&str> {
+        let found = heard.found.iter();
+        found.map(|(fullname, _)| label_of(fullname)).collect()
+    }
+
+    /// What is asked for, but for the question for everything, and what is gone, until then; with
+    /// the time of each in seconds.
+    fn goes_on(
+        browser: &mut Browser,
+        start: Instant,
+        until: f64,
+    ) -> (Vec<(u64, String)>, Vec<u64>) {
+        let (mut questions, mut gone) = (Vec::new(), Vec::new());
+        let mut last = None;
+        while let now = browser.poll_timeout()
+            && now < start + seconds(until)
+        {
+            assert_ne!(last.replace(now), Some(now), "time goes on");
+            let due = browser.handle_timeout(now, 0.0);
+            let at = (now - start).as_millis() as u64 / 100;
+            for (label, kind) in asked(&due.packets) {
+                if !label.is_empty() {
+                    let kind = if kind == QTYPE::TYPE(TYPE::SRV) {
+                        "SRV"
+                    } else {
+                        "TXT"
+                    };
+                    questions.push((at, format!("{label} {kind}")));
+                }
+            }
+            gone.extend(due.gone.iter().map(|_| at));
+        }
+        (questions, gone)
+    }
+
+    #[test]
+    fn what_is_announced_is_found_once_with_all_its_strings() {
+        let (mut browser, now) = (Browser::new(Instant::now(), OWN), Instant::now());
+        let strings: [&[u8]; 5] = [
+            b"LOCATOR=tcp://a",
+            b"TYPE=\xff",
+            b"locator=:1;",
+            b"flag",
+            b"=",
+        ];
+        let parts = [Part::Txt(&strings), Part::Srv(HOST), Part::Ptr];
+        let heard = browser.handle_packet(now, &answer("Arm.left", &parts, 120), 0.0);
+        let [(fullname, properties)] = &heard.found[..] else {
+            panic!("{heard:?}");
+        };
+        assert_eq!(**fullname, format!("Arm.left.{SERVICE_TYPE}"));
+        let expected: [(&str, &[u8]); 4] = [
+            ("LOCATOR", b"tcp://a"),
+            ("TYPE", b"\xff"),
+            ("locator", b":1;"),
+            ("flag", b""),
+        ];
+        let expected = expected.map(|(key, value)| (key.to_owned(), value.to_vec()));
+        assert_eq!(*properties, expected);
+        // The same is no news, something else is.
+        let again = browser.handle_packet(now, &answer("Arm.left", &parts, 120), 0.0);
+        assert_eq!(again, Heard::default());
+        let other = answer("Arm.left", &[Part::Txt(&[b"TYPE=x"])], 120);
+        assert_eq!(
+            names(&browser.handle_packet(now, &other, 0.0)),
+            ["Arm.left"]
+        );
+        // What nobody has introduced is of no interest.
+        let stranger = answer("leg", &[Part::Srv(HOST), Part::Txt(&strings)], 120);
+        assert_eq!(browser.handle_packet(now, &stranger, 0.0), Heard::default());
+        assert_eq!(browser.records.len(), 1);
+    }
+
+    #[test]
+    fn what_is_missing_is_asked_for_a_few_times() {
+        let (mut browser, start) = (browser(Instant::now(), &[]), Instant::now());
+        for label in ["arm", "leg"] {
+            browser.handle_packet(start, &answer(label, &[Part::Ptr], 4500), 0.0);
+        }
+        let (questions, _) = goes_on(&mut browser, start, 0.5);
+        assert_eq!(questions.len(), 4, "{questions:?}");
+        let half = answer("arm", &[Part::Srv(HOST)], 120);
+        assert_eq!(browser.handle_packet(start, &half, 0.0), Heard::default());
+        let half = answer("arm", &[Part::Txt(&[b"TYPE=x"])], 120);
+        assert_eq!(names(&browser.handle_packet(start, &half, 0.0)), ["arm"]);
+        let (questions, gone) = goes_on(&mut browser, start, 30.0);
+        let times: Vec<u64> = questions.iter().map(|(at, _)| *at).collect();
+        assert_eq!(times, [12, 12, 42, 42, 132, 132]);
+        assert!(questions.iter().all(|(_, what)| what.starts_with("leg")));
+        // Who was never known is not gone either.
+        assert_eq!(gone, [0; 0]);
+        assert_eq!((browser.records.len(), browser.unknown), (1, 0));
+    }
+
+    #[test]
+    fn what_is_not_heard_of_is_asked_for_and_gone_in_the_end() {
+        let start = Instant::now();
+        let mut browser = browser(start, &["arm", "leg"]);
+        let (questions, gone) = goes_on(&mut browser, start, 80.0);
+        let expected = ["arm SRV", "arm TXT", "leg SRV", "leg TXT"];
+        let mut asked: Vec<&str> = questions.iter().map(|(_, what)| what.as_str()).collect();
+        asked.sort_unstable();
+        assert_eq!((asked, gone), (expected.to_vec(), vec![]));
+        for part in [Part::Srv(HOST), Part::Txt(&[b"TYPE=x"])] {
+            let now = start + seconds(80.0);
+            browser.handle_packet(now, &answer("arm", &[part], 120), 0.0);
+        }
+        let (questions, gone) = goes_on(&mut browser, start, 130.0);
+        let of_leg = questions.iter().filter(|(_, what)| what == "leg SRV");
+        let times: Vec<u64> = of_leg.map(|(at, _)| *at).collect();
+        assert_eq!((times, gone), (vec![960, 1080, 1140], vec![1200]));
+        assert!(browser.records.contains_key("arm"));
+    }
+
+    #[test]
+    fn hosts_ask_at_different_times_and_for_many_at_once() {
+        let start = Instant::now();
+        let mut first = browser(start, &[]);
+        for number in 0..30 {
+            let now = start + seconds(f64::from(number) * 0.1);
+            let label = format!("agent {number}");
+            first.handle_packet(now, &announced(&label, b"TYPE=x", 120), 0.0);
+        }
+        let (questions, _) = goes_on(&mut first, start, 75.0);
+        let times: std::collections::HashSet<u64> = questions.iter().map(|(at, _)| *at).collect();
+        assert_eq!((questions.len(), times.len()), (60, 1), "{questions:?}");
+        // With the most jitter it is later, and well below what others wait for.
+        let life = Life::new(start, 120);
+        assert_eq!(life.due(0.0), start + seconds(66.0));
+        assert!(life.due(1.0) > start + seconds(80.0));
+        assert!(life.due(1.0) < start + seconds(120.0 * 0.75));
+    }
+
+    #[test]
+    fn beacons_keep_what_is_held_good() {
+        let start = Instant::now();
+        let mut browser = browser(start, &["arm", "peer"]);
+        browser.belongs(&format!("arm.{SERVICE_TYPE}"), OTHER);
+        for second in 1..600 {
+            let now = start + Duration::from_secs(second);
+            browser.confirm(now, OTHER);
+            let (questions, _) = goes_on(&mut browser, start, second as f64 + 1.0);
+            assert!(questions.iter().all(|(_, what)| what.starts_with("peer")));
+        }
+        assert_eq!(browser.records.len(), 1, "the peer has no beacons");
+        // They end, and nobody answers any more.
+        let (questions, gone) = goes_on(&mut browser, start, 800.0);
+        assert_eq!((questions[0].0, gone), (5990 + 660, vec![5990 + 1200]));
+    }
+
+    #[test]
+    fn own_records_are_not_asked_for() {
+        let start = Instant::now();
+        let mut browser = browser(start, &["own"]);
+        browser.belongs(&format!("own.{SERVICE_TYPE}"), OWN);
+        let (questions, gone) = goes_on(&mut browser, start, 200.0);
+        assert_eq!((questions, gone), (vec![], vec![1200]));
+    }
+
+    #[test]
+    fn goodbyes_count_after_a_second_unless_they_are_taken_back() {
+        let start = Instant::now();
+        let mut browser = browser(start, &["arm", "leg", "eye"]);
+        for label in ["arm", "leg"] {
+            browser.handle_packet(start, &announced(label, b"TYPE=x", 0), 0.0);
+        }
+        // Somebody else has had that label, and leaves.
+        let parts = [Part::Ptr, Part::Srv("other.local"), Part::Txt(&[b"TYPE=y"])];
+        browser.handle_packet(start, &answer("eye", &parts, 0), 0.0);
+        let back = start + seconds(0.5);
+        let heard = browser.handle_packet(back, &announced("leg", b"TYPE=x", 120), 0.0);
+        assert_eq!(heard, Heard::default());
+        let (_, gone) = goes_on(&mut browser, start, 5.0);
+        assert_eq!(gone, [10]);
+        assert!(browser.records.contains_key("leg") && browser.records.contains_key("eye"));
+    }
+
+    #[test]
+    fn who_is_doubted_answers_or_is_gone() {
+        let start = Instant::now();
+        let mut browser = browser(start, &["arm", "leg"]);
+        let doubted = ["arm", "leg"].map(|label| format!("{label}.{SERVICE_TYPE}").into());
+        browser.doubt(start, &doubted);
+        let (questions, _) = goes_on(&mut browser, start, 0.5);
+        assert_eq!(questions.len(), 4, "{questions:?}");
+        let now = start + seconds(0.5);
+        browser.handle_packet(now, &answer("leg", &[Part::Srv(HOST)], 120), 0.0);
+        let (questions, gone) = goes_on(&mut browser, start, 5.0);
+        let mut again = questions.iter().map(|(at, what)| (*at, what.as_str()));
+        assert_eq!(again.next(), Some((11, "arm SRV")));
+        assert!(again.all(|(_, what)| what.starts_with("arm")));
+        assert_eq!(gone, [20]);
+        // A beacon is no answer.
+        browser.belongs(&doubted[1], OTHER);
+        browser.doubt(now, &doubted);
+        browser.confirm(now + seconds(0.1), OTHER);
+        let (_, gone) = goes_on(&mut browser, start, 5.0);
+        assert_eq!(gone, [25]);
+    }
+
+    #[test]
+    fn everything_is_asked_for_ever_more_rarely_by_one_of_many() {
+        let start = Instant::now();
+        let mut hosts = [0.3, 0.7].map(|_| Browser::new(start, OWN));
+        let mut times = [Vec::new(), Vec::new()];
+        let mut next = start;
+        while next < start + Duration::from_secs(9000) {
+            for asking in 0..2 {
+                if hosts[asking].poll_timeout() > next {
+                    continue;
+                }
+                let packets = hosts[asking].handle_timeout(next, asking as f64).packets;
+                for packet in packets {
+                    times[asking].push((next - start).as_secs());
+                    for host in &mut hosts {
+                        host.handle_packet(next, &packet, 0.0);
+                    }
+                }
+            }
+            next = hosts.iter().map(Browser::poll_timeout).min().unwrap();
+        }
+        let [first, second] = &times;
+        let mut all: Vec<u64> = first.iter().chain(second).copied().collect();
+        all.sort_unstable();
+        assert_eq!(all[..2], [0, 0], "each asks once in any case");
+        let pauses: Vec<u64> = all.windows(2).skip(1).map(|two| two[1] - two[0]).collect();
+        assert!(pauses.len() <= 9, "{all:?}");
+        assert!(pauses.iter().all(|pause| *pause <= 3600 * 9 / 8), "{all:?}");
+        // Who has just heard the question need not ask because something is missing.
+        let now = start + Duration::from_secs(9000);
+        assert_eq!(hosts[0].ask_for_missing(now).len(), 1);
+        assert_eq!(hosts[0].ask_for_missing(now + seconds(0.5)).len(), 0);
+        assert_eq!(hosts[0].ask_for_missing(now + seconds(1.0)).len(), 1);
+        // A question that leaves out what we do not know does not help us.
+        let knows_more = &packet::question_for_all(&["stranger"])[0];
+        let mut host = Browser::new(start, OWN);
+        host.handle_timeout(start + seconds(0.2), 0.0);
+        let before = host.poll_timeout();
+        host.handle_packet(start + seconds(1.1), knows_more, 0.0);
+        assert_eq!(host.poll_timeout(), before);
+        host.handle_packet(start + seconds(1.1), &packet::question_for_all(&[])[0], 0.0);
+        assert!(host.poll_timeout() > before);
+    }
+
+    #[test]
+    fn peers_are_known_answers_before_others() {
+        let now = Instant::now();
+        let labels: Vec<String> = (0..40).map(|number| format!("agent {number}")).collect();
+        let labels: Vec<&str> = labels.iter().map(String::as_str).collect();
+        let mut browser = browser(now, &labels);
+        for label in &labels[2..] {
+            browser.belongs(&format!("{label}.{SERVICE_TYPE}"), OTHER);
+        }
+        let packets = browser.ask_for_missing(now);
+        let [packet] = &packets[..] else {
+            panic!("{packets:?}");
+        };
+        let packet = packet::parse(packet).unwrap();
+        assert_eq!(packet.answers.len(), KNOWN);
+        let known = packet.answers.iter();
+        let known: Vec<_> = known.map(|one| introduced(&one.name, &one.rdata)).collect();
+        assert!(known.contains(&Some(labels[0])) && known.contains(&Some(labels[1])));
+    }
+
+    #[test]
+    fn what_is_remembered_is_bounded() {
+        let now = Instant::now();
+        let mut browser = Browser::new(now, OWN);
+        for number in 0..MAX_UNKNOWN + 10 {
+            let introduced = answer(&format!("unknown {number}"), &[Part::Ptr], 120);
+            let heard = browser.handle_packet(now, &introduced, 1.0);
+            assert_eq!(heard.refused, u64::from(number >= MAX_UNKNOWN));
+        }
+        assert_eq!(browser.unknown, MAX_UNKNOWN);
+        // They are not in the way of who says all at once.
+        let heard = browser.handle_packet(now, &announced("arm", b"TYPE=x", 10), 0.0);
+        assert_eq!((names(&heard), heard.refused), (vec!["arm"], 0));
+        goes_on(&mut browser, now, 20.0);
+        assert_eq!((browser.records.len(), browser.unknown), (0, 0));
+
+        let long = [b'x'; 255];
+        let strings: Vec<&[u8]> = vec![&long; 33];
+        let long = MdnsDirectory::MAX_BYTES / (33 * 257);
+        for number in 0..MdnsDirectory::MAX_RECORDS + 10 {
+            let strings = if number < long + 5 { &strings[..] } else { &[] };
+            let parts = [Part::Ptr, Part::Srv(HOST), Part::Txt(strings)];
+            let label = format!("agent {number}");
+            browser.handle_packet(now, &answer(&label, &parts, 120), 0.0);
+            assert!(browser.bytes <= MdnsDirectory::MAX_BYTES);
+        }
+        assert_eq!(browser.records.len(), MdnsDirectory::MAX_RECORDS);
+        assert!(browser.unknown >= 5, "for some there was no room");
+        goes_on(&mut browser, now, 200.0);
+        assert_eq!(
+            (browser.records.len(), browser.unknown, browser.bytes),
+            (0, 0, 0)
+        );
+    }
+
+    proptest! {
+        #[test]
+        fn arbitrary_packets_do_no_harm(
+            mut packet in prop::collection::vec(any::<u8>(), 0..600),
+            answers in 0..8_u8,
+        ) {
+            let mut browser = browser(Instant::now(), &["arm"]);
+            if let Some(header) = packet.first_chunk_mut::<12>() {
+                *header = [0, 0, 0x84, 0, 0, 0, 0, answers, 0, 0, 0, 0];
+            }
+            browser.handle_packet(Instant::now(), &packet, 0.5);
+        }
+
+        #[test]
+        fn broken_packets_do_no_harm(at in 0_usize..160, byte: u8) {
+            let mut browser = Browser::new(Instant::now(), OWN);
+            for mut packet in [announced("arm", b"TYPE=x", 120), announced("arm", b"TYPE=x", 0)] {
+                if let Some(broken) = packet.get_mut(at) {
+                    *broken = byte;
+                }
+                browser.handle_packet(Instant::now(), &packet, 0.5);
+                prop_assert!(browser.unknown <= browser.records.len());
+            }
+        }
+    }
+}

@@ -1,0 +1,230 @@
+//! Packets of multicast DNS about records of our type: questions written, answers taken apart.
+
+use simple_dns::rdata::{PTR, RData};
+use simple_dns::{CLASS, Label, Name, Packet, PacketFlag, QCLASS, QTYPE, Question, TYPE};
+use simple_dns::{ResourceRecord, rdata};
+
+use super::SERVICE_TYPE;
+use super::record::Properties;
+
+/// Largest packet of multicast DNS (RFC 6762 clause 17).
+pub(super) const MAX_PACKET: usize = 9000;
+/// Most questions in one packet: they fit the smallest packet every network carries.
+const QUESTIONS: usize = 12;
+/// Known answers in one packet, likewise.
+pub(super) const KNOWN: usize = 14;
+
+/// What a packet says, unless it is none. One is not taken apart that is too short for as many
+/// records as it claims to have: the library takes memory for them before it looks.
+pub(super) fn parse(packet: &[u8]) -> Option<Packet<'_>> {
+    let header = packet.first_chunk::<12>()?;
+    let count = |at: usize| usize::from(u16::from_be_bytes([header[at], header[at + 1]]));
+    let claimed = count(4) * 5 + (count(6) + count(8) + count(10)) * 11;
+    let fits = packet.len() <= MAX_PACKET && claimed + header.len() <= packet.len();
+    fits.then(|| Packet::parse(packet).ok())?
+}
+
+/// The same if it is an answer.
+pub(super) fn parse_answer(packet: &[u8]) -> Option<Packet<'_>> {
+    parse(packet).filter(|packet| packet.has_flags(PacketFlag::RESPONSE))
+}
+
+/// The label of a record of our type, as it is spelt.
+pub(super) fn label_of<'a>(name: &'a Name<'_>) -> Option<&'a str> {
+    let (label, rest) = name.get_labels().split_first()?;
+    is_of_our_type(rest).then(|| std::str::from_utf8(label.as_ref()).ok())?
+}
+
+/// Whether it is the name of our type.
+pub(super) fn is_service(name: &Name<'_>) -> bool {
+    is_of_our_type(name.get_labels())
+}
+
+fn is_of_our_type(labels: &[Label<'_>]) -> bool {
+    let same =
+        |(one, other): (&Label<'_>, &str)| one.as_ref().eq_ignore_ascii_case(other.as_bytes());
+    labels.len() == service_labels().count() && labels.iter().zip(service_labels()).all(same)
+}
+
+/// The strings of a TXT record, in order, all of them.
+pub(super) fn properties(txt: &rdata::TXT<'_>) -> Properties {
+    let properties = txt.iter_raw().filter_map(|(key, value)| {
+        let key = std::str::from_utf8(key).ok()?;
+        Some((key.to_owned(), value.unwrap_or_default().to_vec()))
+    });
+    properties.collect()
+}
+
+/// Packets that ask for the records of these kinds with these labels. A label that is none is left
+/// out.
+pub(super) fn questions<'a>(
+    labels: &'a [impl AsRef<str>],
+    kinds: &'a [TYPE],
+) -> impl Iterator<Item = Vec<u8>> + 'a {
+    labels
+        .chunks(QUESTIONS / kinds.len())
+        .filter_map(move |labels| {
+            let mut packet = Packet::new_query(0);
+            for label in labels {
+                let Some(name) = name_of(label.as_ref()) else {
+                    continue;
+                };
+                for kind in kinds {
+                    let (kind, class) = (QTYPE::TYPE(*kind), QCLASS::CLASS(CLASS::IN));
+                    let question = Question::new(name.clone(), kind, class, false);
+                    packet.questions.push(question);
+                }
+            }
+            packet.build_bytes_vec_compressed().ok()
+        })
+}
+
+/// Packets that ask for all records of our type but those with these labels (RFC 6762 clause 7.1).
+pub(super) fn question_for_all(known: &[&str]) -> Vec<Vec<u8>> {
+    let service = Name::new_unchecked(SERVICE_TYPE);
+    let mut chunks = known.chunks(KNOWN);
+    let first = chunks.next().unwrap_or_default();
+    let all = std::iter::once(first).chain(chunks);
+    let last = known.len().div_ceil(KNOWN).max(1) - 1;
+    let packets = all.enumerate().filter_map(|(number, chunk)| {
+        let mut packet = Packet::new_query(0);
+        if number == 0 {
+            let (kind, class) = (QTYPE::TYPE(TYPE::PTR), QCLASS::CLASS(CLASS::IN));
+            let question = Question::new(service.clone(), kind, class, false);
+            packet.questions.push(question);
+        }
+        if number < last {
+            packet.set_flags(PacketFlag::TRUNCATION);
+        }
+        for name in chunk.iter().filter_map(|label| name_of(label)) {
+            let pointer = RData::PTR(PTR(name));
+            let known = ResourceRecord::new(service.clone(), CLASS::IN, 4500, pointer);
+            packet.answers.push(known);
+        }
+        packet.build_bytes_vec_compressed().ok()
+    });
+    packets.collect()
+}
+
+fn name_of(label: &str) -> Option<Name<'_>> {
+    let mut name = vec![Label::new(label.as_bytes()).ok()?];
+    name.extend(service_labels().map(|label| Label::new_unchecked(label.as_bytes())));
+    Some(Name::new_with_labels(&name))
+}
+
+fn service_labels() -> impl Iterator<Item = &'static str> {
+    SERVICE_TYPE.split_terminator('.')
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use simple_dns::CharacterString;
+    use simple_dns::rdata::{SRV, TXT};
+
+    use super::*;
+
+    /// A record of a packet.
+    pub(in crate::mdns) enum Part<'a> {
+        Ptr,
+        /// With the host.
+        Srv(&'a str),
+        /// With the strings.
+        Txt(&'a [&'a [u8]]),
+    }
+
+    /// An answer with these records of the instance with this label.
+    pub(in crate::mdns) fn answer(label: &str, parts: &[Part<'_>], ttl: u32) -> Vec<u8> {
+        let mut packet = Packet::new_reply(0);
+        packet.set_flags(PacketFlag::AUTHORITATIVE_ANSWER);
+        for part in parts {
+            let mut name = name_of(label).unwrap();
+            let data = match part {
+                Part::Ptr => {
+                    let instance = std::mem::replace(&mut name, Name::new_unchecked(SERVICE_TYPE));
+                    RData::PTR(PTR(instance))
+                }
+                Part::Srv(host) => RData::SRV(SRV {
+                    priority: 0,
+                    weight: 0,
+                    port: 0,
+                    target: Name::new_unchecked(host),
+                }),
+                Part::Txt(strings) => {
+                    let mut txt = TXT::new();
+                    for string in *strings {
+                        txt.add_char_string(CharacterString::new(string).unwrap());
+                    }
+                    RData::TXT(txt)
+                }
+            };
+            let record = ResourceRecord::new(name, CLASS::IN, ttl, data);
+            packet.answers.push(record);
+        }
+        packet.build_bytes_vec_compressed().unwrap()
+    }
+
+    /// The labels and kinds that packets ask for.
+    pub(in crate::mdns) fn asked(packets: &[Vec<u8>]) -> Vec<(String, QTYPE)> {
+        let mut asked = Vec::new();
+        for packet in packets {
+            assert!(packet.len() < 1232, "{}", packet.len());
+            for question in parse(packet).unwrap().questions {
+                let label = label_of(&question.qname).unwrap_or_default();
+                asked.push((label.to_owned(), question.qtype));
+            }
+        }
+        asked
+    }
+
+    #[test]
+    fn questions_fit_the_smallest_packet() {
+        let labels: Vec<String> = (0..30)
+            .map(|number| format!("Agent {number:02} {}", "x".repeat(54)))
+            .collect();
+        for kinds in [&[TYPE::SRV][..], &[TYPE::SRV, TYPE::TXT]] {
+            let packets: Vec<_> = questions(&labels, kinds).collect();
+            let asked = asked(&packets);
+            assert_eq!(asked.len(), labels.len() * kinds.len());
+            assert_eq!(asked[0].0, labels[0], "as it is spelt");
+        }
+    }
+
+    #[test]
+    fn what_is_known_need_not_be_said() {
+        let labels: Vec<String> = (0..30).map(|number| format!("agent {number}")).collect();
+        let labels: Vec<&str> = labels.iter().map(String::as_str).collect();
+        let packets = question_for_all(&labels);
+        let parsed: Vec<_> = packets
+            .iter()
+            .map(|packet| parse(packet).unwrap())
+            .collect();
+        let [first, second, third] = &parsed[..] else {
+            panic!("{parsed:?}");
+        };
+        assert_eq!((first.questions.len(), second.questions.len()), (1, 0));
+        assert!(is_service(&first.questions[0].qname));
+        assert!(second.has_flags(PacketFlag::TRUNCATION));
+        assert!(!third.has_flags(PacketFlag::TRUNCATION));
+        let known: usize = parsed.iter().map(|packet| packet.answers.len()).sum();
+        assert_eq!(known, 30);
+        assert!(packets.iter().all(|packet| packet.len() < 1232));
+        assert_eq!(question_for_all(&[]).len(), 1);
+    }
+
+    #[test]
+    fn packets_that_claim_more_than_they_have_are_not_read() {
+        let good = answer("arm", &[Part::Txt(&[b"TYPE=x"])], 120);
+        assert!(parse_answer(&good).is_some());
+        for at in [4, 6, 8, 10] {
+            let mut claims = good.clone();
+            claims[at] = 0xff;
+            assert!(parse(&claims).is_none());
+        }
+        let question = &question_for_all(&["arm"])[0];
+        assert!(parse(question).is_some() && parse_answer(question).is_none());
+        // A name that points to itself.
+        let mut cyclic = vec![0, 0, 0x84, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0xc0, 12];
+        cyclic.extend([0, 16, 0, 1, 0, 0, 0, 1, 0, 0]);
+        assert!(parse(&cyclic).is_none());
+    }
+}

@@ -1,0 +1,184 @@
+//! Sockets of multicast DNS.
+//!
+//! They are bound to the group's address: they take nothing away from others on this port, to whom
+//! somebody answers directly. Questions are ordinary multicast ones, because Avahi cuts what it
+//! answers to one host alone at 512 bytes.
+
+use std::io;
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4, SocketAddrV6};
+use std::task::Poll;
+
+use if_addrs::Interface;
+use socket2::{Domain, Protocol, SockRef, Socket, Type};
+use tokio::io::ReadBuf;
+use tokio::net::UdpSocket;
+
+use super::MdnsConfig;
+use super::packet::MAX_PACKET;
+
+/// Most interfaces that are asked on.
+const MAX_INTERFACES: usize = 32;
+
+/// Sockets of the multicast group, one for each interface and family of addresses.
+#[derive(Debug)]
+pub(super) struct Sockets {
+    open: Vec<(UdpSocket, SocketAddr)>,
+    /// Those they are for.
+    interfaces: Vec<Interface>,
+    buffer: Vec<u8>,
+}
+
+impl Sockets {
+    /// None yet.
+    pub(super) fn new() -> Self {
+        Self {
+            open: Vec::new(),
+            interfaces: Vec::new(),
+            buffer: vec![0; MAX_PACKET],
+        }
+    }
+
+    /// Opens what can be opened of the interfaces that the configuration names, if they are not
+    /// the same as before. Says whether there are some that there were not.
+    pub(super) fn refresh(&mut self, config: &MdnsConfig) -> io::Result<bool> {
+        let interfaces = interfaces(config)?;
+        if interfaces == self.interfaces {
+            return Ok(false);
+        }
+        self.open.clear();
+        let mut indices = Vec::new();
+        let mut last_error = None;
+        for interface in &interfaces {
+            let opened = match interface.ip() {
+                IpAddr::V4(address) => group_v4(address, config.port),
+                IpAddr::V6(_) => {
+                    let index = interface.index.unwrap_or_default();
+                    // One for all addresses of an interface.
+                    if indices.contains(&index) {
+                        continue;
+                    }
+                    indices.push(index);
+                    group_v6(index, config.port)
+                }
+            };
+            let opened = opened.and_then(|(socket, to)| Ok((UdpSocket::from_std(socket)?, to)));
+            match opened {
+                Ok(socket) => self.open.push(socket),
+                Err(error) => last_error = Some(error),
+            }
+        }
+        match last_error {
+            // An address that is not usable yet may be in a moment.
+            Some(error) if self.open.is_empty() => Err(error),
+            _ => {
+                let mut now = interfaces.iter();
+                let more = now.any(|interface| !self.interfaces.contains(interface));
+                self.interfaces = interfaces;
+                Ok(more)
+            }
+        }
+    }
+
+    /// Sends the packet on all interfaces. One that fails is no reason not to ask on the others.
+    pub(super) fn send(&self, packet: &[u8]) {
+        for (socket, group) in &self.open {
+            if let Err(error) = SockRef::from(socket).send_to(packet, &(*group).into()) {
+                tracing::debug!(%error, %group, "an mDNS question was not sent");
+            }
+        }
+    }
+
+    /// The next packet, and the port it came from. Cancelling the future loses nothing.
+    pub(super) async fn receive(&mut self) -> (&[u8], u16) {
+        let Self { open, buffer, .. } = self;
+        let (len, port) = std::future::poll_fn(|context| {
+            for (socket, _) in open.iter() {
+                let mut packet = ReadBuf::new(buffer);
+                // An error is told once, and stands for a packet that did not come.
+                while let Poll::Ready(received) = socket.poll_recv_from(context, &mut packet) {
+                    if let Ok(from) = received {
+                        return Poll::Ready((packet.filled().len(), from.port()));
+                    }
+                }
+            }
+            Poll::Pending
+        })
+        .await;
+        (self.buffer.get(..len).unwrap_or_default(), port)
+    }
+}
+
+/// Sends one packet on all interfaces, for who has no sockets any more. One that fails is no reason
+/// not to send on the others.
+pub(super) fn send_once(config: &MdnsConfig, packet: &[u8]) -> io::Result<()> {
+    let mut indices = Vec::new();
+    let mut last_error = None;
+    for interface in interfaces(config)? {
+        let index = interface.index.unwrap_or_default();
+        let opened = match interface.ip() {
+            IpAddr::V4(address) => group_v4(address, config.port),
+            IpAddr::V6(_) if indices.contains(&index) => continue,
+            IpAddr::V6(_) => {
+                indices.push(index);
+                group_v6(index, config.port)
+            }
+        };
+        let sent = opened.and_then(|(socket, group)| socket.send_to(packet, group));
+        last_error = sent.err().or(last_error);
+    }
+    last_error.map_or(Ok(()), Err)
+}
+
+/// The addresses of those that are up and that the configuration names.
+pub(super) fn interfaces(config: &MdnsConfig) -> io::Result<Vec<Interface>> {
+    let mut interfaces = if_addrs::get_if_addrs()?;
+    interfaces.retain(|interface| {
+        let chosen = |one: &String| match one.parse::<IpAddr>() {
+            Ok(address) => address == interface.ip(),
+            Err(_) => *one == interface.name,
+        };
+        let all = config.interfaces.is_empty();
+        interface.is_oper_up() && (all || config.interfaces.iter().any(chosen))
+    });
+    interfaces.truncate(MAX_INTERFACES);
+    Ok(interfaces)
+}
+
+/// A socket in the group of an interface, which is not waited for, and the group.
+pub(super) type Grouped = (std::net::UdpSocket, SocketAddr);
+
+pub(super) fn group_v4(interface: Ipv4Addr, port: u16) -> io::Result<Grouped> {
+    let group = Ipv4Addr::new(224, 0, 0, 251);
+    let address = SocketAddr::V4(SocketAddrV4::new(group, port));
+    let socket = socket(Domain::IPV4, address)?;
+    let of_socket = SockRef::from(&socket);
+    of_socket.set_multicast_if_v4(&interface)?;
+    of_socket.set_multicast_all_v4(false)?;
+    of_socket.set_multicast_ttl_v4(255)?;
+    of_socket.join_multicast_v4(&group, &interface)?;
+    Ok((socket, address))
+}
+
+pub(super) fn group_v6(interface: u32, port: u16) -> io::Result<Grouped> {
+    let group = Ipv6Addr::new(0xff02, 0, 0, 0, 0, 0, 0, 0xfb);
+    let address = SocketAddr::V6(SocketAddrV6::new(group, port, 0, interface));
+    let socket = socket(Domain::IPV6, address)?;
+    let of_socket = SockRef::from(&socket);
+    of_socket.set_multicast_if_v6(interface)?;
+    of_socket.set_multicast_all_v6(false)?;
+    of_socket.set_multicast_hops_v6(255)?;
+    of_socket.join_multicast_v6(&group, interface)?;
+    Ok((socket, address))
+}
+
+fn socket(domain: Domain, address: SocketAddr) -> io::Result<std::net::UdpSocket> {
+    let socket = Socket::new(domain, Type::DGRAM, Some(Protocol::UDP))?;
+    if domain == Domain::IPV6 {
+        socket.set_only_v6(true)?;
+    }
+    socket.set_reuse_address(true)?;
+    socket.set_reuse_port(true)?;
+    socket.set_nonblocking(true)?;
+    socket.bind(&address.into())?;
+    Ok(socket.into())
+}
