@@ -91,7 +91,7 @@ pub struct Config {
     pub discovery: Discovery,
     /// `[security]`: who is let in from other hosts.
     pub security: Security,
-    /// `[access]`: who may send what to whom through the gateway.
+    /// `[access]`: who may send what to whom.
     pub access: Access,
     /// `[monitor]`: whether agents keep to their protocols.
     pub monitor: Monitor,
@@ -200,11 +200,20 @@ pub struct Security {
     /// `old_peers`: addresses of old peers, which cannot prove who they are; letters in their
     /// dialects are exchanged with them nevertheless. At most 64.
     pub old_peers: Vec<IpAddr>,
+    /// `peer_connections`: how many connections of each transport the peers at one address may open.
+    /// This and the next two go for other hosts, and for loopback addresses where those have to prove
+    /// who they are, too.
+    pub peer_connections: usize,
+    /// `peer_letters`: letters a second that are read from one address over tcp or quic, as many of
+    /// which may come at once; what is more waits at its sender. 0: any number.
+    pub peer_letters: usize,
+    /// `peer_bytes`: the same of bytes.
+    pub peer_bytes: u64,
 }
 
-/// `[access]`: who may send what to whom through the gateway, hence between hosts; what agents of one
-/// host send each other does not come there. A rule that denies comes before those that allow; when
-/// there are any that allow, nothing else passes.
+/// `[access]`: who may send what to whom. The gateway keeps to it for what it takes, and every process
+/// for what its own agents get. A rule that denies comes before those that allow; when there are any that
+/// allow, nothing else passes.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Access {
@@ -330,6 +339,9 @@ impl Config {
                 insecure: false,
                 loopback: false,
                 old_peers: Vec::new(),
+                peer_connections: 64,
+                peer_letters: 20_000,
+                peer_bytes: 256 << 20,
             },
             access: Access::default(),
             monitor: Monitor {

@@ -117,7 +117,6 @@ impl Domain {
                 gateway: false,
                 // Another way than shared memory between processes of this host; never further.
                 contacts: None,
-                gate: None,
                 // What stays on this host needs no proof.
                 #[cfg(feature = "secure")]
                 security: None,

@@ -4,7 +4,6 @@
 
 mod clerk;
 mod exchange;
-mod gate;
 #[cfg(feature = "secure")]
 mod guard;
 mod neighbours;
@@ -13,8 +12,8 @@ mod publisher;
 use std::sync::Arc;
 use std::time::Instant;
 
+use fipa_mts::Contacts;
 use fipa_mts::core::Peer;
-use fipa_mts::{Contacts, Gate};
 use fipa_sds::{
     ContactDirectory, Directory, MergedDirectory, RegisterError, Registration, Role as EntryRole,
     StaticDirectory,
@@ -25,13 +24,11 @@ use tokio::task::JoinHandle;
 
 use self::clerk::Clerk;
 use self::exchange::{Exchanging, Means};
-use self::gate::Door;
 #[cfg(feature = "secure")]
 use self::guard::Guard;
 pub use self::neighbours::Neighbour;
 use self::neighbours::{Neighbours, View};
 use self::publisher::{Keeper, Publisher};
-use crate::access::Access;
 use crate::config::ConfigError;
 use crate::domain::OpenError;
 use crate::service::{Role, Service};
@@ -72,7 +69,6 @@ impl Gateway {
                 name: config.mts.name.as_str().into(),
                 gateway: true,
                 contacts: Some(Arc::clone(&contacts) as Arc<dyn Contacts>),
-                gate: door(config)?,
                 #[cfg(feature = "secure")]
                 security: guard.as_ref().map(Guard::security),
                 view: &|host, mts| {
@@ -315,15 +311,6 @@ impl Drop for Gateway {
     fn drop(&mut self) {
         self.abort();
     }
-}
-
-/// Who says which letters the gateway takes, when the configuration has rules for that.
-fn door(config: &Config) -> Result<Option<Arc<dyn Gate>>, OpenError> {
-    config.check()?;
-    // What the check has passed can be understood.
-    let access =
-        Access::new(&config.access).map_err(|error| OpenError::Access(error.to_string()))?;
-    Ok(access.map(|access| Arc::new(Door::new(access, &config.mts.name)) as Arc<dyn Gate>))
 }
 
 /// Whether a line of `discovery.static` names an agent of an old peer, not a gateway.

@@ -47,6 +47,7 @@ mod coalition;
 pub mod config;
 pub mod doctor;
 mod domain;
+mod gate;
 #[cfg(feature = "net")]
 mod gateway;
 #[cfg(feature = "secure")]

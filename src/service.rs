@@ -5,14 +5,16 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa_mts::core::CoreConfig;
-use fipa_mts::{Contacts, Mts, RuntimeConfig, Started};
+use fipa_mts::{Contacts, Gate, Mts, RuntimeConfig, Started};
 use fipa_sds::{Directory, Entry, HostConfig, HostDirectory, HostError, Pattern};
 use fipa_transport::{Incarnation, Kind, Location, Transport};
 use tokio::runtime::Handle;
 use tokio::task::JoinHandle;
 
 use crate::Config;
+use crate::access::Access;
 use crate::domain::OpenError;
+use crate::gate::{Door, Of};
 use crate::place::{Place, RETRIES};
 use crate::routes::Report;
 use crate::watch::Taps;
@@ -46,8 +48,6 @@ pub(crate) struct Role<'a> {
     pub(crate) gateway: bool,
     /// Who is told of agents of other hosts that have written.
     pub(crate) contacts: Option<Arc<dyn Contacts>>,
-    /// Who says which letters are taken.
-    pub(crate) gate: Option<Arc<dyn fipa_mts::Gate>>,
     /// What peers have to prove to it.
     #[cfg(feature = "secure")]
     pub(crate) security: Option<fipa_transport_net::secure::Security>,
@@ -67,6 +67,7 @@ impl Service {
         let own = fipa_sds::Mts::new(Arc::clone(&role.name), incarnation);
         let (place, host) = enter(&config.domain, &own, role.gateway)?;
         let view = (role.view)(Arc::clone(&host), &own).inspect_err(|_| place.leave())?;
+        let gate = gate(config, &role, &host).inspect_err(|_| place.leave())?;
         let taps = Arc::new(Taps::new(&own, role.gateway));
         let mut refused = Vec::new();
         let transports = transports(
@@ -89,7 +90,7 @@ impl Service {
                 unframed_deadline: config.mts.deadline,
                 contacts: role.contacts.clone(),
                 tap: Some(Arc::clone(&taps) as Arc<dyn fipa_mts::Tap>),
-                gate: role.gate.clone(),
+                gate,
             },
             view,
             transports,
@@ -163,6 +164,22 @@ impl Service {
         }
         self.place.leave();
     }
+}
+
+/// Who says which letters are taken, when the configuration has rules for that.
+fn gate(
+    config: &Config,
+    role: &Role<'_>,
+    host: &Arc<HostDirectory>,
+) -> Result<Option<Arc<dyn Gate>>, OpenError> {
+    let of = match role.gateway {
+        true => Of::Gateway(Arc::clone(&role.name)),
+        false => Of::Process(Arc::clone(host)),
+    };
+    // What the configuration's check has passed can be understood.
+    let access =
+        Access::new(&config.access).map_err(|error| OpenError::Access(error.to_string()))?;
+    Ok(access.map(|access| Arc::new(Door::new(access, of)) as Arc<dyn Gate>))
 }
 
 /// Makes the domain's place and joins the directory there.
@@ -337,7 +354,10 @@ fn udp(
     let config = UdpConfig {
         listen: listen(&config.transport.udp, role),
         identity: identity(config, role, place, incarnation)?,
-        limits: UdpLimits::default(),
+        limits: UdpLimits {
+            max_per_address: config.security.peer_connections,
+            ..UdpLimits::default()
+        },
     };
     Ok(Arc::new(UdpTransport::new(config, handle.clone())))
 }
@@ -367,6 +387,9 @@ fn stream_limits(config: &Config) -> fipa_transport_net::Limits {
     fipa_transport_net::Limits {
         max_letter: usize::try_from(config.transport.shm.max_letter).unwrap_or(usize::MAX),
         keep_alive: KEEP_ALIVE,
+        max_per_address: config.security.peer_connections,
+        peer_letters: config.security.peer_letters as u64,
+        peer_bytes: config.security.peer_bytes,
         ..fipa_transport_net::Limits::default()
     }
 }

@@ -35,19 +35,25 @@ struct Host {
 impl Host {
     /// `understands` is what the configuration says of the peer, whose agent has this name.
     async fn new(name: &str, understands: &str) -> Self {
+        Self::with(name, understands, &[]).await
+    }
+
+    /// The same, with something else set.
+    async fn with(name: &str, understands: &str, settings: &[&str]) -> Self {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let number = NEXT.fetch_add(1, Ordering::Relaxed);
         let mark = format!("{}-{number}", std::process::id());
         let peer = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let at = peer.local_addr().unwrap();
-        let set = [
+        let mut set = vec![
             format!("domain=old-{mark}"),
             format!("mts.name=gateway-{mark}"),
             "discovery.mdns=false".to_owned(),
             format!("discovery.static={{ \"{name}\" = [\"tcp://{at};{understands}\"] }}"),
         ];
+        set.extend(settings.iter().map(|it| (*it).to_owned()));
         let config = Config::load(&Sources {
-            set: set.into(),
+            set,
             ..Sources::default()
         })
         .unwrap();
@@ -180,5 +186,24 @@ async fn jades_proxy_is_asked_and_answers_where_the_letter_says() {
     let answer = receive(&rusty).await;
     assert_eq!(answer, read(recorded).2);
     assert_eq!(answer.sender().unwrap().name(), "echo@jadetest");
+    host.gateway.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn fipa_services_is_told_in_its_hand_that_a_rule_refuses_its_letter() {
+    let deny = "access.deny={ alice = [\"bob\"] }";
+    let host = Host::with("alice", "fipa-services", &[deny]).await;
+    let [bob, carol] = ["bob", "carol"].map(|it| host.domain.register(it).unwrap());
+    let [(_, recorded)] = recorded!["e01_simple.be"];
+    throw(recorded, &host.address()).await;
+    let (_, letter, failure) = read(&host.read_by_peer().await);
+    assert_eq!(*failure.performative(), Performative::Failure);
+    assert_eq!(failure.receivers()[0].name(), "alice");
+    let theirs = failure.encode(Representation::BitEfficient, Dialect::FipaServices);
+    assert_eq!(letter.payload().to_bytes(), theirs.unwrap());
+    let told = String::from_utf8_lossy(failure.content().unwrap()).into_owned();
+    assert!(told.contains("refused") && told.contains("bob"), "{told}");
+    assert!(bob.try_receive().unwrap().is_none());
+    drop(carol);
     host.gateway.close().await;
 }

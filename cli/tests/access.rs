@@ -1,4 +1,5 @@
-//! The rules of `[access]`: what a gateway does not let through, and what is told of it.
+//! The rules of `[access]`: what a gateway and an agent's own process do not let through, and what
+//! is told of it.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
 
@@ -74,4 +75,27 @@ fn what_a_rule_denies_is_refused_and_audited() {
         theirs.tells(&["fipa::audit", "letter refused", why]);
     }
     assert_eq!(send(&arm, "inform").code, Some(0));
+}
+
+#[test]
+fn agents_of_one_host_are_held_to_the_rules_by_who_gets_their_letters() {
+    let host = Host::new();
+    let deny = "access.deny={ \".*\" = [\"arm performative=request\"] }";
+    let mut arm = host.start(&["echo", "arm", "-v", "--set", deny]);
+    // Who sends has no rules. The gateway, which is not on the way, answers what it is asked.
+    let everything = "access.allow={ nobody = [\"nothing\"] }";
+    let _gateway = host.start(&["up", "--set", everything]);
+    let send = |performative: &str| {
+        let content = ["--content", "hello", "--performative", performative];
+        host.run(&[&["send", "--to", "arm"], &content[..]].concat())
+    };
+    assert_eq!(send("inform").code, Some(0));
+    let sent = send("request");
+    assert_eq!(sent.code, Some(1), "{sent:?}");
+    let told = format!("{}{}", String::from_utf8_lossy(&sent.stdout), sent.stderr);
+    assert!(told.contains("a rule denies it"), "{told}");
+    arm.tells(&["fipa::audit", "letter refused", "a rule denies it"]);
+    // Whoever lets in nobody else still hears the gateway.
+    let routes = host.run(&["routes", "--json", "--set", everything]);
+    assert_eq!(routes.code, Some(0), "{routes:?}");
 }

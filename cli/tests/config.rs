@@ -116,6 +116,9 @@ keys = \"\"                            # default
 insecure = false                     # default
 loopback = false                     # default
 old_peers = []                       # default
+peer_connections = 64                # default
+peer_letters = 20000                 # default
+peer_bytes = \"256MiB\"                # default
 
 [access]
 rate = 0                             # default

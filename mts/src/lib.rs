@@ -6,6 +6,7 @@
 
 pub mod core;
 mod failure;
+mod gate;
 mod post;
 mod runtime;
 mod stamp;
@@ -16,5 +17,6 @@ pub mod watch;
 /// somebody who finds out, by how long things take, which keys collide.
 type Map<K, V> = std::collections::HashMap<K, V, foldhash::fast::RandomState>;
 
+pub use gate::Gate;
 pub use post::{PostError, letter_around, letter_for};
-pub use runtime::{Contacts, Gate, Mts, RuntimeConfig, Sending, Started, Tap};
+pub use runtime::{Contacts, Mts, RuntimeConfig, Sending, Started, Tap};

@@ -16,7 +16,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
-use fipa_acl::Letter;
 use fipa_sds::{Change, Directory, Entry, Pattern};
 use fipa_transport::{
     Conclusion, Incarnation, Introduction, Kind, ListenError, Location, Outcome, Transport,
@@ -28,6 +27,7 @@ use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 
 use self::receiving::Receiving;
+use crate::Gate;
 use crate::Map;
 use crate::core::{
     Action, Core, CoreConfig, Notice, Now, Peer, PeerState, Received, Route, SendId, Submission,
@@ -47,18 +47,8 @@ pub struct RuntimeConfig {
     pub contacts: Option<Arc<dyn Contacts>>,
     /// Whom to tell of the letters that pass, while the service is [watched](Mts::watch).
     pub tap: Option<Arc<dyn Tap>>,
-    /// Who says which letters are taken; all, without.
+    /// Who says which letters are taken; all, without. Is asked with the service locked.
     pub gate: Option<Arc<dyn Gate>>,
-}
-
-/// Who says which letters are taken.
-pub trait Gate: Send + Sync {
-    /// Whether a letter to the agent with this name is taken. Is called for every letter that a
-    /// transport brings, and must not wait nor call the service back.
-    ///
-    /// # Errors
-    /// Why not, as its sender is told.
-    fn admits(&self, receiver: &str, letter: &Letter) -> Result<(), String>;
 }
 
 /// Who is told of other hosts: of services that connections are open with, and of agents that
@@ -177,7 +167,10 @@ impl Mts {
         handle: &Handle,
     ) -> Started {
         let state = State {
-            core: Core::new(core, Arc::clone(&directory)),
+            core: match &config.gate {
+                Some(gate) => Core::new(core, Arc::clone(&directory)).gated(Arc::clone(gate)),
+                None => Core::new(core, Arc::clone(&directory)),
+            },
             unframed_deadline: config.unframed_deadline,
             armed: None,
             sends: Map::default(),

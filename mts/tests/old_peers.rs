@@ -10,8 +10,8 @@ use std::time::{Duration, Instant, SystemTime};
 use bytes::Bytes;
 use fipa_acl::{AgentId, Dialect, Letter, Message, Payload, Performative, Representation};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
-use fipa_mts::letter_for;
-use fipa_sds::{Directory, StaticDirectory};
+use fipa_mts::{Gate, letter_for};
+use fipa_sds::{Directory, MemoryDirectory, Mts, Registration, StaticDirectory};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
     Outcome, Parcel, Ticket, Verdict, WayError, WayFault,
@@ -186,6 +186,55 @@ fn nobody_is_told_where_somebody_elses_letter_says_it_is() {
     let deadline = Duration::from_secs(5);
     core.handle_unframed(now(), deadline, recorded(LETTER), Kind::Tcp, elsewhere);
     assert!(core.poll_action().is_none(), "it came from {elsewhere}");
+}
+
+/// Lets nothing through to the agents whose names begin so.
+struct Refusing(&'static str);
+
+impl Gate for Refusing {
+    fn admits(&self, _: Instant, receiver: &str, _: &Letter) -> Result<(), String> {
+        match receiver.starts_with(self.0) {
+            true => Err("a rule denies it".to_owned()),
+            false => Ok(()),
+        }
+    }
+}
+
+#[test]
+fn who_is_refused_is_told_in_its_own_words_and_not_without_end() {
+    // The receiver of the recorded letter is on this host.
+    let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(9)));
+    let at = "shm://9#0000000000000009".parse().unwrap();
+    let echo = Registration::new("echo", Incarnation::from_u64(5), vec![at]);
+    directory.register(echo).unwrap();
+    let config = CoreConfig {
+        forwards: true,
+        ..CoreConfig::new(
+            "gateway",
+            Incarnation::from_u64(7),
+            vec![Kind::Shm, Kind::Tcp],
+        )
+    };
+    let mut core = Core::new(config, Arc::new(directory)).gated(Arc::new(Refusing("echo")));
+    let (then, deadline) = (now(), Duration::from_secs(5));
+    for _ in 0..200 {
+        core.handle_unframed(then, deadline, recorded(LETTER), Kind::Tcp, HERE);
+    }
+    let mut told = 0;
+    while let Some((attempt, location, parcel)) = dispatched(&mut core) {
+        told += 1;
+        assert_eq!(location.to_string(), "tcp://127.0.0.1:45615;fipa-services");
+        let message = message_of(&parcel);
+        assert_eq!(*message.performative(), Performative::Failure);
+        assert_eq!(message.receivers()[0].name(), "cpp-sender");
+        assert_eq!(message.in_reply_to(), Some("rw-1"));
+        let told = nested(message.content().unwrap());
+        assert_eq!(told.receivers()[0].name(), "echo");
+        let text = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
+        assert!(text.contains("refused"), "{text}");
+        core.handle_conclusion(then, attempt, Conclusion::Handed);
+    }
+    assert_eq!(told, 20, "as many as a second has");
 }
 
 #[test]

@@ -43,6 +43,9 @@ const MAX_PEERS: usize = 1024;
 /// Most addresses of old peers that need not prove who they are.
 const MAX_OLD_PEERS: usize = 64;
 
+/// Least bytes a second that a peer may be held to: connections need some to stay alive.
+const MIN_PEER_BYTES: u64 = 64 << 10;
+
 /// Most files with protocols.
 const MAX_PROTOCOLS: usize = 128;
 
@@ -125,6 +128,20 @@ impl Findings {
         if security.old_peers.len() > MAX_OLD_PEERS {
             let path = ["security", "old_peers"];
             self.too_many(&path, security.old_peers.len(), MAX_OLD_PEERS);
+        }
+        if security.peer_connections == 0 {
+            self.add(
+                &["security", "peer_connections"],
+                "cannot be 0",
+                "nobody could come in: use 1 or more",
+            );
+        }
+        if (1..MIN_PEER_BYTES).contains(&security.peer_bytes) {
+            self.add(
+                &["security", "peer_bytes"],
+                format_args!("cannot be {} bytes", security.peer_bytes),
+                "use at least 64KiB a second, or 0 for any number",
+            );
         }
         if has_keys && security.insecure {
             self.add(

@@ -179,6 +179,27 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::list(&config.security.old_peers),
     },
     Key {
+        path: &["security", "peer_connections"],
+        shape: Shape::Plain,
+        expected: "a number of connections such as 64",
+        write: |config, value| number(value).map(|most| config.security.peer_connections = most),
+        read: |config| Value::Number(config.security.peer_connections),
+    },
+    Key {
+        path: &["security", "peer_letters"],
+        shape: Shape::Plain,
+        expected: "a number of letters a second such as 20000, or 0 for any number",
+        write: |config, value| number(value).map(|most| config.security.peer_letters = most),
+        read: |config| Value::Number(config.security.peer_letters),
+    },
+    Key {
+        path: &["security", "peer_bytes"],
+        shape: Shape::Text,
+        expected: r#"a size for each second such as "256MiB", or 0 for any"#,
+        write: |config, value| size(value).map(|most| config.security.peer_bytes = most),
+        read: |config| size_text(config.security.peer_bytes),
+    },
+    Key {
         path: &["access", "rate"],
         shape: Shape::Plain,
         expected: "a number of letters a second such as 100, or 0 for any number",

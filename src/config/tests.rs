@@ -100,6 +100,9 @@ fn every_key_is_read() {
         keys = "/etc/fipa/keys"
         loopback = true
         old_peers = ["10.0.0.9", "::1"]
+        peer_connections = 8
+        peer_letters = 0
+        peer_bytes = "1MiB"
         [access]
         rate = 100
         allow = { "rover_.*" = ["arm", "crex performative=request"] }
@@ -144,6 +147,9 @@ fn every_key_is_read() {
     assert!(config.security.loopback && !config.security.insecure);
     let old: [std::net::IpAddr; 2] = ["10.0.0.9", "::1"].map(|text| text.parse().unwrap());
     assert_eq!(config.security.old_peers, old);
+    let security = &config.security;
+    assert_eq!((security.peer_connections, security.peer_letters), (8, 0));
+    assert_eq!(security.peer_bytes, 1 << 20);
     assert_eq!(config.monitor.check, Check::Enforce);
     assert!(config.monitor.answer);
     assert_eq!(config.monitor.protocols, ["lift.scxml"]);
@@ -300,6 +306,9 @@ keys = ""                            # default
 insecure = false                     # default
 loopback = false                     # default
 old_peers = []                       # default
+peer_connections = 64                # default
+peer_letters = 20000                 # default
+peer_bytes = "256MiB"                # default
 
 [access]
 rate = 0                             # default
@@ -450,6 +459,11 @@ fn a_gateway_is_open_to_the_network_with_keys_or_by_its_owners_word() {
     );
     assert_eq!(mistakes(&["transport.tcp.listen=[::1]:7788"]), "");
     // What does not go together.
+    for nobody in ["security.peer_connections=0", "security.peer_bytes=1KiB"] {
+        let key = nobody.split('=').next().unwrap();
+        assert!(mistakes(&[nobody]).contains(key), "{nobody}");
+    }
+    assert_eq!(mistakes(&["security.peer_bytes=0"]), "");
     let keys = "security.keys=/etc/fipa/keys";
     assert!(mistakes(&[keys, "security.insecure=true"]).contains("`security.insecure`"));
     assert!(mistakes(&[keys, "mts.transports=shm,udp,tcp"]).contains("not encrypted"));

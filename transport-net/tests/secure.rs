@@ -8,8 +8,8 @@
 mod common;
 
 use std::io::{Read as _, Write as _};
-use std::net::{IpAddr, Ipv4Addr, TcpStream};
-use std::time::{Duration, SystemTime};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpStream};
+use std::time::{Duration, Instant, SystemTime};
 
 use common::certificates::Host;
 use common::{NAME, Party, accepted, config, letter_parcel, parcel, until};
@@ -18,19 +18,24 @@ use fipa_acl::{
 };
 use fipa_transport::{Answer, Conclusion, FailureReason, Transport, WayFault};
 use fipa_transport_net::secure::{Rules, Security};
-use fipa_transport_net::{Counters, TcpTransport};
+use fipa_transport_net::{Counters, Limits, TcpTransport};
 
 /// A transport over which peers prove who they are.
 trait Proving: Transport + Sized {
-    fn party(security: Security) -> Party<Self>;
+    fn party(security: Security) -> Party<Self> {
+        Self::limited(security, |_| {})
+    }
+
+    fn limited(security: Security, limit: fn(&mut Limits)) -> Party<Self>;
 
     fn counters(&self) -> Counters;
 }
 
 impl Proving for TcpTransport {
-    fn party(security: Security) -> Party {
+    fn limited(security: Security, limit: fn(&mut Limits)) -> Party {
         let mut config = config(&["127.0.0.1:0"]);
         config.security = Some(security);
+        limit(&mut config.limits);
         Party::with(config)
     }
 
@@ -41,8 +46,9 @@ impl Proving for TcpTransport {
 
 #[cfg(feature = "quic")]
 impl Proving for fipa_transport_net::QuicTransport {
-    fn party(security: Security) -> Party<Self> {
-        let config = common::quic_config(&["127.0.0.1:0"], security);
+    fn limited(security: Security, limit: fn(&mut Limits)) -> Party<Self> {
+        let mut config = common::quic_config(&["127.0.0.1:0"], security);
+        limit(&mut config.limits);
         Party::over(common::Recorder::default(), |runtime| {
             Self::new(config, runtime)
         })
@@ -75,6 +81,8 @@ over_both! {
     a_peer_speaks_for_its_own_agents_only,
     withdrawn_trust_ends_the_connection,
     a_new_key_takes_over_while_letters_pass,
+    who_sends_more_than_it_may_is_read_later_and_loses_nothing,
+    one_address_cannot_take_all_connections,
 }
 
 fn party(security: Security) -> Party {
@@ -311,4 +319,84 @@ fn an_old_peer_may_be_an_exception_and_is_nothing_more() {
         (to.sink.record.lock().unframed.len() == 1).then_some(())
     });
     assert_refused(&Party::new(), &to);
+}
+
+fn who_sends_more_than_it_may_is_read_later_and_loses_nothing<T: Proving>() {
+    const RATE: u64 = 4 << 20;
+    let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
+    let there: Party<T> = T::limited(crex.security(&[&rover]), |limits| limits.peer_bytes = RATE);
+    let here: Party<T> = T::party(rover.security(&[&crex]));
+    let begun = Instant::now();
+    let content = "x".repeat(256 << 10);
+    for attempt in 1..=48 {
+        let parcel = parcel(attempt, content.clone());
+        here.send(attempt, there.location(), parcel).unwrap();
+    }
+    for attempt in 1..=48 {
+        assert_eq!(here.conclusion(attempt), accepted(), "{attempt}");
+    }
+    assert!(there.transport.counters().held_back > 0);
+    // Twelve megabytes: four of them at once, and a second's pause at most for what comes together.
+    let took = begun.elapsed();
+    assert!(took > Duration::from_millis(500), "{took:?}");
+    assert_eq!(here.transport.counters().held_back, 0);
+}
+
+fn one_address_cannot_take_all_connections<T: Proving>() {
+    let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
+    let there: Party<T> = T::limited(crex.security(&[&rover]), |limits| {
+        limits.max_per_address = 2
+    });
+    let all: Vec<Party<T>> = (0..3).map(|_| T::party(rover.security(&[&crex]))).collect();
+    let [first, second, third] = &all[..] else {
+        unreachable!("three were made");
+    };
+    for party in [first, second] {
+        party
+            .send(1, there.location(), parcel(1, "one of few"))
+            .unwrap();
+        assert_eq!(party.conclusion(1), accepted());
+    }
+    third
+        .send(1, there.location(), parcel(1, "one too many"))
+        .unwrap();
+    let Conclusion::NotSent(error) = third.conclusion(1) else {
+        panic!("it was sent: {:?}", third.conclusion(1));
+    };
+    assert!(error.to_string().contains("no more connections"), "{error}");
+    first
+        .send(2, there.location(), parcel(2, "as before"))
+        .unwrap();
+    assert_eq!(first.conclusion(2), accepted());
+}
+
+/// A connection from this address of this host.
+fn connect_from(ip: [u8; 4], to: &Party) -> TcpStream {
+    let socket = socket2::Socket::new(
+        socket2::Domain::IPV4,
+        socket2::Type::STREAM,
+        Some(socket2::Protocol::TCP),
+    )
+    .unwrap();
+    socket.bind(&SocketAddr::from((ip, 0)).into()).unwrap();
+    let there: SocketAddr = to.location().address().parse().unwrap();
+    socket.connect(&there.into()).unwrap();
+    socket.into()
+}
+
+#[test]
+fn who_knocks_again_and_again_pushes_out_itself_and_nobody_else() {
+    let crex = Host::new(NAME, &[]);
+    let there = TcpTransport::limited(crex.security(&[]), |limits| limits.max_strangers = 8);
+    let mut quiet = connect_from([127, 0, 0, 2], &there);
+    let knocking: Vec<_> = (0..20)
+        .map(|_| connect_from([127, 0, 0, 3], &there))
+        .collect();
+    until("all that are too many have been pushed out", || {
+        (there.transport.counters().refused_crowd >= 16).then_some(())
+    });
+    quiet.set_nonblocking(true).unwrap();
+    let kept = quiet.read(&mut [0]).unwrap_err();
+    assert_eq!(kept.kind(), std::io::ErrorKind::WouldBlock);
+    drop(knocking);
 }

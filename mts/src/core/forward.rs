@@ -7,8 +7,8 @@ use std::time::{Duration, SystemTime};
 use fipa_acl::{Dialect, Letter, Representation};
 use fipa_sds::{Entry, Mts, Reach, Resolution, Role, Source};
 use fipa_transport::{
-    Answer, FailureReason, Hop, Incarnation, Kind, Location, Outcome, Parcel, Signature, Stream,
-    Ticket, Verdict,
+    Allowance, Answer, FailureReason, Hop, Incarnation, Kind, Location, Outcome, Parcel, Signature,
+    Stream, Ticket, Verdict,
 };
 
 use super::desk::{Action, Author, Origin, Undelivered, life_of};
@@ -19,6 +19,9 @@ use crate::stamp;
 
 /// When the sender of a letter is told that it is in custody, if its outcome takes longer.
 const CUSTODY_AFTER: Duration = Duration::from_millis(200);
+/// Letters of old peers a second that they are told were refused. What they may send is not limited
+/// by how fast answers go out, and nobody is to be made to write to them without end.
+const REFUSALS_TOLD: f64 = 20.0;
 /// How long a failure message to an old peer's agent may take.
 const FAILURE_DEADLINE: Duration = Duration::from_secs(5);
 
@@ -38,9 +41,6 @@ impl Core {
             Ok(admitted) => admitted,
             Err(refusal) => return Verdict::Now(refusal),
         };
-        if from.remote {
-            self.hear(parcel.stream.sender, &stamped, &from);
-        }
         let stream = Stream {
             receiver: life_of(&entry),
             ..parcel.stream
@@ -49,26 +49,35 @@ impl Core {
         let (bound, ending) = (self.desk.config.lane, self.ending);
         let bytes = self.desk.held.saturating_add(stamped.len());
         let too_many_bytes = self.desk.held > 0 && bytes > self.desk.config.custody_bytes;
-        let new_lane = || Lane::new(now.instant, stream, Arc::clone(&entry.name));
-        let lane = self.lanes.entry(stream).or_insert_with(new_lane);
         let taken = match unanswered {
             Some(_) => Verdict::Later,
             None => Verdict::Now(Answer::Custody),
         };
-        let origin = Origin::Forwarded {
+        let mut origin = Origin::Forwarded {
             back: from.location.clone(),
             stream: parcel.stream,
             unanswered,
         };
-        let Some(origin) = lane.adopt(parcel.sequence, origin, &mut self.desk) else {
-            return taken;
-        };
+        if let Some(lane) = self.lanes.get_mut(&stream) {
+            origin = match lane.adopt(parcel.sequence, origin, &mut self.desk) {
+                Some(origin) => origin,
+                None => return taken,
+            };
+        }
         if ending {
             return Verdict::Now(Answer::Busy);
         }
-        if too_many_bytes || lane.len() >= bound {
+        if too_many_bytes || self.lanes.get(&stream).map_or(0, Lane::len) >= bound {
+            let new_lane = || Lane::new(now.instant, stream, Arc::clone(&entry.name));
+            let lane = self.lanes.entry(stream).or_insert_with(new_lane);
             lane.wait_for_credit(from.location);
             return Verdict::Now(Answer::Busy);
+        }
+        if let Err(why) = self.admits(now, &entry.name, &stamped) {
+            return Verdict::Now(Answer::failed(FailureReason::Refused, why));
+        }
+        if from.remote {
+            self.hear(parcel.stream.sender, &stamped, &from);
         }
         self.desk
             .notice(stream, parcel.sequence, &entry.name, || News::Passed {
@@ -85,6 +94,14 @@ impl Core {
         delivery.custody_due = unanswered.map(|_| now.instant + CUSTODY_AFTER);
         self.put(now, stream, Arc::clone(&entry.name), delivery);
         taken
+    }
+
+    /// What the gate says, if there is one.
+    fn admits(&self, now: Now, receiver: &str, letter: &Letter) -> Result<(), String> {
+        match &self.gate {
+            Some(gate) => gate.admits(now.instant, receiver, letter),
+            None => Ok(()),
+        }
     }
 
     /// Whether this service passes the letter on: to whom, and the letter with its stamp.
@@ -204,9 +221,18 @@ impl Core {
             let nobody = here.clone().next().is_none() && missing.is_empty();
             let receiver: Arc<str> = receiver.as_str().into();
             for name in missing.into_iter().chain(nobody.then_some(receiver)) {
-                self.unframed_to_nobody(&name, &letter, via, from);
+                tracing::info!(receiver = %name, %from, "an unframed letter names nobody of this host");
+                let why = (FailureReason::NoSuchAgent, String::new());
+                self.unframed_failed(&name, &letter, (via, from), why);
             }
             for entry in here {
+                if let Err(why) = self.admits(now, &entry.name, &letter) {
+                    if self.tells_of_refusal(now) {
+                        let why = (FailureReason::Refused, why);
+                        self.unframed_failed(&entry.name, &letter, (via, from), why);
+                    }
+                    continue;
+                }
                 let stream = Stream {
                     sender: stream_sender,
                     receiver: entry.incarnation,
@@ -255,15 +281,21 @@ impl Core {
         self.tell_failures(now);
     }
 
-    /// An old peer's letter is for somebody who is not on this host.
-    fn unframed_to_nobody(
+    /// Whether an old peer is told of one more letter that was refused.
+    fn tells_of_refusal(&mut self, now: Now) -> bool {
+        let full = || Allowance::new(REFUSALS_TOLD, now.instant);
+        let refusals = self.refusals.get_or_insert_with(full);
+        refusals.take(1.0, REFUSALS_TOLD, now.instant)
+    }
+
+    /// An old peer's letter does not get to this receiver.
+    fn unframed_failed(
         &mut self,
         receiver: &Arc<str>,
         letter: &Letter,
-        via: Kind,
-        from: IpAddr,
+        (via, from): (Kind, IpAddr),
+        (reason, detail): (FailureReason, String),
     ) {
-        tracing::info!(%receiver, %from, "an unframed letter names nobody of this host");
         let own = self.desk.config.incarnation;
         let stream = Stream {
             sender: own,
@@ -278,15 +310,15 @@ impl Core {
             });
         self.desk
             .notice(stream, sequence, receiver, || News::Settled {
-                outcome: failed(FailureReason::NoSuchAgent),
+                outcome: failed(reason),
                 sender: true,
             });
         self.desk.undelivered.push_back(Undelivered {
             sender: Author::OldPeer { from },
             receiver: Arc::clone(receiver),
             letter: letter.clone(),
-            reason: FailureReason::NoSuchAgent,
-            detail: String::new(),
+            reason,
+            detail,
         });
     }
 

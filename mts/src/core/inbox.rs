@@ -9,6 +9,7 @@ use fipa_acl::Letter;
 use fipa_transport::{Answer, FailureReason, Incarnation, Kind, Location, Parcel, Stream};
 
 use super::MAX_DEADLINE;
+use crate::Gate;
 
 /// A letter taken from an agent's queue.
 #[derive(Debug, Clone)]
@@ -72,14 +73,14 @@ impl Inbox {
         }
     }
 
-    /// Takes a letter into the queue, or says why not.
+    /// Takes a letter into the queue, or says why not; that is asked of the gate, too.
     pub(crate) fn accept(
         &mut self,
         now: Instant,
         parcel: &Parcel,
         letter: Letter,
-        via: Kind,
-        back: &Location,
+        (via, back): (Kind, &Location),
+        gate: Option<&dyn Gate>,
     ) -> Answer {
         let (stream, sequence) = (parcel.stream, parcel.sequence);
         if let Some(taken) = self.senders.get_mut(&stream.sender) {
@@ -96,6 +97,11 @@ impl Inbox {
         if self.queue.len() - self.failures >= self.bound {
             self.wait(stream, back);
             return Answer::Busy;
+        }
+        if let Some(gate) = gate
+            && let Err(why) = gate.admits(now, &self.name, &letter)
+        {
+            return Answer::failed(FailureReason::Refused, why);
         }
         if stream.sender.is_known()
             && let Err(refusal) = self.remember(now, stream.sender, sequence)
@@ -257,8 +263,8 @@ mod tests {
             Instant::now(),
             &parcel,
             Letter::default(),
-            Kind::Shm,
-            &back(),
+            (Kind::Shm, &back()),
+            None,
         )
     }
 

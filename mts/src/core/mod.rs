@@ -36,8 +36,8 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::Letter;
 use fipa_sds::{Directory, Entry, Pattern, Resolution};
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind, Location,
-    Outcome, Parcel, Report, Stream, Verdict, WayFault,
+    Allowance, Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind,
+    Location, Outcome, Parcel, Report, Stream, Verdict, WayFault,
 };
 
 pub use config::{CoreConfig, MAX_DEADLINE};
@@ -49,7 +49,7 @@ pub use inbox::Received;
 use lane::{Delivery, Lane, Moved};
 pub use notice::{News, Notice};
 
-use crate::Map;
+use crate::{Gate, Map};
 use peers::Peers;
 pub use peers::{Peer, PeerState};
 pub use routes::{Route, Standing, Way, WayState};
@@ -105,6 +105,9 @@ pub struct Core {
     notes: BinaryHeap<Reverse<LateNote>>,
     peers: Peers,
     departed: Departed,
+    gate: Option<Arc<dyn Gate>>,
+    /// How many old peers' letters that were refused may still be told of.
+    refusals: Option<Allowance>,
     /// No more letters of others are taken.
     ending: bool,
     next_send: u64,
@@ -148,10 +151,21 @@ impl Core {
             notes: BinaryHeap::new(),
             peers: Peers::default(),
             departed: Departed::default(),
+            gate: None,
+            refusals: None,
             ending: false,
             next_send: 1,
             next_sequence: 1,
             next_forget: None,
+        }
+    }
+
+    /// The same core, that asks this gate which letters it takes.
+    #[must_use]
+    pub fn gated(self, gate: Arc<dyn Gate>) -> Self {
+        Self {
+            gate: Some(gate),
+            ..self
         }
     }
 
@@ -422,9 +436,11 @@ impl Core {
         match std::mem::replace(&mut parcel.body, Body::Credit) {
             Body::Letter(letter) => {
                 let watched = self.desk.watched;
-                if let Some(inbox) = self.inbox_for(&parcel) {
+                if let Some(inbox) = self.agents.get_mut(&parcel.stream.receiver) {
                     let seen = watched.then(|| letter.clone());
-                    let answer = inbox.accept(now.instant, &parcel, letter, via, &from.location);
+                    let gate = self.gate.as_deref();
+                    let came = (via, &from.location);
+                    let answer = inbox.accept(now.instant, &parcel, letter, came, gate);
                     if answer == Answer::Accepted {
                         if let Some(letter) = seen {
                             let via = Some(via);
@@ -459,10 +475,6 @@ impl Core {
                 Verdict::Now(Answer::Accepted)
             }
         }
-    }
-
-    fn inbox_for(&mut self, parcel: &Parcel) -> Option<&mut Inbox> {
-        self.agents.get_mut(&parcel.stream.receiver)
     }
 
     fn handle_report(&mut self, now: Now, parcel: &Parcel, report: Report) {

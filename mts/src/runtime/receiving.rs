@@ -4,13 +4,13 @@ use std::net::IpAddr;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Weak};
 
-use fipa_acl::{EnvelopeView, Letter};
+use fipa_acl::Letter;
 use fipa_transport::{
-    Answer, Arrival, Arriving, AttemptId, Body, Conclusion, FailureReason, Introduction, Kind,
+    Answer, Arrival, Arriving, AttemptId, Conclusion, FailureReason, Introduction, Kind,
     LoanedContent, Location, Sink, Verdict,
 };
 
-use super::{Gate, Shared};
+use super::Shared;
 use crate::core::Now;
 
 /// What a transport sees of the service.
@@ -25,12 +25,6 @@ impl Sink for Receiving {
         let Some(shared) = self.shared.upgrade() else {
             return closing();
         };
-        if let Some(gate) = &shared.config.gate
-            && let Body::Letter(letter) = &arrival.parcel.body
-            && let Err(why) = gate.admits(&arrival.parcel.receiver, letter)
-        {
-            return Verdict::Now(Answer::failed(FailureReason::Refused, why));
-        }
         let mut state = shared.state.lock();
         if shared.closed.load(Ordering::Acquire) {
             return closing();
@@ -47,11 +41,6 @@ impl Sink for Receiving {
         let Some(shared) = self.shared.upgrade() else {
             return;
         };
-        if let Some(gate) = &shared.config.gate
-            && !admits_all(&**gate, &letter)
-        {
-            return;
-        }
         let mut state = shared.state.lock();
         let deadline = state.unframed_deadline;
         state
@@ -115,17 +104,6 @@ impl Sink for Receiving {
             shared.carry_out(state);
         }
     }
-}
-
-/// Whether an old peer's letter is taken, for all of its receivers. What is no letter is told as such
-/// by the core.
-fn admits_all(gate: &dyn Gate, letter: &Letter) -> bool {
-    let envelope = letter.envelope();
-    let Ok(view) = EnvelopeView::parse(&envelope) else {
-        return true;
-    };
-    let mut receivers = view.receivers();
-    receivers.all(|name| gate.admits(&name.as_str(), letter).is_ok())
 }
 
 fn closing() -> Verdict {

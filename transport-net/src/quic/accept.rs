@@ -31,7 +31,7 @@ pub(super) async fn accept(
             }
             continue;
         }
-        let Some(place) = endpoint.receive_stranger() else {
+        let Some(place) = endpoint.receive_stranger(incoming.remote_address().ip()) else {
             return;
         };
         let number = place.number;

@@ -4,14 +4,14 @@ use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytes::BytesMut;
 use fipa_transport::ListenError;
 use socket2::{Domain, Protocol, SockRef, Socket, Type};
 use tokio::io::AsyncReadExt;
 use tokio::net::{TcpListener, TcpStream};
-use tokio::time::{sleep, timeout};
+use tokio::time::{sleep, sleep_until, timeout};
 
 use super::config::Limits;
 use super::endpoint::{Endpoint, Stranger};
@@ -78,7 +78,7 @@ pub(crate) async fn accept(endpoint: Arc<Endpoint>, listener: TcpListener) {
     loop {
         match listener.accept().await {
             Ok((stream, from)) => {
-                let Some(place) = endpoint.receive_stranger() else {
+                let Some(place) = endpoint.receive_stranger(from.ip()) else {
                     return;
                 };
                 let number = place.number;
@@ -132,6 +132,11 @@ async fn receive(endpoint: Arc<Endpoint>, place: Stranger, stream: TcpStream, fr
             // A bit-efficient or an XML envelope.
             Some(0xfe | 0xfd | b'<') => match unframed::read(&endpoint, &mut read, begun).await {
                 Ok(letter) => {
+                    if let Some(ration) = endpoint.ration(from.ip())
+                        && let Some(until) = ration.spend(1, letter.len(), Instant::now())
+                    {
+                        sleep_until(until.into()).await;
+                    }
                     unframed::hand_on(&endpoint, letter, from.ip());
                     return;
                 }

@@ -33,6 +33,18 @@ impl TcpConfig {
         true
     }
 
+    /// Whether there are limits to what whoever is at this address may have. The processes of this
+    /// host are many at one address.
+    pub(crate) fn limits_peer_at(&self, ip: IpAddr) -> bool {
+        #[cfg(feature = "secure")]
+        if let Some(security) = &self.security
+            && security.covers(ip)
+        {
+            return true;
+        }
+        !ip.to_canonical().is_loopback()
+    }
+
     /// Whether letters may go to an old peer at this address, which cannot prove anything.
     pub(crate) fn gives_old_peers_at(&self, ip: IpAddr) -> bool {
         #[cfg(feature = "secure")]
@@ -55,6 +67,15 @@ pub struct Limits {
     /// Most accepted connections that have not introduced themselves (an old peer never does).
     /// One more pushes out the oldest. Default 64.
     pub max_strangers: usize,
+    /// Most connections that the peers at one address have opened and introduced themselves on.
+    /// Default 64. This and the next two are not for loopback addresses, unless peers there have to
+    /// prove who they are, too.
+    pub max_per_address: usize,
+    /// Letters a second that are taken from one address, as many of which may come at once; what is
+    /// more is read later. 0: any number. Default 20,000.
+    pub peer_letters: u64,
+    /// The same of bytes. Default 256 MiB.
+    pub peer_bytes: u64,
     /// Most parcels per connection and direction that are not answered yet. Default 1024.
     pub max_in_flight: usize,
     /// Most bytes per connection that wait to be handed to the kernel; a single letter is always
@@ -89,6 +110,9 @@ impl Default for Limits {
             max_letter: 64 << 20,
             max_connections: 256,
             max_strangers: 64,
+            max_per_address: 64,
+            peer_letters: 20_000,
+            peer_bytes: 256 << 20,
             max_in_flight: 1024,
             max_queued_bytes: 64 << 20,
             max_arriving: 32 << 20,

@@ -56,6 +56,8 @@ counters! {
     refused_unproved,
     /// Connections refused or pushed out because there were too many.
     refused_crowd,
+    /// How often a peer was read from later, because it had sent more than it may.
+    held_back,
     /// Failures of the operating system to hand out a new connection.
     accept_failures,
 }

@@ -27,6 +27,7 @@ use super::counters::{Tally, count};
 use super::courier::{self, Couriers};
 use super::link::{Link, MAX_LINKS, of_ticket};
 use super::place::Rooms;
+use super::ration::{Ration, Rations, whose};
 use crate::address;
 use crate::end::End;
 use crate::hello::Hello;
@@ -41,6 +42,8 @@ pub(crate) struct Endpoint {
     pub(crate) couriers: Couriers,
     /// What is taken for content that is arriving.
     pub(crate) rooms: Rooms,
+    /// What peers may still send.
+    rations: Rations,
     tally: Tally,
     registry: Mutex<Registry>,
 }
@@ -59,8 +62,10 @@ struct Registry {
     known: HashMap<Incarnation, Vec<Arc<Link>>>,
     /// The peers' last connections for each of the locations they dialled.
     inbound: HashMap<Inbound, (u64, Arc<Link>)>,
-    /// Accepted connections that have not introduced themselves, oldest first.
-    strangers: BTreeMap<u64, Option<AbortHandle>>,
+    /// Whose the accepted ones are.
+    homes: HashMap<u32, IpAddr>,
+    /// Accepted connections that have not introduced themselves, oldest first, and whose they are.
+    strangers: BTreeMap<u64, (IpAddr, Option<AbortHandle>)>,
     last_stranger: u64,
     last_number: u32,
     last_serial: u64,
@@ -111,6 +116,7 @@ impl Endpoint {
             runtime,
             couriers: Couriers::default(),
             rooms: Rooms::default(),
+            rations: Rations::default(),
             tally: Tally::default(),
             registry: Mutex::default(),
         })
@@ -118,6 +124,12 @@ impl Endpoint {
 
     pub(crate) fn limits(&self) -> &Limits {
         &self.config.limits
+    }
+
+    /// What whoever is at this address may still send, if that is limited.
+    pub(crate) fn ration(&self, ip: IpAddr) -> Option<Arc<Ration>> {
+        let limited = self.config.limits_peer_at(ip);
+        limited.then(|| self.rations.of(ip, self.limits(), Instant::now()))?
     }
 
     pub(crate) fn tally(&self) -> &Tally {
@@ -188,7 +200,7 @@ impl Endpoint {
             tasks.extend(
                 std::mem::take(&mut registry.strangers)
                     .into_values()
-                    .flatten(),
+                    .filter_map(|(_, task)| task),
             );
             let links: Vec<_> = registry.links.values().cloned().collect();
             (links, tasks)
@@ -365,6 +377,13 @@ impl Endpoint {
                     count(&self.tally.refused_crowd);
                     return Err(End::Crowd);
                 }
+                let home = whose(from.ip());
+                let at_home = registry.homes.values().filter(|it| **it == home).count();
+                if self.config.limits_peer_at(home) && at_home >= self.limits().max_per_address {
+                    count(&self.tally.refused_crowd);
+                    return Err(End::Crowd);
+                }
+                registry.homes.insert(link.number, home);
                 registry.links.insert(link.number, link.clone());
             }
             if peer.dialled.is_empty() {
@@ -420,6 +439,7 @@ impl Endpoint {
             .is_some_and(|there| Arc::ptr_eq(there, link))
         {
             registry.links.remove(&link.number);
+            registry.homes.remove(&link.number);
         }
         let is_other = |other: &Arc<Link>| !Arc::ptr_eq(other, link);
         registry.dialled.retain(|_, other| is_other(other));
@@ -437,25 +457,32 @@ impl Endpoint {
     }
 
     /// Gives a place to an accepted connection that has not introduced itself, unless the endpoint
-    /// has been closed; one too many pushes out the oldest.
-    pub(crate) fn receive_stranger(self: &Arc<Self>) -> Option<Stranger> {
+    /// has been closed; one too many pushes out the oldest, of its own address when that has half of
+    /// all places.
+    pub(crate) fn receive_stranger(self: &Arc<Self>, from: IpAddr) -> Option<Stranger> {
+        let home = whose(from);
         let (number, pushed_out) = {
             let mut registry = self.registry.lock();
             if registry.phase != Phase::Open {
                 return None;
             }
             registry.last_stranger += 1;
-            let crowded = registry.strangers.len() >= self.limits().max_strangers.max(1);
-            let oldest = registry
-                .strangers
-                .iter()
-                .find_map(|(number, task)| Some((*number, task.clone()?)))
-                .filter(|_| crowded);
+            let most = self.limits().max_strangers.max(1);
+            let crowded = registry.strangers.len() >= most;
+            let of_home = registry.strangers.values().filter(|(it, _)| *it == home);
+            let greedy = self.config.limits_peer_at(home) && of_home.count() >= most.div_ceil(2);
+            let mut strangers = registry.strangers.iter();
+            let oldest = strangers
+                .find_map(|(number, (of, task))| {
+                    let task = task.clone().filter(|_| !greedy || *of == home)?;
+                    Some((*number, task))
+                })
+                .filter(|_| crowded || greedy);
             if let Some((number, _)) = &oldest {
                 registry.strangers.remove(number);
             }
             let number = registry.last_stranger;
-            registry.strangers.insert(number, None);
+            registry.strangers.insert(number, (home, None));
             (number, oldest)
         };
         if let Some((_, task)) = pushed_out {
@@ -477,7 +504,7 @@ impl Endpoint {
     /// The stranger with this number is served by this task.
     pub(crate) fn stranger_started(&self, number: u64, task: AbortHandle) {
         // Otherwise it is no stranger any more, or gone.
-        if let Some(place) = self.registry.lock().strangers.get_mut(&number) {
+        if let Some((_, place)) = self.registry.lock().strangers.get_mut(&number) {
             *place = Some(task);
         }
     }

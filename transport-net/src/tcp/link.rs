@@ -23,6 +23,7 @@ use super::endpoint::Endpoint;
 use super::frame::{FrameReader, Placed};
 use super::place::Place;
 use super::proof::Proof;
+use super::ration::Ration;
 use super::wire::{Beside, Reading, Writing};
 use crate::end::End;
 use crate::seldom::warn_seldom;
@@ -213,6 +214,10 @@ pub(crate) struct Running {
     dialled: Option<Location>,
     /// Who is there, once the peer has said hello.
     peer: Option<Introduction>,
+    /// What the peer may still send, if that is limited.
+    ration: Option<Arc<Ration>>,
+    /// Until when nothing is read, because it has sent more.
+    paused: Option<Instant>,
     end: End,
 }
 
@@ -232,6 +237,8 @@ impl Running {
             sink,
             dialled,
             peer: None,
+            ration: None,
+            paused: None,
             // What is said when the runtime drops the task.
             end: End::Closed,
         }
@@ -261,6 +268,7 @@ impl Running {
         let mut beside = read.take_beside();
         let writer = Arc::new(writer);
         self.link.proved(&proof);
+        self.ration = self.endpoint.ration(from.ip());
         self.link.state.lock().writer = Some(writer.clone());
         let mut greeted = Some(greeted);
         let exchange = self.exchange(
@@ -313,6 +321,9 @@ impl Running {
                 }
                 (flushed, state.connection.poll_timeout())
             };
+            self.paused = self.paused.filter(|until| *until > Instant::now());
+            let reads = self.paused.is_none();
+            let due = [due, self.paused].into_iter().flatten().min();
             // Most of the time what is due moves away: then the timer is left to go off early.
             let armed = timer.deadline().into_std();
             if let Some(due) = due
@@ -322,7 +333,7 @@ impl Running {
             }
             let mut space = reader.space();
             tokio::select! {
-                arrived = read.read(&mut space) => {
+                arrived = read.read(&mut space), if reads => {
                     let arrived = match arrived {
                         Ok(0) => return End::Hangup,
                         Ok(bytes) => bytes,
@@ -334,7 +345,7 @@ impl Running {
                     }
                 }
                 // What the peer sends after its hello may overtake it.
-                arrived = beside.read(), if self.peer.is_some() => {
+                arrived = beside.read(), if reads && self.peer.is_some() => {
                     let arrived = match arrived {
                         Ok(bytes) => bytes,
                         Err(error) => return End::Nonsense(error.to_string()),
@@ -375,6 +386,7 @@ impl Running {
         let now = Instant::now();
         let link = self.link.clone();
         reader.put(arrived);
+        let mut letters = 0;
         loop {
             let frame = reader.next(|arriving| self.place_for(arriving));
             let frame = frame.map_err(|e| End::Nonsense(e.to_string()))?;
@@ -389,6 +401,7 @@ impl Running {
                 events = [state.connection.poll_event(), state.connection.poll_event()];
             }
             for event in events.into_iter().flatten() {
+                letters += u64::from(matches!(event, Event::Arrived { .. }));
                 self.handle_event(event, from, greeted).await?;
             }
             loop {
@@ -405,6 +418,13 @@ impl Running {
             let add = |counter: &AtomicU64, more| counter.fetch_add(more, Ordering::Relaxed);
             add(&tally.placed, placed.contents);
             add(&tally.placed_moved_bytes, placed.moved);
+        }
+        if let Some(ration) = &self.ration {
+            let until = ration.spend(letters, arrived, now);
+            if self.paused.is_none() && until.is_some() {
+                count(&self.endpoint.tally().held_back);
+            }
+            self.paused = self.paused.max(until);
         }
         let mut state = link.state.lock();
         let partial = reader.is_partial() || other_partial;

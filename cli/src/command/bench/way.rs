@@ -164,6 +164,9 @@ impl Way {
                     keys = stage.keys(&hosts)?;
                     settings.extend(keys.first().cloned());
                     settings.push("security.loopback=true".to_owned());
+                    // As between processes of one host, which are not held back either.
+                    settings.push("security.peer_letters=0".to_owned());
+                    settings.push("security.peer_bytes=0".to_owned());
                 }
                 for (number, domain) in hosts.into_iter().enumerate() {
                     let mut settings = settings.clone();

@@ -1,0 +1,131 @@
+//! Who says which letters are taken: asked once for each, about the agent that gets it.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use fipa_acl::{AgentId, Letter, Message, Performative};
+use fipa_mts::core::{Action, Core, CoreConfig, Now};
+use fipa_mts::{Gate, letter_for};
+use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+use fipa_transport::{
+    Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Stream, Ticket,
+    Verdict,
+};
+use parking_lot::Mutex;
+
+const ARM: Incarnation = Incarnation::from_u64(0xa);
+const BRAKE: Incarnation = Incarnation::from_u64(0xb);
+
+/// Nobody may write to the brake. Notes whom it was asked about.
+#[derive(Default)]
+struct Guarded(Mutex<Vec<String>>);
+
+impl Gate for Guarded {
+    fn admits(&self, _: Instant, receiver: &str, _: &Letter) -> Result<(), String> {
+        self.0.lock().push(receiver.to_owned());
+        match receiver {
+            "brake" => Err("hands off".to_owned()),
+            _ => Ok(()),
+        }
+    }
+}
+
+fn now() -> Now {
+    Now {
+        instant: Instant::now(),
+        utc: SystemTime::UNIX_EPOCH,
+    }
+}
+
+/// A letter to this life of an agent, which the parcel calls so.
+fn arrival(to: Incarnation, called: &str, sequence: u64) -> Arrival {
+    let message = Message::builder(Performative::Request)
+        .sender(AgentId::new("rover").unwrap())
+        .receiver(AgentId::new(called).unwrap())
+        .build()
+        .unwrap();
+    let parcel = Parcel {
+        receiver: called.into(),
+        stream: Stream {
+            sender: Incarnation::from_u64(1),
+            receiver: to,
+        },
+        sequence,
+        after: sequence - 1,
+        remaining: Duration::from_secs(5),
+        hops: 0,
+        body: Body::Letter(letter_for(&message, SystemTime::UNIX_EPOCH).unwrap()),
+    };
+    let location: Location = "shm://1#0000000000000001".parse().unwrap();
+    Arrival {
+        parcel,
+        from: Hop {
+            location,
+            remote: false,
+        },
+        ticket: Ticket(sequence),
+    }
+}
+
+fn refused() -> Verdict {
+    Verdict::Now(Answer::failed(FailureReason::Refused, "hands off"))
+}
+
+fn config(forwards: bool) -> CoreConfig {
+    CoreConfig {
+        forwards,
+        queue: 2,
+        ..CoreConfig::new("mts", Incarnation::from_u64(7), vec![Kind::Shm])
+    }
+}
+
+#[test]
+fn an_agents_letters_are_judged_once_and_only_when_there_is_room() {
+    let gate = Arc::new(Guarded::default());
+    let directory = MemoryDirectory::new(Mts::new("mts", Incarnation::from_u64(7)));
+    let mut core = Core::new(config(false), Arc::new(directory)).gated(gate.clone());
+    core.register("arm".into(), ARM);
+    core.register("brake".into(), BRAKE);
+    let mut arrive = |to, called, sequence| {
+        core.handle_arrival(now(), Kind::Shm, true, arrival(to, called, sequence))
+    };
+    let accepted = Verdict::Now(Answer::Accepted);
+    assert_eq!(arrive(ARM, "arm", 1), accepted);
+    assert_eq!(arrive(ARM, "arm", 1), accepted, "a copy");
+    assert_eq!(arrive(ARM, "arm", 2), accepted);
+    assert_eq!(arrive(ARM, "arm", 3), Verdict::Now(Answer::Busy));
+    assert_eq!(*gate.0.lock(), ["arm", "arm"]);
+    // Whatever the parcel calls it, this is the brake.
+    assert_eq!(arrive(BRAKE, "arm", 1), refused());
+    assert_eq!(core.waiting(BRAKE), 0);
+    assert_eq!(core.waiting(ARM), 2);
+}
+
+#[test]
+fn a_gateway_judges_by_the_agent_that_is_meant() {
+    let gate = Arc::new(Guarded::default());
+    let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(9)));
+    for (name, life) in [("arm", ARM), ("brake", BRAKE)] {
+        let at = "shm://9#0000000000000009".parse().unwrap();
+        let agent = Registration::new(name, life, vec![at]);
+        directory.register(agent).unwrap();
+    }
+    let mut core = Core::new(config(true), Arc::new(directory)).gated(gate.clone());
+    for called in ["brake", "arm"] {
+        let verdict = core.handle_arrival(now(), Kind::Shm, true, arrival(BRAKE, called, 1));
+        assert_eq!(verdict, refused(), "{called}");
+    }
+    assert!(core.poll_action().is_none(), "nothing came of it");
+    for _ in 0..2 {
+        let verdict = core.handle_arrival(now(), Kind::Shm, true, arrival(ARM, "arm", 1));
+        assert_eq!(verdict, Verdict::Now(Answer::Custody));
+    }
+    assert_eq!(
+        *gate.0.lock(),
+        ["brake", "brake", "arm"],
+        "the copy is in custody already"
+    );
+    assert!(matches!(core.poll_action(), Some(Action::Dispatch { .. })));
+}
