@@ -202,6 +202,7 @@ mod tests {
         assert!(!several.contains(Act::Other("not-my-act")));
         assert_eq!(several.shown(), "agree, refuse");
         assert_eq!(Acts::new(".*").unwrap().shown(), "any performative");
+        assert_eq!(Acts::new("my-.*").unwrap().shown(), "my-.*");
         assert!(Acts::new("(").is_err());
         assert!(Acts::new(r"(?:\w{1000}){1000}").is_err(), "too large");
     }

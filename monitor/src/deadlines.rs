@@ -81,4 +81,25 @@ mod tests {
         }
         assert!(deadlines.heap.len() < 4_000, "{}", deadlines.heap.len());
     }
+    #[test]
+    fn as_many_again_and_some_may_not_count() {
+        let mut deadlines = Deadlines::default();
+        let mut left = |more, counts| {
+            for due in 0..more {
+                deadlines.push(Deadline {
+                    due,
+                    at: 0,
+                    generation: 0,
+                    party: 0,
+                });
+            }
+            deadlines.keep_few(|_| counts);
+            deadlines.len()
+        };
+        assert_eq!(left(1_024, false), 1_024);
+        assert_eq!(left(1, false), 0);
+        assert_eq!(left(3_000, true), 3_000);
+        assert_eq!(left(4_024, false), 7_024);
+        assert_eq!(left(1, false), 0);
+    }
 }

@@ -140,8 +140,8 @@ mod tests {
 
     #[test]
     fn long_names_do_not_stay() {
-        let mut names = Names::new(RandomState::new());
-        for (len, kept) in [(200, true), (1_000, false)] {
+        for (len, kept) in [(200, true), (256, true), (257, false), (1_000, false)] {
+            let mut names = Names::new(RandomState::new());
             let name = names.acquire(&"x".repeat(len));
             names.release(name);
             let left = names.entries[name as usize].name.capacity();

@@ -290,6 +290,8 @@ mod tests {
         assert_eq!(order(&table, List::Open), ["c", "b"]);
         table.touch(c, List::Open, 5_999);
         assert_eq!(order(&table, List::Open), ["c", "b"], "within a second");
+        table.touch(c, List::Open, 6_000);
+        assert_eq!(order(&table, List::Open), ["b", "c"]);
         table.remove(b);
         assert_eq!((table.find("b"), table.find("c")), (None, Some(c)));
         assert_eq!(table.insert("d", NONE, 0, 6_000), b);
@@ -299,8 +301,8 @@ mod tests {
 
     #[test]
     fn long_ids_do_not_stay() {
-        let mut table = Table::new(RandomState::new());
-        for (len, kept) in [(200, true), (1_000, false)] {
+        for (len, kept) in [(200, true), (256, true), (257, false), (1_000, false)] {
+            let mut table = Table::new(RandomState::new());
             let at = table.insert(&"x".repeat(len), NONE, 0, 1);
             table.remove(at);
             let left = table.slots[at as usize].conversation.id.capacity();

@@ -156,7 +156,7 @@ fn mistakes_have_their_lines() {
         ),
         (
             r#"<transition performative="agree" from="c" to="a" target="2"/>"#,
-            "the first message has several senders: c, a",
+            "the first message has several senders: c, a; one role",
         ),
         (
             r#"<transition performative="inform|agree" from="a" to="b" target="1"/>"#,
@@ -174,6 +174,40 @@ fn mistakes_have_their_lines() {
             3
         };
         assert!(first.starts_with(&format!("own.scxml:{at}: ")), "{first}");
+    }
+}
+
+#[test]
+fn file_line_and_what_is_wrong_are_told() {
+    let again = GOOD
+        .replace("inform", "inform|agree")
+        .replace("\"2\"", "\"1\"");
+    let ambiguous = format!("{GOOD}\n{again}");
+    let far = format!("{GOOD}</state>\n<state id=\"far\" final=\"yes\">");
+    for (text, told) in [
+        (
+            with(&format!("{GOOD}\n{}", GOOD.replace("\"2\"", "\"done\""))),
+            "a/own.scxml:4: there is no state \"done\"",
+        ),
+        (
+            with(&far),
+            "a/own.scxml:4: no transition leads to state \"far\"; remove it, or lead to it",
+        ),
+        (
+            with(&ambiguous),
+            "a/own.scxml:4: in state \"1\", \"inform\" from \"a\" to \"b\" leads to \"1\" and also to \"2\" \
+             (line 3); keep one of them",
+        ),
+        (
+            with(&format!(
+                "{GOOD}\n<subprotocol name=\".*\" from=\"broker\"/>"
+            )),
+            "a/own.scxml:4: role \"broker\" is never bound: no message is sent to it, and it does \
+             not begin; send it one, or correct its name",
+        ),
+    ] {
+        let error = Machine::read("a/own.scxml", &text).unwrap_err();
+        assert_eq!(error.to_string(), told);
     }
 }
 

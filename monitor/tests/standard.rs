@@ -450,6 +450,74 @@ fn every_path_to_an_end() {
     }
 }
 
+/// Paths to an end, without those on which time passes, for that is everybody's.
+fn timeless_paths(table: &Table) -> Vec<Vec<Row>> {
+    let mut found = Vec::new();
+    let mut paths = vec![Vec::<Row>::new()];
+    while let Some(path) = paths.pop() {
+        let state = path.last().map_or("0", |row| row.3);
+        if state.starts_with('F') {
+            found.push(path.clone());
+        }
+        let here = table.rows.iter().filter(|row| row.0 == state);
+        for row in here.filter(|row| !matches!(row.1, '!' | '#')) {
+            if !path.contains(row) {
+                paths.push([&path[..], &[*row]].concat());
+            }
+        }
+    }
+    found
+}
+
+#[test]
+fn each_of_several_participants_goes_its_own_way() {
+    let library = Arc::new(Library::standard());
+    for table in &TABLES {
+        let paths = timeless_paths(table);
+        let mut walked = 0;
+        for (number, first) in paths.iter().enumerate() {
+            // What begins is said to all three at once; each goes on along another path.
+            let [second, third] = [1, 3].map(|other| &paths[(number + other) % paths.len()]);
+            if first[0] != second[0] || first[0] != third[0] {
+                continue;
+            }
+            walked += 1;
+            let mut walk = Walk::new(table, &library);
+            let say = |walk: &mut Walk<'_>, from: &str, to: &[&str], act: &str| {
+                let act = if act == "*" { "request" } else { act };
+                let header = Header::new(act.parse().unwrap())
+                    .sender(from.to_owned())
+                    .receivers(to.iter().map(|name| (*name).to_owned()))
+                    .protocol(table.name)
+                    .conversation_id("c");
+                match walk.monitor.check(&header, walk.now) {
+                    Verdict::Accepted(accepted) => (accepted.ended, accepted.complete),
+                    other => panic!("{}: {act} from {from} to {to:?}: {other:?}", table.name),
+                }
+            };
+            say(&mut walk, "ann", &["ben", "cid", "dan"], first[0].2);
+            let mut ends = [false; 3];
+            for place in 1..first.len().max(second.len()).max(third.len()) {
+                for (who, path) in [first, second, third].into_iter().enumerate() {
+                    let Some((_, side, act, to)) = path.get(place) else {
+                        continue;
+                    };
+                    let peer = ["ben", "cid", "dan"][who];
+                    let (from, receiver) = if *side == '>' {
+                        ("ann", peer)
+                    } else {
+                        (peer, "ann")
+                    };
+                    let (ended, complete) = say(&mut walk, from, &[receiver], act);
+                    ends[who] = to.starts_with('F');
+                    assert_eq!((ended, complete), (ends[who], ends == [true; 3]));
+                }
+            }
+        }
+        assert!(walked > 1, "{}", table.name);
+    }
+}
+
 #[test]
 fn cancelling_and_what_follows() {
     let library = Arc::new(Library::standard());

@@ -63,6 +63,8 @@ fn what_is_expected_is_listed_by_who_says_it_to_whom() {
             <transition performative="inform" from="b" to="c" target="3"/>
             <transition performative="refuse" from="b" to="a" target="3"/>
             <transition performative="propose" from="c" to="a" target="3"/>
+            <transition performative="refuse" from="b" to="a" target="3"/>
+            <transition performative="confirm" from="a|b" to="c" target="3"/>
         </state>
         <state id="3" final="yes"/></scxml>"#,
     );
@@ -70,7 +72,12 @@ fn what_is_expected_is_listed_by_who_says_it_to_whom() {
     let violation = stage.wrong(own("subscribe ben>ann"));
     assert_eq!(
         expected(&violation),
-        ["agree, refuse ben>ann", "inform ben>c", "propose c>ann"]
+        [
+            "agree, refuse ben>ann",
+            "inform ben>c",
+            "propose c>ann",
+            "confirm a|b>c"
+        ]
     );
 }
 
@@ -82,6 +89,7 @@ fn the_initiator_need_not_be_the_first_role_of_the_file() {
         </state>
         <state id="start">
             <transition performative="request" from="rover" to="arm" target="asked"/>
+            <transition performative="query-ref" from="rover" to="arm" target="asked"/>
         </state>
         <state id="done" final="yes"/></scxml>"#;
     let mut stage = stage_of(text);
