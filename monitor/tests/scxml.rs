@@ -265,6 +265,27 @@ fn what_is_missing_or_left_over() {
 }
 
 #[test]
+fn elements_of_others_are_passed_over_and_ours_have_their_place() {
+    let others = "<datamodel/><onentry><log/><state id=\"no\"/></onentry>";
+    let first = "<state id=\"1\">";
+    for text in [
+        with(GOOD).replace(first, &format!("{others}{first}")),
+        with(&format!("{others}{GOOD}{others}")),
+    ] {
+        assert_eq!(Machine::read("own", &text).unwrap().states().len(), 2);
+    }
+    let sub = "<subprotocol name=\".*\" from=\"a\"/>";
+    for (element, stray) in [("transition", GOOD), ("subprotocol", sub)] {
+        let misplaced = Problem::Misplaced {
+            element: element.into(),
+            inside: "scxml".into(),
+        };
+        let text = with(GOOD).replace(first, &format!("{stray}{first}"));
+        assert_eq!(only(&text), (2, misplaced));
+    }
+}
+
+#[test]
 fn a_near_miss_is_pointed_out() {
     let text = with(GOOD)
         .replace("id=\"2\"", "id=\"agreed\"")

@@ -63,6 +63,75 @@ fn anybody_cancels_and_fails() {
     assert_eq!(stage.right(lift("inform ann>ben")), "cancelled");
 }
 
+/// Figure 6 of the paper about fipa_acl, but that a `failure` that answers a cancel lets the conversation
+/// go on, as in FIPA00026, and does not end it.
+#[test]
+fn states_that_every_protocol_has() {
+    let after = |said: &[&'static str]| {
+        let mut stage = stage(LIFT);
+        stage.right(lift("request ann>ben"));
+        let mut last = None;
+        for words in said {
+            match stage.check(&lift(words)) {
+                Verdict::Accepted(accepted) => {
+                    let state = accepted.state.to_owned();
+                    last = Some((state, accepted.own, accepted.ended, accepted.over));
+                }
+                other => panic!("{said:?}, {words}: {other:?}"),
+            }
+        }
+        (stage, last.unwrap())
+    };
+    for (said, state, own, over) in [
+        (
+            &["not-understood ben>ann"][..],
+            "not-understood",
+            false,
+            true,
+        ),
+        (&["not-understood ann>ben"], "not-understood", false, true),
+        (&["cancel ann>ben"], "cancelling", false, false),
+        (
+            &["cancel ann>ben", "inform ben>ann"],
+            "cancelled",
+            false,
+            true,
+        ),
+        (&["cancel ann>ben", "failure ben>ann"], "2", true, false),
+        (
+            &["cancel ann>ben", "not-understood ben>ann"],
+            "not-understood",
+            false,
+            true,
+        ),
+        (
+            &["cancel ben>ann", "inform ann>ben"],
+            "cancelled",
+            false,
+            true,
+        ),
+        (&["failure host-mts>ann"], "undelivered", false, true),
+        (&["failure ben>ann"], "undelivered", false, true),
+        // What the file says comes first.
+        (&["agree ben>ann", "failure ben>ann"], "5", true, true),
+    ] {
+        let (mut stage, last) = after(said);
+        assert_eq!(last, (state.to_owned(), own, over, over), "{said:?}");
+        if ["not-understood", "cancelled"].contains(&state) {
+            assert_eq!(stage.wrong(lift("agree ben>ann")).kind, Kind::Ended);
+        }
+    }
+    // Nothing of the kind behind the end.
+    for words in [
+        "cancel ben>ann",
+        "failure ben>ann",
+        "not-understood ben>ann",
+    ] {
+        let (mut stage, _) = after(&["refuse ben>ann"]);
+        assert_eq!(stage.wrong(lift(words)).kind, Kind::Ended, "{words}");
+    }
+}
+
 #[test]
 fn roles_are_given_when_they_are_first_used() {
     let mut stage = stage(
