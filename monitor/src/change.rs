@@ -15,14 +15,15 @@ use crate::names::Names;
 pub(crate) fn expire(machine: &Machine, conversation: &mut Conversation, now: u64) {
     for party in &mut conversation.parties {
         if party.deadline != 0 && party.deadline < now {
-            expire_party(machine, party, now);
+            expire_party(machine, party);
         }
     }
 }
 
-pub(crate) fn expire_party(machine: &Machine, party: &mut Party, now: u64) {
+/// Takes the time-out of the party's state, which is due.
+pub(crate) fn expire_party(machine: &Machine, party: &mut Party) {
     let timeout = machine.state(party.state).and_then(|state| state.timeout);
-    if let Some(timeout) = timeout.filter(|_| party.deadline < now) {
+    if let Some(timeout) = timeout {
         party.before = party.state;
         party.state = timeout.target;
     }

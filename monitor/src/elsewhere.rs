@@ -5,24 +5,43 @@
 //! the state from what it is told, where that can only lead to one; an answer that does not fit that
 //! state is no violation, but tells of another one. What the agent says itself must fit.
 //!
-//! What must not live here: conversations that the agent saw begin.
+//! Likewise for who has named somebody else in a `reply-to` himself: what that one and the others say to
+//! each other, he does not hear.
+//!
+//! What must not live here: what conversations allow that are known from their beginning to their end.
 
 use std::sync::Arc;
 use std::time::SystemTime;
 
 use crate::act::Act;
 use crate::change::millis;
-use crate::conversation::{ELSEWHERE, NONE, Party, Side, act_number, side_index};
+use crate::conversation::{Conversation, ELSEWHERE, NONE, Party, Side, act_number, side_index};
 use crate::judge::Heard;
 use crate::machine::{Machine, Scope, step};
 use crate::monitor::{Denied, Monitor};
-use crate::verdict::Unchecked;
+use crate::verdict::{Unchecked, ViolationKind as Kind};
 
 impl Monitor {
     /// Whether the conversation began between others.
     pub(crate) fn is_joined(&self, at: u32) -> bool {
         let slot = self.table.slot(at);
         slot.is_some_and(|slot| slot.conversation.joined)
+    }
+
+    /// Whether others may go on with the conversation where the agent that watches itself does not
+    /// hear it: it began between others, or the agent has named somebody else for the replies.
+    pub(crate) fn goes_on_elsewhere(&self, at: u32) -> bool {
+        let slot = self.table.slot(at);
+        slot.zip(self.agent.as_deref())
+            .is_some_and(|(slot, agent)| {
+                let Conversation {
+                    joined,
+                    initiator,
+                    reply_to,
+                    ..
+                } = &slot.conversation;
+                *joined || !reply_to.is_empty() && self.names.is(*initiator, agent)
+            })
     }
 
     /// Comes into a conversation with what the agent is told in it, if that answers anything.
@@ -50,7 +69,7 @@ impl Monitor {
         self.told(at, protocol, heard, now);
     }
 
-    /// What to say of a message that does not fit a conversation that began between others.
+    /// What to say of a message that does not fit a conversation with which others may go on.
     pub(crate) fn elsewhere(
         &mut self,
         at: u32,
@@ -59,12 +78,19 @@ impl Monitor {
         now: SystemTime,
     ) -> Denied {
         let library = Arc::clone(&self.library);
-        let slot = self.table.slot(at).filter(|slot| slot.conversation.joined);
+        let slot = self.table.slot(at).filter(|_| self.goes_on_elsewhere(at));
         let machine = slot.and_then(|slot| library.machine(slot.conversation.machine));
         let Some((slot, machine)) = slot.zip(machine) else {
             return denied;
         };
-        let not_known = if heard.own {
+        let joined = slot.conversation.joined;
+        // Who has asked knows whom, and what came already.
+        let asked = !joined && slot.conversation.takes_part(&self.names, heard.sender);
+        let known = |kind| [Kind::Repeated, Kind::WrongReceiver].contains(&kind);
+        let asked = asked && !matches!(&denied, Denied::Fault(fault, _) if known(fault.kind));
+        let not_known = if !joined && !asked {
+            false
+        } else if heard.own {
             let unknown = |party: &Party| {
                 let mut receivers = heard.receivers.iter();
                 let mut told = || receivers.any(|receiver| self.names.is(party.peer, receiver));
@@ -77,7 +103,7 @@ impl Monitor {
             true
         } else {
             // Others may begin it with the agent as well.
-            step(&machine.initial().steps, heard.act, u32::MAX, u32::MAX).is_some()
+            joined && step(&machine.initial().steps, heard.act, u32::MAX, u32::MAX).is_some()
         };
         if not_known {
             return Denied::Unchecked(Unchecked::BegunElsewhere);

@@ -237,7 +237,7 @@ impl Monitor {
         now: SystemTime,
     ) -> Result<Passed, Denied> {
         let name = header.protocol_name().unwrap_or_default();
-        let (mut denied, mut joined) = (None, None);
+        let (mut denied, mut open) = (None, None);
         let mut children = 0;
         let mut may_begin = self.may_begin(library, main, name, heard.sender);
         let mut child = self.table.slot(main).map_or(NONE, |slot| slot.child);
@@ -251,14 +251,14 @@ impl Monitor {
                         self.touch(main, millis(now));
                         return Ok(passed);
                     }
-                    Err(fault) if self.is_joined(child) => joined = Some((child, fault)),
+                    Err(fault) if self.goes_on_elsewhere(child) => open = Some((child, fault)),
                     Err(fault) => denied = denied.or(Some(fault)),
                 }
             }
             child = self.table.slot(child).map_or(NONE, |slot| slot.sibling);
         }
         if !may_begin {
-            return Err(match (denied, joined) {
+            return Err(match (denied, open) {
                 (Some(denied), _) => denied,
                 (None, Some((child, fault))) => self.elsewhere(child, heard, fault, now),
                 (None, None) if self.began_elsewhere(library, main, name, heard.sender) => {
@@ -528,7 +528,7 @@ impl Monitor {
         let now = millis(now);
         let mut events = Vec::new();
         while let Some(deadline) = self.deadlines.pop_before(now) {
-            events.extend(self.overdue(deadline, now));
+            events.extend(self.overdue(deadline));
         }
         let spans = [
             (List::Ended, span_millis(self.limits.ended)),
@@ -545,7 +545,7 @@ impl Monitor {
                     |party: &Party| machine.is_some_and(|machine| is_final(machine, party.state));
                 let conversation = &slot.conversation;
                 // How far others have gone on elsewhere is not known.
-                let known = list == List::Open && !conversation.joined;
+                let known = list == List::Open && !self.goes_on_elsewhere(at);
                 if known && !conversation.parties.iter().all(resting) {
                     events.push(Event::Abandoned {
                         protocol: machine.map_or("", Machine::name).to_owned(),
@@ -558,7 +558,9 @@ impl Monitor {
         events
     }
 
-    fn overdue(&mut self, deadline: Deadline, now: u64) -> Option<Event> {
+    fn overdue(&mut self, deadline: Deadline) -> Option<Event> {
+        // Its answer may have gone to somebody else.
+        let heard = !self.goes_on_elsewhere(deadline.at);
         let slot = self.table.slot_mut(deadline.at)?;
         if slot.generation != deadline.generation {
             return None;
@@ -571,7 +573,7 @@ impl Monitor {
         }
         let before = party.state;
         let (peer, scope) = (party.peer, machine.scope);
-        expire_party(machine, party, now);
+        expire_party(machine, party);
         let next = (party.state != before).then(|| state_name(machine, party.state).to_owned());
         let event = Event::Overdue {
             protocol: machine.name().to_owned(),
@@ -587,7 +589,7 @@ impl Monitor {
             slot.parent
         };
         self.touch(main, touched);
-        Some(event)
+        heard.then_some(event)
     }
 
     /// Removes a main conversation, with all that are within it.

@@ -286,6 +286,24 @@ fn elements_of_others_are_passed_over_and_ours_have_their_place() {
 }
 
 #[test]
+fn an_element_of_several_lines_is_in_its_first() {
+    let unknown = |id: &str| Problem::UnknownState {
+        id: id.into(),
+        nearest: None,
+    };
+    let bad = GOOD.replace("\"2\"", "\"9\"").replace(' ', "\n");
+    // With and without anything in between, and behind a mark of the byte order.
+    let lines = GOOD.matches(' ').count();
+    for (between, second) in [("", 3 + lines), ("\n\n", 5 + lines)] {
+        let text = with(&format!("{bad}{between}{bad}\n{GOOD}"));
+        for text in [text.clone(), format!("\u{feff}{text}")] {
+            let found = mistakes(&text);
+            assert_eq!(found, [(3, unknown("9")), (second, unknown("9"))]);
+        }
+    }
+}
+
+#[test]
 fn a_near_miss_is_pointed_out() {
     let text = with(GOOD)
         .replace("id=\"2\"", "id=\"agreed\"")

@@ -301,17 +301,15 @@ impl<'a> Reader<'a> {
 
     fn next(&mut self) -> Result<Tag<'a>, Mistake> {
         loop {
+            let begin = self.xml.buffer_position();
             let event = self.xml.read_event();
             // An element is in the line in which it begins, a mistake where it was noticed.
-            let tag = match &event {
-                Ok(Event::Start(tag) | Event::Empty(tag)) => tag.len() + 2,
-                _ => 0,
-            };
             let place = match &event {
+                Ok(Event::Start(_) | Event::Empty(_)) => begin,
                 Ok(_) => self.xml.buffer_position(),
                 Err(_) => self.xml.error_position(),
             };
-            self.count_lines(usize::try_from(place).unwrap_or(usize::MAX), tag);
+            self.count_lines(usize::try_from(place).unwrap_or(usize::MAX));
             match event {
                 Ok(Event::Start(tag)) => return Ok(Tag::Begin(tag, true)),
                 Ok(Event::Empty(tag)) => return Ok(Tag::Begin(tag, false)),
@@ -324,10 +322,10 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Sets the line to the one in which a tag of `tag` bytes that ends at `place` begins.
-    fn count_lines(&mut self, place: usize, tag: usize) {
+    /// Sets the line to the one in which `place` is.
+    fn count_lines(&mut self, place: usize) {
         let mark = self.text.len() - self.text.trim_start_matches('\u{feff}').len();
-        let place = (place + mark).saturating_sub(tag).min(self.text.len());
+        let place = place.saturating_add(mark).min(self.text.len());
         let passed = self.text.as_bytes().get(self.counted..place);
         self.line += passed
             .unwrap_or_default()

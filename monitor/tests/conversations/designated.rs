@@ -236,6 +236,42 @@ fn who_was_not_told_the_beginning_learns_of_others_by_what_they_answer() {
 }
 
 #[test]
+fn who_lets_others_get_the_answers_does_not_hear_all() {
+    let mut stage = Stage::new(Monitor::agent(library(), "ann"));
+    let due = Time::from_system_time(stage.now + Duration::from_secs(5)).unwrap();
+    stage.right(say("cfp ann>ben,cid").reply_to(["dan"]).reply_by(due));
+    // What was proposed to dan, and that he has accepted it, ann has not heard.
+    let done = || say("inform ben>ann,dan").reply_with("b");
+    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
+    assert_eq!(stage.check(&done()), elsewhere);
+    assert_eq!(stage.wrong(done()).kind, Kind::Repeated);
+    // She knows whom she has asked, and what can be answered.
+    for (words, kind) in [
+        ("inform eve>ann", Kind::Stranger),
+        ("inform ben>eve", Kind::WrongReceiver),
+        ("agree cid>ann", Kind::Unexpected),
+        ("cfp cid>ann", Kind::Unexpected),
+        ("accept-proposal ann>cid", Kind::OutOfOrder),
+    ] {
+        assert_eq!(stage.wrong(say(words)).kind, kind, "{words}");
+    }
+    // Nor does she hear whether something is overdue.
+    assert_eq!(stage.pass(6), []);
+    assert_eq!(stage.pass(10_000), []);
+    assert!(stage.monitor.is_empty());
+    // Within another conversation as well.
+    let mut stage = Stage::new(Monitor::agent(library(), "rec"));
+    stage.right(recruit("proxy ann>rec"));
+    stage.right(recruit("agree rec>ann"));
+    stage.right(say("cfp rec>ben").reply_to(["ann"]));
+    assert_eq!(stage.check(&say("inform ben>rec")), elsewhere);
+    // Who gets the answers himself hears all.
+    let mut stage = Stage::new(Monitor::agent(library(), "ann"));
+    stage.right(say("cfp ann>ben").reply_to(["ann"]));
+    assert_eq!(stage.wrong(say("inform ben>ann")).kind, Kind::OutOfOrder);
+}
+
+#[test]
 fn what_may_lead_to_several_states_is_not_judged() {
     let text = r#"<scxml initial="1" xmlns:f="urn:fipa-rs:protocol" f:scope="participant">
         <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>

@@ -249,3 +249,20 @@ fn a_member_of_a_multicast_is_brought_in_by_its_answer() {
     assert!(opens("refuse arm_2>ann"));
     assert!(!opens("accept-proposal ann>arm_1"));
 }
+
+#[test]
+fn what_is_due_now_is_not_late() {
+    let mut stage = Stage::observer();
+    let due = Time::from_system_time(stage.now + Duration::from_secs(5)).unwrap();
+    stage.right(say("cfp ann>ben,cid").reply_by(due));
+    stage.now += Duration::from_secs(5);
+    let Verdict::Accepted(accepted) = stage.check(&say("propose ben>ann")) else {
+        panic!("it is in time");
+    };
+    assert_eq!((accepted.state, accepted.late), ("proposed", false));
+    stage.now += Duration::from_millis(1);
+    let Verdict::Accepted(accepted) = stage.check(&say("propose cid>ann")) else {
+        panic!("it is told to be late");
+    };
+    assert_eq!((accepted.state, accepted.late), ("late", true));
+}

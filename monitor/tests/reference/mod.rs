@@ -171,10 +171,17 @@ impl<'l> Conversation<'l> {
         }
     }
 
+    /// Whether there may be more than the agent that watches himself hears.
+    fn goes_on_elsewhere(&self) -> bool {
+        self.joined || !self.designated.is_empty() && self.agent == Some(self.initiator)
+    }
+
     /// Of what does not fit a conversation that began between others, some is not known to be wrong.
     fn elsewhere(&mut self, words: &Words, wrong: &'static str) -> Result<Says, &'static str> {
         let machine = self.machine;
-        let excused = if !self.joined {
+        let asked = self.goes_on_elsewhere() && self.takes_part(words.from);
+        let excused = if !self.joined && (!asked || ["repeated", "wrong-receiver"].contains(&wrong))
+        {
             false
         } else if self.agent == Some(words.from) {
             let mut unknown = self.talks.iter().filter(|(_, talk)| talk.is_unknown());
@@ -195,7 +202,7 @@ impl<'l> Conversation<'l> {
             self.learn(words);
             true
         } else {
-            begins(machine, words.act)
+            self.joined && begins(machine, words.act)
         };
         if excused {
             Ok(Says::Nothing)
@@ -223,12 +230,12 @@ impl<'l> Conversation<'l> {
                 .inner
                 .iter()
                 .any(|inner| inner.may_begin(library, name, words.from));
-        let (mut first_wrong, mut joined) = (None, None);
+        let (mut first_wrong, mut open) = (None, None);
         for (at, inner) in self.inner.iter_mut().enumerate() {
             if inner.machine.is_called(name) {
                 match inner.hear(words, now) {
                     Ok(says) => return Ok(says),
-                    Err(wrong) if inner.joined => joined = Some((at, wrong)),
+                    Err(wrong) if inner.goes_on_elsewhere() => open = Some((at, wrong)),
                     Err(wrong) => first_wrong = first_wrong.or(Some(wrong)),
                 }
             }
@@ -237,7 +244,7 @@ impl<'l> Conversation<'l> {
             if let Some(wrong) = first_wrong {
                 return Err(wrong);
             }
-            if let Some((at, wrong)) = joined {
+            if let Some((at, wrong)) = open {
                 return self.inner[at].elsewhere(words, wrong);
             }
             if let Some(agent) = self.agent
