@@ -79,6 +79,15 @@ pub enum KeysError {
     /// What was given has no certificate in it.
     #[error("no certificate in it (PEM, -----BEGIN CERTIFICATE-----)")]
     NoCertificate,
+    /// What was given is a private key.
+    #[error(
+        "a private key, which nobody but its owner may have; if it came from another host, that has to \
+         make new ones"
+    )]
+    PrivateKey,
+    /// What was given is this host's own.
+    #[error("this host's own certificate, which the owners of other hosts are to trust")]
+    Own,
     /// A certificate that cannot be used.
     #[error(transparent)]
     Certificate(#[from] CertificateError),
@@ -125,6 +134,51 @@ impl Stamp {
         });
         let seconds = self.0.iter().flatten().map(|(seconds, ..)| *seconds);
         seconds.max().is_some_and(|newest| newest >= now - 1)
+    }
+}
+
+/// How long before a certificate ends that is told: 30 days.
+const SOON: i64 = 30 * 86_400;
+
+/// Whether a certificate holds at a time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Holding {
+    /// It does, for more than a month.
+    Well,
+    /// It ends within 30 days.
+    EndsSoon,
+    /// It has ended, and is refused.
+    Ended,
+    /// It has not begun, and is refused.
+    NotYet,
+}
+
+impl Holding {
+    /// Of this certificate now.
+    #[must_use]
+    pub fn of(certificate: &Certificate) -> Self {
+        let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+        let now = now.map_or(0, |since| {
+            i64::try_from(since.as_secs()).unwrap_or(i64::MAX)
+        });
+        match certificate.validity() {
+            (_, until) if now > until => Self::Ended,
+            (from, _) if now < from => Self::NotYet,
+            (_, until) if now > until - SOON => Self::EndsSoon,
+            _ => Self::Well,
+        }
+    }
+
+    /// What is to be told of it, where something is.
+    #[must_use]
+    pub fn told(self) -> Option<&'static str> {
+        match self {
+            Self::Well => None,
+            Self::EndsSoon => Some("ends within 30 days"),
+            Self::Ended => Some("has ended"),
+            Self::NotYet => Some("does not hold yet; is the clock right?"),
+        }
     }
 }
 
@@ -246,11 +300,21 @@ impl Keys {
     /// Trusts the certificates in this PEM text, and returns them.
     ///
     /// # Errors
-    /// When there is none in it, one of them cannot be used or was revoked: then none is trusted.
+    /// When there is none in it, one of them cannot be used, was revoked or is this host's own: then
+    /// none is trusted.
     pub fn trust(&self, pem: &[u8]) -> Result<Vec<Certificate>, KeysError> {
         let certificates = certificates(pem)?;
         if certificates.is_empty() {
-            return Err(KeysError::NoCertificate);
+            let is_key = PrivateKeyDer::from_pem_slice(pem).is_ok();
+            return Err(if is_key {
+                KeysError::PrivateKey
+            } else {
+                KeysError::NoCertificate
+            });
+        }
+        let own = self.own().ok();
+        if certificates.iter().any(|it| Some(it) == own.as_ref()) {
+            return Err(KeysError::Own);
         }
         for certificate in &certificates {
             if self.file("revoked", certificate.fingerprint()).exists() {

@@ -122,6 +122,12 @@ pub(crate) fn not_joined(error: OpenError, config: &Config) -> Failure {
                 advice,
             )
         }
+        OpenError::Keys(_) => Failure::failed(
+            error.to_string(),
+            format!("mts.name {:?}", config.mts.name),
+            "`fipa doctor` says what is wrong; keys are of one gateway: use its name (--set \
+             mts.name=NAME), or make new ones in an empty directory (`fipa keys init --dir`)",
+        ),
         OpenError::NoTransport(_) => Failure::failed(
             error.to_string(),
             domain,

@@ -146,11 +146,20 @@ fn what_there_is_is_listed_and_not_overwritten() {
         / 86_400;
     assert_eq!(days, 91, "a day before now, and 90 from now");
     let dir = host.dir();
+    let (own, own_key) = (host.certificate(), format!("{dir}/own.key"));
     for (wrong, told) in [
         (vec!["keys", "init", "--dir", &dir], "nothing was changed"),
         (
             vec!["keys", "trust", "/dev/null", "--dir", &dir],
             "no certificate",
+        ),
+        (
+            vec!["keys", "trust", &own_key, "--dir", &dir],
+            "a private key",
+        ),
+        (
+            vec!["keys", "trust", &own, "--dir", &dir],
+            "this host's own certificate",
         ),
         (
             vec!["keys", "trust", "/nowhere", "--dir", &dir],
@@ -177,7 +186,7 @@ fn a_gateway_does_not_start_with_keys_that_cannot_be_used() {
         .run(&["up", "--set", &keys, "--set", "mts.name=another"]);
     let told = told.failed(1);
     assert!(
-        told.contains("another") && told.contains(&host.name),
+        told.contains("another") && told.contains(&host.name) && told.contains("mts.name=NAME"),
         "{told}"
     );
     let told = host
@@ -193,4 +202,24 @@ fn a_gateway_does_not_start_with_keys_that_cannot_be_used() {
         told.contains("fipa keys init") && told.contains("security.insecure"),
         "{told}"
     );
+}
+
+#[test]
+fn a_certificate_that_has_ended_is_told_wherever_it_is_seen() {
+    let (rover, crex) = (
+        Keyed::new("rover", &["--valid", "1ms"]),
+        Keyed::new("crex", &[]),
+    );
+    // A second is what its times are told in.
+    until("it has ended", || {
+        rover.keys(&["list"]).contains("(has ended)")
+    });
+    let told = crex.keys(&["trust", &rover.certificate()]);
+    assert!(told.contains("(has ended)"), "{told}");
+    let (mut theirs, address) = crex.gateway(&[]);
+    theirs.tells(&["the certificate of rover", "has ended"]);
+    rover.keys(&["trust", &crex.certificate()]);
+    let (mut ours, _) = rover.gateway(&[(&crex.name, &address)]);
+    ours.tells(&["the certificate of this host has ended"]);
+    theirs.tells(&["connection refused", "Expired", "`fipa keys renew` there"]);
 }

@@ -34,11 +34,8 @@ fn keys(_config: &Config, checks: &mut Vec<Check>) {
 
 #[cfg(feature = "secure")]
 fn keys(config: &Config, checks: &mut Vec<Check>) {
-    use crate::keys::{Certificate, Keys, KeysError};
-    use std::time::{SystemTime, UNIX_EPOCH};
+    use crate::keys::{Certificate, Holding, Keys, KeysError};
 
-    /// A certificate that ends so soon is told, in seconds.
-    const SOON: i64 = 30 * 86_400;
     let keys = Keys::at(&config.security.keys);
     let credentials = match keys.credentials_of(&config.mts.name) {
         Ok(credentials) => credentials,
@@ -58,17 +55,12 @@ fn keys(config: &Config, checks: &mut Vec<Check>) {
         let found = "no other host is trusted, so none gets in";
         checks.push(AREA.wrong(KEYS, Verdict::Doubtful, found, advice));
     }
-    let now = SystemTime::now().duration_since(UNIX_EPOCH);
-    let now = now.map_or(0, |since| {
-        i64::try_from(since.as_secs()).unwrap_or(i64::MAX)
-    });
     let mut ending = |whose: &str, certificate: &Certificate, renew: &str| {
-        let (from, until) = certificate.validity();
-        let (verdict, what) = match now {
-            now if now > until => (Verdict::Bad, "has ended"),
-            now if now < from => (Verdict::Bad, "does not hold yet; is the clock right?"),
-            now if now > until - SOON => (Verdict::Doubtful, "ends within 30 days"),
-            _ => return,
+        let holding = Holding::of(certificate);
+        let Some(what) = holding.told() else { return };
+        let verdict = match holding {
+            Holding::EndsSoon => Verdict::Doubtful,
+            _ => Verdict::Bad,
         };
         let found = format!("the certificate of {whose} {what}");
         checks.push(AREA.wrong(KEYS, verdict, found, renew));

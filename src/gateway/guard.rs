@@ -2,14 +2,33 @@
 
 use std::time::Duration;
 
-use fipa_transport_net::secure::{Rules, Security};
+use fipa_transport_net::secure::{Credentials, Rules, Security};
 
 use crate::config;
 use crate::domain::OpenError;
-use crate::keys::{Keys, Stamp};
+use crate::keys::{Holding, Keys, Stamp};
 
 /// How often the directory is looked at. Looking is three calls to the system.
 const LOOK: Duration = Duration::from_secs(1);
+
+/// Says which certificates do not hold, or not for long any more.
+fn tell_of_ends(credentials: &Credentials) {
+    if let Some(what) = Holding::of(&credentials.own).told() {
+        tracing::warn!(
+            "the certificate of this host {what}; without one that holds peers refuse it (`fipa keys \
+             renew`)"
+        );
+    }
+    for trusted in &credentials.trusted {
+        if let Some(what) = Holding::of(trusted).told() {
+            let peer = trusted.certified().mts();
+            tracing::warn!(
+                "the certificate of {peer} {what}; its owner has to make a new one (`fipa keys renew` \
+                 there)"
+            );
+        }
+    }
+}
 
 /// Keeps the keys of a gateway as they are in their directory.
 pub(super) struct Guard {
@@ -33,6 +52,7 @@ impl Guard {
         let seen = keys.stamp();
         let credentials = keys.credentials_of(name);
         let credentials = credentials.map_err(|error| OpenError::Keys(error.to_string()))?;
+        tell_of_ends(&credentials);
         let rules = Rules {
             loopback: config.loopback,
             old_peers: config.old_peers.clone(),
@@ -83,6 +103,9 @@ impl Guard {
             .map_err(|error| error.to_string())
             .and_then(|credentials| {
                 let count = credentials.trusted.len();
+                if changed {
+                    tell_of_ends(&credentials);
+                }
                 let replaced = self.security.replace(credentials);
                 replaced.map(|()| count).map_err(|error| error.to_string())
             });

@@ -96,8 +96,14 @@ impl fmt::Display for Outcome {
                 attempts
             }
         };
-        for attempt in attempts {
+        for same in attempts.chunk_by(|one, other| one == other) {
+            let Some(attempt) = same.first() else {
+                continue;
+            };
             write!(f, "; tried {attempt}")?;
+            if same.len() > 1 {
+                write!(f, " ({} times)", same.len())?;
+            }
         }
         Ok(())
     }

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand};
 use comfy_table::{Table, presets};
-use fipa::keys::{Certificate, Keys, KeysError, VALID};
+use fipa::keys::{Certificate, Holding, Keys, KeysError, VALID};
 use serde_json::{Value, json};
 
 use crate::options::Global;
@@ -136,7 +136,10 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         Action::Trust { file } => {
             let pem = input::read(&file, MAX_PEM)?;
             let trusted = keys.trust(&pem).map_err(|error| match error {
-                KeysError::NoCertificate | KeysError::Certificate(_) => Failure::failed(
+                KeysError::NoCertificate
+                | KeysError::PrivateKey
+                | KeysError::Own
+                | KeysError::Certificate(_) => Failure::failed(
                     error.to_string(),
                     file.display().to_string(),
                     "use the file own.pem of the other host",
@@ -211,8 +214,17 @@ fn described(certificate: &Certificate) -> String {
         "  fingerprint {}\n  speaks for {}\n  holds until {}\n",
         certificate.fingerprint(),
         spoken_for(certificate),
-        date(certificate.validity().1)
+        ends(certificate)
     )
+}
+
+/// The day until which it holds, and what is to be said of that.
+fn ends(certificate: &Certificate) -> String {
+    let date = date(certificate.validity().1);
+    match Holding::of(certificate).told() {
+        Some(what) => format!("{date} ({what})"),
+        None => date,
+    }
 }
 
 /// The agents that its host may speak for.
@@ -257,7 +269,7 @@ fn list(keys: &Keys, json: bool) -> Result<Result<(), Failure>, KeysError> {
                 what.to_owned(),
                 certificate.certified().mts().to_owned(),
                 spoken_for(certificate),
-                date(certificate.validity().1),
+                ends(certificate),
                 certificate.fingerprint().to_string(),
             ]);
         }

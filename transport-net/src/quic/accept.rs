@@ -5,11 +5,11 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use bytes::BytesMut;
-use quinn::{Connection, Incoming, RecvStream, SendStream};
+use quinn::{Connection, ConnectionError, Incoming, RecvStream, SendStream};
 use tokio::time::timeout;
 
 use super::dial::ends;
-use super::sockets::Sockets;
+use super::sockets::{Sockets, why_lost};
 use crate::seldom::warn_seldom;
 use crate::tcp::endpoint::{Endpoint, Stranger};
 use crate::tcp::frame::FrameReader;
@@ -86,7 +86,8 @@ async fn shake(
     sockets: &Sockets,
     incoming: Incoming,
 ) -> io::Result<(Connection, SendStream, RecvStream)> {
-    let connection = sockets.accept(incoming)?.await?;
-    let (send, receive) = connection.accept_bi().await?;
+    let told = |error: ConnectionError| io::Error::other(why_lost(&error));
+    let connection = sockets.accept(incoming)?.await.map_err(told)?;
+    let (send, receive) = connection.accept_bi().await.map_err(told)?;
     Ok((connection, send, receive))
 }

@@ -7,9 +7,9 @@ use std::time::Instant;
 
 use bytes::BytesMut;
 use fipa_transport::{Location, Sink};
-use quinn::{Connection, RecvStream, SendStream};
+use quinn::{Connection, ConnectionError, RecvStream, SendStream};
 
-use super::sockets::Sockets;
+use super::sockets::{Sockets, why_lost};
 use super::streams::{Control, Letters, Outgoing};
 use crate::tcp::dial::{addresses, reach, unreachable};
 use crate::tcp::endpoint::Endpoint;
@@ -52,12 +52,9 @@ async fn connect(
     sockets: Arc<Sockets>,
     address: SocketAddr,
 ) -> io::Result<(Connection, SendStream, RecvStream)> {
-    let told = |error: &dyn std::fmt::Display| {
-        io::Error::other(format!("{error} (`fipa keys list` on both sides)"))
-    };
-    let connecting = sockets.dial(address)?;
-    let connection = connecting.await.map_err(|error| told(&error))?;
-    let (send, receive) = connection.open_bi().await.map_err(|error| told(&error))?;
+    let told = |error: ConnectionError| io::Error::other(why_lost(&error));
+    let connection = sockets.dial(address)?.await.map_err(told)?;
+    let (send, receive) = connection.open_bi().await.map_err(told)?;
     Ok((connection, send, receive))
 }
 

@@ -10,12 +10,14 @@ use std::sync::Arc;
 use fipa_transport::ListenError;
 use parking_lot::Mutex;
 use quinn::{
-    Connecting, Endpoint, EndpointConfig, Incoming, ServerConfig, TokioRuntime, TransportConfig,
+    Connecting, ConnectionError, Endpoint, EndpointConfig, Incoming, ServerConfig, TokioRuntime,
+    TransportConfig,
 };
 use rustls::pki_types::CertificateDer;
 use socket2::{Domain, Protocol, Socket, Type};
 
 use super::settings;
+use crate::secure::advice::{self, Finder};
 use crate::secure::{Certificate, Security};
 use crate::{Limits, address};
 
@@ -93,6 +95,20 @@ impl Sockets {
     /// Lets go of the sockets; connections that are ending keep them for that long.
     pub(super) fn close(&self) {
         *self.dialling.lock() = [None, None];
+    }
+}
+
+/// Why there is no connection, and what to do where that is about certificates.
+pub(super) fn why_lost(error: &ConnectionError) -> String {
+    let (code, finder) = match error {
+        ConnectionError::TransportError(error) => (u64::from(error.code), Finder::Here),
+        ConnectionError::ConnectionClosed(close) => (u64::from(close.error_code), Finder::Peer),
+        other => return other.to_string(),
+    };
+    // An alert of TLS (RFC 9001 section 4.8).
+    match code.checked_sub(0x100).map(u8::try_from) {
+        Some(Ok(alert)) => format!("{error} ({})", advice::of_alert(alert, finder)),
+        _ => error.to_string(),
     }
 }
 

@@ -15,6 +15,7 @@ use bytes::BytesMut;
 use parking_lot::Mutex;
 use quinn::{Connection, ReadError, RecvStream, SendStream, VarInt};
 
+use super::sockets::why_lost;
 use crate::tcp::frame::{self, FrameReader, Space};
 
 /// Answers go before letters.
@@ -37,6 +38,7 @@ impl Control {
             Ok(Some(len)) => Ok(len),
             Ok(None)
             | Err(ReadError::ConnectionLost(quinn::ConnectionError::ApplicationClosed(_))) => Ok(0),
+            Err(ReadError::ConnectionLost(lost)) => Err(io::Error::other(why_lost(&lost))),
             Err(error) => Err(error.into()),
         }
     }

@@ -7,10 +7,12 @@
 //! taking a certificate out again, which ends the connections that were opened with it.
 //!
 //! * `certificate`: what a certificate says.
+//! * `advice`: what to do when a peer is not let in.
 //! * `verify`: whether whoever presents one is trusted.
 //!
 //! What must not live here: files, and what is done with letters.
 
+pub(crate) mod advice;
 mod certificate;
 mod verify;
 

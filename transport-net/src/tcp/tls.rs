@@ -19,7 +19,7 @@ use tokio_rustls::{TlsAcceptor, TlsConnector};
 
 use super::frame::Space;
 use super::wire::{Reading, Writing};
-use crate::secure::{Certificate, Security};
+use crate::secure::{Certificate, Security, advice};
 
 /// The first byte of a TLS connection: a record with a handshake (RFC 8446 section 5.1).
 pub(crate) const FIRST_BYTE: u8 = 22;
@@ -71,7 +71,11 @@ fn too_slow(patience: Duration) -> String {
 }
 
 fn told(error: &io::Error) -> String {
-    format!("no TLS connection: {error} (`fipa keys list` on both sides)")
+    let inner = error.get_ref().and_then(|it| it.downcast_ref());
+    match inner {
+        Some(inner) => format!("no TLS connection: {error} ({})", advice::of_error(inner)),
+        None => format!("no TLS connection: {error}"),
+    }
 }
 
 fn secured(
@@ -196,7 +200,11 @@ impl Incoming {
             }
             session.read_tls(&mut (&mut self.records).reader())?;
             let processed = session.process_new_packets();
-            processed.map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))?;
+            // In TLS 1.3 a client is done before its peer has said whether it is let in.
+            processed.map_err(|error| {
+                let told = format!("{error} ({})", advice::of_error(&error));
+                io::Error::new(io::ErrorKind::InvalidData, told)
+            })?;
         }
     }
 }

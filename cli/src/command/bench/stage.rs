@@ -77,8 +77,12 @@ impl Stage {
             certificates.push(read.map_err(|error| format!("{}: {error}", file.display()))?);
         }
         let mut settings = Vec::new();
-        for keys in &all {
-            for certificate in &certificates {
+        for (number, keys) in all.iter().enumerate() {
+            for (_, certificate) in certificates
+                .iter()
+                .enumerate()
+                .filter(|(it, _)| *it != number)
+            {
                 keys.trust(certificate).map_err(told)?;
             }
             settings.push(format!("security.keys={}", keys.dir().display()));

@@ -1,0 +1,53 @@
+//! What to do when two hosts do not come to trust each other.
+
+use rustls::{CertificateError, Error};
+
+/// What is to be done when neither side says more.
+const LOOK: &str = "`fipa keys list` on both sides";
+
+/// Alerts (RFC 8446 section 6.2) that are about certificates.
+const BAD_CERTIFICATE: u8 = 42;
+const CERTIFICATE_EXPIRED: u8 = 45;
+const CERTIFICATE_UNKNOWN: u8 = 46;
+const UNKNOWN_CA: u8 = 48;
+const ACCESS_DENIED: u8 = 49;
+
+/// Who has found something wrong with the other one's certificate.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Finder {
+    Here,
+    Peer,
+}
+
+/// What to do about an alert.
+pub(crate) fn of_alert(alert: u8, finder: Finder) -> &'static str {
+    match (alert, finder) {
+        (CERTIFICATE_EXPIRED, Finder::Here) => {
+            "the peer's certificate does not hold now: `fipa keys renew` there; are the clocks right?"
+        }
+        (CERTIFICATE_EXPIRED, Finder::Peer) => {
+            "this host's certificate does not hold now: `fipa keys renew`; are the clocks right?"
+        }
+        (UNKNOWN_CA, Finder::Here) => {
+            "the peer is not trusted here: `fipa keys trust` the own.pem of that host"
+        }
+        (BAD_CERTIFICATE | CERTIFICATE_UNKNOWN | UNKNOWN_CA | ACCESS_DENIED, Finder::Peer) => {
+            "the peer does not trust this host: `fipa keys trust` there the own.pem of this one"
+        }
+        _ => LOOK,
+    }
+}
+
+/// What to do about an error of TLS.
+pub(crate) fn of_error(error: &Error) -> &'static str {
+    match error {
+        Error::AlertReceived(alert) => of_alert(u8::from(*alert), Finder::Peer),
+        Error::InvalidCertificate(CertificateError::UnknownIssuer) => {
+            of_alert(UNKNOWN_CA, Finder::Here)
+        }
+        Error::InvalidCertificate(CertificateError::Expired | CertificateError::NotValidYet) => {
+            of_alert(CERTIFICATE_EXPIRED, Finder::Here)
+        }
+        _ => LOOK,
+    }
+}
