@@ -450,6 +450,11 @@ fn a_gateway_is_open_to_the_network_with_keys_or_by_its_owners_word() {
     };
     assert!(mistakes(&[open]).contains("`transport.tcp.listen` lists 0.0.0.0:7788"));
     assert!(mistakes(&["transport.tcp.listen=[fe80::1%eth0]:7788"]).contains("fe80::1"));
+    let datagrams = [
+        "mts.transports=shm,udp",
+        "transport.udp.listen=0.0.0.0:7788",
+    ];
+    assert!(mistakes(&datagrams).contains("`transport.udp.listen` lists 0.0.0.0:7788"));
     assert_eq!(mistakes(&[open, "security.insecure=true"]), "");
     assert_eq!(mistakes(&[open, "security.keys=/etc/fipa/keys"]), "");
     assert_eq!(

@@ -1,6 +1,8 @@
 //! Services that tests put together themselves, to look at their transports or take these away.
 #![allow(dead_code, reason = "each test file uses a part of it")]
 
+pub(crate) mod weather;
+
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,12 +12,20 @@ use fipa_mts::core::CoreConfig;
 use fipa_mts::{Mts, RuntimeConfig, Started};
 use fipa_sds::{Directory as _, MemoryDirectory, Registration};
 use fipa_transport::{Incarnation, Location, Transport};
+#[cfg(feature = "secure")]
+pub(crate) use fipa_transport_net::secure::Security;
 use fipa_transport_net::{
     Counters, Identity, Limits, TcpConfig, TcpTransport, UdpConfig, UdpLimits, UdpTransport,
 };
+#[cfg(feature = "quic")]
+use fipa_transport_net::{QuicConfig, QuicTransport};
 use fipa_transport_shm::{ShmConfig, ShmCounters, ShmTransport};
 use tempfile::TempDir;
 use tokio::runtime::Handle;
+
+/// Nobody has keys.
+#[cfg(not(feature = "secure"))]
+pub(crate) type Security = std::convert::Infallible;
 
 /// The life of the agent that sends, and of the one that receives.
 pub(crate) const ROVER: Incarnation = Incarnation::from_u64(0x50e4);
@@ -28,12 +38,25 @@ pub(crate) struct Place {
     shm: Option<Arc<ShmTransport>>,
     tcp: Option<Arc<TcpTransport>>,
     udp: Option<Arc<UdpTransport>>,
+    #[cfg(feature = "quic")]
+    quic: Option<Arc<QuicTransport>>,
     locations: Vec<Location>,
 }
 
 impl Place {
     /// A service of this host with these transports, in this order of preference.
     pub(crate) fn start(host: &Path, name: &str, order: &[Kind], forwards: bool) -> Self {
+        Self::with_keys(host, name, order, forwards, None)
+    }
+
+    /// The same, speaking with trusted peers only; QUIC needs that.
+    pub(crate) fn with_keys(
+        host: &Path,
+        name: &str,
+        order: &[Kind],
+        forwards: bool,
+        security: Option<Security>,
+    ) -> Self {
         let incarnation = Incarnation::random();
         let handle = Handle::current();
         let mark = host.file_name().unwrap().to_str().unwrap();
@@ -56,7 +79,7 @@ impl Place {
                 identity: identity.clone(),
                 limits: Limits::default(),
                 #[cfg(feature = "secure")]
-                security: None,
+                security: security.clone(),
             };
             Arc::new(TcpTransport::new(config, handle.clone()))
         });
@@ -68,10 +91,22 @@ impl Place {
             };
             Arc::new(UdpTransport::new(config, handle.clone()))
         });
+        #[cfg(feature = "quic")]
+        let quic = has(Kind::Quic).then(|| {
+            let config = QuicConfig {
+                listen: listen.clone(),
+                identity: identity.clone(),
+                limits: Limits::default(),
+                security: security.clone().unwrap(),
+            };
+            Arc::new(QuicTransport::new(config, handle.clone()))
+        });
         let transports = [
             shm.clone().map(|it| it as Arc<dyn Transport>),
             tcp.clone().map(|it| it as Arc<dyn Transport>),
             udp.clone().map(|it| it as Arc<dyn Transport>),
+            #[cfg(feature = "quic")]
+            quic.clone().map(|it| it as Arc<dyn Transport>),
         ];
         let directory = Arc::new(MemoryDirectory::new(fipa_sds::Mts::new(name, incarnation)));
         let core = CoreConfig {
@@ -98,6 +133,8 @@ impl Place {
             shm,
             tcp,
             udp,
+            #[cfg(feature = "quic")]
+            quic,
             locations,
         }
     }
@@ -124,6 +161,8 @@ impl Place {
         let found = match kind {
             Kind::Shm => self.shm.clone().map(|it| it as Arc<dyn Transport>),
             Kind::Tcp => self.tcp.clone().map(|it| it as Arc<dyn Transport>),
+            #[cfg(feature = "quic")]
+            Kind::Quic => self.quic.clone().map(|it| it as Arc<dyn Transport>),
             _ => self.udp.clone().map(|it| it as Arc<dyn Transport>),
         };
         found.unwrap()
@@ -136,6 +175,29 @@ impl Place {
     pub(crate) fn tcp(&self) -> Counters {
         self.tcp.as_ref().unwrap().counters()
     }
+}
+
+/// Keys of two services that trust each other, and nobody else.
+#[cfg(feature = "secure")]
+pub(crate) fn friends(here: &Path, names: [&str; 2]) -> [Security; 2] {
+    let keys = names.map(|name| fipa::keys::Keys::at(here.join(format!("keys-{name}"))));
+    for (keys, name) in keys.iter().zip(names) {
+        keys.init(name, &[], fipa::keys::VALID).unwrap();
+    }
+    let [one, other] = &keys;
+    for (one, other) in [(one, other), (other, one)] {
+        one.trust(&std::fs::read(other.own_file()).unwrap())
+            .unwrap();
+    }
+    let rules = fipa_transport_net::secure::Rules {
+        loopback: true,
+        ..Default::default()
+    };
+    let mut names = names.iter();
+    keys.map(|keys| {
+        let credentials = keys.credentials_of(names.next().unwrap()).unwrap();
+        Security::new(credentials, rules.clone()).unwrap()
+    })
 }
 
 /// The directory of a host that no other test has.

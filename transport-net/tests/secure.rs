@@ -79,6 +79,7 @@ over_both! {
     certificates_that_do_not_hold_now_are_refused,
     who_proved_one_name_cannot_take_another,
     a_peer_speaks_for_its_own_agents_only,
+    who_has_keys_is_not_taken_for_one_of_this_host,
     withdrawn_trust_ends_the_connection,
     a_new_key_takes_over_while_letters_pass,
     who_sends_more_than_it_may_is_read_later_and_loses_nothing,
@@ -250,6 +251,19 @@ fn a_peer_speaks_for_its_own_agents_only<T: Proving>() {
         panic!("{:?}", later.conclusion(1));
     };
     assert_eq!(refused.fault, WayFault::Refused);
+}
+
+/// Gateways pass on what processes of their own host send.
+fn who_has_keys_is_not_taken_for_one_of_this_host<T: Proving>() {
+    let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
+    let (from, to) = friends::<T>(&rover, &crex);
+    // All endpoints of these tests say that they are on the same host, in the same domain.
+    from.assert_reaches(1, &to);
+    to.assert_reaches(2, &from);
+    for party in [&from, &to] {
+        let (_, hop, _) = party.sink.record.lock().arrivals[0].clone();
+        assert!(hop.remote, "{hop:?}");
+    }
 }
 
 fn withdrawn_trust_ends_the_connection<T: Proving>() {

@@ -123,6 +123,8 @@ fn open(address: SocketAddr) -> io::Result<UdpSocket> {
 }
 
 fn endpoint(server: Option<ServerConfig>, socket: UdpSocket) -> io::Result<Endpoint> {
-    let config = EndpointConfig::default();
+    let mut config = EndpointConfig::default();
+    // RFC 9000, and none of the drafts before it.
+    config.supported_versions(vec![1]);
     Endpoint::new(config, server, socket, Arc::new(TokioRuntime))
 }

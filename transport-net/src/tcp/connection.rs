@@ -199,6 +199,11 @@ impl Connection {
         self.peer.as_ref()
     }
 
+    /// Whether the peer is on another host, whatever it says: those of this one have no keys.
+    pub(crate) fn is_from_afar(&self) -> bool {
+        self.proof.is_given()
+    }
+
     /// Takes a parcel for sending.
     ///
     /// # Errors

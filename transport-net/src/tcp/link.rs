@@ -449,9 +449,14 @@ impl Running {
     ) -> Result<(), End> {
         match event {
             Event::Greeted => {
-                let peer = self.link.state.lock().connection.peer().cloned();
+                let (peer, from_afar) = {
+                    let connection = &self.link.state.lock().connection;
+                    (connection.peer().cloned(), connection.is_from_afar())
+                };
                 if let Some(peer) = peer {
-                    let hop = self.endpoint.enter(&self.link, &peer, from).await?;
+                    let mut hop = self.endpoint.enter(&self.link, &peer, from).await?;
+                    // Letters of this host are passed on to others, those of others are not.
+                    hop.remote |= from_afar;
                     self.peer = Some(Introduction {
                         name: peer.identity.name.into(),
                         hop,

@@ -53,6 +53,15 @@ impl Proof {
         false
     }
 
+    /// Whether the peer has proved anything: only those on other hosts do.
+    pub(crate) fn is_given(&self) -> bool {
+        #[cfg(feature = "secure")]
+        if self.certificate.is_some() {
+            return true;
+        }
+        false
+    }
+
     /// Waits until the peer is not trusted any more.
     pub(crate) async fn withdrawn(&self) {
         #[cfg(feature = "secure")]

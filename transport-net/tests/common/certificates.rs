@@ -60,6 +60,14 @@ impl Host {
         Security::new(self.credentials(trusted), rules).unwrap()
     }
 
+    /// Somebody who has its certificate, which is no secret, and not its key.
+    pub(crate) fn thief(&self) -> Self {
+        Self {
+            certificate: self.certificate.clone(),
+            key: KeyPair::generate().unwrap(),
+        }
+    }
+
     /// This certificate, with somebody else's key.
     pub(crate) fn with_key_of(mut self, other: &Self) -> Self {
         self.key = KeyPair::try_from(other.key.serialize_der()).unwrap();

@@ -4,6 +4,8 @@
 
 #[cfg(feature = "secure")]
 pub(crate) mod certificates;
+#[cfg(feature = "quic")]
+pub(crate) mod intruder;
 
 use std::collections::HashMap;
 use std::net::IpAddr;
@@ -298,17 +300,32 @@ pub(crate) fn parcel(sequence: u64, content: impl Into<Bytes>) -> Parcel {
 
 /// What somebody says of himself who means no good.
 pub(crate) fn rogue_hello(incarnation: u64) -> Vec<u8> {
+    hello_of("rogue", incarnation)
+}
+
+/// What somebody with this name says of himself.
+pub(crate) fn hello_of(name: &str, incarnation: u64) -> Vec<u8> {
     let mut body = Vec::new();
     body.extend(incarnation.to_le_bytes());
     body.extend((1_u64 << 30).to_le_bytes());
     body.extend(100_u32.to_le_bytes());
     body.extend(1_u64.to_le_bytes());
-    for text in ["rogue", "test", "there", "tcp://127.0.0.1:1"] {
+    for text in [name, "test", "there", "tcp://127.0.0.1:1"] {
         body.extend((text.len() as u16).to_le_bytes());
         body.extend(text.as_bytes());
     }
     body.push(0);
     body
+}
+
+/// A frame of this kind.
+pub(crate) fn frame_of(kind: u8, id: u64, body: &[u8]) -> Vec<u8> {
+    let mut frame = b"fipa\x01".to_vec();
+    frame.extend([kind, 0, 0]);
+    frame.extend(id.to_le_bytes());
+    frame.extend((body.len() as u64).to_le_bytes());
+    frame.extend(body);
+    frame
 }
 
 /// A parcel as it stands in frames and packets.

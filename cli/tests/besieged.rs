@@ -1,0 +1,207 @@
+//! Fifty hostile peers beside two honest gateways: every honest letter arrives.
+//!
+//! How long they take is printed: while it is quiet, while the hostile peers are at the gateway, and
+//! while they are at somebody who takes whatever comes and does nothing about it. The last says what
+//! their own work costs on the processors that all share. `FIPA_SIEGE_SECONDS` is how long each of
+//! these goes on, three times; without it, one second, once. Only in a release build and on a machine
+//! that does nothing else do the figures mean something:
+//!
+//! ```console
+//! $ FIPA_SIEGE_SECONDS=10 cargo test --release -p fipa-cli --test besieged -- --nocapture --test-threads=1
+//! ```
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::print_stdout, reason = "what it came to is worth knowing")]
+
+mod fuzzing;
+mod siege;
+
+use std::io::{BufRead as _, BufReader};
+use std::net::SocketAddr;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::time::Duration;
+
+use fipa::keys::Keys;
+use fuzzing::trusted::{client, quic};
+use fuzzing::{Writer, datagram, stream};
+use siege::hostile::{self, AT_KEYS, IN_THE_CLEAR, Means};
+use siege::{percentiles, usage};
+
+/// Where the hostile peers are to go: two addresses; whether there are keys.
+const GO: &str = "FIPA_SIEGE_AT";
+
+/// First datagrams of connections, each of which may be used again when its connection is over.
+const INITIALS: usize = 300;
+
+/// The hostile peers in a process of their own, so that what they need can be told apart.
+struct Hostile(Child);
+
+impl Hostile {
+    fn set_off(to: Option<(SocketAddr, SocketAddr)>, secured: bool, place: &Path) -> Self {
+        let at = to.map_or("sink".to_owned(), |(tcp, datagrams)| {
+            format!("{tcp} {datagrams}")
+        });
+        let mut command = Command::new(std::env::current_exe().unwrap());
+        command
+            .args([
+                "--exact",
+                "inside_hostile_peers",
+                "--ignored",
+                "--nocapture",
+            ])
+            .env(GO, format!("{secured} {} {at}", place.display()))
+            .stdout(Stdio::piped());
+        let mut child = command.spawn().unwrap();
+        let lines = BufReader::new(child.stdout.take().unwrap()).lines();
+        let mut lines = lines.map_while(Result::ok);
+        assert!(
+            lines.any(|line| line.contains("READY")),
+            "they did not set off"
+        );
+        // It goes on saying how much it did.
+        std::thread::spawn(move || lines.for_each(drop));
+        Self(child)
+    }
+}
+
+impl Drop for Hostile {
+    fn drop(&mut self) {
+        // It may have ended already, which is as good.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[test]
+#[ignore = "is run by the other tests in a process of its own"]
+fn inside_hostile_peers() {
+    let go = std::env::var(GO).unwrap();
+    let mut words = go.split(' ');
+    let secured: bool = words.next().unwrap().parse().unwrap();
+    let place = Path::new(words.next().unwrap()).to_owned();
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build();
+    runtime.unwrap().block_on(async move {
+        let at = match words.next().unwrap() {
+            "sink" => hostile::sink().await,
+            tcp => (tcp.parse().unwrap(), words.next().unwrap().parse().unwrap()),
+        };
+        let means = Arc::new(means(secured, &place, at).await);
+        println!("READY");
+        let vices = if secured { &AT_KEYS } else { &IN_THE_CLEAR };
+        hostile::set_off(vices, &means);
+        std::future::pending::<()>().await;
+    });
+}
+
+async fn means(secured: bool, place: &Path, (tcp, datagrams): (SocketAddr, SocketAddr)) -> Means {
+    let mut random = fastrand::Rng::with_seed(1);
+    let receivers = ["nobody".to_owned()];
+    let mut writer = Writer {
+        random: &mut random,
+        name: "rogue",
+        receivers: &receivers,
+    };
+    let mut means = Means {
+        tcp: Some(tcp),
+        datagrams: Some(datagrams),
+        greeting: fuzzing::frame(fuzzing::HELLO, 0, &writer.hello()),
+        letter: fuzzing::frame(fuzzing::PARCEL, 1, &writer.letter_of(64)),
+        announcement: fuzzing::frame(fuzzing::PARCEL, 1, &writer.letter_of(60 << 20))[..10_000]
+            .to_vec(),
+        hello: datagram::hello(1, &[0; 16], &writer.hello()),
+        ..Means::default()
+    };
+    let keys = Keys::at(place.join("stranger"));
+    if secured {
+        let tls = client(&keys, "stranger");
+        means.client_hello = stream::client_hello(&tls);
+        let quic = quic(&tls);
+        for _ in 0..INITIALS {
+            means.initials.push(datagram::initial(&quic).await);
+        }
+    } else {
+        means.client_hello = vec![22; 200];
+    }
+    means
+}
+
+/// How it went in one of the states.
+#[derive(Debug, Default)]
+struct Account {
+    took: Vec<Duration>,
+    gateway: Duration,
+    hostile: Duration,
+}
+
+fn besieged(secured: bool) {
+    let asked = siege::number("FIPA_SIEGE_SECONDS");
+    let (seconds, rounds) = asked.map_or((1, 1), |seconds| (seconds, 3));
+    let place = tempfile::Builder::new().prefix("siege-").tempdir().unwrap();
+    if secured {
+        // Nobody trusts him.
+        siege::keys(place.path().join("stranger"), "stranger");
+    }
+    let pair = siege::Pair::new(place.path(), secured, "besieged");
+    let talk = pair.rover.talk("arm");
+    talk.goes_on(100);
+    talk.take();
+    let to = (
+        pair.gateway.at("tcp"),
+        pair.gateway.at(if secured { "quic" } else { "udp" }),
+    );
+    let mut accounts: [Account; 3] = Default::default();
+    for _ in 0..rounds {
+        for (state, account) in accounts.iter_mut().enumerate() {
+            let hostile = match state {
+                0 => None,
+                1 => Some(Hostile::set_off(Some(to), secured, place.path())),
+                _ => Some(Hostile::set_off(None, secured, place.path())),
+            };
+            let used = |of: Option<&Hostile>| of.map(|it| usage(it.0.id()).processor);
+            let before = (pair.gateway.usage(), used(hostile.as_ref()));
+            talk.take();
+            std::thread::sleep(Duration::from_secs(seconds));
+            // However slow they have become.
+            talk.goes_on(20);
+            account.took.extend(talk.take());
+            account.gateway += pair.gateway.usage().processor - before.0.processor;
+            if let (Some(now), Some(before)) = (used(hostile.as_ref()), before.1) {
+                account.hostile += now - before;
+            }
+        }
+    }
+    talk.end();
+    println!("{}:", if secured { "with keys" } else { "in the clear" });
+    let quiet = percentiles(accounts[0].took.clone());
+    for (what, account) in ["quiet", "at the gateway", "at a sink"]
+        .iter()
+        .zip(accounts)
+    {
+        let letters = account.took.len();
+        let (median, last) = percentiles(account.took);
+        let ratio = |one: Duration, other: Duration| one.as_secs_f64() / other.as_secs_f64();
+        println!(
+            "  {what:14} {letters:6} letters: median {median:.1?} ({:.2}), 99 % {last:.1?} ({:.2}); \
+             processor: gateway {:.1?}, hostile peers {:.1?}",
+            ratio(median, quiet.0),
+            ratio(last, quiet.1),
+            account.gateway,
+            account.hostile,
+        );
+    }
+    pair.end();
+}
+
+#[test]
+fn honest_letters_arrive_at_a_gateway_with_keys() {
+    besieged(true);
+}
+
+#[test]
+fn honest_letters_arrive_at_a_gateway_in_the_clear() {
+    besieged(false);
+}

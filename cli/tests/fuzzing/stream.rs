@@ -1,0 +1,73 @@
+//! Connections over TCP, in the clear and with TLS.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use rustls::pki_types::ServerName;
+use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
+use tokio::net::TcpStream;
+use tokio::time::{sleep, timeout};
+use tokio_rustls::TlsConnector;
+
+use super::{Ending, Script};
+
+/// Says something in the clear.
+pub(crate) async fn plain(to: SocketAddr, script: Script) -> u64 {
+    match TcpStream::connect(to).await {
+        Ok(stream) => perform(stream, script).await,
+        Err(_) => 0,
+    }
+}
+
+/// Says something as a peer that is trusted. Nothing when that did not work.
+pub(crate) async fn secured(
+    to: SocketAddr,
+    config: Arc<rustls::ClientConfig>,
+    script: Script,
+) -> Option<u64> {
+    let stream = TcpStream::connect(to).await.ok()?;
+    let connector = TlsConnector::from(config);
+    let stream = connector.connect(ServerName::from(to.ip()), stream).await;
+    Some(perform(stream.ok()?, script).await)
+}
+
+/// What a peer of ours says first.
+pub(crate) fn client_hello(config: &Arc<rustls::ClientConfig>) -> Vec<u8> {
+    let name = ServerName::try_from("127.0.0.1").unwrap();
+    let mut client = rustls::ClientConnection::new(config.clone(), name).unwrap();
+    let mut hello = Vec::new();
+    client.write_tls(&mut hello).unwrap();
+    hello
+}
+
+/// Bytes that were written.
+async fn perform(stream: impl AsyncRead + AsyncWrite + Unpin, script: Script) -> u64 {
+    let (mut read, mut write) = tokio::io::split(stream);
+    let mut written = 0;
+    for (piece, pause) in script.pieces {
+        // Whoever has had enough hangs up, or reads no more.
+        match timeout(Duration::from_secs(1), write.write_all(&piece)).await {
+            Ok(Ok(())) => written += piece.len() as u64,
+            _ => return written,
+        }
+        if !pause.is_zero() {
+            sleep(pause).await;
+        }
+    }
+    // The gateway may be gone by now; whether it should be is not for this side to say.
+    let _ = write.flush().await;
+    match script.ending {
+        Ending::Drop => {}
+        Ending::Deaf => sleep(script.patience).await,
+        Ending::Finish | Ending::Linger => {
+            if script.ending == Ending::Finish {
+                let _ = write.shutdown().await;
+            }
+            let mut sink = [0; 4096];
+            let reading = async { while matches!(read.read(&mut sink).await, Ok(1..)) {} };
+            let _ = timeout(script.patience, reading).await;
+        }
+    }
+    written
+}

@@ -1,0 +1,415 @@
+//! Two gateway processes and an honest pair of agents that talk through them, whatever others do to
+//! the gateways meanwhile.
+
+#![allow(dead_code, reason = "not every test uses all of it")]
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+
+pub(crate) mod hostile;
+
+use std::collections::HashSet;
+use std::fs;
+use std::io::{BufRead as _, BufReader};
+use std::net::SocketAddr;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use fipa::config::Sources;
+use fipa::keys::{Keys, VALID};
+use fipa::{Agent, AgentId, Config, Domain, Outcome, Performative};
+use parking_lot::Mutex;
+use serde_json::Value;
+use tokio::runtime::Runtime;
+
+/// Ends what hangs; nothing is expected to take this long.
+pub(crate) const WATCHDOG: Duration = Duration::from_secs(90);
+
+/// Lines of a gateway's log that are kept, the latest.
+const LINES: usize = 200;
+
+/// What the content of the pair's letters begins with.
+const HONEST: &str = "honest ";
+
+/// Waits for a condition.
+pub(crate) fn until(what: &str, condition: impl Fn() -> bool) {
+    let begun = Instant::now();
+    while !condition() {
+        assert!(begun.elapsed() < WATCHDOG, "never: {what}");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// The number in this environment variable.
+pub(crate) fn number(variable: &str) -> Option<u64> {
+    let text = std::env::var(variable).ok()?;
+    Some(
+        text.parse()
+            .unwrap_or_else(|_| panic!("{variable} is no number: {text}")),
+    )
+}
+
+/// Keys in this directory, of a service with this name.
+pub(crate) fn keys(dir: impl Into<std::path::PathBuf>, name: &str) -> Keys {
+    let keys = Keys::at(dir);
+    keys.init(name, &[], VALID).unwrap();
+    keys
+}
+
+/// Each trusts the other.
+pub(crate) fn befriend(one: &Keys, other: &Keys) {
+    one.trust(&fs::read(other.own_file()).unwrap()).unwrap();
+    other.trust(&fs::read(one.own_file()).unwrap()).unwrap();
+}
+
+/// What a process uses.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Usage {
+    /// Memory that it has, in KiB.
+    pub(crate) resident: u64,
+    pub(crate) descriptors: usize,
+    /// Time on a processor so far.
+    pub(crate) processor: Duration,
+}
+
+/// What the process with this number uses.
+pub(crate) fn usage(process: u32) -> Usage {
+    let proc = format!("/proc/{process}");
+    let status = fs::read_to_string(format!("{proc}/status")).unwrap();
+    let resident = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+    let resident = resident.unwrap().trim_end_matches("kB").trim();
+    let stat = fs::read_to_string(format!("{proc}/stat")).unwrap();
+    // Fields 14 and 15 of proc_pid_stat(5); the name, which may have blanks, ends with the last ).
+    let fields: Vec<&str> = stat
+        .rsplit_once(')')
+        .unwrap()
+        .1
+        .split_whitespace()
+        .collect();
+    let ticks: u64 = fields[11..13]
+        .iter()
+        .map(|it| it.parse::<u64>().unwrap())
+        .sum();
+    Usage {
+        resident: resident.parse().unwrap(),
+        descriptors: fs::read_dir(format!("{proc}/fd")).unwrap().count(),
+        processor: Duration::from_millis(ticks * 10),
+    }
+}
+
+/// A gateway process; killed when it is dropped.
+pub(crate) struct Gateway {
+    child: Child,
+    pub(crate) settings: Vec<String>,
+    locations: Vec<String>,
+    told: Arc<Mutex<Vec<String>>>,
+}
+
+impl Gateway {
+    /// Starts it with a command for the program, and waits until it is ready.
+    pub(crate) fn start(mut command: Command, settings: Vec<String>) -> Self {
+        command.args(["up", "--json"]);
+        for setting in &settings {
+            command.args(["--set", setting]);
+        }
+        command.stdin(Stdio::null());
+        command.stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut child = command.spawn().unwrap();
+        let told: Arc<Mutex<Vec<String>>> = Arc::default();
+        let (keep, errors) = (Arc::clone(&told), child.stderr.take().unwrap());
+        std::thread::spawn(move || {
+            for line in BufReader::new(errors).lines().map_while(Result::ok) {
+                let mut kept = keep.lock();
+                // What it complains of when it panics is worth more than what others did to it.
+                if kept.len() >= LINES && !line.contains("panicked") {
+                    kept.remove(0);
+                }
+                kept.push(line);
+            }
+        });
+        let mut ready = String::new();
+        BufReader::new(child.stdout.take().unwrap())
+            .read_line(&mut ready)
+            .unwrap();
+        let ready: Value = serde_json::from_str(&ready).unwrap_or_else(|error| {
+            panic!("the gateway is not ready ({error}): {:?}", told.lock())
+        });
+        let locations = ready["locations"].as_array().unwrap().iter();
+        let locations = locations.map(|location| location.as_str().unwrap());
+        let locations = locations.map(|location| location.split('#').next().unwrap().to_owned());
+        Self {
+            child,
+            settings,
+            locations: locations.collect(),
+            told,
+        }
+    }
+
+    /// Where it is, as others are told in `discovery.static`.
+    pub(crate) fn known_as(&self, name: &str) -> String {
+        let network = self.locations.iter().filter(|it| !it.starts_with("shm"));
+        let locations: Vec<String> = network.map(|location| format!("{location:?}")).collect();
+        format!(
+            "discovery.static={{ {name:?} = [{}] }}",
+            locations.join(", ")
+        )
+    }
+
+    /// Where it listens, by this kind of transport.
+    pub(crate) fn at(&self, kind: &str) -> SocketAddr {
+        let mut locations = self.locations.iter();
+        let found = locations.find_map(|it| it.strip_prefix(kind)?.strip_prefix("://"));
+        found.unwrap().parse().unwrap()
+    }
+
+    pub(crate) fn usage(&self) -> Usage {
+        usage(self.child.id())
+    }
+
+    /// Ends it in good order.
+    pub(crate) fn end(mut self) {
+        let told = self.told.lock().join("\n");
+        assert!(!told.contains("panicked"), "{told}");
+        let ended = self.child.try_wait().unwrap();
+        assert!(ended.is_none(), "it has ended before ({ended:?}): {told}");
+        let pid = self.child.id().to_string();
+        let sent = Command::new("kill").args(["-TERM", &pid]).status().unwrap();
+        assert!(sent.success());
+        until("the gateway ends", || {
+            fs::read_to_string(format!("/proc/{pid}/stat")).map_or(true, |stat| {
+                stat.rsplit_once(") ")
+                    .is_none_or(|(_, state)| state.starts_with('Z'))
+            })
+        });
+        let status = self.child.wait().unwrap();
+        assert!(
+            status.success(),
+            "{status}: {}",
+            self.told.lock().join("\n")
+        );
+    }
+}
+
+impl Drop for Gateway {
+    fn drop(&mut self) {
+        // It may have ended already, which is as good.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Two gateways that know each other, and an agent on the host of each.
+pub(crate) struct Pair {
+    /// The one that others may do something to.
+    pub(crate) gateway: Gateway,
+    other: Gateway,
+    pub(crate) rover: Party,
+    arm: Party,
+}
+
+impl Pair {
+    /// With keys in directories of this place, or without any. `what` tells its domains from others.
+    pub(crate) fn new(place: &Path, secured: bool, what: &str) -> Self {
+        let mark = if secured { "keys" } else { "clear" };
+        let mark = format!("{what}-{}-{mark}", std::process::id());
+        if secured {
+            let [one, other] = ["target", "other"].map(|name| keys(place.join(name), name));
+            befriend(&one, &other);
+        }
+        let fipa = || {
+            let mut command = Command::new(env!("CARGO_BIN_EXE_fipa"));
+            command.current_dir(place).env("HOME", place);
+            command
+        };
+        let settings = |name: &str| {
+            let mut settings = vec![
+                format!("domain={mark}-{name}"),
+                format!("mts.name={name}"),
+                "discovery.mdns=false".to_owned(),
+                // Two hosts on one machine.
+                "security.loopback=true".to_owned(),
+                // Whoever waits this long waits for ever, on the busiest machine.
+                "mts.deadline=60s".to_owned(),
+            ];
+            match secured {
+                true => settings.extend([
+                    format!("security.keys={}", place.join(name).display()),
+                    "mts.transports=shm,quic,tcp".to_owned(),
+                ]),
+                false => settings.push("mts.transports=shm,udp,tcp".to_owned()),
+            }
+            settings
+        };
+        let gateway = Gateway::start(fipa(), settings("target"));
+        let mut knowing = settings("other");
+        knowing.push(gateway.known_as("target"));
+        let other = Gateway::start(fipa(), knowing);
+        let arm = Party::new(&gateway.settings, "arm");
+        let rover = Party::new(&other.settings, "rover");
+        rover.knows("arm");
+        arm.answer();
+        Self {
+            gateway,
+            other,
+            rover,
+            arm,
+        }
+    }
+
+    /// Ends all of it in good order.
+    pub(crate) fn end(self) {
+        self.rover.end();
+        self.arm.end();
+        self.other.end();
+        self.gateway.end();
+    }
+}
+
+/// An honest agent on the host of a gateway.
+pub(crate) struct Party {
+    runtime: Runtime,
+    agent: Arc<Agent>,
+}
+
+impl Party {
+    /// On the host of the gateway with these settings.
+    pub(crate) fn new(settings: &[String], name: &str) -> Self {
+        let sources = Sources {
+            set: settings.to_vec(),
+            ..Sources::default()
+        };
+        let config = Config::load(&sources).unwrap();
+        let mut builder = tokio::runtime::Builder::new_multi_thread();
+        let runtime = builder.worker_threads(1).enable_all().build().unwrap();
+        let domain = runtime.block_on(Domain::open(&config)).unwrap();
+        let agent = runtime.block_on(async { domain.register(name) }).unwrap();
+        Self {
+            runtime,
+            agent: Arc::new(agent),
+        }
+    }
+
+    /// Answers every honest letter with what it says, and takes none twice.
+    pub(crate) fn answer(&self) {
+        let agent = Arc::clone(&self.agent);
+        self.runtime.spawn(async move {
+            let mut taken = HashSet::new();
+            while let Ok(incoming) = agent.receive().await {
+                let Some(content) = honest(&incoming.message) else {
+                    continue;
+                };
+                assert!(taken.insert(content.clone()), "twice: {content}");
+                let answer = agent.reply(&incoming.message, Performative::Inform);
+                // The other side says whether it has come.
+                drop(agent.send(answer.content(content).build().unwrap()));
+            }
+        });
+    }
+
+    /// Writes letters to an agent that answers, one after the other, until it is told to end.
+    pub(crate) fn talk(&self, to: &str) -> Talk {
+        let (agent, to) = (Arc::clone(&self.agent), AgentId::new(to).unwrap());
+        let stop = Arc::new(AtomicBool::new(false));
+        let said = Arc::new(AtomicU64::new(0));
+        let (ended, count) = (Arc::clone(&stop), Arc::clone(&said));
+        let runtime = self.runtime.handle().clone();
+        let took: Arc<Mutex<Vec<Duration>>> = Arc::default();
+        let noted = Arc::clone(&took);
+        let thread = std::thread::spawn(move || {
+            while !ended.load(Ordering::Acquire) {
+                let took = runtime.block_on(round(&agent, &to));
+                noted.lock().push(took);
+                count.fetch_add(1, Ordering::Relaxed);
+                std::thread::sleep(Duration::from_millis(2));
+            }
+        });
+        Talk {
+            stop,
+            said,
+            took,
+            thread,
+        }
+    }
+
+    /// Waits until it knows an agent of the other host.
+    pub(crate) fn knows(&self, name: &str) {
+        until("the agent of the other host is known", || {
+            self.agent.domain().directory().lookup(name).is_some()
+        });
+    }
+
+    pub(crate) fn end(self) {
+        // Whoever answers holds the agent.
+        self.runtime.shutdown_timeout(Duration::from_secs(5));
+    }
+}
+
+/// Letters of the honest pair, one after the other.
+pub(crate) struct Talk {
+    stop: Arc<AtomicBool>,
+    said: Arc<AtomicU64>,
+    took: Arc<Mutex<Vec<Duration>>>,
+    thread: JoinHandle<()>,
+}
+
+impl Talk {
+    /// Waits until so many more letters were answered.
+    pub(crate) fn goes_on(&self, letters: u64) {
+        let before = self.said.load(Ordering::Relaxed);
+        until("the honest pair goes on talking", || {
+            self.said.load(Ordering::Relaxed) >= before + letters || self.thread.is_finished()
+        });
+    }
+
+    /// How long each letter and its answer took since this was asked before.
+    pub(crate) fn take(&self) -> Vec<Duration> {
+        std::mem::take(&mut self.took.lock())
+    }
+
+    /// Ends it.
+    pub(crate) fn end(self) {
+        self.stop.store(true, Ordering::Release);
+        if let Err(panic) = self.thread.join() {
+            std::panic::resume_unwind(panic);
+        }
+    }
+}
+
+fn honest(message: &fipa::Message) -> Option<String> {
+    let content = std::str::from_utf8(message.content()?).ok()?;
+    let is_honest = *message.performative() == Performative::Inform && content.starts_with(HONEST);
+    is_honest.then(|| content.to_owned())
+}
+
+/// One letter there and its answer back; each has one outcome and arrives.
+async fn round(agent: &Agent, to: &AgentId) -> Duration {
+    let content = format!("{HONEST}{}", agent.unique_id());
+    let message = agent.message(Performative::Inform).receiver(to.clone());
+    let begun = Instant::now();
+    let sent = agent.send(message.content(content.clone()).build().unwrap());
+    let answered = async {
+        loop {
+            let incoming = agent.receive().await.unwrap();
+            if honest(&incoming.message).as_deref() == Some(&content) {
+                return begun.elapsed();
+            }
+        }
+    };
+    let both = async { tokio::join!(sent, answered) };
+    let (sent, took) = tokio::time::timeout(WATCHDOG, both).await.unwrap();
+    let deliveries = sent.unwrap();
+    let [delivery] = &deliveries.0[..] else {
+        panic!("not one outcome: {deliveries}");
+    };
+    let arrived = matches!(delivery.outcome, Outcome::Delivered { .. });
+    assert!(arrived, "{deliveries}");
+    took
+}
+
+/// The median and the 99th percentile.
+pub(crate) fn percentiles(mut took: Vec<Duration>) -> (Duration, Duration) {
+    took.sort_unstable();
+    (took[took.len() / 2], took[took.len() * 99 / 100])
+}

@@ -1,0 +1,204 @@
+//! Somebody who speaks TLS and QUIC on terms of his own, with or without a certificate.
+
+use std::io::{Read as _, Write as _};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::sync::Arc;
+use std::time::Duration;
+
+use quinn::crypto::rustls::{QuicClientConfig, QuicServerConfig};
+use rustls::client::ResolvesClientCert;
+use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
+use rustls::crypto::ring;
+use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
+use rustls::sign::CertifiedKey;
+use rustls::version::TLS13;
+use rustls::{
+    ClientConfig, ClientConnection, DigitallySignedStruct, Error, ServerConfig, ServerConnection,
+    SignatureScheme, StreamOwned, SupportedProtocolVersion,
+};
+
+use super::certificates::Host;
+use super::{frame_of, hello_of, parcel, runtime, written};
+
+/// What he is called; certificates have to be of this name.
+pub(crate) const ROGUE: &str = "rogue";
+
+/// The protocol that QUIC connections are for.
+pub(crate) const PROTOCOL: &[u8] = b"fipa/1";
+
+const HELLO: u8 = 1;
+const PARCEL: u8 = 2;
+
+/// Ends what hangs.
+const WATCHDOG: Duration = Duration::from_secs(30);
+
+pub(crate) type Versions = &'static [&'static SupportedProtocolVersion];
+
+/// With this certificate and key, over these versions of TLS.
+pub(crate) fn client(own: Option<&Host>, versions: Versions) -> ClientConfig {
+    let own = own.map(|host| {
+        let credentials = host.credentials(&[]);
+        let key = ring::sign::any_supported_type(&credentials.key).unwrap();
+        CertifiedKey::new(vec![credentials.own.der().clone()], key)
+    });
+    ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
+        .with_protocol_versions(versions)
+        .unwrap()
+        .dangerous()
+        .with_custom_certificate_verifier(Arc::new(Anybody))
+        .with_client_cert_resolver(Arc::new(Own(own.map(Arc::new))))
+}
+
+/// The same for the other side, which asks nobody who he is.
+pub(crate) fn server(own: &Host, versions: Versions) -> ServerConfig {
+    let credentials = own.credentials(&[]);
+    ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
+        .with_protocol_versions(versions)
+        .unwrap()
+        .with_no_client_auth()
+        .with_single_cert(vec![credentials.own.der().clone()], credentials.key)
+        .unwrap()
+}
+
+/// What he says when he has got in: who he is, and a letter.
+pub(crate) fn said() -> Vec<u8> {
+    let mut said = frame_of(HELLO, 0, &hello_of(ROGUE, 77));
+    said.extend(frame_of(PARCEL, 1, &written(&parcel(1, "let me in"))));
+    said
+}
+
+/// Says it over TLS, and returns what is said to that.
+pub(crate) fn greet_tls(config: ClientConfig, at: &str) -> Result<Vec<u8>, String> {
+    let stream = TcpStream::connect(at).unwrap();
+    stream.set_read_timeout(Some(WATCHDOG)).unwrap();
+    let name = ServerName::try_from("127.0.0.1").unwrap();
+    let session = ClientConnection::new(Arc::new(config), name).unwrap();
+    let mut stream = StreamOwned::new(session, stream);
+    stream
+        .write_all(&said())
+        .map_err(|error| error.to_string())?;
+    let mut answer = vec![0; 24];
+    match stream.read_exact(&mut answer) {
+        Ok(()) => Ok(answer),
+        Err(error) => Err(error.to_string()),
+    }
+}
+
+/// Listens and takes one TLS connection: what the other side says over it.
+pub(crate) fn hear_tls(
+    config: ServerConfig,
+) -> (SocketAddr, std::thread::JoinHandle<Result<Vec<u8>, String>>) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let at = listener.local_addr().unwrap();
+    let heard = std::thread::spawn(move || {
+        let (stream, _) = listener.accept().unwrap();
+        stream.set_read_timeout(Some(WATCHDOG)).unwrap();
+        let session = ServerConnection::new(Arc::new(config)).unwrap();
+        let mut heard = vec![0; 24];
+        match StreamOwned::new(session, stream).read_exact(&mut heard) {
+            Ok(()) => Ok(heard),
+            Err(error) => Err(error.to_string()),
+        }
+    });
+    (at, heard)
+}
+
+/// The settings of QUIC with this TLS for a protocol, in a version.
+pub(crate) fn quic(mut tls: ClientConfig, protocol: &[u8], version: u32) -> quinn::ClientConfig {
+    tls.alpn_protocols = vec![protocol.to_vec()];
+    let mut config = quinn::ClientConfig::new(Arc::new(QuicClientConfig::try_from(tls).unwrap()));
+    config.version(version);
+    config
+}
+
+/// Says it over QUIC, and returns what is said to that.
+pub(crate) fn greet_quic(config: quinn::ClientConfig, at: &str) -> Result<Vec<u8>, String> {
+    runtime().block_on(async {
+        let endpoint = quinn::Endpoint::client("127.0.0.1:0".parse().unwrap()).unwrap();
+        let connecting = endpoint
+            .connect_with(config, at.parse().unwrap(), "x")
+            .unwrap();
+        let greeting = async {
+            let connection = connecting.await.map_err(|error| error.to_string())?;
+            let opened = connection
+                .open_bi()
+                .await
+                .map_err(|error| error.to_string());
+            let (mut send, mut receive) = opened?;
+            let sent = send.write_all(&said()).await;
+            sent.map_err(|error| error.to_string())?;
+            let mut answer = vec![0; 24];
+            let read = receive.read_exact(&mut answer).await;
+            read.map_err(|error| error.to_string())?;
+            Ok(answer)
+        };
+        tokio::time::timeout(WATCHDOG, greeting).await.unwrap()
+    })
+}
+
+/// Somebody who listens for QUIC of this protocol.
+pub(crate) fn listen_quic(mut tls: ServerConfig, protocol: &[u8]) -> quinn::Endpoint {
+    tls.alpn_protocols = vec![protocol.to_vec()];
+    let config = QuicServerConfig::try_from(tls).unwrap();
+    let config = quinn::ServerConfig::with_crypto(Arc::new(config));
+    quinn::Endpoint::server(config, "127.0.0.1:0".parse().unwrap()).unwrap()
+}
+
+/// Shows this certificate, whether the key belongs to it or not.
+#[derive(Debug)]
+struct Own(Option<Arc<CertifiedKey>>);
+
+impl ResolvesClientCert for Own {
+    fn resolve(&self, _: &[&[u8]], _: &[SignatureScheme]) -> Option<Arc<CertifiedKey>> {
+        self.0.clone()
+    }
+
+    fn has_certs(&self) -> bool {
+        self.0.is_some()
+    }
+}
+
+/// Whoever is there is welcome.
+#[derive(Debug)]
+struct Anybody;
+
+impl ServerCertVerifier for Anybody {
+    fn verify_server_cert(
+        &self,
+        _: &CertificateDer<'_>,
+        _: &[CertificateDer<'_>],
+        _: &ServerName<'_>,
+        _: &[u8],
+        _: UnixTime,
+    ) -> Result<ServerCertVerified, Error> {
+        Ok(ServerCertVerified::assertion())
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        _: &[u8],
+        _: &CertificateDer<'_>,
+        _: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        Ok(HandshakeSignatureValid::assertion())
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        _: &[u8],
+        _: &CertificateDer<'_>,
+        _: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        Ok(HandshakeSignatureValid::assertion())
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        let provider = ring::default_provider();
+        provider
+            .signature_verification_algorithms
+            .supported_schemes()
+    }
+}
+
+/// TLS as it has to be.
+pub(crate) const ONLY_13: Versions = &[&TLS13];
