@@ -7,13 +7,14 @@
 mod common;
 
 use std::io::{Read, Write};
-use std::net::{Shutdown, TcpStream};
+use std::net::{Shutdown, SocketAddr, TcpStream};
 use std::time::Duration;
 
 use common::{Party, accepted, config, parcel, rogue_hello, until, written};
 use fipa_acl::Envelope;
 use fipa_transport::{Conclusion, Kind, Location, Parcel, Verdict, WayFault};
 use fipa_transport_net::{Counters, Limits};
+use socket2::{Domain, Socket, Type};
 
 /// A letter as a fipa_services peer sent it.
 const TCP_LETTER: &[u8] = include_bytes!("data/tcp_letter.bin");
@@ -217,6 +218,26 @@ fn a_thousand_silent_connections_hold_few_descriptors_and_stop_nobody() {
     }
     Party::new().assert_reaches(1, &party);
     counted(&party, |c| c.refused_crowd, 1000 + 1 - max);
+}
+
+#[test]
+fn who_knocks_often_pushes_out_nobody_else() {
+    let party = Party::new();
+    // Somebody at another address, with a slow link.
+    let slow = Socket::new(Domain::IPV4, Type::STREAM, None).unwrap();
+    let other: SocketAddr = "127.0.0.2:0".parse().unwrap();
+    slow.bind(&other.into()).unwrap();
+    let at: SocketAddr = party.location().address().parse().unwrap();
+    slow.connect(&at.into()).unwrap();
+    let mut slow = TcpStream::from(slow);
+    let mut said = hello(77);
+    said.extend(frame(1, &parcel(1, "hello")));
+    slow.write_all(&said[..10]).unwrap();
+    let max = Limits::default().max_strangers as u64;
+    let _crowd: Vec<TcpStream> = (0..2 * max).map(|_| connect(&party)).collect();
+    counted(&party, |c| c.refused_crowd, max + 1);
+    slow.write_all(&said[10..]).unwrap();
+    until("his letter", || (party.arrivals() == 1).then_some(()));
 }
 
 #[test]

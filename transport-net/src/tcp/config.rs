@@ -65,7 +65,8 @@ pub struct Limits {
     /// Most connections whose peer has introduced itself, or that this side opened. Default 256.
     pub max_connections: usize,
     /// Most accepted connections that have not introduced themselves (an old peer never does).
-    /// One more pushes out the oldest. Default 64.
+    /// One more pushes out the oldest of the address (with IPv6, the network of 64 bits) that has the
+    /// most. Default 64.
     pub max_strangers: usize,
     /// Most connections that the peers at one address have opened and introduced themselves on.
     /// Default 64. This and the next two are not for loopback addresses, unless peers there have to

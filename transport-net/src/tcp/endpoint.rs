@@ -7,6 +7,7 @@
 //! two endpoints connect to each other at the same time both connections are kept: the one that is
 //! not used closes when it has been idle.
 
+use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap};
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
@@ -456,9 +457,9 @@ impl Endpoint {
         }
     }
 
-    /// Gives a place to an accepted connection that has not introduced itself, unless the endpoint
-    /// has been closed; one too many pushes out the oldest, of its own address when that has half of
-    /// all places.
+    /// Gives a place to a connection accepted from this address that has not introduced itself, unless
+    /// the endpoint has been closed. One too many pushes out another; so does one more of an address
+    /// that has half of all places.
     pub(crate) fn receive_stranger(self: &Arc<Self>, from: IpAddr) -> Option<Stranger> {
         let home = whose(from);
         let (number, pushed_out) = {
@@ -468,24 +469,16 @@ impl Endpoint {
             }
             registry.last_stranger += 1;
             let most = self.limits().max_strangers.max(1);
-            let crowded = registry.strangers.len() >= most;
             let of_home = registry.strangers.values().filter(|(it, _)| *it == home);
             let greedy = self.config.limits_peer_at(home) && of_home.count() >= most.div_ceil(2);
-            let mut strangers = registry.strangers.iter();
-            let oldest = strangers
-                .find_map(|(number, (of, task))| {
-                    let task = task.clone().filter(|_| !greedy || *of == home)?;
-                    Some((*number, task))
-                })
-                .filter(|_| crowded || greedy);
-            if let Some((number, _)) = &oldest {
-                registry.strangers.remove(number);
-            }
+            let too_many = greedy || registry.strangers.len() >= most;
+            let pushed_out = too_many.then(|| registry.one_too_many(home)).flatten();
+            let pushed_out = pushed_out.and_then(|number| registry.strangers.remove(&number));
             let number = registry.last_stranger;
             registry.strangers.insert(number, (home, None));
-            (number, oldest)
+            (number, pushed_out)
         };
-        if let Some((_, task)) = pushed_out {
+        if let Some(task) = pushed_out.and_then(|(_, task)| task) {
             count(&self.tally.refused_crowd);
             task.abort();
         }
@@ -507,6 +500,23 @@ impl Endpoint {
         if let Some((_, place)) = self.registry.lock().strangers.get_mut(&number) {
             *place = Some(task);
         }
+    }
+}
+
+impl Registry {
+    /// Which stranger goes when another one comes from this home: the oldest of those from the home
+    /// that has the most places then. So those who knock often push out each other, and somebody with
+    /// a slow link gets in beside them.
+    fn one_too_many(&self, coming: IpAddr) -> Option<u64> {
+        let mut homes: HashMap<IpAddr, (usize, Reverse<u64>)> = HashMap::new();
+        for (number, (home, task)) in &self.strangers {
+            if task.is_some() {
+                let fresh = || (usize::from(*home == coming), Reverse(*number));
+                homes.entry(*home).or_insert_with(fresh).0 += 1;
+            }
+        }
+        let most = homes.into_values().max();
+        most.map(|(_, Reverse(oldest))| oldest)
     }
 }
 
