@@ -26,19 +26,25 @@ fuzz_target!(|bytes: &[u8]| {
     assert!(!machine.initial().id().is_empty());
     let mut library = Library::standard();
     let _ = library.add(machine);
-    let mut monitor = Monitor::observer(Arc::new(library));
+    let library = Arc::new(library);
+    run(Monitor::observer(Arc::clone(&library)), &name);
+    run(Monitor::agent(library, "ann"), &name);
+});
+
+fn run(mut monitor: Monitor, name: &str) {
     let mut now = SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000);
-    for round in 0..4_usize {
+    for round in 0..6_usize {
         for (number, act) in Performative::STANDARD.iter().enumerate() {
             let agents = ["ann", "ben", "cid"];
             let header = Header::new(act.clone())
                 .sender(agents[(number + round) % 3])
                 .receivers([agents[(number + round + 1 + number % 2) % 3]])
-                .protocol(name.as_str())
+                .reply_to(["dan", "cid"].into_iter().skip(round % 3))
+                .protocol(name)
                 .conversation_id("c");
             monitor.check(&header, now);
             now += Duration::from_secs(1);
             monitor.handle_timeout(now);
         }
     }
-});
+}

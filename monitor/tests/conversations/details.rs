@@ -266,3 +266,33 @@ fn what_is_due_now_is_not_late() {
     };
     assert_eq!((accepted.state, accepted.late), ("late", true));
 }
+
+#[test]
+fn who_begins_may_begin_protocols_within() {
+    let mut stage = stage_of(
+        r#"<scxml initial="start" xmlns:fipa="urn:fipa-rs:protocol" fipa:scope="participant">
+        <state id="asked">
+            <transition performative="inform" from="arm" to="rover" target="done"/>
+            <subprotocol name="fipa-.*" from="rover"/>
+        </state>
+        <state id="start">
+            <transition performative="subscribe" from="rover" to="arm" target="asked"/>
+        </state>
+        <state id="done" final="yes"/></scxml>"#,
+    );
+    stage.right(own("subscribe ann>ben"));
+    let other = stage.wrong(request("request ben>cid"));
+    assert_eq!(other.kind, Kind::WrongProtocol);
+    assert_eq!(stage.right(request("request ann>cid")), "requested");
+    assert_eq!(stage.right(request("inform cid>ann")), "done");
+}
+
+#[test]
+fn what_was_not_understood_need_not_be_cancelled() {
+    let mut stage = Stage::observer();
+    stage.right(request("request ann>ben").reply_with("q"));
+    stage.right(request("cancel ann>ben").reply_with("x"));
+    let crossing = request("not-understood ben>ann").in_reply_to("q");
+    assert_eq!(stage.right(crossing), "not-understood");
+    assert_eq!(stage.wrong(request("inform ben>ann")).kind, Kind::Ended);
+}

@@ -159,7 +159,8 @@ fn sub_protocols_begin_where_the_file_allows_it() {
         <state id="1"><transition performative="propagate" from="i" to="B" target="2"/></state>
         <state id="2" final="yes"><subprotocol name="fipa-.*" from="B"/></state></scxml>"#,
     );
-    stage.right(lift("propagate ann>ben"));
+    // Who is named twice has his role once.
+    stage.right(lift("propagate ann>ben,ben"));
     stage.right(request("request ben>cid"));
     stage.right(request("agree cid>ben"));
     let query = stage.wrong(say_in("query", "query-if ben>cid"));
