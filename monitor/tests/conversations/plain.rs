@@ -120,6 +120,11 @@ fn states_that_every_protocol_has() {
         if ["not-understood", "cancelled"].contains(&state) {
             assert_eq!(stage.wrong(lift("agree ben>ann")).kind, Kind::Ended);
         }
+        // What failed may be tried again, and what was said before it may have come.
+        if state == "undelivered" {
+            assert_eq!(stage.wrong(lift("inform ben>ann")).kind, Kind::OutOfOrder);
+            assert_eq!(stage.right(lift("agree ben>ann")), "4", "{said:?}");
+        }
     }
     // Nothing of the kind behind the end.
     for words in [
