@@ -457,6 +457,9 @@ fn brokers_run_protocols_within() {
     stage.right(broker("agree bro>ann"));
     stage.right(say_in("fipa-query", "query-ref bro>ben,cid"));
     stage.right(say_in("fipa-request", "request bro>dan"));
+    // What is wrong in the query that is there is no other one.
+    let own = stage.wrong(say_in("fipa-query", "inform bro>cid"));
+    assert_eq!(own.kind, Kind::WrongSender);
     assert_eq!(
         stage.wrong(say_in("fipa-query", "query-ref ann>ben")).kind,
         Kind::Stranger
