@@ -154,6 +154,7 @@ fn where_all_have_one_state_it_is_the_initiators_part() {
     for words in [
         "propose ben>dan",
         "accept-proposal dan>ben",
+        "accept-proposal dan>cid",
         "cancel dan>ben",
     ] {
         assert_eq!(stage.check(&own(words)), elsewhere, "{words}");
@@ -318,6 +319,28 @@ fn who_had_others_recruited_goes_on_with_them() {
     assert_eq!(stage.monitor.len(), 2, "both in one within the recruiting");
     let again = stage.wrong(recruit("inform rec>ann"));
     assert_eq!(again.kind, Kind::Unexpected);
+}
+
+#[test]
+fn what_is_told_keeps_a_conversation_from_being_forgotten() {
+    let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
+    let mut stage = as_dan(|_| {});
+    stage.pass(3_000);
+    assert_eq!(stage.check(&say("propose ben>dan")), elsewhere);
+    stage.pass(1_000);
+    assert_eq!(stage.monitor.len(), 1);
+    // Within another conversation it keeps that one.
+    let mut stage = Stage::new(Monitor::agent(library(), "ann"));
+    stage.right(recruit("proxy ann>rec"));
+    stage.right(recruit("agree rec>ann"));
+    for _ in 0..2 {
+        stage.pass(3_000);
+        assert_eq!(stage.check(&say("propose ben>ann")), elsewhere);
+    }
+    stage.pass(1_000);
+    assert_eq!(stage.monitor.len(), 2);
+    assert_eq!(stage.pass(3_000).len(), 1, "the recruiting is abandoned");
+    assert!(stage.monitor.is_empty());
 }
 
 #[test]

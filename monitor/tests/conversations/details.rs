@@ -86,6 +86,10 @@ fn the_initiator_need_not_be_the_first_role_of_the_file() {
     let text = r#"<scxml initial="start" xmlns:fipa="urn:fipa-rs:protocol" fipa:scope="participant">
         <state id="asked">
             <transition performative="inform" from="arm" to="rover" target="done"/>
+            <transition performative="propose" from="arm" to="rover" target="proposed"/>
+        </state>
+        <state id="proposed">
+            <transition performative="accept-proposal" from="rover" to="arm" target="done"/>
         </state>
         <state id="start">
             <transition performative="request" from="rover" to="arm" target="asked"/>
@@ -102,6 +106,8 @@ fn the_initiator_need_not_be_the_first_role_of_the_file() {
     let mut stage = Stage::new(Monitor::agent(Arc::new(library), "dan"));
     let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
     assert_eq!(stage.check(&own("inform ben>dan")), elsewhere);
+    assert_eq!(stage.check(&own("propose cid>dan")), elsewhere);
+    assert_eq!(stage.right(own("accept-proposal dan>cid")), "done");
 }
 
 #[test]
@@ -295,4 +301,14 @@ fn what_was_not_understood_need_not_be_cancelled() {
     let crossing = request("not-understood ben>ann").in_reply_to("q");
     assert_eq!(stage.right(crossing), "not-understood");
     assert_eq!(stage.wrong(request("inform ben>ann")).kind, Kind::Ended);
+}
+
+#[test]
+fn an_acceptance_is_repeated_like_all_else() {
+    let mut stage = Stage::observer();
+    stage.right(say("cfp ann>ben"));
+    stage.right(say("propose ben>ann"));
+    let accept = || say("accept-proposal ann>ben").reply_with("a");
+    stage.right(accept());
+    assert_eq!(stage.wrong(accept()).kind, Kind::Repeated);
 }
