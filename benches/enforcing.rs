@@ -1,7 +1,7 @@
 //! What it costs that agents check themselves: a request and its inform through shared memory,
-//! between threads that block, with `monitor.check = "enforce"` beside the same without. Both take turns
-//! of some milliseconds, so that other work on the machine hits both alike; a ratio is the median of
-//! those of the turns.
+//! between threads that block, with `monitor.check = "enforce"`, and with rules under `[access]`, beside the
+//! same without. All take turns of some milliseconds, so that other work on the machine hits all alike; a
+//! ratio is the median of those of the turns.
 //!
 //! ```console
 //! $ cargo bench --features monitor --bench enforcing
@@ -10,6 +10,7 @@
 #![expect(clippy::unwrap_used, reason = "a bench that cannot go on has failed")]
 #![expect(clippy::print_stdout, reason = "figures")]
 
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Instant;
 
 use fipa::config::Sources;
@@ -21,38 +22,52 @@ const TURNS: usize = 300;
 const ROUNDS: usize = 150;
 const FIRST: usize = 10;
 
+/// What is compared, with its settings; first that with nothing.
+const KINDS: [(&str, &[&str]); 3] = [
+    ("nothing checked", &[]),
+    ("protocols enforced", &["monitor.check=enforce"]),
+    (
+        "rules kept",
+        &[
+            "access.rate=1000000",
+            "access.allow={ rover = [\"arm\"], arm = [\"rover protocol=fipa-request\"] }",
+            "access.deny={ \".*\" = [\"brake.*\", \"arm performative=cancel protocol=x\"], \"guest_.*\" = [\"arm\"] }",
+        ],
+    ),
+];
+
 fn main() {
-    let mut without = Pair::new("off");
-    let mut with = Pair::new("enforce");
-    for pair in [&mut without, &mut with] {
+    let mut pairs = KINDS.map(|(_, settings)| Pair::new(settings));
+    for pair in &mut pairs {
         pair.turn();
     }
-    let mut medians = [Vec::new(), Vec::new()];
-    let mut ratios = Vec::new();
+    let mut times = KINDS.map(|_| Vec::with_capacity(TURNS));
     for turn in 0..TURNS {
         // Who is first has no advantage.
-        let (one, other) = if turn % 2 == 0 {
-            let one = without.turn();
-            (one, with.turn())
-        } else {
-            let other = with.turn();
-            (without.turn(), other)
-        };
-        ratios.push(other / one);
-        medians[0].push(one);
-        medians[1].push(other);
+        for number in 0..pairs.len() {
+            let which = (turn + number) % pairs.len();
+            times[which].push(pairs[which].turn());
+        }
     }
-    let [without_us, with_us] = medians.map(|mut all| middle(&mut all, 2));
-    println!("a request and its inform, blocking: {without_us:.1} us");
-    println!("with both sides enforcing:          {with_us:.1} us");
-    println!(
-        "ratio: {:.3} (middle half {:.3} to {:.3})",
-        middle(&mut ratios, 2),
-        middle(&mut ratios, 1),
-        middle(&mut ratios, 3),
-    );
-    without.end();
-    with.end();
+    let base = times[0].clone();
+    println!("a request and its inform, blocking, both sides alike:");
+    for ((what, _), mut times) in KINDS.into_iter().zip(times) {
+        let mut ratios: Vec<f64> = times
+            .iter()
+            .zip(&base)
+            .map(|(one, base)| one / base)
+            .collect();
+        println!(
+            "{what:20} {:.1} us, ratio {:.3} (middle half {:.3} to {:.3})",
+            middle(&mut times, 2),
+            middle(&mut ratios, 2),
+            middle(&mut ratios, 1),
+            middle(&mut ratios, 3),
+        );
+    }
+    for pair in pairs {
+        pair.end();
+    }
 }
 
 /// One of the quartiles.
@@ -71,15 +86,18 @@ struct Pair {
 }
 
 impl Pair {
-    fn new(check: &str) -> Self {
+    fn new(settings: &[&str]) -> Self {
+        static NEXT: AtomicU32 = AtomicU32::new(0);
+        let number = NEXT.fetch_add(1, Ordering::Relaxed);
+        let mut set = vec![format!("domain=enforcing-{}-{number}", std::process::id())];
+        let common = [
+            "mts.transports=shm",
+            "transport.shm.spin=0us",
+            "discovery.mdns=false",
+        ];
+        set.extend(common.iter().chain(settings).map(|it| (*it).to_owned()));
         let config = Config::load(&Sources {
-            set: vec![
-                format!("domain=enforcing-{}-{check}", std::process::id()),
-                format!("monitor.check={check}"),
-                "mts.transports=shm".to_owned(),
-                "transport.shm.spin=0us".to_owned(),
-                "discovery.mdns=false".to_owned(),
-            ],
+            set,
             ..Sources::default()
         })
         .unwrap();

@@ -56,12 +56,6 @@ impl Door {
             let what = format!("its envelope is from {sender}, and its message from {signed}");
             return Err(Refused::Other(what));
         }
-        if let Of::Process(host) = &self.of
-            && let Some(entry) = host.lookup(sender)
-            && entry.role == EntryRole::Gateway
-        {
-            return Ok(());
-        }
         let performative = message.performative_name();
         let protocol = message.protocol();
         let protocol = protocol.as_ref().map(|text| text.as_str());
@@ -71,14 +65,30 @@ impl Door {
             performative: &performative.as_str(),
             protocol: protocol.as_deref(),
         };
-        let mut access = self.access.lock();
-        access.judge(&claim)?;
         // A gateway has stamped what it has passed on, and counted it.
         let is_counted = matches!(self.of, Of::Process(_)) && view.stamps().next().is_some();
-        if !is_counted {
-            access.count(sender, now)?;
-        }
-        Ok(())
+        let judged = {
+            let mut access = self.access.lock();
+            let judged = access.judge(&claim);
+            match is_counted {
+                true => judged,
+                false => judged.and_then(|()| access.count(sender, now)),
+            }
+        };
+        // Asked only now: hardly any letter is the gateway's own.
+        judged.or_else(|refusal| match self.is_gateway(sender) {
+            true => Ok(()),
+            false => Err(refusal.into()),
+        })
+    }
+
+    /// Whether this is the name of the gateway of this host, which writes to a process of it.
+    fn is_gateway(&self, sender: &str) -> bool {
+        let Of::Process(host) = &self.of else {
+            return false;
+        };
+        let entry = host.lookup(sender);
+        entry.is_some_and(|entry| entry.role == EntryRole::Gateway)
     }
 }
 
