@@ -62,11 +62,14 @@ const MAX_LIFE: Duration = Duration::from_secs(4500);
 const GRAIN: Duration = Duration::from_millis(20);
 
 /// The time between the first two questions for everything, by what each following one grows, and
-/// the longest (RFC 6762 clause 5.2 asks for at least twofold). Every gateway answers them in
-/// full.
+/// the longest (RFC 6762 clause 5.2 asks for at least twofold).
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const GROWTH: u32 = 4;
 const LONGEST_PAUSE: Duration = Duration::from_secs(3600);
+/// The least of that for each record that is known. Every gateway answers in full, with half a
+/// kilobyte for each of its agents on IPv4 and as much on IPv6: so the answers take no more than
+/// 2 kB/s in the long run, until the pause is the longest.
+const PAUSE_EACH: Duration = Duration::from_millis(500);
 /// Most known answers to a question for everything that take packets of their own.
 const MAX_KNOWN: usize = 50 * KNOWN;
 
@@ -345,7 +348,7 @@ impl Browser {
         let all_known = known_answers
             .all(|answer| introduced(&answer.name, &answer.rdata).is_some_and(is_known));
         if for_all && !more_to_come && all_known {
-            self.everything.asked_by_others(now);
+            self.everything.asked_by_others(now, self.records.len());
         }
     }
 
@@ -405,7 +408,7 @@ impl Browser {
         let mut due = Due::default();
         if self.everything.next <= now {
             due.packets = self.question_for_all();
-            self.everything.asked(now, chance);
+            self.everything.asked(now, self.records.len(), chance);
         }
         if self.next.is_none_or(|next| now < next) {
             return due;
@@ -583,19 +586,21 @@ impl Everything {
         }
     }
 
-    fn asked(&mut self, now: Instant, chance: f64) {
+    fn asked(&mut self, now: Instant, known: usize, chance: f64) {
+        let least = PAUSE_EACH.saturating_mul(u32::try_from(known).unwrap_or(u32::MAX));
+        let pause = self.pause.max(least).min(LONGEST_PAUSE);
         self.last = Some(now);
-        self.next = now + self.pause + (self.pause / 8).mul_f64(chance.clamp(0.0, 1.0));
-        self.pause = (self.pause * GROWTH).min(LONGEST_PAUSE);
+        self.next = now + pause + (pause / 8).mul_f64(chance.clamp(0.0, 1.0));
+        self.pause = pause * GROWTH;
     }
 
     /// That counts when we would have asked soon. Our own question, which comes back to us, does
     /// not: we have just asked.
-    fn asked_by_others(&mut self, now: Instant) {
+    fn asked_by_others(&mut self, now: Instant, known: usize) {
         if let Some(last) = self.last
             && now >= last + self.next.saturating_duration_since(last) / 2
         {
-            self.asked(now, 0.0);
+            self.asked(now, known, 0.0);
         }
     }
 
@@ -900,8 +905,29 @@ mod tests {
         let before = host.poll_timeout();
         host.handle_packet(start + seconds(1.1), knows_more, 0.0);
         assert_eq!(host.poll_timeout(), before);
-        host.handle_packet(start + seconds(1.1), &packet::question_for_all(&[])[0], 0.0);
+        let question = &packet::question_for_all(&[])[0];
+        host.handle_packet(start + seconds(1.1), question, 0.0);
         assert!(host.poll_timeout() > before);
+    }
+
+    #[test]
+    fn the_more_would_answer_the_longer_are_the_pauses() {
+        let start = Instant::now();
+        let labels: Vec<String> = (0..100).map(|number| format!("agent {number}")).collect();
+        let labels: Vec<&str> = labels.iter().map(String::as_str).collect();
+        let mut browser = browser(start, &labels);
+        for label in labels {
+            browser.belongs(&format!("{label}.{SERVICE_TYPE}"), OTHER);
+        }
+        let mut times = Vec::new();
+        for second in 0..9000 {
+            let now = start + seconds(f64::from(second));
+            browser.confirm(now, OTHER);
+            if !browser.handle_timeout(now, 0.0).packets.is_empty() {
+                times.push(second);
+            }
+        }
+        assert_eq!(times, [1, 51, 251, 1051, 4251, 7851]);
     }
 
     #[test]
