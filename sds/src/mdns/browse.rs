@@ -58,8 +58,9 @@ const RENEWED_JITTER: f64 = 0.12;
 const ALONG: u32 = 24;
 /// A record is not believed in for longer than that, whatever it says.
 const MAX_LIFE: Duration = Duration::from_secs(4500);
-/// The shortest time between two looks at all records.
+/// The shortest time between two looks at all records: that, and so much for each.
 const GRAIN: Duration = Duration::from_millis(20);
+const GRAIN_EACH: Duration = Duration::from_micros(10);
 
 /// The time between the first two questions for everything, by what each following one grows, and
 /// the longest (RFC 6762 clause 5.2 asks for at least twofold).
@@ -191,7 +192,8 @@ impl Browser {
     /// A packet has been heard. `chance`, from 0 to 1, says how much jitter there is.
     pub(super) fn handle_packet(&mut self, now: Instant, packet: &[u8], chance: f64) -> Heard {
         let mut heard = Heard::default();
-        let Some(packet) = packet::parse(packet) else {
+        let ours = packet::may_name_our_type(packet);
+        let Some(packet) = ours.then(|| packet::parse(packet)).flatten() else {
             return heard;
         };
         if !packet.has_flags(PacketFlag::RESPONSE) {
@@ -472,7 +474,9 @@ impl Browser {
     }
 
     fn wake(&mut self, at: Instant) {
-        let at = self.looked.map_or(at, |looked| at.max(looked + GRAIN));
+        let known = u32::try_from(self.records.len()).unwrap_or(u32::MAX);
+        let grain = GRAIN + GRAIN_EACH.saturating_mul(known);
+        let at = self.looked.map_or(at, |looked| at.max(looked + grain));
         self.next = Some(self.next.map_or(at, |next| next.min(at)));
     }
 }

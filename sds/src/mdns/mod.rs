@@ -312,6 +312,24 @@ struct Own {
     resting: HashMap<Arc<str>, Instant>,
     /// Full names that the daemon has renamed, and will rename ever after.
     spoilt: HashSet<Arc<str>>,
+    /// What was announced when the daemon was ended, until there is another one: nobody hears of
+    /// what changes meanwhile, and who was told of it would ask in vain.
+    meanwhile: Option<beacon::Announced>,
+}
+
+impl Own {
+    fn announced(&self) -> beacon::Announced {
+        let mut announced = beacon::Announced::default();
+        for one in self.agents.values() {
+            if let Some((_, told)) = one.told {
+                announced.all.add(told);
+            }
+            if matches!(one.entry.role, Role::Coalition(_)) {
+                announced.coalitions.add(one.digest);
+            }
+        }
+        announced
+    }
 }
 
 #[derive(Debug)]
@@ -517,7 +535,9 @@ impl Shared {
             Err(mdns_sd::Error::DaemonShutdown) => None,
             ended => Some(ended?),
         };
+        let mut own = self.own.lock();
         *self.daemon.lock() = None;
+        own.meanwhile = Some(own.announced());
         Ok(ended)
     }
 
@@ -539,6 +559,7 @@ impl Shared {
         };
         self.choose(&daemon);
         *self.daemon.lock() = Some(daemon);
+        own.meanwhile = None;
         let now = Instant::now();
         let agents = own.agents.values_mut();
         let mut before: Vec<_> = agents.filter(|one| one.told.is_some()).collect();
@@ -577,17 +598,8 @@ impl Shared {
     /// What this gateway announces; of the coalitions also what it will in a moment, because
     /// others are to wait for that.
     fn announced(&self) -> beacon::Announced {
-        let mut announced = beacon::Announced::default();
         let own = self.own.lock();
-        for one in own.agents.values() {
-            if let Some((_, told)) = one.told {
-                announced.all.add(told);
-            }
-            if matches!(one.entry.role, Role::Coalition(_)) {
-                announced.coalitions.add(one.digest);
-            }
-        }
-        announced
+        own.meanwhile.unwrap_or_else(|| own.announced())
     }
 
     /// Others are told at once, if this is about a coalition.

@@ -29,6 +29,15 @@ pub(super) fn parse_answer(packet: &[u8]) -> Option<Packet<'_>> {
     parse(packet).filter(|packet| packet.has_flags(PacketFlag::RESPONSE))
 }
 
+/// Whether the packet may name our type. Most do not, which is seen without taking them apart.
+pub(super) fn may_name_our_type(packet: &[u8]) -> bool {
+    let name = service_labels().next().unwrap_or_default().as_bytes();
+    memchr::memchr_iter(b'_', packet).any(|at| {
+        let found = packet.get(at..at + name.len());
+        found.is_some_and(|found| found.eq_ignore_ascii_case(name))
+    })
+}
+
 /// The label of a record of our type, as it is spelt.
 pub(super) fn label_of<'a>(name: &'a Name<'_>) -> Option<&'a str> {
     let (label, rest) = name.get_labels().split_first()?;
@@ -221,6 +230,9 @@ pub(super) mod tests {
             assert!(parse(&claims).is_none());
         }
         let question = &question_for_all(&["arm"])[0];
+        assert!(may_name_our_type(question) && may_name_our_type(&good));
+        assert!(may_name_our_type(&good.to_ascii_uppercase()));
+        assert!(!may_name_our_type(&good[..30]) && !may_name_our_type(b"__fipa_"));
         assert!(parse(question).is_some() && parse_answer(question).is_none());
         // A name that points to itself.
         let mut cyclic = vec![0, 0, 0x84, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0xc0, 12];
