@@ -341,7 +341,8 @@ fn a_letter_that_was_not_delivered_can_be_sent_again() {
         stage.right(request("request ann>ben").reply_with("2")),
         "requested"
     );
-    stage.right(request("failure host-mts>ann"));
+    // To what, is not said: it is about the last one.
+    assert_eq!(stage.right(request("failure host-mts>ann")), "undelivered");
     assert_eq!(
         stage.right(request("agree ben>ann")),
         "agreed",
