@@ -248,6 +248,51 @@ async fn promises_hold_on_real_sockets_with_quic_in_the_order() {
     }
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn a_letter_does_not_go_in_the_clear_and_its_sender_is_told() {
+    let here = host();
+    let [ours, theirs] = friends(here.path(), ["rovers", "arms"]);
+    let order = [Kind::Tcp, Kind::Quic];
+    let start = |name, keys: &Security| {
+        Place::with_keys(here.path(), name, &order, false, Some(keys.clone()))
+    };
+    let arms = start("arms", &theirs);
+    // Somebody in the clear, where the arm was by TCP, or so it is said; he would take the letter.
+    let plain = Place::start(here.path(), "plain", &[Kind::Tcp], false);
+    for place in [&arms, &plain] {
+        place.knows_arm_at(place.everywhere());
+        place.mts.register("arm".into(), ARM);
+    }
+    let life = arms.at(Kind::Quic).incarnation();
+    let said = plain.at(Kind::Tcp).with_incarnation(life);
+    for (ways, by) in [
+        (vec![said.clone(), arms.at(Kind::Quic)], Some(Kind::Quic)),
+        (vec![said], None),
+    ] {
+        let rovers = start("rovers", &ours);
+        rovers.knows_arm_at(ways);
+        rovers.mts.register("rover".into(), ROVER);
+        let sending = rovers.mts.send(Submission {
+            sender: ROVER,
+            letter: letter(1),
+            receivers: vec!["arm".into()],
+            deadline: Duration::from_secs(5),
+        });
+        let outcome = outcome(sending).await;
+        assert_eq!(outcome.via(), by, "{outcome}");
+        let tried = outcome.attempts().iter();
+        let tried = tried.filter(|attempt| attempt.via == Kind::Tcp);
+        assert!(tried.count() > 0, "nothing is told of TCP: {outcome}");
+        rovers.mts.close(Duration::from_secs(1)).await;
+    }
+    let taken = timeout(WATCHDOG, arms.mts.receive(ARM)).await.unwrap();
+    assert_eq!(number(&taken.unwrap().letter), 1);
+    assert!(plain.mts.try_receive(ARM).is_none(), "it went in the clear");
+    for place in [&arms, &plain] {
+        place.mts.close(Duration::from_secs(1)).await;
+    }
+}
+
 /// Notes how attempts were concluded.
 #[derive(Default)]
 struct Conclusions(Mutex<HashMap<AttemptId, Conclusion>>);
