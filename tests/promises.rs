@@ -183,11 +183,26 @@ async fn through(seed: u64) -> String {
             closing.push(spawn_blocking(move || shm.close()));
         }
         let link = if random.bool() { &quic } else { &tcp };
-        link.turn([Sky::Clear, Sky::Silent, Sky::Broken][random.usize(..3)]);
+        let skies = [Sky::Clear, Sky::Silent, Sky::Unanswered, Sky::Broken];
+        link.turn(skies[random.usize(..skies.len())]);
     }
     for link in [&quic, &tcp] {
         link.turn(Sky::Clear);
     }
+    goes_on().await;
+    // Letters arrive by TCP and their answers do not, then it breaks: they go again, by QUIC.
+    quic.turn(Sky::Silent);
+    let before = account.lock().went_by(Kind::Tcp);
+    until("letters go by TCP", || {
+        account.lock().went_by(Kind::Tcp) > before + IN_A_ROW
+    })
+    .await;
+    quic.turn(Sky::Clear);
+    tcp.turn(Sky::Unanswered);
+    sleep(Duration::from_millis(random.u64(1..100))).await;
+    tcp.turn(Sky::Broken);
+    sleep(Duration::from_millis(random.u64(100..900))).await;
+    tcp.turn(Sky::Clear);
     goes_on().await;
     // Until QUIC has been tried again.
     let before = account.lock().went_by(Kind::Quic);

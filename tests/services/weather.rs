@@ -16,6 +16,8 @@ pub(crate) enum Sky {
     Clear,
     /// It is kept, or lost, and nobody is told.
     Silent,
+    /// What the side that dialled says is passed on, and the answers are kept or lost.
+    Unanswered,
     /// Connections break, and there are no new ones.
     Broken,
 }
@@ -74,8 +76,8 @@ async fn connections(listener: TcpListener, to: SocketAddr, sky: watch::Receiver
             };
             let (there, back) = (dialler.into_split(), other.into_split());
             tokio::select! {
-                () = pass(there.0, back.1, seen.clone()) => {}
-                () = pass(back.0, there.1, seen.clone()) => {}
+                () = pass(there.0, back.1, seen.clone(), &[Sky::Clear, Sky::Unanswered]) => {}
+                () = pass(back.0, there.1, seen.clone(), &[Sky::Clear]) => {}
                 // An error means that the test is over.
                 _ = seen.wait_for(|sky| *sky == Sky::Broken) => {}
             }
@@ -87,10 +89,11 @@ async fn pass(
     mut from: tokio::net::tcp::OwnedReadHalf,
     mut to: tokio::net::tcp::OwnedWriteHalf,
     mut sky: watch::Receiver<Sky>,
+    under: &[Sky],
 ) {
     let mut bytes = vec![0; 65_536];
     while let Ok(len @ 1..) = from.read(&mut bytes).await {
-        if sky.wait_for(|sky| *sky == Sky::Clear).await.is_err() {
+        if sky.wait_for(|sky| under.contains(sky)).await.is_err() {
             return;
         }
         let Some(read) = bytes.get(..len) else { return };
@@ -110,7 +113,7 @@ async fn datagrams(front: UdpSocket, to: SocketAddr, sky: watch::Receiver<Sky>) 
             read = front.recv_from(&mut there) => {
                 let Ok((len, from)) = read else { continue };
                 dialler = Some(from);
-                if *sky.borrow() == Sky::Clear {
+                if [Sky::Clear, Sky::Unanswered].contains(&*sky.borrow()) {
                     // What a socket does not take is lost, as on any network.
                     let _ = back.send(&there[..len]).await;
                 }
