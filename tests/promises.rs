@@ -35,7 +35,7 @@ const ORDER: [Kind; 3] = [Kind::Shm, Kind::Quic, Kind::Tcp];
 /// Letters under way.
 const WINDOW: usize = 8;
 /// What a letter has: shorter than some cuts last.
-const DEADLINE: Duration = Duration::from_millis(700);
+const DEADLINE: Duration = Duration::from_millis(400);
 /// Changes of the weather.
 const CHANGES: usize = 12;
 /// Letters delivered in a row that count as traffic that goes on.
@@ -201,7 +201,7 @@ async fn through(seed: u64) -> String {
     tcp.turn(Sky::Unanswered);
     sleep(Duration::from_millis(random.u64(1..100))).await;
     tcp.turn(Sky::Broken);
-    sleep(Duration::from_millis(random.u64(100..900))).await;
+    sleep(Duration::from_millis(random.u64(100..600))).await;
     tcp.turn(Sky::Clear);
     goes_on().await;
     // Until QUIC has been tried again.
