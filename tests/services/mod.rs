@@ -57,6 +57,11 @@ impl Place {
         forwards: bool,
         security: Option<Security>,
     ) -> Self {
+        let mut limits = Limits::default();
+        if security.is_some() {
+            // Links to such services are cut, and that is to be noticed soon.
+            limits.keep_alive = Duration::from_millis(500);
+        }
         // Nobody can have any.
         #[cfg(not(feature = "secure"))]
         drop(security);
@@ -80,7 +85,7 @@ impl Place {
             let config = TcpConfig {
                 listen: listen.clone(),
                 identity: identity.clone(),
-                limits: Limits::default(),
+                limits: limits.clone(),
                 #[cfg(feature = "secure")]
                 security: security.clone(),
             };
@@ -99,7 +104,7 @@ impl Place {
             let config = QuicConfig {
                 listen: listen.clone(),
                 identity: identity.clone(),
-                limits: Limits::default(),
+                limits: limits.clone(),
                 security: security.clone().unwrap(),
             };
             Arc::new(QuicTransport::new(config, handle.clone()))
