@@ -1,0 +1,374 @@
+//! What a browser does with packets and time.
+
+use proptest::prelude::*;
+
+use super::super::packet::tests::{Part, answer, asked};
+use super::*;
+
+const HOST: &str = "host.local";
+const OWN: Incarnation = Incarnation::from_u64(1);
+const OTHER: Incarnation = Incarnation::from_u64(7);
+
+fn seconds(seconds: f64) -> Duration {
+    Duration::from_secs_f64(seconds)
+}
+
+fn announced(label: &str, text: &[u8], ttl: u32) -> Vec<u8> {
+    answer(
+        label,
+        &[Part::Ptr, Part::Srv(HOST), Part::Txt(&[text])],
+        ttl,
+    )
+}
+
+/// A browser that has heard these announced by nobody in particular.
+fn browser(now: Instant, labels: &[&str]) -> Browser {
+    let mut browser = Browser::new(now, OWN);
+    for label in labels {
+        let heard = browser.handle_packet(now, &announced(label, b"TYPE=x", 120), 0.0);
+        assert_eq!(names(&heard), [*label]);
+    }
+    browser
+}
+
+fn names(heard: &Heard) -> Vec<&str> {
+    let found = heard.found.iter();
+    found.map(|(fullname, _)| label_of(fullname)).collect()
+}
+
+/// What is asked for, but for the question for everything, and what is gone, until then; with
+/// the time of each in seconds.
+fn goes_on(browser: &mut Browser, start: Instant, until: f64) -> (Vec<(u64, String)>, Vec<u64>) {
+    let (mut questions, mut gone) = (Vec::new(), Vec::new());
+    let mut last = None;
+    while let now = browser.poll_timeout()
+        && now < start + seconds(until)
+    {
+        assert_ne!(last.replace(now), Some(now), "time goes on");
+        let due = browser.handle_timeout(now, 0.0);
+        let at = (now - start).as_millis() as u64 / 100;
+        for (label, kind) in asked(&due.packets) {
+            if !label.is_empty() {
+                let kind = if kind == QTYPE::TYPE(TYPE::SRV) {
+                    "SRV"
+                } else {
+                    "TXT"
+                };
+                questions.push((at, format!("{label} {kind}")));
+            }
+        }
+        gone.extend(due.gone.iter().map(|_| at));
+    }
+    (questions, gone)
+}
+
+#[test]
+fn what_is_announced_is_found_once_with_all_its_strings() {
+    let (mut browser, now) = (Browser::new(Instant::now(), OWN), Instant::now());
+    let strings: [&[u8]; 5] = [
+        b"LOCATOR=tcp://a",
+        b"TYPE=\xff",
+        b"locator=:1;",
+        b"flag",
+        b"=",
+    ];
+    let parts = [Part::Txt(&strings), Part::Srv(HOST), Part::Ptr];
+    let heard = browser.handle_packet(now, &answer("Arm.left", &parts, 120), 0.0);
+    let [(fullname, properties)] = &heard.found[..] else {
+        panic!("{heard:?}");
+    };
+    assert_eq!(**fullname, format!("Arm.left.{SERVICE_TYPE}"));
+    let expected: [(&str, &[u8]); 4] = [
+        ("LOCATOR", b"tcp://a"),
+        ("TYPE", b"\xff"),
+        ("locator", b":1;"),
+        ("flag", b""),
+    ];
+    let expected = expected.map(|(key, value)| (key.to_owned(), value.to_vec()));
+    assert_eq!(*properties, expected);
+    // The same is no news, something else is.
+    let again = browser.handle_packet(now, &answer("Arm.left", &parts, 120), 0.0);
+    assert_eq!(again, Heard::default());
+    let other = answer("Arm.left", &[Part::Txt(&[b"TYPE=x"])], 120);
+    assert_eq!(
+        names(&browser.handle_packet(now, &other, 0.0)),
+        ["Arm.left"]
+    );
+    // What nobody has introduced is of no interest.
+    let stranger = answer("leg", &[Part::Srv(HOST), Part::Txt(&strings)], 120);
+    assert_eq!(browser.handle_packet(now, &stranger, 0.0), Heard::default());
+    assert_eq!(browser.records.len(), 1);
+}
+
+#[test]
+fn what_is_missing_is_asked_for_a_few_times() {
+    let (mut browser, start) = (browser(Instant::now(), &[]), Instant::now());
+    for label in ["arm", "leg"] {
+        browser.handle_packet(start, &answer(label, &[Part::Ptr], 4500), 0.0);
+    }
+    let (questions, _) = goes_on(&mut browser, start, 0.5);
+    assert_eq!(questions.len(), 4, "{questions:?}");
+    let half = answer("arm", &[Part::Srv(HOST)], 120);
+    assert_eq!(browser.handle_packet(start, &half, 0.0), Heard::default());
+    let half = answer("arm", &[Part::Txt(&[b"TYPE=x"])], 120);
+    assert_eq!(names(&browser.handle_packet(start, &half, 0.0)), ["arm"]);
+    let (questions, gone) = goes_on(&mut browser, start, 30.0);
+    let times: Vec<u64> = questions.iter().map(|(at, _)| *at).collect();
+    assert_eq!(times, [12, 12, 42, 42, 132, 132]);
+    assert!(questions.iter().all(|(_, what)| what.starts_with("leg")));
+    // Who was never known is not gone either.
+    assert_eq!(gone, [0; 0]);
+    assert_eq!((browser.records.len(), browser.unknown), (1, 0));
+}
+
+#[test]
+fn what_is_not_heard_of_is_asked_for_and_gone_in_the_end() {
+    let start = Instant::now();
+    let mut browser = browser(start, &["arm", "leg"]);
+    let (questions, gone) = goes_on(&mut browser, start, 80.0);
+    let expected = ["arm SRV", "arm TXT", "leg SRV", "leg TXT"];
+    let mut asked: Vec<&str> = questions.iter().map(|(_, what)| what.as_str()).collect();
+    asked.sort_unstable();
+    assert_eq!((asked, gone), (expected.to_vec(), vec![]));
+    for part in [Part::Srv(HOST), Part::Txt(&[b"TYPE=x"])] {
+        let now = start + seconds(80.0);
+        browser.handle_packet(now, &answer("arm", &[part], 120), 0.0);
+    }
+    let (questions, gone) = goes_on(&mut browser, start, 130.0);
+    let of_leg = questions.iter().filter(|(_, what)| what == "leg SRV");
+    let times: Vec<u64> = of_leg.map(|(at, _)| *at).collect();
+    assert_eq!((times, gone), (vec![960, 1080, 1140], vec![1200]));
+    assert!(browser.records.contains_key("arm"));
+}
+
+#[test]
+fn hosts_ask_at_different_times_and_for_many_at_once() {
+    let start = Instant::now();
+    let mut first = browser(start, &[]);
+    for number in 0..30 {
+        let now = start + seconds(f64::from(number) * 0.1);
+        let label = format!("agent {number}");
+        first.handle_packet(now, &announced(&label, b"TYPE=x", 120), 0.0);
+    }
+    let (questions, _) = goes_on(&mut first, start, 75.0);
+    let times: std::collections::HashSet<u64> = questions.iter().map(|(at, _)| *at).collect();
+    assert_eq!((questions.len(), times.len()), (60, 1), "{questions:?}");
+    // With the most jitter it is later, and well below what others wait for.
+    let life = Life::new(start, 120);
+    assert_eq!(life.due(0.0), start + seconds(66.0));
+    assert!(life.due(1.0) > start + seconds(80.0));
+    assert!(life.due(1.0) < start + seconds(120.0 * 0.75));
+}
+
+#[test]
+fn beacons_keep_what_is_held_good() {
+    let start = Instant::now();
+    let mut browser = browser(start, &["arm", "peer"]);
+    browser.belongs(&format!("arm.{SERVICE_TYPE}"), OTHER);
+    for second in 1..600 {
+        let now = start + Duration::from_secs(second);
+        browser.confirm(now, OTHER);
+        let (questions, _) = goes_on(&mut browser, start, second as f64 + 1.0);
+        assert!(questions.iter().all(|(_, what)| what.starts_with("peer")));
+    }
+    assert_eq!(browser.records.len(), 1, "the peer has no beacons");
+    // They end, and nobody answers any more.
+    let (questions, gone) = goes_on(&mut browser, start, 800.0);
+    assert_eq!((questions[0].0, gone), (5990 + 660, vec![5990 + 1200]));
+}
+
+#[test]
+fn own_records_are_not_asked_for() {
+    let start = Instant::now();
+    let mut browser = browser(start, &["own"]);
+    browser.belongs(&format!("own.{SERVICE_TYPE}"), OWN);
+    let (questions, gone) = goes_on(&mut browser, start, 200.0);
+    assert_eq!((questions, gone), (vec![], vec![1200]));
+}
+
+#[test]
+fn goodbyes_count_after_a_second_unless_they_are_taken_back() {
+    let start = Instant::now();
+    let mut browser = browser(start, &["arm", "leg", "eye"]);
+    for label in ["arm", "leg"] {
+        browser.handle_packet(start, &announced(label, b"TYPE=x", 0), 0.0);
+    }
+    // Somebody else has had that label, and leaves.
+    let parts = [Part::Ptr, Part::Srv("other.local"), Part::Txt(&[b"TYPE=y"])];
+    browser.handle_packet(start, &answer("eye", &parts, 0), 0.0);
+    let back = start + seconds(0.5);
+    let heard = browser.handle_packet(back, &announced("leg", b"TYPE=x", 120), 0.0);
+    assert_eq!(heard, Heard::default());
+    let (_, gone) = goes_on(&mut browser, start, 5.0);
+    assert_eq!(gone, [10]);
+    assert!(browser.records.contains_key("leg") && browser.records.contains_key("eye"));
+}
+
+#[test]
+fn who_is_doubted_answers_or_is_gone() {
+    let start = Instant::now();
+    let mut browser = browser(start, &["arm", "leg"]);
+    let doubted = ["arm", "leg"].map(|label| format!("{label}.{SERVICE_TYPE}").into());
+    browser.doubt(start, &doubted);
+    let (questions, _) = goes_on(&mut browser, start, 0.5);
+    assert_eq!(questions.len(), 4, "{questions:?}");
+    let now = start + seconds(0.5);
+    browser.handle_packet(now, &answer("leg", &[Part::Srv(HOST)], 120), 0.0);
+    let (questions, gone) = goes_on(&mut browser, start, 5.0);
+    let mut again = questions.iter().map(|(at, what)| (*at, what.as_str()));
+    assert_eq!(again.next(), Some((11, "arm SRV")));
+    assert!(again.all(|(_, what)| what.starts_with("arm")));
+    assert_eq!(gone, [20]);
+    // A beacon is no answer.
+    browser.belongs(&doubted[1], OTHER);
+    browser.doubt(now, &doubted);
+    browser.confirm(now + seconds(0.1), OTHER);
+    let (_, gone) = goes_on(&mut browser, start, 5.0);
+    assert_eq!(gone, [25]);
+}
+
+#[test]
+fn everything_is_asked_for_ever_more_rarely_by_one_of_many() {
+    let start = Instant::now();
+    let mut hosts = [0.3, 0.7].map(|_| Browser::new(start, OWN));
+    let mut times = [Vec::new(), Vec::new()];
+    let mut next = start;
+    while next < start + Duration::from_secs(9000) {
+        for asking in 0..2 {
+            if hosts[asking].poll_timeout() > next {
+                continue;
+            }
+            let packets = hosts[asking].handle_timeout(next, asking as f64).packets;
+            for packet in packets {
+                times[asking].push((next - start).as_secs());
+                for host in &mut hosts {
+                    host.handle_packet(next, &packet, 0.0);
+                }
+            }
+        }
+        next = hosts.iter().map(Browser::poll_timeout).min().unwrap();
+    }
+    let [first, second] = &times;
+    let mut all: Vec<u64> = first.iter().chain(second).copied().collect();
+    all.sort_unstable();
+    assert_eq!(all[..2], [0, 0], "each asks once in any case");
+    let pauses: Vec<u64> = all.windows(2).skip(1).map(|two| two[1] - two[0]).collect();
+    assert!(pauses.len() <= 9, "{all:?}");
+    assert!(pauses.iter().all(|pause| *pause <= 3600 * 9 / 8), "{all:?}");
+    // Who has just heard the question need not ask because something is missing.
+    let now = start + Duration::from_secs(9000);
+    assert_eq!(hosts[0].ask_for_missing(now).len(), 1);
+    assert_eq!(hosts[0].ask_for_missing(now + seconds(0.5)).len(), 0);
+    assert_eq!(hosts[0].ask_for_missing(now + seconds(1.0)).len(), 1);
+    // A question that leaves out what we do not know does not help us.
+    let knows_more = &packet::question_for_all(&["stranger"])[0];
+    let mut host = Browser::new(start, OWN);
+    host.handle_timeout(start + seconds(0.2), 0.0);
+    let before = host.poll_timeout();
+    host.handle_packet(start + seconds(1.1), knows_more, 0.0);
+    assert_eq!(host.poll_timeout(), before);
+    let question = &packet::question_for_all(&[])[0];
+    host.handle_packet(start + seconds(1.1), question, 0.0);
+    assert!(host.poll_timeout() > before);
+}
+
+#[test]
+fn the_more_would_answer_the_longer_are_the_pauses() {
+    let start = Instant::now();
+    let labels: Vec<String> = (0..100).map(|number| format!("agent {number}")).collect();
+    let labels: Vec<&str> = labels.iter().map(String::as_str).collect();
+    let mut browser = browser(start, &labels);
+    for label in labels {
+        browser.belongs(&format!("{label}.{SERVICE_TYPE}"), OTHER);
+    }
+    let mut times = Vec::new();
+    for second in 0..9000 {
+        let now = start + seconds(f64::from(second));
+        browser.confirm(now, OTHER);
+        if !browser.handle_timeout(now, 0.0).packets.is_empty() {
+            times.push(second);
+        }
+    }
+    assert_eq!(times, [1, 51, 251, 1051, 4251, 7851]);
+}
+
+#[test]
+fn peers_are_known_answers_before_others() {
+    let now = Instant::now();
+    let labels: Vec<String> = (0..40).map(|number| format!("agent {number}")).collect();
+    let labels: Vec<&str> = labels.iter().map(String::as_str).collect();
+    let mut browser = browser(now, &labels);
+    for label in &labels[2..] {
+        browser.belongs(&format!("{label}.{SERVICE_TYPE}"), OTHER);
+    }
+    let packets = browser.ask_for_missing(now);
+    let [packet] = &packets[..] else {
+        panic!("{packets:?}");
+    };
+    let packet = packet::parse(packet).unwrap();
+    assert_eq!(packet.answers.len(), KNOWN);
+    let known = packet.answers.iter();
+    let known: Vec<_> = known.map(|one| introduced(&one.name, &one.rdata)).collect();
+    assert!(known.contains(&Some(labels[0])) && known.contains(&Some(labels[1])));
+}
+
+#[test]
+fn what_is_remembered_is_bounded() {
+    let now = Instant::now();
+    let mut browser = Browser::new(now, OWN);
+    for number in 0..MAX_UNKNOWN + 10 {
+        let introduced = answer(&format!("unknown {number}"), &[Part::Ptr], 120);
+        let heard = browser.handle_packet(now, &introduced, 1.0);
+        assert_eq!(heard.refused, u64::from(number >= MAX_UNKNOWN));
+    }
+    assert_eq!(browser.unknown, MAX_UNKNOWN);
+    // They are not in the way of who says all at once.
+    let heard = browser.handle_packet(now, &announced("arm", b"TYPE=x", 10), 0.0);
+    assert_eq!((names(&heard), heard.refused), (vec!["arm"], 0));
+    goes_on(&mut browser, now, 20.0);
+    assert_eq!((browser.records.len(), browser.unknown), (0, 0));
+
+    let long = [b'x'; 255];
+    let strings: Vec<&[u8]> = vec![&long; 33];
+    let long = MdnsDirectory::MAX_BYTES / (33 * 257);
+    for number in 0..MdnsDirectory::MAX_RECORDS + 10 {
+        let strings = if number < long + 5 { &strings[..] } else { &[] };
+        let parts = [Part::Ptr, Part::Srv(HOST), Part::Txt(strings)];
+        let label = format!("agent {number}");
+        browser.handle_packet(now, &answer(&label, &parts, 120), 0.0);
+        assert!(browser.bytes <= MdnsDirectory::MAX_BYTES);
+    }
+    assert_eq!(browser.records.len(), MdnsDirectory::MAX_RECORDS);
+    assert!(browser.unknown >= 5, "for some there was no room");
+    goes_on(&mut browser, now, 200.0);
+    assert_eq!(
+        (browser.records.len(), browser.unknown, browser.bytes),
+        (0, 0, 0)
+    );
+}
+
+proptest! {
+    #[test]
+    fn arbitrary_packets_do_no_harm(
+        mut packet in prop::collection::vec(any::<u8>(), 0..600),
+        answers in 0..8_u8,
+    ) {
+        let mut browser = browser(Instant::now(), &["arm"]);
+        if let Some(header) = packet.first_chunk_mut::<12>() {
+            *header = [0, 0, 0x84, 0, 0, 0, 0, answers, 0, 0, 0, 0];
+        }
+        browser.handle_packet(Instant::now(), &packet, 0.5);
+    }
+
+    #[test]
+    fn broken_packets_do_no_harm(at in 0_usize..160, byte: u8) {
+        let mut browser = Browser::new(Instant::now(), OWN);
+        for mut packet in [announced("arm", b"TYPE=x", 120), announced("arm", b"TYPE=x", 0)] {
+            if let Some(broken) = packet.get_mut(at) {
+                *broken = byte;
+            }
+            browser.handle_packet(Instant::now(), &packet, 0.5);
+            prop_assert!(browser.unknown <= browser.records.len());
+        }
+    }
+}
