@@ -156,15 +156,15 @@ pub(super) struct Due {
 }
 
 impl Browser {
-    /// Knows nothing, and asks for everything.
-    pub(super) fn new(now: Instant, own: Incarnation) -> Self {
+    /// Knows nothing, and asks for everything. `chance`, from 0 to 1, says how much jitter there is.
+    pub(super) fn new(now: Instant, own: Incarnation, chance: f64) -> Self {
         Self {
             own,
             records: HashMap::new(),
             unknown: 0,
             bytes: 0,
             confirmed: HashMap::new(),
-            everything: Everything::new(now),
+            everything: Everything::new(now, chance),
             share: 0.0,
             looked: None,
             next: None,
@@ -173,8 +173,8 @@ impl Browser {
 
     /// There is an interface on which nobody has been asked: everything is asked for, as in the
     /// beginning.
-    pub(super) fn start_again(&mut self, now: Instant) {
-        self.everything = Everything::new(now);
+    pub(super) fn start_again(&mut self, now: Instant, chance: f64) {
+        self.everything = Everything::new(now, chance);
     }
 
     /// A packet has been heard. `chance`, from 0 to 1, says how much jitter there is.
@@ -239,8 +239,9 @@ impl Browser {
             if let Some(news) = known.news.take() {
                 heard.found.push((Arc::clone(&known.fullname), news));
             }
-            let due = known.due(self.share, self.own);
-            self.wake(due);
+            if let Some(due) = known.due(self.share, self.own) {
+                self.wake(due);
+            }
         }
         // What comes with all that it says is not waited for.
         for label in new {
@@ -436,7 +437,7 @@ impl Browser {
                 }
             }
             let then = record.due(self.share, self.own);
-            next = next.min(Some(then)).or(Some(then));
+            next = next.into_iter().chain(then).min();
             true
         });
         if let Some(next) = next {
@@ -513,15 +514,13 @@ impl Record {
     }
 
     /// When it is to be looked at.
-    fn due(&self, share: f64, own: Incarnation) -> Instant {
+    fn due(&self, share: f64, own: Incarnation) -> Option<Instant> {
         let lives = [self.place, self.text].into_iter().flatten();
         let renewed = lives
             .filter(|_| self.is_renewed(own))
             .map(|life| life.due(share));
         let asked = self.questions.as_ref().map(|it| it.due);
-        let due = renewed.chain(asked).chain(self.end()).min();
-        // There is always an end.
-        due.unwrap_or_else(Instant::now)
+        renewed.chain(asked).chain(self.end()).min()
     }
 }
 

@@ -30,7 +30,7 @@ impl Ear {
         let now = Instant::now();
         Self {
             sockets: Sockets::new(),
-            browser: Browser::new(now, shared.config.mts.incarnation),
+            browser: Browser::new(now, shared.config.mts.incarnation, fastrand::f64()),
             beacons: Beacons::default(),
             next_beacon: now,
             next_urgent: now,
@@ -50,7 +50,7 @@ impl Ear {
             // Interfaces come and go.
             match self.sockets.refresh(&shared.config) {
                 Ok(false) => {}
-                Ok(true) => self.browser.start_again(now),
+                Ok(true) => self.browser.start_again(now, fastrand::f64()),
                 Err(error) => shared.failed(format!("cannot open a multicast socket: {error}")),
             }
             let beacon = beacon::packet(shared.config.mts.incarnation, shared.announced());

@@ -23,11 +23,12 @@ pub(super) struct Everything {
 }
 
 impl Everything {
-    /// At once, but for the jitter that keeps hosts that start together apart.
-    pub(super) fn new(now: Instant) -> Self {
+    /// At once, but for the jitter that keeps hosts that start together apart, of which there is
+    /// `chance`, from 0 to 1.
+    pub(super) fn new(now: Instant, chance: f64) -> Self {
         Self {
             last: None,
-            next: now + JITTER.mul_f64(fastrand::f64()),
+            next: now + JITTER.mul_f64(chance.clamp(0.0, 1.0)),
             pause: FIRST_PAUSE,
         }
     }
