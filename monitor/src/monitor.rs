@@ -667,4 +667,19 @@ mod tests {
             monitor.deadlines.len()
         );
     }
+
+    #[test]
+    fn names_are_forgotten_with_the_last_conversation() {
+        let mut monitor = Monitor::observer(Arc::new(Library::standard()));
+        let now = UNIX_EPOCH + Duration::from_secs(1_700_000_000);
+        for id in ["1", "2"] {
+            let call = Header::new(Performative::Cfp).sender("ann");
+            let call = call.receivers(["ben", "cid"]).reply_to(["dan"]);
+            let call = call.protocol("fipa-contract-net").conversation_id(id);
+            assert!(monitor.check(&call, now).is_accepted());
+        }
+        assert_eq!(monitor.names.len(), 4);
+        monitor.handle_timeout(now + Duration::from_secs(100_000));
+        assert_eq!(monitor.names.len(), 0);
+    }
 }

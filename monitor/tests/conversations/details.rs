@@ -312,3 +312,82 @@ fn an_acceptance_is_repeated_like_all_else() {
     stage.right(accept());
     assert_eq!(stage.wrong(accept()).kind, Kind::Repeated);
 }
+
+const ONE_STATE: &str = r#"<scxml initial="1">
+    <state id="2"><transition performative="agree" from="b" to="a" target="3"/></state>
+    <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+    <state id="3" final="yes"/></scxml>"#;
+
+#[test]
+fn who_is_told_twice_is_told() {
+    let mut stage = stage_of(ONE_STATE);
+    stage.right(own("request ann>ben,ben"));
+    assert_eq!(stage.right(own("agree ben>ann")), "3");
+}
+
+#[test]
+fn who_begins_may_name_himself_and_others_for_the_replies() {
+    let mut stage = stage_of(ONE_STATE);
+    stage.right(own("request ann>ben").reply_to(["ann", "dan"]));
+    assert_eq!(stage.right(own("agree ben>ann,dan")), "3");
+    let mut library = Library::standard();
+    library
+        .add(Machine::read("own", ONE_STATE).unwrap())
+        .unwrap();
+    let mut limits = Limits::default();
+    limits.participants = 4;
+    let monitor = Monitor::observer(Arc::new(library)).with_limits(limits);
+    let mut stage = Stage::new(monitor);
+    stage.right(own("request ann>ben").reply_to(["dan", "eve"]));
+    assert_eq!(stage.right(own("agree ben>ann,dan,eve")), "3");
+}
+
+#[test]
+fn among_many_participants_each_goes_its_own_way() {
+    let mut stage = Stage::observer();
+    stage.right(say("cfp ann>1,2,3,4,5,6,7,8,9,10"));
+    stage.right(say("refuse 9>ann"));
+    assert_eq!(stage.wrong(say("propose 9>ann")).kind, Kind::Ended);
+    assert_eq!(stage.right(say("propose 10>ann")), "proposed");
+    assert_eq!(stage.right(say("propose 1>ann")), "proposed");
+    assert!(!stage.monitor.is_empty());
+}
+
+#[test]
+fn the_longest_text_is_taken() {
+    let mut stage = Stage::observer();
+    let with = |length| request("request ann>ben").conversation_id("x".repeat(length));
+    stage.right(with(4_096));
+    let too_large = Verdict::Unchecked(Unchecked::TooLarge);
+    assert_eq!(stage.check(&with(4_097)), too_large);
+}
+
+#[test]
+fn what_is_over_within_does_not_end_what_it_is_within() {
+    let mut stage = Stage::observer();
+    let broker = |words| say_in("fipa-brokering", words);
+    stage.right(broker("proxy ann>bro"));
+    stage.right(broker("agree bro>ann"));
+    stage.right(request("request bro>ben"));
+    stage.right(request("inform ben>bro"));
+    // What is over is forgotten after a minute, what is silent after an hour.
+    assert_eq!(stage.pass(120), []);
+    stage.right(broker("inform bro>ann"));
+}
+
+#[test]
+fn what_time_has_ended_is_kept_no_longer_than_what_has_ended_otherwise() {
+    let mut stage = stage_of(
+        r#"<scxml initial="1" xmlns:fipa="urn:fipa-rs:protocol" fipa:scope="participant">
+        <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
+        <state id="2">
+            <transition performative="agree" from="b" to="a" target="3"/>
+            <transition fipa:after="30s" target="3"/>
+        </state>
+        <state id="3" final="yes"/></scxml>"#,
+    );
+    stage.right(own("request ann>ben"));
+    assert!(matches!(&stage.pass(31)[..], [Event::Overdue { .. }]));
+    assert_eq!(stage.pass(61), []);
+    assert!(stage.monitor.is_empty());
+}
