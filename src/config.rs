@@ -204,8 +204,8 @@ pub struct Security {
     /// This and the next two go for other hosts, and for loopback addresses where those have to prove
     /// who they are, too.
     pub peer_connections: usize,
-    /// `peer_letters`: letters a second that are read from one address over tcp or quic, as many of
-    /// which may come at once; what is more waits at its sender. 0: any number.
+    /// `peer_letters`: letters a second that each transport takes from one address, as many of which may
+    /// come at once; what is more waits at its sender. 0: any number.
     pub peer_letters: usize,
     /// `peer_bytes`: the same of bytes.
     pub peer_bytes: u64,

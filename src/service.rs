@@ -356,6 +356,8 @@ fn udp(
         identity: identity(config, role, place, incarnation)?,
         limits: UdpLimits {
             max_per_address: config.security.peer_connections,
+            peer_letters: config.security.peer_letters as u64,
+            peer_bytes: config.security.peer_bytes,
             ..UdpLimits::default()
         },
     };

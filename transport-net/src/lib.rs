@@ -8,7 +8,8 @@
 //!
 //! Each has a module tree of its own. Beside them stands what they share: who is there
 //! ([`Identity`]) and how they introduce themselves (`hello`), addresses as text (`address`), how
-//! answers are written (`answer`), and why a connection ends (`end`).
+//! answers are written (`answer`), how much a peer may send (`ration`), and why a connection ends
+//! (`end`).
 //!
 //! What must not live here: routes, retries, order across transports, directories. A transport
 //! tries once and reports.
@@ -20,6 +21,7 @@ mod hello;
 mod identity;
 #[cfg(feature = "quic")]
 mod quic;
+mod ration;
 #[cfg(feature = "secure")]
 pub mod secure;
 mod seldom;

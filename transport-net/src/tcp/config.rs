@@ -4,6 +4,7 @@ use std::net::IpAddr;
 use std::time::Duration;
 
 use crate::Identity;
+use crate::ration::Rates;
 
 /// Configuration of a [`TcpTransport`](crate::TcpTransport).
 #[derive(Debug, Clone)]
@@ -103,6 +104,13 @@ pub struct Limits {
 impl Limits {
     /// Bytes that must arrive within `stall_timeout` while something is half arrived.
     pub const MIN_PROGRESS: u64 = 4096;
+
+    pub(crate) fn rates(&self) -> Rates {
+        Rates {
+            letters: self.peer_letters,
+            bytes: self.peer_bytes,
+        }
+    }
 }
 
 impl Default for Limits {

@@ -28,10 +28,10 @@ use super::counters::{Tally, count};
 use super::courier::{self, Couriers};
 use super::link::{Link, MAX_LINKS, of_ticket};
 use super::place::Rooms;
-use super::ration::{Ration, Rations, whose};
 use crate::address;
 use crate::end::End;
 use crate::hello::Hello;
+use crate::ration::{Ration, Rations, whose};
 use crate::seldom::warn_seldom;
 
 #[derive(Debug)]
@@ -130,7 +130,7 @@ impl Endpoint {
     /// What whoever is at this address may still send, if that is limited.
     pub(crate) fn ration(&self, ip: IpAddr) -> Option<Arc<Ration>> {
         let limited = self.config.limits_peer_at(ip);
-        limited.then(|| self.rations.of(ip, self.limits(), Instant::now()))?
+        limited.then(|| self.rations.of(ip, self.limits().rates(), Instant::now()))?
     }
 
     pub(crate) fn tally(&self) -> &Tally {

@@ -23,9 +23,9 @@ use super::endpoint::Endpoint;
 use super::frame::{FrameReader, Placed};
 use super::place::Place;
 use super::proof::Proof;
-use super::ration::Ration;
 use super::wire::{Beside, Reading, Writing};
 use crate::end::End;
+use crate::ration::Ration;
 use crate::seldom::warn_seldom;
 
 /// Pieces handed to the kernel in one call.

@@ -20,7 +20,6 @@ pub(crate) mod link;
 mod outbox;
 mod place;
 pub(crate) mod proof;
-pub(crate) mod ration;
 #[cfg(feature = "secure")]
 mod tls;
 mod unframed;

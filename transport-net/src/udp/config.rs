@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use super::packet::{BASE, LARGEST};
 use crate::Identity;
+use crate::ration::Rates;
 
 /// Configuration of a [`UdpTransport`](crate::UdpTransport).
 #[derive(Debug, Clone)]
@@ -31,6 +32,12 @@ pub struct UdpLimits {
     pub max_connections: usize,
     /// Most connections that one address opens. Default 64.
     pub max_per_address: usize,
+    /// Letters a second that are taken from one address, as many of which may come at once; what is
+    /// more is taken when the peer sends it again. Loopback addresses are left out. 0: any number.
+    /// Default 20,000.
+    pub peer_letters: u64,
+    /// The same of bytes. Default 256 MiB.
+    pub peer_bytes: u64,
     /// Most parcels per connection and direction that are not answered yet. Default 1024.
     pub max_in_flight: usize,
     /// Most bytes per connection and direction that wait to be sent, or for an earlier parcel that
@@ -50,6 +57,13 @@ impl UdpLimits {
     pub const BASE: usize = BASE;
     /// Largest datagram there is: 65,487 bytes.
     pub const LARGEST: usize = LARGEST;
+
+    pub(super) fn rates(&self) -> Rates {
+        Rates {
+            letters: self.peer_letters,
+            bytes: self.peer_bytes,
+        }
+    }
 }
 
 impl Default for UdpLimits {
@@ -58,6 +72,8 @@ impl Default for UdpLimits {
             max_datagram: LARGEST,
             max_connections: 256,
             max_per_address: 64,
+            peer_letters: 20_000,
+            peer_bytes: 256 << 20,
             max_in_flight: 1024,
             max_queued_bytes: 4 << 20,
             connect_timeout: Duration::from_secs(2),

@@ -10,6 +10,7 @@ mod sending;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
 use std::time::Instant;
 
 use bytes::{Bytes, BytesMut};
@@ -26,6 +27,7 @@ use super::recovery::{Kept, Recovery};
 use crate::answer;
 use crate::end::End;
 use crate::hello::Hello;
+use crate::ration::Ration;
 
 /// Numbers of parcels stay below this, so that a ticket has room for the connection's number too.
 pub(crate) const MAX_ID: u64 = 1 << 40;
@@ -90,6 +92,9 @@ pub(crate) struct Connection {
     arrivals: HashSet<u64>,
     /// The last parcel that the sink has really been told of.
     told: u64,
+    /// What the peer may still send, if that is limited; no parcels are taken before then.
+    pub(super) ration: Option<Arc<Ration>>,
+    resting: Option<Instant>,
     received: Received,
     recovery: Recovery,
     mtu: Mtu,
@@ -152,6 +157,11 @@ impl Connection {
         }
     }
 
+    /// The same, of a peer that may send so much.
+    pub(crate) fn rationed(self, ration: Option<Arc<Ration>>) -> Self {
+        Self { ration, ..self }
+    }
+
     fn new(limits: UdpLimits, id: u64, now: Instant) -> Self {
         Self {
             id,
@@ -173,6 +183,8 @@ impl Connection {
             held_bytes: 0,
             arrivals: HashSet::new(),
             told: 0,
+            ration: None,
+            resting: None,
             received: Received::default(),
             recovery: Recovery::new(now),
             mtu: Mtu::new(limits.max_datagram),

@@ -29,6 +29,7 @@ use super::counters::UdpCounters;
 use super::packet::{self, Datagram};
 use crate::Identity;
 use crate::end::End;
+use crate::ration::{Ration, Rations};
 use crate::seldom::warn_seldom;
 
 /// Numbers of connections stay below this (see [`Core::ticket`]).
@@ -89,6 +90,8 @@ pub(crate) struct Core {
     notes: VecDeque<Told>,
     /// Connections that are no more.
     gone: Vec<u32>,
+    /// What peers may still send.
+    rations: Rations,
     counters: UdpCounters,
     last_number: u32,
     last_serial: u64,
@@ -143,6 +146,7 @@ impl Core {
             eventful: VecDeque::new(),
             notes: VecDeque::new(),
             gone: Vec::new(),
+            rations: Rations::default(),
             counters: UdpCounters::default(),
             last_number: 0,
             last_serial: 0,
@@ -151,6 +155,13 @@ impl Core {
 
     pub(crate) fn counters(&self) -> UdpCounters {
         self.counters
+    }
+
+    /// What whoever is at this address may still send. The processes of this host are many at one
+    /// address.
+    fn ration(&self, ip: IpAddr, now: Instant) -> Option<Arc<Ration>> {
+        let limited = !ip.to_canonical().is_loopback();
+        limited.then(|| self.rations.of(ip, self.limits.rates(), now))?
     }
 
     /// Takes a parcel for sending. When the connection has just been made up, its number is

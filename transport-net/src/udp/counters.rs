@@ -22,6 +22,8 @@ pub struct UdpCounters {
     pub parcels_in: u64,
     /// Packets and parcels that arrived again.
     pub duplicates: u64,
+    /// Parcels to be taken later, because their peer had sent more than it may.
+    pub held_back: u64,
     /// Datagrams ignored: garbage, or from strangers.
     pub ignored: u64,
     /// Connections closed because of what the peer sent.

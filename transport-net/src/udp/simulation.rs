@@ -556,3 +556,23 @@ fn one_address_opens_so_many_connections_and_no_more() {
     while world.step() {}
     assert_eq!(world.cores[B].counters().connections, 0);
 }
+
+#[test]
+fn a_peer_that_sends_more_than_it_may_is_held_back_and_loses_nothing() {
+    let limits = UdpLimits {
+        peer_letters: 20,
+        ..UdpLimits::default()
+    };
+    let mut world = World::new(1, FAIR, &limits);
+    let begun = world.now;
+    let attempts: BTreeSet<u64> = (0..100).collect();
+    for number in &attempts {
+        world.send(A, *number, 10).unwrap();
+    }
+    world.until_concluded(A, &attempts);
+    assert_eq!(world.check(A, &attempts), attempts.len());
+    assert!(world.now - begun >= Duration::from_secs(3), "too fast");
+    let counters = world.cores[B].counters();
+    assert!(counters.held_back > 0);
+    assert_eq!((counters.accepted, counters.connections), (1, 1));
+}

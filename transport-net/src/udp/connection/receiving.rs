@@ -86,6 +86,10 @@ impl Connection {
         let Some((header, body)) = split_parcel(bytes) else {
             return nonsense(&"a parcel without a header");
         };
+        if self.resting.is_some_and(|until| now < until) {
+            counters.held_back += 1;
+            return Ok(false);
+        }
         if self.answers.len() >= self.limits.max_in_flight.max(1).saturating_mul(2) {
             // The peer does not acknowledge answers.
             return Ok(false);
@@ -98,6 +102,8 @@ impl Connection {
         if held {
             self.busy = now;
             counters.parcels_in += 1;
+            let ration = self.ration.as_ref();
+            self.resting = ration.and_then(|ration| ration.spend(1, bytes.len(), now));
         }
         Ok(held)
     }

@@ -11,6 +11,7 @@ use super::{Core, Inbound, MAX_OUTBOX};
 use crate::address;
 use crate::end::End;
 use crate::hello::Hello;
+use crate::ration::whose;
 
 impl Core {
     /// A stranger says hello.
@@ -56,7 +57,8 @@ impl Core {
             Some((_, before)) => self.end(before, &End::Superseded),
             None => {}
         }
-        let same_address = self.greeted.keys().filter(|(a, _)| a.ip() == from.ip());
+        let home = whose(from.ip());
+        let same_address = self.greeted.keys().filter(|(a, _)| whose(a.ip()) == home);
         if self.connections.len() >= self.limits.max_connections
             || same_address.count() >= self.limits.max_per_address
         {
@@ -72,7 +74,8 @@ impl Core {
         let serial = peer.serial;
         let name = peer.identity.name.as_str().into();
         let limits = self.limits.clone();
-        let connection = Connection::accepted(limits, id, initiator, peer, path, now);
+        let connection = Connection::accepted(limits, id, initiator, peer, path, now)
+            .rationed(self.ration(from.ip(), now));
         let number = self.insert(connection, None, Some((from, initiator)));
         self.greeted.insert((from, initiator), number);
         self.inbound.insert(inbound, (serial, number));
@@ -97,10 +100,12 @@ impl Core {
             return;
         };
         let hop = self.hop(&peer, path.remote);
+        let ration = self.ration(path.remote.ip(), now);
         let mut greeted = None;
         self.of_dialling(to, path, |number, connection| {
             let name = peer.identity.name.as_str().into();
             connection.welcomed(path, acceptor, peer, now)?;
+            connection.ration = ration;
             greeted = Some((number, name));
             Ok(())
         });

@@ -11,10 +11,15 @@ use std::time::{Duration, Instant};
 use fipa_transport::Allowance;
 use parking_lot::Mutex;
 
-use super::config::Limits;
-
 /// Addresses that are told apart. All beyond share what one of them has.
 const MAX_ADDRESSES: usize = 4096;
+
+/// What a peer may send in a second; 0: any number.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Rates {
+    pub(crate) letters: u64,
+    pub(crate) bytes: u64,
+}
 
 /// What is remembered of all peers.
 #[derive(Debug, Default)]
@@ -36,8 +41,8 @@ struct Left {
 
 impl Rations {
     /// The one of whoever is at this address; none when peers may send as much as they like.
-    pub(crate) fn of(&self, ip: IpAddr, limits: &Limits, now: Instant) -> Option<Arc<Ration>> {
-        if limits.peer_letters == 0 && limits.peer_bytes == 0 {
+    pub(crate) fn of(&self, ip: IpAddr, rates: Rates, now: Instant) -> Option<Arc<Ration>> {
+        if rates.letters == 0 && rates.bytes == 0 {
             return None;
         }
         let ip = whose(ip);
@@ -52,19 +57,19 @@ impl Rations {
                 return all.values().next().cloned();
             }
         }
-        let ration = Arc::new(Ration::new(limits, now));
+        let ration = Arc::new(Ration::new(rates, now));
         all.insert(ip, ration.clone());
         Some(ration)
     }
 }
 
 impl Ration {
-    fn new(limits: &Limits, now: Instant) -> Self {
+    fn new(rates: Rates, now: Instant) -> Self {
         let rate = |limit: u64| match limit {
             0 => f64::INFINITY,
             limit => limit as f64,
         };
-        let (letters, bytes) = (rate(limits.peer_letters), rate(limits.peer_bytes));
+        let (letters, bytes) = (rate(rates.letters), rate(rates.bytes));
         Self {
             letters_per_second: letters,
             bytes_per_second: bytes,
@@ -118,12 +123,8 @@ pub(crate) fn whose(ip: IpAddr) -> IpAddr {
 mod tests {
     use super::*;
 
-    fn limits(peer_letters: u64, peer_bytes: u64) -> Limits {
-        Limits {
-            peer_letters,
-            peer_bytes,
-            ..Limits::default()
-        }
+    fn rates(letters: u64, bytes: u64) -> Rates {
+        Rates { letters, bytes }
     }
 
     #[test]
@@ -131,7 +132,7 @@ mod tests {
         let (rations, now) = (Rations::default(), Instant::now());
         let of = |ip: &str| {
             let ip = ip.parse().unwrap();
-            rations.of(ip, &limits(10, 1000), now).unwrap()
+            rations.of(ip, rates(10, 1000), now).unwrap()
         };
         assert_eq!(of("10.0.0.1").spend(6, 0, now), None);
         let later = of("::ffff:10.0.0.1").spend(5, 0, now);
@@ -156,12 +157,12 @@ mod tests {
         let (rations, now) = (Rations::default(), Instant::now());
         let address = |number: u32| IpAddr::from(number.to_be_bytes());
         for number in 0..2 * MAX_ADDRESSES as u32 {
-            let ration = rations.of(address(number), &limits(1, 1), now).unwrap();
+            let ration = rations.of(address(number), rates(1, 1), now).unwrap();
             ration.spend(1, 1, now);
         }
         assert_eq!(rations.0.lock().len(), MAX_ADDRESSES);
         let later = now + Duration::from_secs(2);
-        rations.of(address(u32::MAX), &limits(1, 1), later);
+        rations.of(address(u32::MAX), rates(1, 1), later);
         assert_eq!(rations.0.lock().len(), 1);
     }
 
@@ -169,8 +170,8 @@ mod tests {
     fn what_is_not_limited_is_not_counted() {
         let (rations, now) = (Rations::default(), Instant::now());
         let ip = address();
-        assert!(rations.of(ip, &limits(0, 0), now).is_none());
-        let ration = rations.of(ip, &limits(0, 10), now).unwrap();
+        assert!(rations.of(ip, rates(0, 0), now).is_none());
+        let ration = rations.of(ip, rates(0, 10), now).unwrap();
         assert_eq!(ration.spend(u64::MAX, 10, now), None);
         assert!(ration.spend(0, 1, now).is_some());
     }
