@@ -9,15 +9,15 @@
 mod services;
 
 use std::collections::VecDeque;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
-use fipa::{AgentId, Kind, Message, Outcome, Performative};
+use fipa::{Kind, Message, Outcome};
+use fipa_mts::Sending;
 use fipa_mts::core::Submission;
-use fipa_mts::{Sending, letter_for};
 use tokio::task::{JoinHandle, spawn_blocking};
 use tokio::time::timeout;
 
-use services::{ARM, Place, ROVER, host};
+use services::{ARM, Place, ROVER, host, letter};
 
 /// Letters by each way.
 const EACH: usize = 60;
@@ -27,15 +27,9 @@ const WATCHDOG: Duration = Duration::from_secs(120);
 
 /// A letter with this number.
 fn submission(number: usize) -> Submission {
-    let message = Message::builder(Performative::Inform)
-        .sender(AgentId::new("rover").unwrap())
-        .receiver(AgentId::new("arm").unwrap())
-        .content(number.to_string())
-        .build()
-        .unwrap();
     Submission {
         sender: ROVER,
-        letter: letter_for(&message, SystemTime::now()).unwrap(),
+        letter: letter(number),
         receivers: vec!["arm".into()],
         deadline: Duration::from_secs(60),
     }

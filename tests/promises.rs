@@ -13,12 +13,12 @@ use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
 use fastrand::Rng;
-use fipa::{AgentId, FailureReason, Kind, Letter, Message, Outcome, Performative};
+use fipa::{FailureReason, Kind, Letter, Outcome};
+use fipa_mts::Sending;
 use fipa_mts::core::Submission;
-use fipa_mts::{Sending, letter_for};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Parcel, Sink, Stream, Transport,
     Verdict,
@@ -26,7 +26,7 @@ use fipa_transport::{
 use fipa_transport_net::{Identity, Limits, QuicConfig, QuicTransport, TcpConfig, TcpTransport};
 use parking_lot::Mutex;
 use services::weather::{Link, Sky};
-use services::{ARM, Place, ROVER, Security, friends, host};
+use services::{ARM, Place, ROVER, Security, friends, host, letter, number};
 use tokio::runtime::Handle;
 use tokio::task::spawn_blocking;
 use tokio::time::{sleep, timeout};
@@ -41,23 +41,6 @@ const CHANGES: usize = 12;
 /// Letters delivered in a row that count as traffic that goes on.
 const IN_A_ROW: usize = 20;
 const WATCHDOG: Duration = Duration::from_secs(120);
-
-/// A letter with this number.
-fn letter(number: usize) -> Letter {
-    let message = Message::builder(Performative::Inform)
-        .sender(AgentId::new("rover").unwrap())
-        .receiver(AgentId::new("arm").unwrap())
-        .content(number.to_string())
-        .build()
-        .unwrap();
-    letter_for(&message, SystemTime::now()).unwrap()
-}
-
-fn number(letter: &Letter) -> usize {
-    let message = Message::decode(letter.payload()).unwrap();
-    let text = std::str::from_utf8(message.content().unwrap()).unwrap();
-    text.parse().unwrap()
-}
 
 /// What happened.
 #[derive(Default)]

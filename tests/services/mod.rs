@@ -5,11 +5,11 @@ pub(crate) mod weather;
 
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
-use fipa::Kind;
+use fipa::{AgentId, Kind, Letter, Message, Performative};
 use fipa_mts::core::CoreConfig;
-use fipa_mts::{Mts, RuntimeConfig, Started};
+use fipa_mts::{Mts, RuntimeConfig, Started, letter_for};
 use fipa_sds::{Directory as _, MemoryDirectory, Registration};
 use fipa_transport::{Incarnation, Location, Transport};
 #[cfg(feature = "secure")]
@@ -30,6 +30,24 @@ pub(crate) type Security = std::convert::Infallible;
 /// The life of the agent that sends, and of the one that receives.
 pub(crate) const ROVER: Incarnation = Incarnation::from_u64(0x50e4);
 pub(crate) const ARM: Incarnation = Incarnation::from_u64(0xa53);
+
+/// A letter from the rover to the arm with this number.
+pub(crate) fn letter(number: usize) -> Letter {
+    let message = Message::builder(Performative::Inform)
+        .sender(AgentId::new("rover").unwrap())
+        .receiver(AgentId::new("arm").unwrap())
+        .content(number.to_string())
+        .build()
+        .unwrap();
+    letter_for(&message, SystemTime::now()).unwrap()
+}
+
+/// The number of such a letter.
+pub(crate) fn number(letter: &Letter) -> usize {
+    let message = Message::decode(letter.payload()).unwrap();
+    let text = std::str::from_utf8(message.content().unwrap()).unwrap();
+    text.parse().unwrap()
+}
 
 /// A service: a robot process, or a gateway.
 pub(crate) struct Place {
