@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use common::{Party, accepted, config, parcel, rogue_hello, until, written};
 use fipa_acl::Envelope;
-use fipa_transport::{Conclusion, Kind, Location, Parcel, Verdict, WayFault};
+use fipa_transport::{Conclusion, Kind, Location, Parcel, Transport as _, Verdict, WayFault};
 use fipa_transport_net::{Counters, Limits};
 use socket2::{Domain, Socket, Type};
 
@@ -315,6 +315,34 @@ fn a_peer_that_stops_reading_is_given_up() {
         other => panic!("{other:?}"),
     }
     drop(server.join().unwrap());
+}
+
+/// Nor does it keep a thread of ours busy: the socket of a broken connection is always writable.
+#[test]
+fn a_peer_that_resets_while_goodbye_is_said_holds_up_nothing() {
+    let party = Party::new();
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    let server = std::thread::spawn(move || {
+        let (mut stream, _) = listener.accept().unwrap();
+        stream.write_all(&hello(77)).unwrap();
+        stream.read_exact(&mut [0; 100_000]).unwrap();
+        stream
+    });
+    let to = Location::new(Kind::Tcp, &address).unwrap();
+    // More than the system's buffers take: the goodbye waits behind it.
+    party.send(1, &to, parcel(1, vec![0; 16 << 20])).unwrap();
+    let peer = server.join().unwrap();
+    party.transport.close();
+    match party.conclusion(1) {
+        Conclusion::Unconfirmed(error) => assert_eq!(error.fault, WayFault::Closed, "{error}"),
+        other => panic!("{other:?}"),
+    }
+    // With bytes that nobody has read: a reset.
+    drop(peer);
+    until("every task has ended", || {
+        (party.runtime.metrics().num_alive_tasks() == 0).then_some(())
+    });
 }
 
 #[test]

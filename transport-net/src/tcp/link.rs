@@ -61,6 +61,8 @@ struct State {
 enum Flushed {
     All,
     Rest,
+    /// Writing failed: nothing more goes out, ever.
+    Broken,
 }
 
 impl Link {
@@ -152,7 +154,7 @@ impl Link {
 
     /// Writes what the kernel takes, and sees to it that the task writes the rest.
     fn flush(&self, state: &mut State) {
-        if state.flush() == Flushed::Rest {
+        if state.flush() != Flushed::All {
             self.wake.notify_one();
         }
     }
@@ -178,9 +180,7 @@ impl State {
             let count = self.connection.gather(&mut slices);
             match writer.try_write(&slices[..count]) {
                 Ok(0) => {
-                    let nothing = "the system takes no more bytes".into();
-                    self.ending.get_or_insert(End::Broken(nothing));
-                    return Flushed::Rest;
+                    return self.broken("the system takes no more bytes");
                 }
                 Ok(taken) => {
                     burst += taken;
@@ -188,20 +188,20 @@ impl State {
                 }
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => return Flushed::Rest,
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                Err(error) => {
-                    self.ending.get_or_insert(End::Broken(error.to_string()));
-                    return Flushed::Rest;
-                }
+                Err(error) => return self.broken(error),
             }
         }
         match writer.try_finish() {
             Ok(()) => Flushed::All,
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => Flushed::Rest,
-            Err(error) => {
-                self.ending.get_or_insert(End::Broken(error.to_string()));
-                Flushed::Rest
-            }
+            Err(error) => self.broken(error),
         }
+    }
+
+    fn broken(&mut self, why: impl ToString) -> Flushed {
+        let why = why.to_string();
+        self.ending.get_or_insert(End::Broken(why));
+        Flushed::Broken
     }
 }
 
@@ -536,6 +536,8 @@ async fn farewell(link: &Link, mut read: Reading) {
             let flushed = state.flush();
             match (flushed, &state.writer) {
                 (Flushed::Rest, Some(writer)) => writer.clone(),
+                // The socket of one that is broken counts as writable: waiting would be no waiting.
+                (Flushed::Broken, _) => return,
                 _ => break,
             }
         };

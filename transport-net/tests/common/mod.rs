@@ -9,6 +9,7 @@ pub(crate) mod intruder;
 
 use std::collections::HashMap;
 use std::net::IpAddr;
+use std::ops::Deref;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -24,13 +25,40 @@ use parking_lot::Mutex;
 use tokio::runtime::{Handle, Runtime};
 use zerocopy::IntoBytes as _;
 
-pub(crate) fn runtime() -> Runtime {
-    tokio::runtime::Builder::new_multi_thread()
+pub(crate) fn runtime() -> Threads {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .enable_all()
-        .build()
-        .unwrap()
+        .build();
+    Threads(Some(runtime.unwrap()))
 }
+
+/// A runtime. A task that never lets go of its thread fails the test instead of holding it up.
+pub(crate) struct Threads(Option<Runtime>);
+
+impl Deref for Threads {
+    type Target = Runtime;
+
+    fn deref(&self) -> &Runtime {
+        self.0.as_ref().unwrap()
+    }
+}
+
+impl Drop for Threads {
+    fn drop(&mut self) {
+        let began = Instant::now();
+        if let Some(runtime) = self.0.take() {
+            runtime.shutdown_timeout(PATIENCE);
+        }
+        assert!(
+            began.elapsed() < PATIENCE || std::thread::panicking(),
+            "a task does not let go of its thread"
+        );
+    }
+}
+
+/// Whoever waits this long in a test waits for ever.
+const PATIENCE: Duration = Duration::from_secs(60);
 
 /// What every endpoint of the tests is called.
 pub(crate) const NAME: &str = "test-mts";
@@ -189,7 +217,7 @@ pub(crate) struct Party<T = TcpTransport> {
     pub(crate) transport: T,
     pub(crate) sink: Arc<Recorder>,
     pub(crate) locations: Vec<Location>,
-    pub(crate) runtime: Runtime,
+    pub(crate) runtime: Threads,
 }
 
 impl Party {
@@ -278,10 +306,7 @@ pub(crate) fn until<T>(what: &str, condition: impl Fn() -> Option<T>) -> T {
             return value;
         }
         let elapsed = started.elapsed();
-        assert!(
-            elapsed < Duration::from_secs(60),
-            "gave up waiting for: {what}"
-        );
+        assert!(elapsed < PATIENCE, "gave up waiting for: {what}");
         std::thread::sleep(Duration::from_micros(200));
     }
 }
