@@ -13,10 +13,9 @@ use fipa_transport::conformance::Fixture;
 use fipa_transport::{Faulty, Kind, Location, Transport};
 use fipa_transport_net::{TcpTransport, UdpTransport};
 use tokio::net::TcpSocket;
-use tokio::runtime::Runtime;
 
 struct Tcp {
-    runtime: Runtime,
+    runtime: common::Threads,
     address: &'static str,
     /// Bound and never listening: connecting to it is refused, and nobody else gets the port.
     nowhere: TcpSocket,
@@ -54,7 +53,7 @@ impl Fixture for Tcp {
 }
 
 struct Udp {
-    runtime: Runtime,
+    runtime: common::Threads,
     address: &'static str,
     /// Connected to itself: whatever others send is refused, and nobody else gets the port.
     nowhere: UdpSocket,
@@ -151,12 +150,11 @@ mod quic {
     use fipa_transport::conformance::Fixture;
     use fipa_transport::{Kind, Location, Transport};
     use fipa_transport_net::QuicTransport;
-    use tokio::runtime::Runtime;
 
     use super::common;
 
     pub(super) struct Quic {
-        runtime: Runtime,
+        runtime: common::Threads,
         address: &'static str,
         /// Connected to itself: whatever others send is refused, and nobody else gets the port.
         nowhere: UdpSocket,

@@ -13,13 +13,12 @@ use std::time::Duration;
 use common::{Recorder, accepted, parcel, rogue_hello, runtime, udp_config, until, written};
 use fipa_transport::{AttemptId, Conclusion, Kind, Location, Sink, Transport, WayFault};
 use fipa_transport_net::{UdpConfig, UdpTransport};
-use tokio::runtime::Runtime;
 
 struct Party {
     transport: UdpTransport,
     sink: Arc<Recorder>,
     location: Location,
-    _runtime: Runtime,
+    _runtime: common::Threads,
 }
 
 impl Party {
