@@ -13,7 +13,7 @@ use std::task::{Context, Poll, Waker};
 
 use bytes::BytesMut;
 use parking_lot::Mutex;
-use quinn::{Connection, ReadError, RecvStream, SendStream, VarInt};
+use quinn::{Connection, ConnectionError, ReadError, RecvStream, SendStream, VarInt, WriteError};
 
 use super::sockets::why_lost;
 use crate::tcp::frame::{self, FrameReader, Space};
@@ -36,9 +36,10 @@ impl Control {
     pub(crate) async fn read(&mut self, space: &mut Space<'_>) -> io::Result<usize> {
         match fill(&mut self.stream, space).await {
             Ok(Some(len)) => Ok(len),
-            Ok(None)
-            | Err(ReadError::ConnectionLost(quinn::ConnectionError::ApplicationClosed(_))) => Ok(0),
-            Err(ReadError::ConnectionLost(lost)) => Err(io::Error::other(why_lost(&lost))),
+            Ok(None) | Err(ReadError::ConnectionLost(ConnectionError::ApplicationClosed(_))) => {
+                Ok(0)
+            }
+            Err(ReadError::ConnectionLost(error)) => Err(lost(&error)),
             Err(error) => Err(error.into()),
         }
     }
@@ -106,6 +107,18 @@ impl Letters {
 async fn fill(stream: &mut RecvStream, space: &mut Space<'_>) -> Result<Option<usize>, ReadError> {
     let chunk = stream.read_chunk(space.room(), true).await?;
     Ok(chunk.map(|chunk| space.fill(&chunk.bytes)))
+}
+
+/// Reading or writing, whichever notices first: why says the connection.
+fn lost(error: &ConnectionError) -> io::Error {
+    io::Error::other(why_lost(error))
+}
+
+fn not_written(error: WriteError) -> io::Error {
+    match error {
+        WriteError::ConnectionLost(error) => lost(&error),
+        other => other.into(),
+    }
 }
 
 /// Where a link writes its frames, one after the other.
@@ -197,7 +210,7 @@ impl Outgoing {
         if begun.lane == Lane::Letter && state.letter.is_none() {
             let opening = std::pin::pin!(self.connection.open_uni());
             match opening.poll(&mut context) {
-                Poll::Ready(opened) => state.keep(opened?),
+                Poll::Ready(opened) => state.keep(opened.map_err(|error| lost(&error))?),
                 Poll::Pending => return Err(io::ErrorKind::WouldBlock.into()),
             }
         }
@@ -207,7 +220,7 @@ impl Outgoing {
             .ok_or(io::ErrorKind::NotConnected)?;
         let wanted = bytes.get(..most).unwrap_or(bytes);
         let taken = match Pin::new(stream).poll_write(&mut context, wanted) {
-            Poll::Ready(taken) => taken?,
+            Poll::Ready(taken) => taken.map_err(not_written)?,
             // Another frame may come before this one, if it has not begun.
             Poll::Pending => return Err(io::ErrorKind::WouldBlock.into()),
         };
@@ -229,7 +242,8 @@ impl Outgoing {
             state.blocked == Lane::Letter && state.letter.is_none()
         };
         if opens {
-            let opened = self.connection.open_uni().await?;
+            let opened = self.connection.open_uni().await;
+            let opened = opened.map_err(|error| lost(&error))?;
             let mut state = self.state.lock();
             // Another thread may have had a later one meanwhile. Then this one ends without a byte,
             // which its reader passes over: letters are read in the order of their streams.
@@ -243,7 +257,7 @@ impl Outgoing {
                 // Nothing is written: what is asked is whether something could be.
                 Some(stream) => match Pin::new(stream).poll_write(context, &[]) {
                     Poll::Ready(Ok(_)) => Poll::Ready(Ok(())),
-                    Poll::Ready(Err(error)) => Poll::Ready(Err(error.into())),
+                    Poll::Ready(Err(error)) => Poll::Ready(Err(not_written(error))),
                     Poll::Pending => Poll::Pending,
                 },
                 None => Poll::Ready(Ok(())),
