@@ -13,6 +13,10 @@
 //!
 //! What must not live here: what is done with keys on connections (`fipa_transport_net::secure`).
 
+mod error;
+#[cfg(test)]
+mod tests;
+
 use std::fs::{self, DirBuilder, OpenOptions};
 use std::io::{self, Write as _};
 use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _, OpenOptionsExt as _};
@@ -24,6 +28,8 @@ use fipa_transport_net::secure::{Credentials, alternative_names};
 use rcgen::{CertificateParams, DnType, KeyPair, SanType};
 use rustls_pki_types::pem::PemObject as _;
 use rustls_pki_types::{CertificateDer, PrivateKeyDer};
+
+pub use self::error::KeysError;
 
 /// Longest file that is read, in bytes.
 const MAX_FILE: u64 = 1 << 20;
@@ -37,88 +43,13 @@ pub const VALID: Duration = Duration::from_secs(10 * 365 * 86_400);
 /// How far clocks of two robots may differ.
 const SKEW: Duration = Duration::from_secs(86_400);
 
+/// The last second that a certificate can name: of the year 9999 (RFC 5280 clause 4.1.2.5), since 1970.
+const LAST: Duration = Duration::from_secs(253_402_300_799);
+
 /// A directory with keys.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Keys {
     dir: PathBuf,
-}
-
-/// Why something cannot be done with keys.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum KeysError {
-    /// A file or directory cannot be used.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// Which one.
-        path: PathBuf,
-        /// What the operating system said.
-        source: io::Error,
-    },
-    /// There are keys already.
-    #[error("{} is there already; nothing was changed", .0.display())]
-    Exists(PathBuf),
-    /// There are none.
-    #[error("there are no keys in {}; make them with `fipa keys init`", .0.display())]
-    Missing(PathBuf),
-    /// Others could read the private key.
-    #[error(
-        "{} can be read by others than its owner, or is not this user's; `chmod 600` it, and make new \
-         keys if somebody may have read it",
-        .0.display()
-    )]
-    Readable(PathBuf),
-    /// A file is not what its name says.
-    #[error("{}: {what}", path.display())]
-    Contents {
-        /// Which one.
-        path: PathBuf,
-        /// What is wrong with it.
-        what: String,
-    },
-    /// What was given has no certificate in it.
-    #[error("no certificate in it (PEM, -----BEGIN CERTIFICATE-----)")]
-    NoCertificate,
-    /// What was given is a private key.
-    #[error(
-        "a private key, which nobody but its owner may have; if it came from another host, that has to \
-         make new ones"
-    )]
-    PrivateKey,
-    /// What was given is this host's own.
-    #[error("this host's own certificate, which the owners of other hosts are to trust")]
-    Own,
-    /// A certificate that cannot be used.
-    #[error(transparent)]
-    Certificate(#[from] CertificateError),
-    /// The certificate is of another service.
-    #[error(
-        "the certificate in {} is of {certified:?}, and mts.name is {name:?}: peers would refuse this \
-         gateway",
-        dir.display()
-    )]
-    Name {
-        /// Where the certificate is.
-        dir: PathBuf,
-        /// Whose it is.
-        certified: String,
-        /// Who wants to use it.
-        name: String,
-    },
-    /// It was revoked once.
-    #[error("the certificate {0} was revoked; its owner has to make a new one")]
-    Revoked(Fingerprint),
-    /// None of the trusted certificates is meant, or several are.
-    #[error("{found} trusted certificates are meant by {which:?}; `fipa keys list` shows them")]
-    Which {
-        /// What was asked for.
-        which: String,
-        /// How many there are.
-        found: usize,
-    },
-    /// A key or certificate could not be made.
-    #[error("could not make a key: {0}")]
-    Make(String),
 }
 
 /// What is in the directory at one time, as far as that is seen without reading it.
@@ -212,7 +143,8 @@ impl Keys {
     /// so).
     ///
     /// # Errors
-    /// When there are keys already, or the directory cannot be written.
+    /// When there are keys already, the directory cannot be written, or no certificate can be valid
+    /// for so long.
     pub fn init(
         &self,
         mts: &str,
@@ -240,7 +172,7 @@ impl Keys {
     pub fn switch(&self) -> Result<Certificate, KeysError> {
         let (key, certificate) = (self.dir.join("next.key"), self.next_file());
         if !key.exists() || !certificate.exists() {
-            return Err(KeysError::Missing(certificate));
+            return Err(KeysError::NoNext(self.dir.clone()));
         }
         // Who reads in between finds a key and a certificate that do not belong together, and
         // looks again.
@@ -257,6 +189,11 @@ impl Keys {
         valid: Duration,
     ) -> Result<Certificate, KeysError> {
         let failed = |error: rcgen::Error| KeysError::Make(error.to_string());
+        let now = SystemTime::now();
+        let until = now.checked_add(valid);
+        let until =
+            until.filter(|until| !valid.is_zero() && *until <= SystemTime::UNIX_EPOCH + LAST);
+        let until = until.ok_or(KeysError::Validity(valid))?;
         make_private(&self.dir)?;
         let (key_file, file) = (
             self.dir.join(format!("{what}.key")),
@@ -271,9 +208,8 @@ impl Keys {
             let uri = uri.try_into().map_err(failed)?;
             params.subject_alt_names.push(SanType::URI(uri));
         }
-        let now = SystemTime::now();
         params.not_before = (now - SKEW).into();
-        params.not_after = (now + valid).into();
+        params.not_after = until.into();
         let key = KeyPair::generate().map_err(failed)?;
         let made = params.self_signed(&key).map_err(failed)?;
         let certificate = Certificate::from_der(made.der().to_vec())?;
@@ -287,14 +223,16 @@ impl Keys {
     /// # Errors
     /// When there is none, or it cannot be read.
     pub fn own(&self) -> Result<Certificate, KeysError> {
-        let file = self.own_file();
-        match read(&file) {
-            Ok(pem) => only(&file, &pem),
-            Err(KeysError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
-                Err(KeysError::Missing(self.dir.clone()))
-            }
-            Err(error) => Err(error),
-        }
+        let own = certificate_in(&self.own_file())?;
+        own.ok_or_else(|| KeysError::Missing(self.dir.clone()))
+    }
+
+    /// The certificate that will be this host's next, if one has been made.
+    ///
+    /// # Errors
+    /// When it cannot be read.
+    pub fn next(&self) -> Result<Option<Certificate>, KeysError> {
+        certificate_in(&self.next_file())
     }
 
     /// Trusts the certificates in this PEM text, and returns them.
@@ -370,12 +308,12 @@ impl Keys {
     }
 
     /// Withdraws trust for good: from the certificate whose fingerprint begins so, or from all of the
-    /// service with this name.
+    /// service with this name. Others that cannot be read do not keep anybody from it.
     ///
     /// # Errors
     /// When nothing is meant, or two by a fingerprint.
     pub fn revoke(&self, which: &str) -> Result<Vec<Certificate>, KeysError> {
-        let trusted = self.trusted()?;
+        let (trusted, mut doubtful) = self.confirmed();
         let begins = |certificate: &Certificate| {
             let fingerprint = certificate.fingerprint().to_string();
             which.len() >= 8 && fingerprint.starts_with(which)
@@ -389,7 +327,9 @@ impl Keys {
             meant.extend(trusted.into_iter().filter(begins));
             if meant.len() != 1 {
                 let (which, found) = (which.to_owned(), meant.len());
-                return Err(KeysError::Which { which, found });
+                // It may be that one.
+                let unread = doubtful.pop().filter(|_| found == 0);
+                return Err(unread.unwrap_or(KeysError::Which { which, found }));
             }
         }
         make_private(&self.dir.join("revoked"))?;
@@ -424,13 +364,23 @@ impl Keys {
     /// This host's certificate and key, and whom it trusts, whatever the service is called.
     ///
     /// # Errors
-    /// When there are no keys, or something cannot be read.
+    /// When there are no keys, something cannot be read, or others could read or write it.
     fn credentials(&self) -> Result<Credentials, KeysError> {
         let own = self.own()?;
+        let user = rustix::process::geteuid().as_raw();
         let file = self.dir.join("own.key");
         let meta = fs::metadata(&file).map_err(|source| io_error(&file, source))?;
-        if meta.mode() & 0o077 != 0 || meta.uid() != rustix::process::geteuid().as_raw() {
+        if meta.mode() & 0o077 != 0 || meta.uid() != user {
             return Err(KeysError::Readable(file));
+        }
+        for dir in ["", "trusted", "revoked"].map(|folder| self.dir.join(folder)) {
+            // What is not there nobody can write to, or it is told where it is read.
+            let Ok(meta) = fs::metadata(&dir) else {
+                continue;
+            };
+            if meta.mode() & 0o022 != 0 || ![0, user].contains(&meta.uid()) {
+                return Err(KeysError::Writable(dir));
+            }
         }
         let key = PrivateKeyDer::from_pem_slice(&read(&file)?);
         let key = key.map_err(|error| contents(&file, &error))?;
@@ -551,6 +501,15 @@ fn certificates(pem: &[u8]) -> Result<Vec<Certificate>, KeysError> {
     Ok(all)
 }
 
+/// The certificate in a file of ours, which need not be there.
+fn certificate_in(file: &Path) -> Result<Option<Certificate>, KeysError> {
+    match read(file) {
+        Ok(pem) => only(file, &pem).map(Some),
+        Err(KeysError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
 /// The one certificate in a file of ours.
 fn only(file: &Path, pem: &[u8]) -> Result<Certificate, KeysError> {
     let found = certificates(pem).map_err(|error| contents(file, &error))?;
@@ -561,95 +520,4 @@ fn only(file: &Path, pem: &[u8]) -> Result<Certificate, KeysError> {
 
 fn to_pem(certificate: &Certificate) -> String {
     pem::encode(&pem::Pem::new("CERTIFICATE", certificate.der().to_vec()))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn keys() -> (tempfile::TempDir, Keys) {
-        let dir = tempfile::tempdir().unwrap();
-        let keys = Keys::at(dir.path().join("keys"));
-        (dir, keys)
-    }
-
-    #[test]
-    fn what_a_certificate_says_is_what_was_asked_for() {
-        let (_dir, keys) = keys();
-        let agents = ["arm_1".to_owned(), "Käptn *".to_owned()];
-        let made = keys.init("crex mts/1", &agents, VALID).unwrap();
-        assert_eq!(keys.own().unwrap(), made);
-        assert_eq!(made.certified().mts(), "crex mts/1");
-        assert_eq!(made.certified().agents(), agents);
-        let (from, until) = made.validity();
-        assert!(until - from >= i64::try_from(VALID.as_secs()).unwrap());
-        assert!(matches!(
-            keys.init("crex", &[], VALID),
-            Err(KeysError::Exists(_))
-        ));
-        assert_eq!(keys.own().unwrap(), made);
-    }
-
-    #[test]
-    fn trust_is_given_and_withdrawn_for_good() {
-        let ((_a, crex), (_b, rover)) = (keys(), keys());
-        let made = crex.init("crex-mts", &[], VALID).unwrap();
-        rover.init("rover-mts", &[], VALID).unwrap();
-        let before = rover.stamp();
-        let pem = fs::read(crex.own_file()).unwrap();
-        assert_eq!(rover.trust(&pem).unwrap(), std::slice::from_ref(&made));
-        assert_eq!(rover.trust(&pem).unwrap().len(), 1, "twice is once");
-        assert_ne!(rover.stamp(), before);
-        assert_eq!(rover.credentials().unwrap().trusted.len(), 1);
-        assert!(matches!(
-            rover.revoke("nobody"),
-            Err(KeysError::Which { found: 0, .. })
-        ));
-        let fingerprint = made.fingerprint().to_string();
-        assert_eq!(rover.revoke(&fingerprint[..12]).unwrap().len(), 1);
-        assert_eq!(rover.trusted().unwrap(), []);
-        assert_eq!(rover.revoked().unwrap(), [made]);
-        assert!(matches!(rover.trust(&pem), Err(KeysError::Revoked(_))));
-    }
-
-    #[test]
-    fn a_renewed_key_is_used_when_it_is_switched_to() {
-        let (_dir, keys) = keys();
-        assert!(matches!(keys.renew(VALID), Err(KeysError::Missing(_))));
-        let first = keys.init("crex", &["crex".to_owned()], VALID).unwrap();
-        assert!(matches!(keys.switch(), Err(KeysError::Missing(_))));
-        let next = keys.renew(VALID).unwrap();
-        assert_eq!(keys.own().unwrap(), first);
-        assert_eq!(keys.switch().unwrap(), next);
-        assert_eq!(next.certified(), first.certified());
-        assert_ne!(next.fingerprint(), first.fingerprint());
-        assert_eq!(keys.credentials().unwrap().own, next);
-    }
-
-    #[test]
-    fn a_key_that_others_can_read_is_refused() {
-        use std::os::unix::fs::PermissionsExt as _;
-        let (_dir, keys) = keys();
-        keys.init("crex", &[], VALID).unwrap();
-        let file = keys.dir().join("own.key");
-        assert_eq!(fs::metadata(&file).unwrap().mode() & 0o777, 0o600);
-        fs::set_permissions(&file, fs::Permissions::from_mode(0o640)).unwrap();
-        assert!(matches!(keys.credentials(), Err(KeysError::Readable(_))));
-    }
-
-    #[test]
-    fn what_is_no_certificate_is_told() {
-        let (_dir, keys) = keys();
-        for wrong in [
-            &b""[..],
-            b"hello",
-            b"-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n",
-        ] {
-            assert!(keys.trust(wrong).is_err());
-        }
-        assert!(matches!(keys.own(), Err(KeysError::Missing(_))));
-        keys.init("crex", &[], VALID).unwrap();
-        fs::write(keys.own_file(), b"hello").unwrap();
-        assert!(matches!(keys.own(), Err(KeysError::Contents { .. })));
-    }
 }

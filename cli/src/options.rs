@@ -1,6 +1,7 @@
 //! The command line: the options all commands share.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use clap::{ArgAction, ArgMatches, Args, Command as Clap, CommandFactory, FromArgMatches, Parser};
 use fipa::Config;
@@ -122,6 +123,12 @@ impl Global {
             ..Sources::from_environment()
         })
     }
+}
+
+/// A time such as 10s.
+pub(crate) fn duration(text: &str) -> Result<Duration, String> {
+    let duration = humantime::parse_duration(text);
+    duration.map_err(|_| "use a time such as 10s, 500ms or 2h".to_owned())
 }
 
 /// What runs everything that waits.

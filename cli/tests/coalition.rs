@@ -38,7 +38,10 @@ fn a_coalition_is_shown_and_written_to() {
     assert!(stranger.contains("owl"), "{stranger}");
     assert_eq!(birds.signal("-INT"), (Some(0), String::new()));
     let gone = host.run(&["agents", "birds"]).done();
-    assert!(gone.contains("nobody"), "{gone}");
+    assert!(
+        gone.contains("nobody") && gone.contains("by that description"),
+        "{gone}"
+    );
     drop((parrot, owl));
 }
 
@@ -54,7 +57,10 @@ fn who_watches_ends_when_nobody_reads_any_more() {
     let mut line = String::new();
     let mut output = BufReader::new(watching.stdout.take().unwrap());
     output.read_line(&mut line).unwrap();
-    assert!(line.contains("present  parrot"), "{line}");
+    output.read_line(&mut line).unwrap();
+    let (first, second) = line.split_once('\n').unwrap();
+    assert!(first.starts_with("watching the domain"), "{line}");
+    assert!(second.contains("present  parrot"), "{line}");
     // As `head` does. Nothing else happens that would be told; a watchdog ends a test that hangs.
     drop(output);
     assert!(watching.wait().unwrap().success());

@@ -167,14 +167,39 @@ fn what_there_is_is_listed_and_not_overwritten() {
         ),
         (
             vec!["keys", "revoke", "nobody", "--dir", &dir],
-            "0 trusted certificates",
+            "0 of the trusted certificates",
         ),
-        (vec!["keys", "renew", "--use", "--dir", &dir], "fipa keys"),
+        (
+            vec!["keys", "renew", "--use", "--dir", &dir],
+            "no next keys",
+        ),
+        (
+            vec!["keys", "renew", "--valid", "9000years", "--dir", &dir],
+            "the year 9999",
+        ),
     ] {
         let said = host.host.run(&wrong).failed(1);
         assert!(said.contains(told), "{wrong:?}: {said}");
     }
     assert_eq!(host.list(), listed);
+
+    // The next ones are seen too, and made once.
+    assert_eq!(listed["next"], Value::Null);
+    host.keys(&["renew"]);
+    assert_eq!(host.list()["next"]["mts"], json!(host.name));
+    let said = host.host.run(&["keys", "renew", "--dir", &dir]).failed(1);
+    assert!(said.contains("`fipa keys renew --use`"), "{said}");
+}
+
+#[test]
+fn who_has_no_keys_is_told_how_to_make_them() {
+    let host = Host::new();
+    let told = host.run(&["keys", "list"]).done();
+    assert!(told.contains("make them with `fipa keys init`"), "{told}");
+    let told = host.run(&["keys", "init", "--dir", "some"]).done();
+    // Wherever the gateway is started from.
+    let dir = host.path("some").canonicalize().unwrap();
+    assert!(told.contains(&format!("keys = {dir:?}")), "{told}");
 }
 
 #[test]

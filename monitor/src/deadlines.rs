@@ -81,6 +81,7 @@ mod tests {
         }
         assert!(deadlines.heap.len() < 4_000, "{}", deadlines.heap.len());
     }
+
     #[test]
     fn as_many_again_and_some_may_not_count() {
         let mut deadlines = Deadlines::default();

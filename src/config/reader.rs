@@ -228,7 +228,7 @@ fn known() -> impl Iterator<Item = &'static [&'static str]> {
 }
 
 /// The keys and sections directly in a section, in their order.
-fn children(section: &[impl AsRef<str>]) -> String {
+fn children<T: AsRef<str>>(section: &[T]) -> String {
     let mut names: Vec<&str> = Vec::new();
     for path in known().filter(|path| path.len() > section.len()) {
         let (front, rest) = path.split_at(section.len());
@@ -268,7 +268,11 @@ fn suggestion(path: &[&str]) -> String {
         top if top.is_empty() => "at the top".to_owned(),
         name => format!("in [{name}]"),
     };
-    let listed = format!("known {place}: {}", children(section));
+    let is_there = |path: &[&str]| path.starts_with(section) || section.starts_with(path);
+    let listed = match known().any(is_there) {
+        true => format!("known {place}: {}", children(section)),
+        false => format!("known at the top: {}", children::<&str>(&[])),
+    };
     match nearest {
         Some((distance, candidate)) if distance <= 1 + last.chars().count() / 3 => {
             format!("did you mean `{}`? ({listed})", candidate.join("."))

@@ -112,7 +112,8 @@ impl Guard {
         self.seen = now;
         match used {
             Ok(count) => {
-                if changed || self.fault.take().is_some() {
+                let mended = self.fault.take().is_some();
+                if changed || mended {
                     tracing::info!(trusted = count, "the keys were read again");
                 }
             }

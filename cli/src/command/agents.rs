@@ -136,6 +136,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         directory.refresh();
         let entries = directory.entries();
         let listed = Listed {
+            nobody: entries.is_empty(),
             gateway: gateway(directory).map(|entry| entry.name.to_string()),
             entries: entries
                 .iter()
@@ -153,8 +154,12 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         );
     }
     if listed.entries.is_empty() {
+        let description = match listed.nobody {
+            true => "",
+            false => " by that description",
+        };
         return output::text(&format!(
-            "nobody in the domain {} is known here by that description\n",
+            "nobody in the domain {} is known here{description}\n",
             config.domain
         ));
     }
@@ -168,6 +173,8 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 }
 
 struct Listed {
+    /// Whether there is nobody at all, whatever is looked for.
+    nobody: bool,
     gateway: Option<String>,
     entries: Vec<Row>,
 }

@@ -60,11 +60,14 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         });
         let told = match formed {
             Ok(coalition) => {
+                let members = match coalition.members().names().len() {
+                    1 => "1 member".to_owned(),
+                    several => format!("{several} members"),
+                };
                 let told = output::text(&format!(
-                    "{} of the domain {} has {} members; Ctrl-C dissolves it\n",
+                    "{} of the domain {} has {members}; Ctrl-C dissolves it\n",
                     coalition.name(),
                     config.domain,
-                    coalition.members().names().len()
                 ));
                 stop.requested().await;
                 told

@@ -1,14 +1,15 @@
 //! `fipa keys`: who this host is, and which others it speaks with.
 
-use std::path::PathBuf;
+use std::path::{self, Path, PathBuf};
 use std::time::Duration;
 
+use clap::builder::NonEmptyStringValueParser;
 use clap::{Args, Subcommand};
 use comfy_table::{Table, presets};
 use fipa::keys::{Certificate, Holding, Keys, KeysError, VALID};
 use serde_json::{Value, json};
 
-use crate::options::Global;
+use crate::options::{self, Global};
 use crate::report::Failure;
 use crate::{input, output};
 
@@ -47,10 +48,10 @@ Examples:
     Init {
         /// An agent that this host may speak for; one that ends with * stands for all that begin so
         /// [default: every agent]
-        #[arg(long = "agent", value_name = "NAME")]
+        #[arg(long = "agent", value_name = "NAME", value_parser = NonEmptyStringValueParser::new())]
         agents: Vec<String>,
         /// How long the certificate holds [default: ten years]
-        #[arg(long, value_name = "DURATION", value_parser = humantime::parse_duration)]
+        #[arg(long, value_name = "DURATION", value_parser = options::duration)]
         valid: Option<Duration>,
     },
 
@@ -66,14 +67,14 @@ Examples:
         file: PathBuf,
     },
 
-    /// Show this host's certificate and those that are trusted or revoked
+    /// Show this host's certificate, the next one, and those that are trusted or revoked
     #[command(after_help = "\
 Examples:
   fipa keys list
   fipa keys list --json | jq -r '.trusted[].mts'
 
 JSON:
-  { \"dir\": path, \"own\": certificate or null, \"trusted\": [ certificate ], \"revoked\": [ certificate ] }
+  { \"dir\": path, \"own\" and \"next\": certificate or null, \"trusted\" and \"revoked\": [ certificate ] }
   certificate = { \"mts\": text, \"agents\": [ text ], \"fingerprint\": text,
                   \"from\": seconds, \"until\": seconds }   since 1970-01-01 00:00 UTC")]
     List {
@@ -104,7 +105,7 @@ Examples:
         #[arg(long = "use", conflicts_with = "valid")]
         change_over: bool,
         /// How long the certificate holds [default: ten years]
-        #[arg(long, value_name = "DURATION", value_parser = humantime::parse_duration)]
+        #[arg(long, value_name = "DURATION", value_parser = options::duration)]
         valid: Option<Duration>,
     },
 }
@@ -130,7 +131,12 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
                 made.certified().mts(),
                 described(&made),
                 keys.own_file().display(),
-                keys.dir().display().to_string(),
+                // From wherever the gateway is started.
+                path::absolute(keys.dir())
+                    .as_deref()
+                    .unwrap_or(keys.dir())
+                    .display()
+                    .to_string(),
             ))
         }
         Action::Trust { file } => {
@@ -200,13 +206,26 @@ fn usual_place() -> Result<PathBuf, Failure> {
 
 fn failed(error: &KeysError, keys: &Keys) -> Failure {
     let advice = match error {
+        KeysError::Exists(file) if is_next(file) => {
+            "give next.pem to the owners of other hosts, then `fipa keys renew --use`"
+        }
         KeysError::Exists(_) => "`fipa keys renew` makes the next ones",
+        KeysError::Validity(_) => "use more than 0, and nothing beyond the year 9999",
+        KeysError::Certificate(_) => "use other names (mts.name, --agent)",
+        KeysError::Contents { .. } => "put a right file in its place, or take it away",
         KeysError::Which { .. } => "give the name of a gateway, or more of a fingerprint",
         KeysError::Revoked(_) => "ask for another certificate (`fipa keys renew` there)",
-        KeysError::Missing(_) => "`fipa keys init` makes keys, `fipa keys renew` the next ones",
+        KeysError::Missing(_) | KeysError::NoNext(_) => {
+            "`fipa keys init` makes keys, `fipa keys renew` the next ones"
+        }
         _ => "see whether this user may read and write there",
     };
     Failure::failed(error.to_string(), keys.dir().display().to_string(), advice)
+}
+
+/// Whether the file is one that `fipa keys renew` makes.
+fn is_next(file: &Path) -> bool {
+    file.file_stem().is_some_and(|stem| stem == "next")
 }
 
 fn described(certificate: &Certificate) -> String {
@@ -248,22 +267,36 @@ fn list(keys: &Keys, json: bool) -> Result<Result<(), Failure>, KeysError> {
         Err(KeysError::Missing(_)) => None,
         Err(error) => return Err(error),
     };
-    let (trusted, revoked) = (keys.trusted()?, keys.revoked()?);
+    let (next, trusted, revoked) = (keys.next()?, keys.trusted()?, keys.revoked()?);
     if json {
         let all =
             |certificates: &[Certificate]| certificates.iter().map(to_json).collect::<Vec<_>>();
         return Ok(output::json(&json!({
             "dir": keys.dir().display().to_string(),
             "own": own.as_ref().map(to_json),
+            "next": next.as_ref().map(to_json),
             "trusted": all(&trusted),
             "revoked": all(&revoked),
         })));
     }
+    let dir = keys.dir().display();
+    let missing = match own {
+        Some(_) => String::new(),
+        None => format!("there are no keys in {dir}; make them with `fipa keys init`\n"),
+    };
+    let all = [
+        ("own", own.as_slice()),
+        ("next", next.as_slice()),
+        ("trusted", &trusted),
+        ("revoked", &revoked),
+    ];
+    if all.iter().all(|(_, certificates)| certificates.is_empty()) {
+        return Ok(output::text(&missing));
+    }
     let mut table = Table::new();
     table.load_style(presets::NOTHING);
     table.set_header(["", "gateway", "speaks for", "until", "fingerprint"]);
-    let own = own.as_slice();
-    for (what, certificates) in [("own", own), ("trusted", &trusted), ("revoked", &revoked)] {
+    for (what, certificates) in all {
         for certificate in certificates {
             table.add_row([
                 what.to_owned(),
@@ -274,10 +307,7 @@ fn list(keys: &Keys, json: bool) -> Result<Result<(), Failure>, KeysError> {
             ]);
         }
     }
-    Ok(output::text(&format!(
-        "{}\n{table}\n",
-        keys.dir().display()
-    )))
+    Ok(output::text(&format!("{dir}\n{table}\n{missing}")))
 }
 
 fn to_json(certificate: &Certificate) -> Value {

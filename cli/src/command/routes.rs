@@ -86,7 +86,14 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             &json!({ "domain": config.domain, "process": process, "gateway": gateway }),
         );
     }
-    output::text(&told(&process, gateway.as_ref(), &config.domain))
+    if process.routes.is_empty() {
+        let name = pattern.map_or("", |_| " by that name");
+        let domain = &config.domain;
+        return output::text(&format!(
+            "nobody in the domain {domain} is known here{name}\n"
+        ));
+    }
+    output::text(&told(&process, gateway.as_ref()))
 }
 
 /// What the gateway of this host says, if there is one.
@@ -122,10 +129,7 @@ async fn ask(domain: &Domain, receivers: Option<&str>) -> Result<Option<Report>,
     }
 }
 
-fn told(process: &Report, gateway: Option<&Report>, domain: &str) -> String {
-    if process.routes.is_empty() {
-        return format!("nobody in the domain {domain} is known here by that name\n");
-    }
+fn told(process: &Report, gateway: Option<&Report>) -> String {
     let mut text = String::new();
     let mut table = table(&["TO", "FROM", "WAY", "STANDING"]);
     for route in &process.routes {

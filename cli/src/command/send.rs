@@ -13,7 +13,7 @@ use fipa::{
 use fipa_acl::json::message_to_json;
 use serde_json::json;
 
-use crate::options::Global;
+use crate::options::{self, Global};
 use crate::report::{self, Failure};
 use crate::{input, membership, output};
 
@@ -71,7 +71,7 @@ pub(crate) struct Arguments {
 
     /// How long to wait for it
     #[arg(long, value_name = "TIME", default_value = "10s", requires = "wait",
-          value_parser = humantime::parse_duration)]
+          value_parser = options::duration)]
     timeout: Duration,
 
     /// Print JSON
@@ -283,7 +283,7 @@ fn no_reply(deliveries: &Deliveries, patience: Duration) -> Failure {
 
 /// What the configuration allows for `mts.deadline`.
 fn deadline(text: &str) -> Result<Duration, String> {
-    let deadline = humantime::parse_duration(text).map_err(|error| error.to_string())?;
+    let deadline = options::duration(text)?;
     if deadline.is_zero() || deadline > Duration::from_secs(3600) {
         return Err("use more than 0 and at most 1h".to_owned());
     }

@@ -97,7 +97,7 @@ impl<'a> Reader<'a> {
     fn document(&mut self) -> Result<Document, Mistake> {
         let (root, has_content) = match self.next()? {
             Tag::Begin(root, has_content) => (root, has_content),
-            Tag::End | Tag::Eof => return Err(self.wrong(Problem::NotScxml(String::new()))),
+            Tag::End | Tag::Eof => return Err(self.wrong(Problem::Empty)),
         };
         let name = local(&root);
         if name != "scxml" {

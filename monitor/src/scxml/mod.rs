@@ -125,6 +125,9 @@ pub enum Problem {
     /// A document type definition could make a small file large.
     #[error("a document type is not accepted; remove the <!DOCTYPE …>")]
     DocumentType,
+    /// It has no element.
+    #[error("no element is there, but a protocol is an <scxml>")]
+    Empty,
     /// The outermost element is another one.
     #[error("the outermost element is <{0}>, but a protocol is an <scxml>")]
     NotScxml(String),

@@ -26,6 +26,11 @@ fn mistakes_are_named_with_line_and_key() {
              (known at the top: domain, mts, transport, discovery, security, access, monitor, routes)",
         ),
         (
+            "[radio]\nrate = 1\n",
+            "fipa.toml:1: unknown key `radio`; known at the top: domain, mts, transport, discovery, \
+             security, access, monitor, routes",
+        ),
+        (
             "[transport.serial]\nlisten = []\n",
             "fipa.toml:1: unknown key `transport.serial`; known in [transport]: shm, tcp, udp, quic",
         ),

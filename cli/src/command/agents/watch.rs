@@ -23,6 +23,10 @@ pub(super) fn run(filter: &Filter, config: &Config, json: bool) -> Result<(), Fa
         // Watching begins before reading: what joins in between is told by one of them.
         let mut changes = directory.watch();
         directory.refresh();
+        if !json {
+            let domain = &config.domain;
+            output::text(&format!("watching the domain {domain}; Ctrl-C ends it\n"))?;
+        }
         let mut shown = Shown::default();
         let mut told = shown.all(directory, filter, What::Present, json);
         loop {

@@ -75,6 +75,7 @@ pub(crate) struct Arguments {
         long,
         value_delimiter = ',',
         value_name = "SIZE",
+        value_parser = size,
         default_value = "100B,1KiB,64KiB,1MiB,4MiB"
     )]
     sizes: Vec<ByteSize>,
@@ -199,6 +200,11 @@ fn again(arguments: &Arguments) -> Result<(), Failure> {
         return output::json(&paper);
     }
     output::text(&paper.text())
+}
+
+fn size(text: &str) -> Result<ByteSize, String> {
+    let size = text.parse();
+    size.map_err(|_| "use a size such as 100B, 64KiB or 1MiB".to_owned())
 }
 
 fn effort(arguments: &Arguments) -> Result<Effort, Failure> {

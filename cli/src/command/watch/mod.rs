@@ -92,7 +92,7 @@ pub(crate) struct Arguments {
 
     /// Show content, too: so many bytes of each message at most
     #[arg(long, value_name = "BYTES", num_args = 0..=1, default_missing_value = "80",
-          require_equals = true)]
+          require_equals = true, value_parser = bytes)]
     content: Option<usize>,
 
     /// Protocols besides those of the FIPA standards: SCXML files in this directory
@@ -113,12 +113,17 @@ pub(crate) struct Arguments {
     count: Option<u64>,
 
     /// End after this time, for example 10s
-    #[arg(long = "for", value_name = "TIME", value_parser = humantime::parse_duration)]
+    #[arg(long = "for", value_name = "TIME", value_parser = options::duration)]
     time: Option<Duration>,
 
     /// Print JSON, one object on a line
     #[arg(long)]
     json: bool,
+}
+
+fn bytes(text: &str) -> Result<usize, String> {
+    let bytes = text.parse();
+    bytes.map_err(|_| "use a number of bytes such as 80".to_owned())
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
@@ -158,7 +163,10 @@ async fn watch(arguments: &Arguments, judge: Judge, config: &Config) -> Result<(
         open: true,
     };
     show.begin(&config.domain, watcher.processes())?;
-    let ends = arguments.time.map(|time| Instant::now() + time);
+    // Beyond all clocks is never.
+    let ends = arguments
+        .time
+        .and_then(|time| Instant::now().checked_add(time));
     {
         let mut stopped = pin!(stop.requested());
         while show.open && arguments.count.is_none_or(|count| show.tally.shown < count) {

@@ -1,0 +1,133 @@
+//! Keys, in directories of their own.
+
+use super::*;
+
+fn keys() -> (tempfile::TempDir, Keys) {
+    let dir = tempfile::tempdir().unwrap();
+    let keys = Keys::at(dir.path().join("keys"));
+    (dir, keys)
+}
+
+#[test]
+fn what_a_certificate_says_is_what_was_asked_for() {
+    let (_dir, keys) = keys();
+    let agents = ["arm_1".to_owned(), "Käptn *".to_owned()];
+    let made = keys.init("crex mts/1", &agents, VALID).unwrap();
+    assert_eq!(keys.own().unwrap(), made);
+    assert_eq!(made.certified().mts(), "crex mts/1");
+    assert_eq!(made.certified().agents(), agents);
+    let (from, until) = made.validity();
+    assert!(until - from >= i64::try_from(VALID.as_secs()).unwrap());
+    assert!(matches!(
+        keys.init("crex", &[], VALID),
+        Err(KeysError::Exists(_))
+    ));
+    assert_eq!(keys.own().unwrap(), made);
+}
+
+#[test]
+fn trust_is_given_and_withdrawn_for_good() {
+    let ((_a, crex), (_b, rover)) = (keys(), keys());
+    let made = crex.init("crex-mts", &[], VALID).unwrap();
+    rover.init("rover-mts", &[], VALID).unwrap();
+    let before = rover.stamp();
+    let pem = fs::read(crex.own_file()).unwrap();
+    assert_eq!(rover.trust(&pem).unwrap(), std::slice::from_ref(&made));
+    assert_eq!(rover.trust(&pem).unwrap().len(), 1, "twice is once");
+    assert_ne!(rover.stamp(), before);
+    assert_eq!(rover.credentials().unwrap().trusted.len(), 1);
+    assert!(matches!(
+        rover.revoke("nobody"),
+        Err(KeysError::Which { found: 0, .. })
+    ));
+    let fingerprint = made.fingerprint().to_string();
+    assert_eq!(rover.revoke(&fingerprint[..12]).unwrap().len(), 1);
+    assert_eq!(rover.trusted().unwrap(), []);
+    assert_eq!(rover.revoked().unwrap(), [made]);
+    assert!(matches!(rover.trust(&pem), Err(KeysError::Revoked(_))));
+}
+
+#[test]
+fn a_renewed_key_is_used_when_it_is_switched_to() {
+    let (_dir, keys) = keys();
+    assert!(matches!(keys.renew(VALID), Err(KeysError::Missing(_))));
+    let first = keys.init("crex", &["crex".to_owned()], VALID).unwrap();
+    assert!(matches!(keys.switch(), Err(KeysError::NoNext(_))));
+    assert_eq!(keys.next().unwrap(), None);
+    let next = keys.renew(VALID).unwrap();
+    assert_eq!(keys.own().unwrap(), first);
+    assert_eq!(keys.next().unwrap().as_ref(), Some(&next));
+    assert_eq!(keys.switch().unwrap(), next);
+    assert_eq!(next.certified(), first.certified());
+    assert_ne!(next.fingerprint(), first.fingerprint());
+    assert_eq!(keys.credentials().unwrap().own, next);
+}
+
+#[test]
+fn no_certificate_holds_for_no_time_or_beyond_all_calendars() {
+    let (_dir, keys) = keys();
+    let beyond = Duration::from_secs(8000 * 365 * 86_400);
+    for valid in [Duration::ZERO, beyond, Duration::MAX] {
+        let refused = keys.init("crex", &[], valid);
+        assert!(matches!(refused, Err(KeysError::Validity(it)) if it == valid));
+    }
+    assert!(!keys.dir().exists(), "nothing was begun");
+    keys.init("crex", &[], beyond / 2).unwrap();
+}
+
+#[test]
+fn what_cannot_be_read_keeps_nobody_from_revoking() {
+    let ((_a, crex), (_b, rover)) = (keys(), keys());
+    crex.init("crex-mts", &[], VALID).unwrap();
+    rover.trust(&fs::read(crex.own_file()).unwrap()).unwrap();
+    fs::write(rover.dir().join("trusted/junk.pem"), b"junk").unwrap();
+    let unread = rover.revoke("another-mts");
+    assert!(matches!(unread, Err(KeysError::Contents { .. })));
+    assert_eq!(rover.revoke("crex-mts").unwrap().len(), 1);
+    assert_eq!(rover.confirmed().0, []);
+}
+
+#[test]
+fn a_directory_in_which_others_could_give_trust_is_refused() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let ((_a, crex), (_b, rover)) = (keys(), keys());
+    crex.init("crex", &[], VALID).unwrap();
+    rover.init("rover", &[], VALID).unwrap();
+    rover.trust(&fs::read(crex.own_file()).unwrap()).unwrap();
+    for folder in ["", "trusted"] {
+        let dir = rover.dir().join(folder);
+        for (mode, fits) in [(0o777, false), (0o770, false), (0o755, true)] {
+            fs::set_permissions(&dir, fs::Permissions::from_mode(mode)).unwrap();
+            let used = rover.credentials();
+            let refused = matches!(used, Err(KeysError::Writable(it)) if it == dir);
+            assert_eq!(refused, !fits, "{mode:o}");
+        }
+    }
+}
+
+#[test]
+fn a_key_that_others_can_read_is_refused() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let (_dir, keys) = keys();
+    keys.init("crex", &[], VALID).unwrap();
+    let file = keys.dir().join("own.key");
+    assert_eq!(fs::metadata(&file).unwrap().mode() & 0o777, 0o600);
+    fs::set_permissions(&file, fs::Permissions::from_mode(0o640)).unwrap();
+    assert!(matches!(keys.credentials(), Err(KeysError::Readable(_))));
+}
+
+#[test]
+fn what_is_no_certificate_is_told() {
+    let (_dir, keys) = keys();
+    for wrong in [
+        &b""[..],
+        b"hello",
+        b"-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n",
+    ] {
+        assert!(keys.trust(wrong).is_err());
+    }
+    assert!(matches!(keys.own(), Err(KeysError::Missing(_))));
+    keys.init("crex", &[], VALID).unwrap();
+    fs::write(keys.own_file(), b"hello").unwrap();
+    assert!(matches!(keys.own(), Err(KeysError::Contents { .. })));
+}
