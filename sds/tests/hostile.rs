@@ -161,6 +161,25 @@ async fn malformed_records_disturb_nobody() {
     }
 }
 
+/// A record that is good for two minutes, of a peer without beacons: whose letters do not arrive is
+/// asked for, and nobody else.
+#[tokio::test(flavor = "multi_thread")]
+async fn an_old_peer_that_vanished_is_noticed_when_it_is_used() {
+    let port = free_port();
+    let (directory, other) = (open(port, "directory"), open(port, "other"));
+    other.register(registration("before")).unwrap();
+    eventually("it listens", || directory.lookup("before")).await;
+    let peer = Attacker::new(port);
+    for label in ["used", "unused"] {
+        peer.announce(label.as_bytes(), &[b"TYPE=x"]);
+        eventually("the peer's agent", || directory.lookup(label)).await;
+    }
+    directory.verify("used");
+    let is_gone = || directory.lookup("used").is_none().then_some(());
+    eventually("nobody answers for it", is_gone).await;
+    assert!(directory.lookup("unused").is_some());
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_flood_of_records_is_bounded_and_others_are_found() {
     let port = free_port();
