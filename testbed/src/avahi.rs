@@ -6,6 +6,11 @@ use std::time::{Duration, Instant};
 
 use crate::{Host, Running};
 
+/// How long `avahi-browse` has, in seconds: it takes one, or never ends.
+const PATIENCE: &str = "10";
+/// How often it is asked.
+const TRIES: usize = 6;
+
 const BUS: &str = "/run/fipa-testbed-bus";
 
 const BUS_CONFIG: &str = r#"<!DOCTYPE busconfig PUBLIC
@@ -75,15 +80,27 @@ impl<'a> Avahi<'a> {
     /// What `avahi-browse` has to say about a type of services, one line each. `=` begins the line
     /// of one that was resolved; labels come in decimal escapes.
     ///
+    /// When a record leaves while `avahi-browse` resolves it, that goes on waiting for it, for ever.
+    /// So it is ended after a while, and asked again.
+    ///
     /// # Panics
     /// When it fails.
     #[must_use]
     pub fn browse(&self, service_type: &str) -> Vec<String> {
-        let mut command = with_bus(self.host.command("avahi-browse"));
-        let output = command.args(["-rpt", service_type]).output().unwrap();
-        assert!(output.status.success(), "avahi-browse: {output:?}");
-        let text = String::from_utf8_lossy(&output.stdout);
-        text.lines().map(str::to_owned).collect()
+        /// What `timeout` says of what it has ended.
+        const ENDED: i32 = 124;
+        for _ in 0..TRIES {
+            let mut command = with_bus(self.host.command("timeout"));
+            command.args([PATIENCE, "avahi-browse", "-rpt", service_type]);
+            let output = command.output().unwrap();
+            if output.status.code() == Some(ENDED) {
+                continue;
+            }
+            assert!(output.status.success(), "avahi-browse: {output:?}");
+            let text = String::from_utf8_lossy(&output.stdout);
+            return text.lines().map(str::to_owned).collect();
+        }
+        panic!("avahi-browse does not end");
     }
 }
 

@@ -45,13 +45,17 @@ pub use network::{Host, Network};
 /// Tells the process in the namespaces that it is there.
 const INSIDE: &str = "FIPA_TESTBED_INSIDE";
 
+/// How long a test in namespaces may take, in seconds, before it counts as one that hangs. None needs
+/// half of it.
+const WATCHDOG: &str = "900";
+
 /// Runs the ignored test `name` of this test program in namespaces of its own, as root. Skips it,
 /// aloud, when a right or one of the `tools` is missing; then fails if `CI=true`.
 ///
 /// # Panics
 /// When that test fails, or cannot be run in CI.
 pub fn isolated(name: &str, tools: &[&str]) {
-    let needed = ["ip", "mount", "unshare"].iter().chain(tools);
+    let needed = ["ip", "mount", "timeout", "unshare"].iter().chain(tools);
     let mut missing: Vec<&str> = needed
         .copied()
         .filter(|tool| find(tool).is_none())
@@ -66,8 +70,10 @@ pub fn isolated(name: &str, tools: &[&str]) {
         eprintln!("SKIPPED, not a success: {name} needs {missing}");
         return;
     }
-    // What is started in there ends with it: the namespace of processes, too, is its own.
-    let status = Command::new("unshare")
+    // What is started in there ends with it: the namespace of processes, too, is its own. What hangs is
+    // killed, as `unshare` heeds nothing less, and with it all else.
+    let status = Command::new("timeout")
+        .args(["--foreground", "--signal=KILL", WATCHDOG, "unshare"])
         .args(["--net", "--mount", "--pid", "--fork", "--kill-child"])
         .args(["--mount-proc", "--"])
         .arg(std::env::current_exe().unwrap())

@@ -71,8 +71,26 @@ impl Pauses {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
+    use std::net::UdpSocket;
+
+    use fipa_transport::Incarnation;
+
+    use super::super::{MdnsConfig, MdnsDirectory};
     use super::*;
+    use crate::{Directory, Mts, Registration};
+
+    /// A directory on loopback, alone on its port. In a test with one thread its task does not run as
+    /// long as nothing is awaited.
+    pub(in crate::mdns) fn directory() -> MdnsDirectory {
+        let free = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr();
+        let config = MdnsConfig {
+            interfaces: vec!["lo".to_owned()],
+            port: free.unwrap().port(),
+            ..MdnsConfig::new(Mts::new("own", Incarnation::random()))
+        };
+        MdnsDirectory::open(config).unwrap()
+    }
 
     #[test]
     fn all_kinds_of_records_count() {
@@ -109,5 +127,24 @@ mod tests {
         }
         assert_eq!(seconds, [1, 2, 4, 8, 16, 30, 30, 30]);
         assert_eq!(pauses.ended(now + CALM), FIRST_PAUSE);
+    }
+
+    #[tokio::test]
+    async fn beacons_say_what_they_said_last_while_there_is_no_library() {
+        let directory = directory();
+        let life = Incarnation::random();
+        let at = || vec!["tcp://127.0.0.1:7788#00000000000000aa".parse().unwrap()];
+        directory
+            .register(Registration::new("arm", life, at()))
+            .unwrap();
+        let said = directory.shared.announced();
+        directory.shared.end_daemon().unwrap();
+        let leg = Registration::new("leg", Incarnation::random(), at());
+        directory.register(leg).unwrap();
+        directory.deregister("arm", life).unwrap();
+        assert_eq!(directory.shared.announced(), said);
+        // Then there is somebody to be asked about what has changed.
+        assert!(directory.shared.start_daemon());
+        assert_ne!(directory.shared.announced(), said);
     }
 }

@@ -96,7 +96,7 @@ impl Ear {
         self.browser.handle_packet(now, packet, fastrand::f64())
     }
 
-    fn handle_beacon(
+    pub(super) fn handle_beacon(
         &mut self,
         now: Instant,
         shared: &Shared,

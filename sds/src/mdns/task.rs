@@ -252,7 +252,42 @@ fn contested(shared: &Shared, theirs: &Arc<Entry>) {
 #[cfg(test)]
 mod tests {
     use super::super::SERVICE_TYPE;
+    use super::super::anew::tests::directory;
+    use super::super::beacon::{Announced, Digest};
+    use super::super::packet::tests::{Part, answer};
     use super::*;
+    use crate::{Directory, Mts, Registration, Source};
+
+    #[tokio::test]
+    async fn what_is_found_of_a_gateway_is_good_as_long_as_its_beacons_say_so() {
+        let directory = directory();
+        let shared = &directory.shared;
+        let gateway = Mts::new("theirs", Incarnation::random());
+        let at = "tcp://127.0.0.1:7788#00000000000000aa".parse().unwrap();
+        let arm = Registration::new("arm", Incarnation::random(), vec![at]);
+        let said = record::encode(&arm.into_entry(&gateway, Source::Mdns).unwrap());
+        let strings = said
+            .iter()
+            .map(|(key, value)| [key.as_bytes(), b"=", value].concat());
+        let strings: Vec<Vec<u8>> = strings.collect();
+        let strings: Vec<&[u8]> = strings.iter().map(Vec::as_slice).collect();
+        let parts = [Part::Ptr, Part::Srv("theirs.local"), Part::Txt(&strings)];
+
+        let (mut ear, now) = (Ear::new(shared), Instant::now());
+        let at = |seconds| now + Duration::from_secs(seconds);
+        let heard = ear
+            .browser
+            .handle_packet(now, &answer("arm", &parts, 120), 0.0);
+        handle(shared, &mut ear, heard);
+        assert!(directory.lookup("arm").is_some());
+        let mut all = Digest::default();
+        all.add(Digest::of(&said));
+        let coalitions = Digest::default();
+        let beacon = Announced { all, coalitions };
+        ear.handle_beacon(at(100), shared, gateway.incarnation, beacon);
+        assert_eq!(ear.browser.handle_timeout(at(150), 0.0).gone.len(), 0);
+        assert_eq!(ear.browser.handle_timeout(at(221), 0.0).gone.len(), 1);
+    }
 
     #[test]
     fn renamed_records_are_recognised() {
