@@ -285,6 +285,15 @@ mod tests {
         }
         assert_eq!(read(b""), None);
         assert_eq!(read(&question_for_all(&[])[0]), None);
+        // It introduces itself, or the mDNS library would keep it for ever.
+        let written = packet(gateway(0xab), Announced::default()).unwrap();
+        let answers = parse_answer(&written).unwrap().answers;
+        let (of, introduced) = match &answers[..] {
+            [of, pointer] => (of.name.clone(), pointer),
+            other => panic!("{other:?}"),
+        };
+        assert_eq!(introduced.rdata, RData::PTR(PTR(of)));
+        assert_eq!(introduced.name.to_string(), "_fipa_gateway._udp.local");
     }
 
     #[test]
