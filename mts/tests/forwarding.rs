@@ -444,3 +444,42 @@ fn a_stranger_that_writes_can_be_answered() {
         Some(Action::Dispatch { .. })
     ));
 }
+
+/// Whoever hands a letter over says which one it comes after, and the gateway follows that from letter
+/// to letter; in a circle it would for ever.
+#[test]
+fn a_letter_that_comes_after_itself_is_refused() {
+    let mut gateway = Gateway::new(true);
+    for (sequence, after) in [(5, 5), (5, 7), (7, 5)] {
+        let parcel = Parcel {
+            after,
+            ..parcel(sequence, letter())
+        };
+        let verdict = gateway.arrive(0, Kind::Tcp, parcel);
+        if after < sequence {
+            assert_eq!(verdict, Verdict::Later);
+            continue;
+        }
+        let Verdict::Now(Answer::Failed { reason, .. }) = verdict else {
+            panic!("{sequence} after {after}: {verdict:?}");
+        };
+        assert_eq!(reason, FailureReason::Refused);
+    }
+    // What it was told of those that failed is all there is to follow.
+    let (_, _, first) = gateway.dispatched();
+    assert_eq!((first.sequence, first.after), (7, 5));
+    gateway.time(2500);
+    let next = Parcel {
+        after: 7,
+        ..parcel(8, letter())
+    };
+    assert_eq!(gateway.arrive(2600, Kind::Tcp, next), Verdict::Later);
+    let passed_on = std::iter::from_fn(|| gateway.next()).find_map(|action| match action {
+        Action::Dispatch { parcel, .. } => {
+            Some(parcel).filter(|it| matches!(it.body, Body::Letter(_)))
+        }
+        _ => None,
+    });
+    let passed_on = passed_on.unwrap();
+    assert_eq!((passed_on.sequence, passed_on.after), (8, 5));
+}

@@ -435,6 +435,11 @@ impl Core {
         } = arrival;
         match std::mem::replace(&mut parcel.body, Body::Credit) {
             Body::Letter(letter) => {
+                if parcel.after > 0 && parcel.after >= parcel.sequence {
+                    // Followed from letter to letter, this would lead nowhere, or in a circle.
+                    let detail = "the letter comes after itself or a later one";
+                    return Verdict::Now(Answer::failed(FailureReason::Refused, detail));
+                }
                 let watched = self.desk.watched;
                 if let Some(inbox) = self.agents.get_mut(&parcel.stream.receiver) {
                     let seen = watched.then(|| letter.clone());

@@ -308,7 +308,10 @@ impl Lane {
     }
 
     /// The letter that the one at `index` comes after: what it was told, unless that failed here,
-    /// or the one before it here, whichever is later. What it was told may not have come yet.
+    /// or the one before it here, whichever is later. What it was told may not have come yet. Ends,
+    /// because every letter comes after an earlier one ([`Core::handle_arrival`] sees to it).
+    ///
+    /// [`Core::handle_arrival`]: super::Core::handle_arrival
     fn after(&self, index: usize) -> u64 {
         let mut told = self.letters[index].after;
         while let Some((_, before)) = self.skipped.iter().find(|(failed, _)| *failed == told) {
