@@ -21,7 +21,7 @@ use super::config::UdpLimits;
 use super::counters::UdpCounters;
 use super::dialling::Dialling;
 use super::mtu::Mtu;
-use super::packet::{self, DATA_LEN, MAX_ACK, PARCEL_OVERHEAD};
+use super::packet::{self, BASE, DATA_LEN, MAX_ACK, PARCEL_OVERHEAD};
 use super::received::Received;
 use super::recovery::{Kept, Recovery};
 use crate::answer;
@@ -212,6 +212,11 @@ impl Connection {
         self.peer.as_ref()
     }
 
+    /// Whether the peer has not answered yet.
+    pub(crate) fn is_opening(&self) -> bool {
+        self.dialling.is_some()
+    }
+
     /// The opening of this connection, while it goes on.
     pub(crate) fn dialling_mut(&mut self) -> Option<&mut Dialling> {
         self.dialling.as_mut()
@@ -323,10 +328,20 @@ impl Connection {
     }
 
     /// The datagram that was taken last is larger than what can be sent from here.
-    pub(crate) fn too_big(&mut self, size: usize) {
+    ///
+    /// # Errors
+    /// When it was of a size that every path carries: nothing smaller is made of what it carried.
+    pub(crate) fn too_big(&mut self, size: usize) -> Result<(), End> {
+        if !self.is_opening() && size <= BASE {
+            return Err(End::Broken(format!(
+                "this host takes no datagrams of {size} bytes for this peer, and UDP needs {BASE}; \
+                 see the MTU of the interface that leads there"
+            )));
+        }
         self.mtu.too_big(size);
         let kept = self.recovery.withdraw();
         kept.into_iter().for_each(|kept| self.lost(kept));
+        Ok(())
     }
 
     pub(crate) fn has_events(&self) -> bool {

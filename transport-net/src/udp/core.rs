@@ -195,6 +195,12 @@ impl Core {
         Ok(fresh.then_some(number))
     }
 
+    /// Whether a connection that was made up is still to be opened.
+    pub(crate) fn is_opening(&self, number: u32) -> bool {
+        let entry = self.connections.get(&number);
+        entry.is_some_and(|entry| entry.connection.is_opening())
+    }
+
     /// The ways to the peer of a connection that was made up.
     pub(crate) fn begin(&mut self, now: Instant, number: u32, paths: Vec<Path>) {
         self.with(number, |connection, _| {
@@ -300,10 +306,7 @@ impl Core {
 
     /// The datagram that was taken last is larger than what can be sent from here.
     pub(crate) fn too_big(&mut self, number: u32, size: usize) {
-        self.with(number, |connection, _| {
-            connection.too_big(size);
-            Ok(())
-        });
+        self.with(number, |connection, _| connection.too_big(size));
     }
 
     pub(crate) fn poll_transmit(&mut self, now: Instant) -> Option<Transmit> {

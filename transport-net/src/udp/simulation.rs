@@ -576,3 +576,22 @@ fn a_peer_that_sends_more_than_it_may_is_held_back_and_loses_nothing() {
     assert!(counters.held_back > 0);
     assert_eq!((counters.accepted, counters.connections), (1, 1));
 }
+
+#[test]
+fn an_interface_that_takes_less_than_every_path_carries_ends_the_connection() {
+    let mut world = World::new(1, FAIR, &UdpLimits::default());
+    world.send(A, 1, 500).unwrap();
+    world.until_concluded(A, &BTreeSet::from([1]));
+    // Packets leave by another interface from now on.
+    world.weather.interface = 1000;
+    let attempts = BTreeSet::from([1, 2, 3]);
+    world.send(A, 2, 500).unwrap();
+    world.send(A, 3, 1000).unwrap();
+    world.until_concluded(A, &attempts);
+    world.check(A, &attempts);
+    let [Conclusion::Unconfirmed(error)] = &world.concluded[A][&AttemptId(3)][..] else {
+        panic!("{:?}", world.concluded[A]);
+    };
+    assert_eq!(error.fault, WayFault::Broken);
+    assert!(error.detail.contains("1200"), "{error}");
+}
