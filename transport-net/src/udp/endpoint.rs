@@ -204,6 +204,11 @@ impl Endpoint {
     }
 
     fn begin(&self, state: &mut State, connection: u32, addresses: &[SocketAddr]) {
+        let core = state.core.as_ref();
+        if !core.is_some_and(|core| core.is_opening(connection)) {
+            // Looking up took longer than the connection was waited for: nobody would close these.
+            return;
+        }
         let _inside = self.runtime.enter();
         let mut paths = Vec::new();
         let mut fault = "the name has no address".to_owned();
@@ -403,5 +408,75 @@ impl Drop for Running {
     fn drop(&mut self) {
         self.0.close();
         self.0.deliver();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::IpAddr;
+
+    use fipa_acl::Letter;
+    use fipa_transport::{Conclusion, Incarnation, Kind};
+
+    use super::*;
+    use crate::{Identity, UdpLimits};
+
+    struct Deaf;
+
+    impl Sink for Deaf {
+        fn arrived(&self, _: Arrival) -> Verdict {
+            Verdict::Later
+        }
+
+        fn arrived_unframed(&self, _: Letter, _: Kind, _: IpAddr) {}
+
+        fn concluded(&self, _: AttemptId, _: Conclusion) {}
+    }
+
+    #[tokio::test]
+    async fn addresses_that_are_found_too_late_take_no_sockets() {
+        let config = UdpConfig {
+            listen: Vec::new(),
+            identity: Identity {
+                name: "mts".into(),
+                incarnation: Incarnation::from_u64(1),
+                domain: "test".into(),
+                host: "here".into(),
+            },
+            limits: UdpLimits::default(),
+        };
+        let endpoint = Endpoint::new(config, Handle::current());
+        let random = Box::new(|| Incarnation::random().as_u64());
+        endpoint.open(Arc::new(Deaf), random).unwrap();
+        let silent = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+        let found = [silent.local_addr().unwrap()];
+        let sockets = |state: &State| state.sockets.len();
+        let mut state = endpoint.state.lock();
+        let to = Location::new(Kind::Udp, &found[0].to_string()).unwrap();
+        let core = state.core.as_mut().unwrap();
+        let (now, attempt) = (Instant::now(), AttemptId(1));
+        let parcel = Parcel {
+            receiver: "arm".into(),
+            stream: fipa_transport::Stream {
+                sender: Incarnation::from_u64(1),
+                receiver: Incarnation::from_u64(2),
+            },
+            sequence: 1,
+            after: 0,
+            remaining: Duration::from_secs(1),
+            hops: 0,
+            body: fipa_transport::Body::Credit,
+        };
+        let fresh = core.dispatch(now, attempt, &to, &parcel).unwrap().unwrap();
+        endpoint.begin(&mut state, fresh, &found);
+        assert_eq!(sockets(&state), 1);
+        let core = state.core.as_mut().unwrap();
+        core.handle_timeout(now + endpoint.config.limits.connect_timeout);
+        endpoint.flush(&mut state);
+        assert_eq!(sockets(&state), 0);
+        endpoint.begin(&mut state, fresh, &found);
+        assert_eq!(sockets(&state), 0);
+        drop(state);
+        endpoint.close();
     }
 }
