@@ -340,7 +340,11 @@ impl Mts {
                 {
                     return Some(Some(received));
                 }
-                door.gone.load(Ordering::Acquire).then_some(None)
+                door.gone.load(Ordering::Acquire).then(|| {
+                    // Others may have been about to wait, too, and one is told at a time.
+                    door.notify.notify_one();
+                    None
+                })
             })
             .await
     }
