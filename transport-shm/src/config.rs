@@ -169,6 +169,15 @@ pub enum ShmError {
         /// What the operating system said.
         source: std::io::Error,
     },
+    /// Another process keeps the domain locked.
+    #[error(
+        "the lock on {path} was not to be had: another process holds it and does not let go (is one \
+         stopped, state T in ps?)"
+    )]
+    Busy {
+        /// The directory.
+        path: PathBuf,
+    },
     /// The domain's directory is not private.
     #[error(
         "the directory {path} {problem}; it must be a directory of this user with mode 0700, because whoever \

@@ -16,10 +16,11 @@ use fipa_transport::Incarnation;
 use iceoryx2::node::{Node, NodeState, NodeView};
 use iceoryx2::prelude::{CallbackProgression, Config};
 use parking_lot::Mutex;
-use rustix::fs::{FlockOperation, Mode, OFlags, fchmod, flock, fstat, open, stat};
+use rustix::fs::{FlockOperation, Mode, OFlags, fchmod, fstat, open, stat};
+use rustix::io::Errno;
 
 use crate::layout::Svc;
-use crate::memory::SHM;
+use crate::memory::{SHM, lock};
 use crate::presence::{Names, Neighbour, wait_for_looks};
 use crate::{ShmConfig, ShmError};
 
@@ -59,8 +60,10 @@ pub(crate) struct Domain {
     member: bool,
     /// Somebody of this process is cleaning.
     cleaning: Mutex<()>,
-    /// The endpoint closes: whoever is cleaning should come to an end.
+    /// The endpoint closes: whoever is cleaning should come to an end, and nobody wait for long.
     closing: AtomicBool,
+    /// Somebody has the lock and does not let go.
+    held_up: AtomicBool,
     ice: Config,
     names: Names,
     config: ShmConfig,
@@ -72,6 +75,7 @@ impl Domain {
             member: false,
             cleaning: Mutex::default(),
             closing: AtomicBool::new(false),
+            held_up: AtomicBool::new(false),
             ice: config.iceoryx()?,
             names: Names::new(&config.root, &config.prefix),
             config: config.clone(),
@@ -135,21 +139,38 @@ impl Domain {
     /// Excludes others from starting and cleaning until the result is dropped. The lock is on the
     /// directory itself, so that there is no file to be left behind.
     pub(crate) fn lock(&self) -> Result<OwnedFd, ShmError> {
-        self.locked(FlockOperation::LockExclusive)
+        let how = FlockOperation::NonBlockingLockExclusive;
+        self.locked(how, || match self.closing.load(Ordering::Relaxed) {
+            true => LEAVING,
+            false => LOCKING,
+        })
     }
 
     /// Excludes others from cleaning, but not from doing the same, until the result is dropped.
-    /// For whoever is about to make files outside of [`Domain::lock`].
+    /// For whoever is about to make files outside of [`Domain::lock`]; all letters of this process
+    /// wait meanwhile.
     pub(crate) fn lock_shared(&self) -> Result<OwnedFd, ShmError> {
-        self.locked(FlockOperation::LockShared)
+        self.locked(FlockOperation::NonBlockingLockShared, || SHARING)
     }
 
-    fn locked(&self, how: FlockOperation) -> Result<OwnedFd, ShmError> {
+    /// Whoever was waited for in vain is not waited for again until the lock was to be had.
+    fn locked(
+        &self,
+        how: FlockOperation,
+        patience: impl Fn() -> Duration,
+    ) -> Result<OwnedFd, ShmError> {
         let root = &self.config.root;
-        let flags = OFlags::DIRECTORY | OFlags::RDONLY | OFlags::CLOEXEC;
-        open(root, flags, Mode::empty())
-            .and_then(|fd| flock(&fd, how).map(|()| fd))
-            .map_err(|e| file_error("cannot lock", root, e))
+        let held_up = self.held_up.load(Ordering::Relaxed);
+        let locked = lock(root, how, || match held_up {
+            true => Duration::ZERO,
+            false => patience(),
+        });
+        let busy = matches!(locked, Err(Errno::WOULDBLOCK));
+        self.held_up.store(busy, Ordering::Relaxed);
+        locked.map_err(|e| match busy {
+            true => ShmError::Busy { path: root.clone() },
+            false => file_error("cannot lock", root, e),
+        })
     }
 
     /// Closes to others what iceoryx2 0.10 leaves open to everybody. To be called under the lock,
@@ -496,6 +517,16 @@ impl Domain {
 /// How much longer the next one waits before it cleans up.
 const TURN: Duration = Duration::from_millis(20);
 
+/// How long to wait for the lock of the domain. Everybody has it for milliseconds, when it starts or
+/// ends; but hundreds may do that at the same time, on a machine that is busy.
+const LOCKING: Duration = Duration::from_secs(30);
+
+/// The same, for who may go another way.
+const SHARING: Duration = Duration::from_secs(1);
+
+/// The same, for whoever ends. When many end, those who have the lock meanwhile clean up for it.
+const LEAVING: Duration = Duration::from_secs(2);
+
 /// How often an endpoint tries to enter a domain whose directory others are removing.
 const ENTERING: u32 = 20;
 
@@ -522,6 +553,7 @@ impl Drop for Domain {
     /// endpoint was open.
     fn drop(&mut self) {
         if self.member && self.config.root.exists() {
+            self.closing.store(true, Ordering::SeqCst);
             // Nobody to report to; what cannot be removed is removed by the next who starts.
             let _ = self.clean(true);
             // Those who are still there let go of what connected them with this process.

@@ -37,6 +37,11 @@ pub(crate) const PAGE: usize = 4096;
 /// How long to wait for others who are taking memory.
 const PATIENCE: Duration = Duration::from_millis(200);
 
+/// How long to wait before asking for a lock again: longer each time, because many who wait would
+/// otherwise take more of the processor than whom they wait for.
+const FIRST_PAUSE: Duration = Duration::from_micros(200);
+const LAST_PAUSE: Duration = Duration::from_millis(4);
+
 /// The share of one domain in this host's shared memory.
 #[derive(Debug)]
 pub(crate) struct Budget {
@@ -92,22 +97,13 @@ impl Budget {
         Ok(turn)
     }
 
-    /// The lock, on the directory itself: no file is left behind by it. Somebody who has it and
-    /// was stopped must not stop everybody else.
+    /// The lock, on the directory itself: no file is left behind by it.
     fn turn(&self) -> rustix::io::Result<OwnedFd> {
-        let flags = OFlags::DIRECTORY | OFlags::RDONLY | OFlags::CLOEXEC;
-        let directory = open(&self.directory, flags, Mode::empty())?;
-        let began = Instant::now();
-        loop {
-            match flock(&directory, FlockOperation::NonBlockingLockExclusive) {
-                Ok(()) => return Ok(directory),
-                Err(Errno::INTR) => {}
-                Err(Errno::WOULDBLOCK) if began.elapsed() < PATIENCE => {
-                    std::thread::sleep(Duration::from_micros(500));
-                }
-                Err(e) => return Err(e),
-            }
-        }
+        lock(
+            &self.directory,
+            FlockOperation::NonBlockingLockExclusive,
+            || PATIENCE,
+        )
     }
 
     /// Whether `need` more bytes could be taken now.
@@ -153,6 +149,34 @@ impl Budget {
             .filter(is_ours)
             .map(|metadata| metadata.blocks() * 512)
             .sum()
+    }
+}
+
+/// Locks a directory until the result is dropped, in a way that does not block. Somebody who has the
+/// lock and was stopped must not stop everybody else: he is waited for as long as `patience` says,
+/// which is asked again and again.
+///
+/// # Errors
+/// `WOULDBLOCK` when somebody else still has it then.
+pub(crate) fn lock(
+    directory: &Path,
+    how: FlockOperation,
+    patience: impl Fn() -> Duration,
+) -> rustix::io::Result<OwnedFd> {
+    let flags = OFlags::DIRECTORY | OFlags::RDONLY | OFlags::CLOEXEC;
+    let directory = open(directory, flags, Mode::empty())?;
+    let began = Instant::now();
+    let mut pause = FIRST_PAUSE;
+    loop {
+        match flock(&directory, how) {
+            Ok(()) => return Ok(directory),
+            Err(Errno::INTR) => {}
+            Err(Errno::WOULDBLOCK) if began.elapsed() < patience() => {
+                std::thread::sleep(pause);
+                pause = (pause * 2).min(LAST_PAUSE);
+            }
+            Err(e) => return Err(e),
+        }
     }
 }
 

@@ -4,8 +4,11 @@
 
 mod common;
 
+use std::fs::File;
 use std::os::unix::fs::PermissionsExt;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc;
+use std::time::Duration;
 
 use bytes::Bytes;
 use common::{Place, attempt, parcel, wait_for};
@@ -155,4 +158,34 @@ fn what_cannot_be_opened_waits_for_nobody_and_harms_nobody() {
         .dispatch(attempt(), &one.location(), parcel(Bytes::new()))
         .unwrap();
     wait_for("answer", || told.conclusions() == 1);
+}
+
+#[test]
+fn who_has_the_lock_and_was_stopped_holds_up_neither_letters_nor_the_end() {
+    let place = Place::new();
+    let (one, _) = place.listening();
+    let (other, told) = place.listening();
+    let root = place.directory.path().join("domain");
+    // What processes do when they start, end or clean up; but this one does not go on.
+    let stopped = File::open(&root).unwrap();
+    stopped.lock().unwrap();
+    let (done, finished) = mpsc::channel();
+    let refused = std::thread::spawn(move || {
+        let refused = other.dispatch(attempt(), &one.location(), parcel(Bytes::new()));
+        other.close();
+        one.close();
+        done.send(()).unwrap();
+        refused
+    });
+    let watchdog = Duration::from_secs(60);
+    finished.recv_timeout(watchdog).unwrap();
+    let refused = refused.join().unwrap().unwrap_err();
+    assert_eq!(refused.fault, WayFault::Congested);
+    assert!(refused.detail.contains("stopped"), "{refused}");
+    assert_eq!(told.conclusions(), 0);
+    // It goes on, and whoever comes next removes what was left.
+    drop(stopped);
+    let (next, _) = place.listening();
+    next.close();
+    assert_eq!(place.traces(), Vec::<String>::new());
 }
