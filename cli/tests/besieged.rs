@@ -24,6 +24,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fipa::keys::Keys;
+use fipa_testbed::frame;
 use fuzzing::trusted::{client, quic};
 use fuzzing::{Writer, datagram, stream};
 use siege::hostile::{self, AT_KEYS, IN_THE_CLEAR, Means};
@@ -108,10 +109,9 @@ async fn means(secured: bool, place: &Path, (tcp, datagrams): (SocketAddr, Socke
     let mut means = Means {
         tcp: Some(tcp),
         datagrams: Some(datagrams),
-        greeting: fuzzing::frame(fuzzing::HELLO, 0, &writer.hello()),
-        letter: fuzzing::frame(fuzzing::PARCEL, 1, &writer.letter_of(64)),
-        announcement: fuzzing::frame(fuzzing::PARCEL, 1, &writer.letter_of(60 << 20))[..10_000]
-            .to_vec(),
+        greeting: frame(fuzzing::HELLO, 0, &writer.hello()),
+        letter: frame(fuzzing::PARCEL, 1, &writer.letter_of(64)),
+        announcement: frame(fuzzing::PARCEL, 1, &writer.letter_of(60 << 20))[..10_000].to_vec(),
         hello: datagram::hello(1, &[0; 16], &writer.hello()),
         ..Means::default()
     };

@@ -1,4 +1,5 @@
-//! Networks for tests: hosts in network namespaces, their links, and the real Avahi.
+//! Networks for tests: hosts in network namespaces, their links, and the real Avahi. And what peers
+//! say that are none of ours.
 //!
 //! A test that needs a network of its own is two functions. The one that the test harness sees
 //! calls [`isolated`], which runs the other, ignored one in a process with namespaces of its own
@@ -34,6 +35,7 @@
 mod avahi;
 mod ghost;
 mod network;
+mod peer;
 
 use std::path::PathBuf;
 use std::process::{Child, Command};
@@ -41,6 +43,9 @@ use std::process::{Child, Command};
 pub use avahi::Avahi;
 pub use ghost::Ghost;
 pub use network::{Host, Network};
+#[cfg(feature = "tls")]
+pub use peer::Anybody;
+pub use peer::{frame, frame_header};
 
 /// Tells the process in the namespaces that it is there.
 const INSIDE: &str = "FIPA_TESTBED_INSIDE";

@@ -16,7 +16,8 @@ use common::intruder::{
     ONLY_13, PROTOCOL, ROGUE, Versions, client, greet_quic, greet_tls, hear_tls, listen_quic, quic,
     server,
 };
-use common::{NAME, Party, Recorder, config, frame_of, hello_of, parcel, quic_config, until};
+use common::{NAME, Party, Recorder, config, hello_of, parcel, quic_config, until};
+use fipa_testbed::frame;
 use fipa_transport::{Conclusion, Kind, Location, Transport, WayFault};
 use fipa_transport_net::{QuicTransport, TcpTransport};
 use rustls::version::TLS12;
@@ -175,7 +176,7 @@ fn a_listener_in_the_clear_hears_nothing_but_the_wish_to_encrypt() {
         let (mut stream, _) = listener.accept().unwrap();
         // A peer of ours would be content with this.
         stream
-            .write_all(&frame_of(1, 0, &hello_of(ROGUE, 77)))
+            .write_all(&frame(1, 0, &hello_of(ROGUE, 77)))
             .unwrap();
         let mut heard = Vec::new();
         // A reset is as good as an end.

@@ -12,6 +12,7 @@ use std::time::Duration;
 
 use common::{Party, accepted, config, parcel, rogue_hello, until, written};
 use fipa_acl::Envelope;
+use fipa_testbed::frame_header;
 use fipa_transport::{Conclusion, Kind, Location, Parcel, Transport as _, Verdict, WayFault};
 use fipa_transport_net::{Counters, Limits};
 use socket2::{Domain, Socket, Type};
@@ -59,32 +60,13 @@ fn counted(party: &Party, what: impl Fn(&Counters) -> u64, expected: u64) {
     });
 }
 
-/// The first 24 bytes of a frame.
-fn header(kind: u8, body_len: u64) -> Vec<u8> {
-    header_of(kind, 1, body_len)
-}
-
-fn header_of(kind: u8, id: u64, body_len: u64) -> Vec<u8> {
-    let mut header = b"fipa\x01".to_vec();
-    header.extend([kind, 0, 0]);
-    header.extend(id.to_le_bytes());
-    header.extend(body_len.to_le_bytes());
-    header
-}
-
 fn hello(incarnation: u64) -> Vec<u8> {
-    let body = rogue_hello(incarnation);
-    let mut frame = header(1, body.len() as u64);
-    frame.extend(body);
-    frame
+    fipa_testbed::frame(1, 1, &rogue_hello(incarnation))
 }
 
 /// A parcel, as a rogue sends it.
 fn frame(id: u64, parcel: &Parcel) -> Vec<u8> {
-    let body = written(parcel);
-    let mut frame = header_of(2, id, body.len() as u64);
-    frame.extend(body);
-    frame
+    fipa_testbed::frame(2, id, &written(parcel))
 }
 
 #[test]
@@ -129,9 +111,9 @@ fn what_is_no_letter_is_refused() {
         b"GET / HTTP/1.1\r\n\r\n",
         b"\0",
         b"fipX",
-        &header(1, 1 << 40),
-        &header(99, 0),
-        &header(4, 0),
+        &frame_header(1, 1, 1 << 40),
+        &frame_header(99, 1, 0),
+        &frame_header(4, 1, 0),
         &[0xfe, 0xff, 0xff, 0xff],
         b"<?xml version=\"1.0\"?><envelope>",
         b"<!DOCTYPE html><html/>",
@@ -151,9 +133,9 @@ fn what_is_no_letter_is_refused() {
 fn who_is_slow_is_shut_out_and_nobody_else_notices() {
     let party = impatient();
     let mut after_hello = hello(76);
-    after_hello.extend(&header(2, 1000)[..10]);
+    after_hello.extend(&frame_header(2, 1, 1000)[..10]);
     let mut half_a_parcel = hello(77);
-    half_a_parcel.extend(header(2, 60 << 20));
+    half_a_parcel.extend(frame_header(2, 1, 60 << 20));
     let beginnings: [&[u8]; 5] = [b"", b"fip", &after_hello, &half_a_parcel, &TCP_LETTER[..20]];
     let streams: Vec<TcpStream> = beginnings
         .iter()
@@ -185,7 +167,7 @@ fn announcing_gigabytes_is_refused_at_once() {
     let party = Party::new();
     let mut stream = connect(&party);
     let mut bytes = hello(77);
-    bytes.extend(header(2, 4 << 30));
+    bytes.extend(frame_header(2, 1, 4 << 30));
     stream.write_all(&bytes).unwrap();
     assert_shut_out(&mut stream);
     counted(&party, |c| c.refused_nonsense, 1);

@@ -13,6 +13,7 @@ use std::time::Duration;
 use fastrand::Rng;
 use fipa::{AgentId, Message, Performative};
 use fipa_acl::{AclRepresentation, Envelope, EnvelopeParams, Letter};
+use fipa_testbed::frame;
 use fipa_transport::wire::ParcelHeader;
 use fipa_transport::{Body, FailureReason, Incarnation, Outcome, Parcel, Report, Stream};
 
@@ -267,15 +268,6 @@ fn letter_with(random: &mut Rng, receiver: &str, content: Vec<u8>) -> Letter {
         .build()
         .unwrap();
     Letter::new(envelope.encode_standard().unwrap(), message.to_payload())
-}
-
-pub(crate) fn frame(kind: u8, id: u64, body: &[u8]) -> Vec<u8> {
-    let mut frame = b"fipa\x01".to_vec();
-    frame.extend([kind, 0, 0]);
-    frame.extend(id.to_le_bytes());
-    frame.extend((body.len() as u64).to_le_bytes());
-    frame.extend(body);
-    frame
 }
 
 /// Makes one mistake.

@@ -5,20 +5,20 @@ use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::sync::Arc;
 use std::time::Duration;
 
+use fipa_testbed::{Anybody, frame};
 use quinn::crypto::rustls::{QuicClientConfig, QuicServerConfig};
 use rustls::client::ResolvesClientCert;
-use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
 use rustls::crypto::ring;
-use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
+use rustls::pki_types::ServerName;
 use rustls::sign::CertifiedKey;
 use rustls::version::TLS13;
 use rustls::{
-    ClientConfig, ClientConnection, DigitallySignedStruct, Error, ServerConfig, ServerConnection,
-    SignatureScheme, StreamOwned, SupportedProtocolVersion,
+    ClientConfig, ClientConnection, ServerConfig, ServerConnection, SignatureScheme, StreamOwned,
+    SupportedProtocolVersion,
 };
 
 use super::certificates::Host;
-use super::{frame_of, hello_of, parcel, runtime, written};
+use super::{hello_of, parcel, runtime, written};
 
 /// What he is called; certificates have to be of this name.
 pub(crate) const ROGUE: &str = "rogue";
@@ -62,8 +62,8 @@ pub(crate) fn server(own: &Host, versions: Versions) -> ServerConfig {
 
 /// What he says when he has got in: who he is, and a letter.
 pub(crate) fn said() -> Vec<u8> {
-    let mut said = frame_of(HELLO, 0, &hello_of(ROGUE, 77));
-    said.extend(frame_of(PARCEL, 1, &written(&parcel(1, "let me in"))));
+    let mut said = frame(HELLO, 0, &hello_of(ROGUE, 77));
+    said.extend(frame(PARCEL, 1, &written(&parcel(1, "let me in"))));
     said
 }
 
@@ -155,48 +155,6 @@ impl ResolvesClientCert for Own {
 
     fn has_certs(&self) -> bool {
         self.0.is_some()
-    }
-}
-
-/// Whoever is there is welcome.
-#[derive(Debug)]
-struct Anybody;
-
-impl ServerCertVerifier for Anybody {
-    fn verify_server_cert(
-        &self,
-        _: &CertificateDer<'_>,
-        _: &[CertificateDer<'_>],
-        _: &ServerName<'_>,
-        _: &[u8],
-        _: UnixTime,
-    ) -> Result<ServerCertVerified, Error> {
-        Ok(ServerCertVerified::assertion())
-    }
-
-    fn verify_tls12_signature(
-        &self,
-        _: &[u8],
-        _: &CertificateDer<'_>,
-        _: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        Ok(HandshakeSignatureValid::assertion())
-    }
-
-    fn verify_tls13_signature(
-        &self,
-        _: &[u8],
-        _: &CertificateDer<'_>,
-        _: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        Ok(HandshakeSignatureValid::assertion())
-    }
-
-    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        let provider = ring::default_provider();
-        provider
-            .signature_verification_algorithms
-            .supported_schemes()
     }
 }
 

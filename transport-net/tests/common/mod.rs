@@ -343,16 +343,6 @@ pub(crate) fn hello_of(name: &str, incarnation: u64) -> Vec<u8> {
     body
 }
 
-/// A frame of this kind.
-pub(crate) fn frame_of(kind: u8, id: u64, body: &[u8]) -> Vec<u8> {
-    let mut frame = b"fipa\x01".to_vec();
-    frame.extend([kind, 0, 0]);
-    frame.extend(id.to_le_bytes());
-    frame.extend((body.len() as u64).to_le_bytes());
-    frame.extend(body);
-    frame
-}
-
 /// A parcel as it stands in frames and packets.
 pub(crate) fn written(parcel: &Parcel) -> Vec<u8> {
     let (header, pieces) = ParcelHeader::of(parcel).unwrap();
