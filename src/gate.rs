@@ -125,3 +125,80 @@ impl Gate for Door {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use fipa_acl::{
+        AclRepresentation, AgentId, Envelope, EnvelopeParams, Message, Performative, Received, Time,
+    };
+    use fipa_sds::{HostConfig, Mts};
+    use fipa_transport::Incarnation;
+
+    use super::*;
+    use crate::config;
+
+    /// A letter to the arm from this sender, around a message that names that one as its sender; with
+    /// the stamp of a gateway or without.
+    fn letter(sender: &str, signed: &str, is_stamped: bool) -> Letter {
+        let [arm, sender, signed] = ["arm", sender, signed].map(|name| AgentId::new(name).unwrap());
+        let date: Time = "20261121T120000000Z".parse().unwrap();
+        let base = EnvelopeParams {
+            to: vec![arm.clone()],
+            from: Some(sender),
+            acl_representation: Some(AclRepresentation::BitEfficient),
+            date: Some(date),
+            ..EnvelopeParams::default()
+        };
+        let stamp = EnvelopeParams {
+            received: Some(Received::new("mts", date)),
+            ..EnvelopeParams::default()
+        };
+        let extensions = is_stamped.then_some(stamp).into_iter().collect();
+        let envelope = Envelope { base, extensions };
+        let message = Message::builder(Performative::Inform).sender(signed);
+        let message = message.receiver(arm).build().unwrap();
+        Letter::new(envelope.encode_standard().unwrap(), message.to_payload())
+    }
+
+    /// The door of a process of a host, which lets in a letter a second of each sender; until the
+    /// directory goes.
+    fn door() -> (tempfile::TempDir, Door) {
+        let place = tempfile::tempdir().unwrap();
+        let host = HostDirectory::open(HostConfig {
+            dir: place.path().join("domain"),
+            mts: Mts::new("mts", Incarnation::random()),
+            gateway: false,
+        });
+        let rules = config::Access {
+            rate: 1,
+            ..config::Access::default()
+        };
+        let access = Access::new(&rules).unwrap().unwrap();
+        (
+            place,
+            Door::new(access, Of::Process(Arc::new(host.unwrap()))),
+        )
+    }
+
+    #[tokio::test]
+    async fn what_a_gateway_has_counted_is_not_counted_again() {
+        let (_place, door) = door();
+        let now = Instant::now();
+        let taken = |is_stamped| {
+            let letter = letter("rover", "rover", is_stamped);
+            door.admits(now, "arm", &letter).is_ok()
+        };
+        // Held up on the way, they come closer together than they were sent.
+        assert!(taken(true) && taken(true) && taken(true));
+        assert!(taken(false));
+        assert!(!taken(false), "one a second");
+    }
+
+    #[tokio::test]
+    async fn envelope_and_message_name_one_sender() {
+        let (_place, door) = door();
+        let judged = door.admits(Instant::now(), "arm", &letter("rover", "crex", false));
+        let told = judged.unwrap_err();
+        assert!(told.contains("rover") && told.contains("crex"), "{told}");
+    }
+}
