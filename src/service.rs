@@ -350,16 +350,11 @@ fn udp(
     incarnation: Incarnation,
     handle: &Handle,
 ) -> Result<Arc<dyn Transport>, String> {
-    use fipa_transport_net::{UdpConfig, UdpLimits, UdpTransport};
+    use fipa_transport_net::{UdpConfig, UdpTransport};
     let config = UdpConfig {
         listen: listen(&config.transport.udp, role),
         identity: identity(config, role, place, incarnation)?,
-        limits: UdpLimits {
-            max_per_address: config.security.peer_connections,
-            peer_letters: config.security.peer_letters as u64,
-            peer_bytes: config.security.peer_bytes,
-            ..UdpLimits::default()
-        },
+        limits: datagram_limits(config),
     };
     Ok(Arc::new(UdpTransport::new(config, handle.clone())))
 }
@@ -396,6 +391,17 @@ fn stream_limits(config: &Config) -> fipa_transport_net::Limits {
     }
 }
 
+/// The limits of the one whose letters fit datagrams.
+#[cfg(feature = "net")]
+fn datagram_limits(config: &Config) -> fipa_transport_net::UdpLimits {
+    fipa_transport_net::UdpLimits {
+        max_per_address: config.security.peer_connections,
+        peer_letters: config.security.peer_letters as u64,
+        peer_bytes: config.security.peer_bytes,
+        ..fipa_transport_net::UdpLimits::default()
+    }
+}
+
 /// A gateway listens where its owner wants it, other processes for their own host.
 #[cfg(feature = "net")]
 fn listen(settings: &crate::config::Listen, role: &Role<'_>) -> Vec<String> {
@@ -421,4 +427,36 @@ fn identity(
             .host_id()
             .map_err(|error| format!("cannot tell this host: {error}"))?,
     })
+}
+
+#[cfg(all(test, feature = "net"))]
+mod tests {
+    use super::*;
+    use crate::config::Sources;
+
+    #[test]
+    fn what_one_peer_may_have_is_what_the_configuration_says_over_every_transport() {
+        let set = ["connections=3", "letters=5", "bytes=70KiB"];
+        let sources = Sources {
+            set: set.map(|it| format!("security.peer_{it}")).into(),
+            ..Sources::default()
+        };
+        let config = Config::load(&sources).unwrap();
+        let stream = stream_limits(&config);
+        let datagram = datagram_limits(&config);
+        for (connections, letters, bytes) in [
+            (
+                stream.max_per_address,
+                stream.peer_letters,
+                stream.peer_bytes,
+            ),
+            (
+                datagram.max_per_address,
+                datagram.peer_letters,
+                datagram.peer_bytes,
+            ),
+        ] {
+            assert_eq!((connections, letters, bytes), (3, 5, 70 << 10));
+        }
+    }
 }

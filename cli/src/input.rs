@@ -19,7 +19,7 @@ pub(crate) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, Failure> {
         Ok(false) => Err(Failure::failed(
             format!("there are more than {limit} bytes"),
             name(path),
-            "give it in pieces",
+            "use a smaller file",
         )),
         Err(error) => Err(Failure::failed(
             format!("cannot read: {error}"),

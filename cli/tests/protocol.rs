@@ -68,7 +68,7 @@ fn files_are_checked() {
     let (good, bad) = (good.to_str().unwrap(), bad.to_str().unwrap());
     let fine = host.run(&["protocol", "check", good]).done();
     assert!(
-        fine.ends_with("lift: lift, 3 states, no mistakes\n"),
+        fine.ends_with("lift: lift, states: 3, no mistakes\n"),
         "{fine}"
     );
     let wrong = host.run(&["protocol", "check", bad]).failed(1);

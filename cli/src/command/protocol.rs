@@ -223,7 +223,7 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
         for file in files {
             match read(file) {
                 Ok(machine) => output::text(&format!(
-                    "{}: {}, {} states, no mistakes\n",
+                    "{}: {}, states: {}, no mistakes\n",
                     input::name(file),
                     machine.name(),
                     machine.states().len()

@@ -30,11 +30,11 @@ pub struct UdpLimits {
     pub max_datagram: usize,
     /// Most connections. Default 256.
     pub max_connections: usize,
-    /// Most connections that one address opens. Default 64.
+    /// Most connections that the peers at one address open. Default 64. This and the next two are not
+    /// for loopback addresses.
     pub max_per_address: usize,
     /// Letters a second that are taken from one address, as many of which may come at once; what is
-    /// more is taken when the peer sends it again. Loopback addresses are left out. 0: any number.
-    /// Default 20,000.
+    /// more is taken when the peer sends it again. 0: any number. Default 20,000.
     pub peer_letters: u64,
     /// The same of bytes. Default 256 MiB.
     pub peer_bytes: u64,

@@ -119,6 +119,12 @@ struct Inbound {
     dialled: String,
 }
 
+/// Whether there are limits to what whoever is at this address may have. The processes of this host
+/// are many at one address.
+fn limits_peer_at(ip: IpAddr) -> bool {
+    !ip.to_canonical().is_loopback()
+}
+
 impl Core {
     pub(crate) fn new(
         identity: Identity,
@@ -157,11 +163,9 @@ impl Core {
         self.counters
     }
 
-    /// What whoever is at this address may still send. The processes of this host are many at one
-    /// address.
+    /// What whoever is at this address may still send, if that is limited.
     fn ration(&self, ip: IpAddr, now: Instant) -> Option<Arc<Ration>> {
-        let limited = !ip.to_canonical().is_loopback();
-        limited.then(|| self.rations.of(ip, self.limits.rates(), now))?
+        limits_peer_at(ip).then(|| self.rations.of(ip, self.limits.rates(), now))?
     }
 
     /// Takes a parcel for sending. When the connection has just been made up, its number is

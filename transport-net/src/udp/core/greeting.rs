@@ -7,7 +7,7 @@ use fipa_transport::{Hop, Kind, Location};
 
 use super::super::connection::{Connection, Path};
 use super::super::packet::{self, NO_COOKIE};
-use super::{Core, Inbound, MAX_OUTBOX};
+use super::{Core, Inbound, MAX_OUTBOX, limits_peer_at};
 use crate::address;
 use crate::end::End;
 use crate::hello::Hello;
@@ -59,9 +59,8 @@ impl Core {
         }
         let home = whose(from.ip());
         let same_address = self.greeted.keys().filter(|(a, _)| whose(a.ip()) == home);
-        if self.connections.len() >= self.limits.max_connections
-            || same_address.count() >= self.limits.max_per_address
-        {
+        let greedy = limits_peer_at(home) && same_address.count() >= self.limits.max_per_address;
+        if greedy || self.connections.len() >= self.limits.max_connections {
             self.counters.refused_crowd += 1;
             self.reply(path, packet::refused(initiator));
             return;
