@@ -264,6 +264,12 @@ impl Agent {
         }
     }
 
+    /// Waits until the domain is closed.
+    #[cfg(feature = "monitor")]
+    pub(crate) async fn closed(&self) {
+        self.domain.inner.service.mts.gone(self.incarnation).await;
+    }
+
     pub(crate) fn letter_now(&self) -> Option<Result<Incoming, ReceiveError>> {
         let received = self.domain.inner.service.mts.try_receive(self.incarnation);
         received.map(|received| self.taken(received))

@@ -114,11 +114,14 @@ struct Door {
     /// Nothing will come any more.
     gone: AtomicBool,
     notify: Notify,
+    /// Told when it is gone, to all.
+    over: Notify,
 }
 
 impl Door {
     fn close(&self) {
         self.gone.store(true, Ordering::Release);
+        self.over.notify_waiters();
         self.notify.notify_waiters();
         // Whoever is about to wait.
         self.notify.notify_one();
@@ -347,6 +350,18 @@ impl Mts {
                 })
             })
             .await
+    }
+
+    /// Waits until nothing more will come for this agent: it was deregistered, or the service closed.
+    pub async fn gone(&self, agent: Incarnation) {
+        let Some(door) = self.shared.state.lock().agents.get(&agent).map(Arc::clone) else {
+            return;
+        };
+        // Before looking, so that what happens afterwards is noticed.
+        let over = door.over.notified();
+        if !door.gone.load(Ordering::Acquire) {
+            over.await;
+        }
     }
 
     /// The next letter for this agent, if there is one now.

@@ -102,6 +102,7 @@ impl Desk {
                     }
                     self.put(received);
                 }
+                () = agent.closed(), if !room => return Err(ReceiveError::Closed),
             }
         }
     }

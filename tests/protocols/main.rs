@@ -226,6 +226,32 @@ async fn other_messages_are_received_meanwhile() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_conversation_behind_messages_that_nobody_reads_ends_with_the_domain() {
+    let (rover, arm) = pair(&[]).await;
+    let initiator = async {
+        let subscribe = to(&rover, Performative::Subscribe, &arm, "pose");
+        let mut poses = rover.subscribe(subscribe, PATIENCE).await.unwrap();
+        tokio::time::timeout(PATIENCE, poses.next()).await.unwrap()
+    };
+    let participant = async {
+        let first = arm.receive().await.unwrap().message;
+        let mut task = arm.take_part(&first).unwrap();
+        task.agree("").await.unwrap();
+        // As many as are put aside for `receive`, which nobody calls.
+        for number in 0..1_024 {
+            let note = to(&arm, Performative::Inform, &rover, &number.to_string());
+            let told = arm.send(note.build().unwrap()).await.unwrap();
+            assert!(told.all_succeeded(), "{told:?}");
+        }
+        rover.domain().clone().close().await;
+    };
+    let (next, ()) = tokio::join!(initiator, participant);
+    let ended = next.unwrap_err();
+    let closed = matches!(ended, DialogueError::Receive(ReceiveError::Closed));
+    assert!(closed, "{ended}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_subscription_goes_on_until_it_is_cancelled() {
     let (rover, arm) = pair(&["monitor.check=enforce"]).await;
     let initiator = async {
