@@ -8,7 +8,7 @@ use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::path::PathBuf;
 use std::process::{Child, Command, Output, Stdio};
-use std::sync::mpsc::{Receiver, channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread;
 use std::time::Duration;
 
@@ -57,25 +57,13 @@ impl Host {
 
     /// Runs it to its end.
     pub(crate) fn run(&self, arguments: &[&str]) -> Ran {
-        self.command(arguments).output().unwrap().into()
+        output_of(&mut self.command(arguments), Vec::new())
     }
 
     /// Runs it to its end with something on standard input.
     pub(crate) fn run_with_input(&self, arguments: &[&str], input: &[u8]) -> Ran {
-        let mut child = self
-            .command(arguments)
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let mut stdin = child.stdin.take().unwrap();
-        let input = input.to_vec();
-        let writer = thread::spawn(move || stdin.write_all(&input));
-        let output = child.wait_with_output().unwrap();
-        // Whoever does not read all of it has a reason, which the output tells.
-        let _ = writer.join().unwrap();
-        output.into()
+        let mut command = self.command(arguments);
+        output_of(command.stdin(Stdio::piped()), input.to_vec())
     }
 
     /// Starts it and waits for the first line of its output.
@@ -250,8 +238,11 @@ impl Running {
     }
 
     /// Waits for its end, and returns the exit code and all of standard error.
+    #[track_caller]
     pub(crate) fn end(&mut self) -> (Option<i32>, String) {
+        let watchdog = Watchdog::over(&self.child);
         let status = self.child.wait().unwrap();
+        drop(watchdog);
         for line in self.errors.iter() {
             self.told.push_str(&format!("{line}\n"));
         }
@@ -263,6 +254,38 @@ impl Drop for Running {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
+    }
+}
+
+/// Runs a command to its end, with something on standard input if that is piped.
+fn output_of(command: &mut Command, input: Vec<u8>) -> Ran {
+    let piped = command.stdout(Stdio::piped()).stderr(Stdio::piped());
+    let mut child = piped.spawn().unwrap();
+    let watchdog = Watchdog::over(&child);
+    let stdin = child.stdin.take();
+    let writer = thread::spawn(move || stdin.map(|mut stdin| stdin.write_all(&input)));
+    let output = child.wait_with_output().unwrap();
+    drop(watchdog);
+    // Whoever does not read all of it has a reason, which the output tells.
+    let _ = writer.join().unwrap();
+    output.into()
+}
+
+/// Kills a process that hangs, which then has no exit code. To be dropped once it has been waited for.
+struct Watchdog {
+    _waiting: Sender<()>,
+}
+
+impl Watchdog {
+    fn over(child: &Child) -> Self {
+        let pid = child.id().to_string();
+        let (waiting, ended) = channel();
+        thread::spawn(move || {
+            if ended.recv_timeout(WATCHDOG) == Err(RecvTimeoutError::Timeout) {
+                let _ = Command::new("kill").args(["-KILL", &pid]).status();
+            }
+        });
+        Self { _waiting: waiting }
     }
 }
 
