@@ -2,18 +2,20 @@
 
 use super::*;
 
-/// A rover, somebody who asks for it, and an arm that is asked: each in a process of its own.
-async fn three(go_between: &str) -> [Agent; 3] {
+/// These agents, each in a membership of its own and held to its protocols.
+async fn enforcing<const N: usize>(names: [&str; N]) -> [Agent; N] {
     let config = config(&["monitor.check=enforce"]);
-    let join = async |name: &str| {
+    let mut agents = Vec::new();
+    for name in names {
         let domain = Domain::open(&config).await.unwrap();
-        domain.register(name).unwrap()
-    };
-    [
-        join("rover").await,
-        join(go_between).await,
-        join("arm").await,
-    ]
+        agents.push(domain.register(name).unwrap());
+    }
+    agents.try_into().ok().unwrap()
+}
+
+/// A rover, somebody who asks for it, and an arm that is asked.
+async fn three(go_between: &str) -> [Agent; 3] {
+    enforcing(["rover", go_between, "arm"]).await
 }
 
 fn proxy(rover: &Agent, go_between: &Agent) -> MessageBuilder {
@@ -170,13 +172,7 @@ async fn who_has_others_recruited_accepts_their_proposal() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn whom_the_recruited_are_told_to_answer_accepts_a_proposal() {
-    let config = config(&["monitor.check=enforce"]);
-    let join = async |name: &str| {
-        let domain = Domain::open(&config).await.unwrap();
-        domain.register(name).unwrap()
-    };
-    let [rover, recruiter] = [join("rover").await, join("recruiter").await];
-    let [arm, base] = [join("arm").await, join("base").await];
+    let [rover, recruiter, arm, base] = enforcing(["rover", "recruiter", "arm", "base"]).await;
     let initiator = async {
         let proxy = proxy(&rover, &recruiter);
         let _answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
@@ -199,14 +195,8 @@ async fn whom_the_recruited_are_told_to_answer_accepts_a_proposal() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn the_recruited_answer_whom_they_are_told_to() {
-    let config = config(&["monitor.check=enforce"]);
-    let join = async |name: &str| {
-        let domain = Domain::open(&config).await.unwrap();
-        domain.register(name).unwrap()
-    };
-    let [rover, recruiter] = [join("rover").await, join("recruiter").await];
     // The base is told of nothing before the answers come.
-    let [arm, base] = [join("arm").await, join("base").await];
+    let [rover, recruiter, arm, base] = enforcing(["rover", "recruiter", "arm", "base"]).await;
     let initiator = async {
         let proxy = proxy(&rover, &recruiter);
         let _answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
