@@ -76,7 +76,7 @@ fn keys(config: &Config, checks: &mut Vec<Check>) {
     }
     if checks.iter().all(|check| check.area != AREA.0) {
         let count = credentials.trusted.len();
-        checks.push(AREA.fine(KEYS, format!("{count} other hosts are trusted")));
+        checks.push(AREA.fine(KEYS, format!("other hosts that are trusted: {count}")));
     }
 }
 

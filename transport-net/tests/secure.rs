@@ -326,25 +326,49 @@ fn nothing_is_said_in_the_clear_to_who_has_to_prove_who_he_is() {
     assert_eq!(to.arrivals() + to.sink.record.lock().unframed.len(), 0);
 }
 
-#[test]
-fn an_old_peer_may_be_an_exception_and_is_nothing_more() {
+/// What a host asks of others with which it trusts the rover, and old peers on this host.
+fn with_an_exception() -> Security {
     let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
     let rules = Rules {
         loopback: true,
         old_peers: vec![IpAddr::V4(Ipv4Addr::LOCALHOST)],
     };
-    let security = Security::new(crex.credentials(&[&rover]), rules).unwrap();
-    let to = party(security);
-    let address = to.location().address().to_owned();
-    let mut stream = TcpStream::connect(address).unwrap();
+    Security::new(crex.credentials(&[&rover]), rules).unwrap()
+}
+
+/// Sends a letter as old peers do.
+fn throw(to: &Party) {
+    let mut stream = TcpStream::connect(to.location().address()).unwrap();
     stream
         .write_all(&letter_from("cpp-sender").to_bytes())
         .unwrap();
     stream.shutdown(std::net::Shutdown::Write).unwrap();
+}
+
+#[test]
+fn an_old_peer_may_be_an_exception_and_is_nothing_more() {
+    let to = party(with_an_exception());
+    throw(&to);
     until("its letter", || {
         (to.sink.record.lock().unframed.len() == 1).then_some(())
     });
     assert_refused(&Party::new(), &to);
+}
+
+#[test]
+fn an_old_peer_that_sends_more_than_it_may_is_heard_later() {
+    let to = TcpTransport::limited(with_an_exception(), |limits| limits.peer_letters = 2);
+    let begun = Instant::now();
+    for _ in 0..6 {
+        throw(&to);
+    }
+    until("its letters", || {
+        (to.sink.record.lock().unframed.len() == 6).then_some(())
+    });
+    // Two at once, and two more a second; nobody is made to wait longer than that.
+    let took = begun.elapsed();
+    assert!(took > Duration::from_millis(900), "{took:?}");
+    assert!(to.transport.counters().held_back > 0);
 }
 
 fn who_sends_more_than_it_may_is_read_later_and_loses_nothing<T: Proving>() {

@@ -14,6 +14,7 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::time::{sleep, sleep_until, timeout};
 
 use super::config::Limits;
+use super::counters::count;
 use super::endpoint::{Endpoint, Stranger};
 use super::frame::{FrameReader, MAGIC};
 use super::link::Running;
@@ -135,6 +136,7 @@ async fn receive(endpoint: Arc<Endpoint>, place: Stranger, stream: TcpStream, fr
                     if let Some(ration) = endpoint.ration(from.ip())
                         && let Some(until) = ration.spend(1, letter.len(), Instant::now())
                     {
+                        count(&endpoint.tally().held_back);
                         sleep_until(until.into()).await;
                     }
                     unframed::hand_on(&endpoint, letter, from.ip());
