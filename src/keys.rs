@@ -373,7 +373,8 @@ impl Keys {
         if meta.mode() & 0o077 != 0 || meta.uid() != user {
             return Err(KeysError::Readable(file));
         }
-        for dir in ["", "trusted", "revoked"].map(|folder| self.dir.join(folder)) {
+        let folders = ["trusted", "revoked"].map(|folder| self.dir.join(folder));
+        for dir in std::iter::once(self.dir.clone()).chain(folders) {
             // What is not there nobody can write to, or it is told where it is read.
             let Ok(meta) = fs::metadata(&dir) else {
                 continue;

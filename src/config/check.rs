@@ -125,6 +125,13 @@ impl Findings {
     fn security(&mut self, config: &Config) {
         let security = &config.security;
         let has_keys = !security.keys.is_empty();
+        if security.keys == "~" || security.keys.starts_with("~/") {
+            self.add(
+                &["security", "keys"],
+                "begins with ~, which only shells understand",
+                "write the directory out, such as /home/robot/.config/fipa/keys",
+            );
+        }
         if security.old_peers.len() > MAX_OLD_PEERS {
             let path = ["security", "old_peers"];
             self.too_many(&path, security.old_peers.len(), MAX_OLD_PEERS);

@@ -469,6 +469,7 @@ fn a_gateway_is_open_to_the_network_with_keys_or_by_its_owners_word() {
         assert!(mistakes(&[nobody]).contains(key), "{nobody}");
     }
     assert_eq!(mistakes(&["security.peer_bytes=0"]), "");
+    assert!(mistakes(&["security.keys=~/keys"]).contains("only shells understand"));
     let keys = "security.keys=/etc/fipa/keys";
     assert!(mistakes(&[keys, "security.insecure=true"]).contains("`security.insecure`"));
     assert!(mistakes(&[keys, "mts.transports=shm,udp,tcp"]).contains("not encrypted"));

@@ -94,8 +94,7 @@ fn a_directory_in_which_others_could_give_trust_is_refused() {
     crex.init("crex", &[], VALID).unwrap();
     rover.init("rover", &[], VALID).unwrap();
     rover.trust(&fs::read(crex.own_file()).unwrap()).unwrap();
-    for folder in ["", "trusted"] {
-        let dir = rover.dir().join(folder);
+    for dir in [rover.dir().to_owned(), rover.dir().join("trusted")] {
         for (mode, fits) in [(0o777, false), (0o770, false), (0o755, true)] {
             fs::set_permissions(&dir, fs::Permissions::from_mode(mode)).unwrap();
             let used = rover.credentials();

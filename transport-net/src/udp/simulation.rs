@@ -527,7 +527,7 @@ fn one_address_opens_so_many_connections_and_no_more() {
         ..UdpLimits::default()
     };
     let mut world = World::new(1, FAIR, &limits);
-    for n in 0..20_u64 {
+    for n in 0..30_u64 {
         let hello = crate::hello::Hello {
             identity: Identity {
                 name: "x".into(),
@@ -541,8 +541,13 @@ fn one_address_opens_so_many_connections_and_no_more() {
             dialled: "x".into(),
             listening: Vec::new(),
         };
-        // On this host there are many at one address.
-        let from = if n < 10 { "198.51.100.7" } else { "127.0.0.1" };
+        let from = match n {
+            0..10 => "198.51.100.7".to_owned(),
+            // A host of IPv6 takes as many addresses as it likes.
+            10..20 => format!("[2001:db8::{n}]"),
+            // On this host there are many at one address.
+            _ => "127.0.0.1".to_owned(),
+        };
         let from: SocketAddr = format!("{from}:{}", 1000 + n).parse().unwrap();
         world.receive(B, from, &packet::hello(n + 1, &NO_COOKIE, &hello));
         let reply = world.cores[B].poll_transmit(world.now).unwrap();
@@ -553,7 +558,10 @@ fn one_address_opens_so_many_connections_and_no_more() {
         while world.cores[B].poll_transmit(world.now).is_some() {}
     }
     let counters = world.cores[B].counters();
-    assert_eq!((counters.accepted, counters.refused_crowd), (3 + 10, 7));
+    assert_eq!(
+        (counters.accepted, counters.refused_crowd),
+        (3 + 3 + 10, 7 + 7)
+    );
     // They never said anything more, and are forgotten.
     while world.step() {}
     assert_eq!(world.cores[B].counters().connections, 0);
