@@ -480,9 +480,12 @@ fn rename(from: &Path, to: &Path) -> Result<(), KeysError> {
 }
 
 fn read(file: &Path) -> Result<Vec<u8>, KeysError> {
-    let len = fs::metadata(file)
-        .map_err(|source| io_error(file, source))?
-        .len();
+    let metadata = fs::metadata(file).map_err(|source| io_error(file, source))?;
+    if !metadata.is_file() {
+        // A pipe would be waited for.
+        return Err(contents(file, &"it is no file"));
+    }
+    let len = metadata.len();
     if len > MAX_FILE {
         return Err(contents(
             file,

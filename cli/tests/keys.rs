@@ -4,6 +4,7 @@
 
 mod common;
 
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use common::{Host, Running};
@@ -247,4 +248,21 @@ fn a_certificate_that_has_ended_is_told_wherever_it_is_seen() {
     let (mut ours, _) = rover.gateway(&[(&crex.name, &address)]);
     ours.tells(&["the certificate of this host has ended"]);
     theirs.tells(&["connection refused", "Expired", "`fipa keys renew` there"]);
+}
+
+#[test]
+fn a_pipe_among_the_certificates_is_waited_for_by_nobody() {
+    let rover = Keyed::new("rover", &[]);
+    let trusted = rover.host.path("keys/trusted");
+    std::fs::create_dir_all(&trusted).unwrap();
+    let pipe = trusted.join("other.pem").display().to_string();
+    let made = Command::new("mkfifo").args(["-m", "600", &pipe]).status();
+    assert!(made.unwrap().success());
+    let listed = rover.host.run(&["keys", "list", "--dir", &rover.dir()]);
+    let told = format!(
+        "{}{}",
+        String::from_utf8_lossy(&listed.stdout),
+        listed.stderr
+    );
+    assert!(told.contains("no file"), "{told}");
 }
