@@ -76,7 +76,7 @@ impl Stop {
 /// Does some work that ends by itself. A signal ends it before; dropping the work leaves the
 /// domain in order.
 pub(crate) fn run<T>(work: impl Future<Output = Result<T, Failure>>) -> Result<T, Failure> {
-    options::runtime()?.block_on(async {
+    options::block_on(async {
         let mut stop = Stop::listen()?;
         let mut work = pin!(work);
         tokio::select! {
@@ -87,7 +87,7 @@ pub(crate) fn run<T>(work: impl Future<Output = Result<T, Failure>>) -> Result<T
                 "run it again when you want the rest",
             )),
         }
-    })
+    })?
 }
 
 /// Joins the domain that the configuration names.

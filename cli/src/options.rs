@@ -131,13 +131,42 @@ pub(crate) fn duration(text: &str) -> Result<Duration, String> {
     duration.map_err(|_| "use a time such as 10s, 500ms or 2h".to_owned())
 }
 
-/// What runs everything that waits.
-pub(crate) fn runtime() -> Result<Runtime, Failure> {
-    Runtime::new().map_err(|error| {
+/// How long threads have to end that are still blocked when everything else has been done.
+const BLOCKED: Duration = Duration::from_secs(3);
+
+/// Runs what waits, to its end. A thread that is blocked all the same, in looking up a name that
+/// nobody answers for, or in reading standard input, ends with the process.
+pub(crate) fn block_on<T>(work: impl Future<Output = T>) -> Result<T, Failure> {
+    let runtime = Runtime::new().map_err(|error| {
         Failure::failed(
             format!("cannot start the threads that do the work: {error}"),
             "this process",
             "see `ulimit -u` and `ulimit -n`",
         )
-    })
+    })?;
+    let done = runtime.block_on(work);
+    runtime.shutdown_timeout(BLOCKED);
+    Ok(done)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc::channel;
+
+    use super::*;
+
+    #[test]
+    fn a_thread_that_is_blocked_is_not_waited_for() {
+        let (release, blocked) = channel::<()>();
+        let (done, finished) = channel();
+        std::thread::spawn(move || {
+            let ran = block_on(async {
+                tokio::task::spawn_blocking(move || blocked.recv());
+            });
+            done.send(ran.is_ok())
+        });
+        let ran = finished.recv_timeout(Duration::from_secs(60));
+        assert_eq!(ran, Ok(true));
+        drop(release);
+    }
 }

@@ -45,7 +45,7 @@ pub(crate) struct Arguments {
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
-    options::runtime()?.block_on(async {
+    options::block_on(async {
         let mut stop = Stop::listen()?;
         let domain = membership::join(&config).await?;
         let formed = form(&domain, &arguments).map_err(|error| match error {
@@ -76,7 +76,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         };
         domain.close().await;
         told
-    })
+    })?
 }
 
 fn form(domain: &Domain, arguments: &Arguments) -> Result<fipa::Coalition, CoalitionError> {

@@ -45,7 +45,7 @@ pub(crate) struct Arguments {
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
-    options::runtime()?.block_on(serve(arguments, &config))
+    options::block_on(serve(arguments, &config))?
 }
 
 async fn serve(arguments: Arguments, config: &Config) -> Result<(), Failure> {

@@ -47,7 +47,7 @@ const LOOK_FOR_PROBLEMS: Duration = Duration::from_secs(5);
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
-    options::runtime()?.block_on(serve(&config, arguments.json, global))
+    options::block_on(serve(&config, arguments.json, global))?
 }
 
 async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failure> {

@@ -15,7 +15,7 @@ use crate::report::Failure;
 
 /// Tells until a signal ends it.
 pub(super) fn run(filter: &Filter, config: &Config, json: bool) -> Result<(), Failure> {
-    options::runtime()?.block_on(async {
+    options::block_on(async {
         let mut stop = Stop::listen()?;
         let mut reader = output::Reader::of_output();
         let domain = membership::join(config).await?;
@@ -49,7 +49,7 @@ pub(super) fn run(filter: &Filter, config: &Config, json: bool) -> Result<(), Fa
         }
         domain.close().await;
         told
-    })
+    })?
 }
 
 #[derive(Clone, Copy)]

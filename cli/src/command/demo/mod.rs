@@ -7,7 +7,7 @@ mod steps;
 use clap::Args;
 use serde_json::json;
 
-use crate::options::Global;
+use crate::options::{self, Global};
 use crate::output;
 use crate::report::Failure;
 
@@ -45,19 +45,18 @@ enum Part {
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
-    let runtime = crate::options::runtime()?;
     if let (Some(part), Some(name)) = (arguments.part, arguments.name) {
         let config = global.config()?;
-        let played = runtime.block_on(async {
+        let played = options::block_on(async {
             match part {
                 Part::Agent => part::agent(&config, &name).await,
                 Part::Gateway => part::gateway(&config).await,
                 Part::Watcher => part::watcher(&config).await,
             }
-        });
+        })?;
         return played.map_err(|error| Failure::failed(error, name, "see the demo's own report"));
     }
-    let report = runtime.block_on(steps::play(!arguments.json))?;
+    let report = options::block_on(steps::play(!arguments.json))??;
     if arguments.json {
         output::json(&json!({ "steps": report.steps, "measured": report.measured }))?;
     }

@@ -133,7 +133,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         // Better known now than at the end.
         mermaid::write(file, "sequenceDiagram\n")?;
     }
-    options::runtime()?.block_on(watch(&arguments, judge, &config))
+    options::block_on(watch(&arguments, judge, &config))?
 }
 
 async fn watch(arguments: &Arguments, judge: Judge, config: &Config) -> Result<(), Failure> {
