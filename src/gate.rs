@@ -66,17 +66,18 @@ impl Door {
             protocol: protocol.as_deref(),
         };
         // A gateway has stamped what it has passed on, and counted it.
-        let is_counted = matches!(self.of, Of::Process(_)) && view.stamps().next().is_some();
+        let is_passed_on = matches!(self.of, Of::Process(_)) && view.stamps().next().is_some();
         let judged = {
             let mut access = self.access.lock();
             let judged = access.judge(&claim);
-            match is_counted {
+            match is_passed_on {
                 true => judged,
                 false => judged.and_then(|()| access.count(sender, now)),
             }
         };
-        // Asked only now: hardly any letter is the gateway's own.
-        judged.or_else(|refusal| match self.is_gateway(sender) {
+        // Asked only now: hardly any letter is the gateway's own. Somebody else who calls himself so
+        // has been passed on.
+        judged.or_else(|refusal| match !is_passed_on && self.is_gateway(sender) {
             true => Ok(()),
             false => Err(refusal.into()),
         })
@@ -131,7 +132,7 @@ mod tests {
     use fipa_acl::{
         AclRepresentation, AgentId, Envelope, EnvelopeParams, Message, Performative, Received, Time,
     };
-    use fipa_sds::{HostConfig, Mts};
+    use fipa_sds::{HostConfig, Mts, Registration};
     use fipa_transport::Incarnation;
 
     use super::*;
@@ -160,29 +161,35 @@ mod tests {
         Letter::new(envelope.encode_standard().unwrap(), message.to_payload())
     }
 
-    /// The door of a process of a host, which lets in a letter a second of each sender; until the
-    /// directory goes.
-    fn door() -> (tempfile::TempDir, Door) {
+    /// The door of a process of a host, which lets in a letter a second of each sender, but none of
+    /// those who are called so; the directory of the gateway there; and their place, for as long.
+    fn door(denied: &[&str]) -> (Door, HostDirectory, tempfile::TempDir) {
         let place = tempfile::tempdir().unwrap();
-        let host = HostDirectory::open(HostConfig {
-            dir: place.path().join("domain"),
-            mts: Mts::new("mts", Incarnation::random()),
-            gateway: false,
+        let open = |gateway| {
+            let directory = HostDirectory::open(HostConfig {
+                dir: place.path().join("domain"),
+                mts: Mts::new("mts", Incarnation::random()),
+                gateway,
+            });
+            directory.unwrap()
+        };
+        let deny = denied.iter().map(|sender| config::AccessRule {
+            sender: (*sender).to_owned(),
+            receivers: vec![".*".to_owned()],
         });
         let rules = config::Access {
             rate: 1,
+            deny: deny.collect(),
             ..config::Access::default()
         };
         let access = Access::new(&rules).unwrap().unwrap();
-        (
-            place,
-            Door::new(access, Of::Process(Arc::new(host.unwrap()))),
-        )
+        let door = Door::new(access, Of::Process(Arc::new(open(false))));
+        (door, open(true), place)
     }
 
     #[tokio::test]
     async fn what_a_gateway_has_counted_is_not_counted_again() {
-        let (_place, door) = door();
+        let (door, _gateway, _place) = door(&[]);
         let now = Instant::now();
         let taken = |is_stamped| {
             let letter = letter("rover", "rover", is_stamped);
@@ -196,9 +203,27 @@ mod tests {
 
     #[tokio::test]
     async fn envelope_and_message_name_one_sender() {
-        let (_place, door) = door();
+        let (door, _gateway, _place) = door(&[]);
         let judged = door.admits(Instant::now(), "arm", &letter("rover", "crex", false));
         let told = judged.unwrap_err();
         assert!(told.contains("rover") && told.contains("crex"), "{told}");
+    }
+
+    #[tokio::test]
+    async fn the_gateway_of_the_host_is_heard_and_nobody_else_by_its_name() {
+        let (door, gateway, _place) = door(&["mts", "rover"]);
+        let at = "shm://1#0000000000000001".parse().unwrap();
+        let registration = Registration {
+            role: EntryRole::Gateway,
+            ..Registration::new("mts", Incarnation::random(), vec![at])
+        };
+        gateway.register(registration).unwrap();
+        let taken = |sender, is_passed_on| {
+            let letter = letter(sender, sender, is_passed_on);
+            door.admits(Instant::now(), "arm", &letter).is_ok()
+        };
+        assert!(taken("mts", false));
+        assert!(!taken("mts", true), "from another host");
+        assert!(!taken("rover", false));
     }
 }
