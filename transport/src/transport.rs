@@ -20,7 +20,8 @@ use crate::{FailureReason, Kind, Location, Parcel, Stream};
 /// 2. **Honest conclusions.** [`Conclusion::NotSent`] only when the other side cannot have got
 ///    the letter, and never will. If in doubt, [`Conclusion::Unconfirmed`].
 /// 3. **An answer is the other sink's answer.** `Accepted` is reported only after the receiving
-///    sink said so; nothing is acknowledged on its behalf.
+///    sink said so; nothing is acknowledged on its behalf. It gets the parcel of an attempt once; of
+///    a copy that reached it nevertheless, what it says is no answer to the attempt.
 /// 4. **Order.** Parcels dispatched to one location arrive in the order of the calls, or do not
 ///    arrive.
 /// 5. **No call-back from a call.** A sink is never called from within `dispatch`, `abandon` or

@@ -76,25 +76,26 @@ impl World {
         let between_hosts = self.processes[at].host != self.processes[receiver].host;
         let mut strays = |rate: f64| between_hosts && rate > 0.0 && self.random.f64() < rate;
         let (copied, late) = (strays(w.copies), strays(w.overtaken));
-        let arrive = |parcel| Event::Arrive {
+        let arrive = |parcel, copy| Event::Arrive {
             from: at,
             to: receiver,
             kind,
             attempt,
             parcel,
             mute,
+            copy,
         };
         if copied {
-            self.after_ms(LATE_MS, arrive(parcel.clone()));
+            self.after_ms(LATE_MS, arrive(parcel.clone(), true));
         }
         if late {
-            return self.after_ms(LATE_MS, arrive(parcel));
+            return self.after_ms(LATE_MS, arrive(parcel, false));
         }
         let delay = Duration::from_micros(self.random.u64(20..5000));
         let link = self.links.entry((at, receiver, kind)).or_insert(self.now);
         *link = (*link).max(self.now + delay);
         let arrives = *link;
-        self.at(arrives, arrive(parcel));
+        self.at(arrives, arrive(parcel, false));
     }
 
     /// Whether nothing passes from one of these processes to the other.
@@ -112,15 +113,18 @@ impl World {
 
     pub(super) fn arrive(
         &mut self,
-        from: usize,
-        to: usize,
+        (from, to): (usize, usize),
         kind: Kind,
         attempt: AttemptId,
         parcel: Parcel,
         mute: bool,
+        copy: bool,
     ) -> Result<(), Breach> {
         let broken = || Conclusion::Unconfirmed(WayError::new(WayFault::Broken, "simulated"));
         if !self.processes[to].alive {
+            if copy {
+                return Ok(());
+            }
             self.after_ms(
                 5,
                 Event::Conclude {
@@ -150,6 +154,8 @@ impl World {
         let at_once = kind == Kind::Shm;
         let verdict = process.core.handle_arrival(now, kind, at_once, arrival);
         match verdict {
+            // What is said of a copy is no answer to the attempt (rule 3 of transports).
+            _ if copy => {}
             // The way back is cut.
             Verdict::Now(_) if cut => {}
             Verdict::Now(answer) => {

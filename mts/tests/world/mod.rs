@@ -61,6 +61,7 @@ enum Event {
         attempt: AttemptId,
         parcel: Parcel,
         mute: bool,
+        copy: bool,
     },
     Conclude {
         at: usize,
@@ -337,7 +338,8 @@ impl World {
                 attempt,
                 parcel,
                 mute,
-            } => self.arrive(from, to, kind, attempt, parcel, mute),
+                copy,
+            } => self.arrive((from, to), kind, attempt, parcel, mute, copy),
             Event::Conclude {
                 at,
                 attempt,

@@ -17,7 +17,8 @@ pub(crate) struct Weather {
     /// A parcel between hosts is late, by up to [`LATE_MS`], and others overtake it: more than
     /// transports allow themselves.
     pub overtaken: f64,
-    /// A parcel between hosts arrives a second time, up to [`LATE_MS`] later.
+    /// A parcel between hosts arrives a second time, up to [`LATE_MS`] later: more than transports
+    /// allow themselves, too.
     pub copies: f64,
     /// How often a host is cut off from the others for a while: nothing passes, and nobody is told.
     pub partitions: u32,
