@@ -46,21 +46,8 @@ impl Sockets {
             return Ok(false);
         }
         self.open.clear();
-        let mut indices = Vec::new();
         let mut last_error = None;
-        for interface in &interfaces {
-            let opened = match interface.ip() {
-                IpAddr::V4(address) => group_v4(address, config.port),
-                IpAddr::V6(_) => {
-                    let index = interface.index.unwrap_or_default();
-                    // One for all addresses of an interface.
-                    if indices.contains(&index) {
-                        continue;
-                    }
-                    indices.push(index);
-                    group_v6(index, config.port)
-                }
-            };
+        for opened in groups(&interfaces, config.port) {
             let opened = opened.and_then(|(socket, to)| Ok((UdpSocket::from_std(socket)?, to)));
             match opened {
                 Ok(socket) => self.open.push(socket),
@@ -111,18 +98,8 @@ impl Sockets {
 /// Sends one packet on all interfaces, for who has no sockets any more. One that fails is no reason
 /// not to send on the others.
 pub(super) fn send_once(config: &MdnsConfig, packet: &[u8]) -> io::Result<()> {
-    let mut indices = Vec::new();
     let mut last_error = None;
-    for interface in interfaces(config)? {
-        let index = interface.index.unwrap_or_default();
-        let opened = match interface.ip() {
-            IpAddr::V4(address) => group_v4(address, config.port),
-            IpAddr::V6(_) if indices.contains(&index) => continue,
-            IpAddr::V6(_) => {
-                indices.push(index);
-                group_v6(index, config.port)
-            }
-        };
+    for opened in groups(&interfaces(config)?, config.port) {
         let sent = opened.and_then(|(socket, group)| socket.send_to(packet, group));
         last_error = sent.err().or(last_error);
     }
@@ -146,6 +123,23 @@ pub(super) fn interfaces(config: &MdnsConfig) -> io::Result<Vec<Interface>> {
 
 /// A socket in the group of an interface, which is not waited for, and the group.
 pub(super) type Grouped = (std::net::UdpSocket, SocketAddr);
+
+/// Opens one for each address of these interfaces: with IPv6 one for all of an interface.
+fn groups(interfaces: &[Interface], port: u16) -> impl Iterator<Item = io::Result<Grouped>> {
+    let mut indices = Vec::new();
+    let open = move |interface: &Interface| match interface.ip() {
+        IpAddr::V4(address) => Some(group_v4(address, port)),
+        IpAddr::V6(_) => {
+            let index = interface.index.unwrap_or_default();
+            if indices.contains(&index) {
+                return None;
+            }
+            indices.push(index);
+            Some(group_v6(index, port))
+        }
+    };
+    interfaces.iter().filter_map(open)
+}
 
 pub(super) fn group_v4(interface: Ipv4Addr, port: u16) -> io::Result<Grouped> {
     let group = Ipv4Addr::new(224, 0, 0, 251);
