@@ -8,8 +8,8 @@
 //! | `trusted/<fingerprint>.pem` | a certificate of a trusted peer |
 //! | `revoked/<fingerprint>.pem` | one that is never to be trusted again |
 //!
-//! All are PEM (RFC 7468). A gateway looks after the directory while it runs: what is changed here
-//! counts within seconds, without a new start.
+//! All are PEM (RFC 7468). Nobody but its owner may write to the directory. A gateway looks after it
+//! while it runs: what is changed here counts within seconds, without a new start.
 //!
 //! What must not live here: what is done with keys on connections (`fipa_transport_net::secure`).
 
