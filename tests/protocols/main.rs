@@ -18,12 +18,18 @@ use fipa::config::Sources;
 use fipa::monitor::ViolationKind;
 use fipa::protocol::{Decision, DialogueError, Reply, Task};
 use fipa::{
-    Agent, AgentId, Config, Domain, Message, MessageBuilder, OpenError, Performative, ReceiveError,
-    SendError,
+    Agent, AgentId, Config, Domain, Incoming, Message, MessageBuilder, OpenError, Performative,
+    ReceiveError, SendError,
 };
 
 /// Longer than any test takes; nothing waits so long unless something is wrong.
 const PATIENCE: Duration = Duration::from_secs(60);
+
+/// What the agent gets next. A letter that never comes ends the test.
+async fn heard(agent: &Agent) -> Result<Incoming, ReceiveError> {
+    let received = tokio::time::timeout(PATIENCE, agent.receive()).await;
+    received.unwrap_or_else(|_| panic!("nothing came to {}", agent.name()))
+}
 
 /// A configuration for a domain that no other test has.
 fn config(set: &[&str]) -> Config {
@@ -89,7 +95,7 @@ async fn a_request_is_agreed_to_and_done() {
         assert_eq!(text(&request.result().await.unwrap()), "lifted");
     };
     let participant = async {
-        let first = arm.receive().await.unwrap().message;
+        let first = heard(&arm).await.unwrap().message;
         assert_eq!(first.protocol(), Some("fipa-request"));
         assert!(first.reply_by().is_some() && first.reply_with().is_some());
         let handler = async |task: &mut Task<'_>| {
@@ -142,7 +148,7 @@ async fn answers_of_every_kind() {
             Reply::Accept("".into()),
             Reply::Reject("".into()),
         ] {
-            let first = arm.receive().await.unwrap().message;
+            let first = heard(&arm).await.unwrap().message;
             let when = *first.performative() == Performative::RequestWhen;
             let handler = async |task: &mut Task<'_>| {
                 if when {
@@ -165,15 +171,15 @@ async fn silence_and_nonsense_are_errors() {
         request.result().await,
         Err(DialogueError::TimedOut)
     ));
-    let first = arm.receive().await.unwrap().message;
+    let first = heard(&arm).await.unwrap().message;
     // Nobody waits for it any more: it goes to whoever receives.
     let late = arm.reply(&first, Performative::Agree).build().unwrap();
     assert!(arm.send(late).await.unwrap().all_succeeded());
-    let late = rover.receive().await.unwrap().message;
+    let late = heard(&rover).await.unwrap().message;
     assert_eq!(*late.performative(), Performative::Agree);
 
     let request = rover.request(lift(), PATIENCE).await.unwrap();
-    let first = arm.receive().await.unwrap().message;
+    let first = heard(&arm).await.unwrap().message;
     let nonsense = arm.reply(&first, Performative::Propose).build().unwrap();
     arm.send(nonsense).await.unwrap();
     match request.result().await {
@@ -184,7 +190,7 @@ async fn silence_and_nonsense_are_errors() {
         other => panic!("{other:?}"),
     }
     let request = rover.request(lift(), PATIENCE).await.unwrap();
-    let first = arm.receive().await.unwrap().message;
+    let first = heard(&arm).await.unwrap().message;
     let answer = arm
         .reply(&first, Performative::NotUnderstood)
         .build()
@@ -194,7 +200,7 @@ async fn silence_and_nonsense_are_errors() {
     assert!(matches!(result, Err(DialogueError::NotUnderstood(_))));
     // A handler that would break the protocol does not.
     let _request = rover.request(lift(), PATIENCE).await.unwrap();
-    let first = arm.receive().await.unwrap().message;
+    let first = heard(&arm).await.unwrap().message;
     let wrong = respond(&arm, &first, async |_| Ok(Reply::Accept("".into()))).await;
     assert!(matches!(wrong, Err(DialogueError::WouldViolate(_))));
 }
@@ -204,13 +210,13 @@ async fn other_messages_are_received_meanwhile() {
     let (rover, arm) = pair(&[]).await;
     let lift = to(&rover, Performative::Request, &arm, "lift");
     let request = rover.request(lift, PATIENCE).await.unwrap();
-    let first = arm.receive().await.unwrap().message;
+    let first = heard(&arm).await.unwrap().message;
     for number in 0..5 {
         let note = to(&arm, Performative::Inform, &rover, &number.to_string());
         arm.send(note.build().unwrap()).await.unwrap();
     }
     // Read before the result, and after it.
-    let early = rover.receive().await.unwrap().message;
+    let early = heard(&rover).await.unwrap().message;
     assert_eq!(text(&early), "0");
     let result = tokio::join!(request.result(), async {
         respond(&arm, &first, async |_| Ok(Reply::Inform("done".into())))
@@ -234,7 +240,7 @@ async fn a_conversation_behind_messages_that_nobody_reads_ends_with_the_domain()
         tokio::time::timeout(PATIENCE, poses.next()).await.unwrap()
     };
     let participant = async {
-        let first = arm.receive().await.unwrap().message;
+        let first = heard(&arm).await.unwrap().message;
         let mut task = arm.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         // As many as are put aside for `receive`, which nobody calls.
@@ -263,7 +269,7 @@ async fn a_subscription_goes_on_until_it_is_cancelled() {
         poses.cancel(PATIENCE).await.unwrap();
     };
     let participant = async {
-        let first = arm.receive().await.unwrap().message;
+        let first = heard(&arm).await.unwrap().message;
         let handler = async |task: &mut Task<'_>| {
             task.agree("").await?;
             for number in 0..10 {
@@ -287,7 +293,7 @@ async fn a_request_is_cancelled() {
         request.cancel(PATIENCE).await.unwrap();
     };
     let participant = async {
-        let first = arm.receive().await.unwrap().message;
+        let first = heard(&arm).await.unwrap().message;
         let handler = async |task: &mut Task<'_>| {
             task.agree("").await?;
             tokio::select! {
@@ -313,7 +319,7 @@ async fn a_contract_net_with_several_participants() {
     called.push(AgentId::new("nobody").unwrap());
     let participants = async {
         let bid = async |arm: &Agent, price: &'static str| {
-            let call = arm.receive().await.unwrap().message;
+            let call = heard(arm).await.unwrap().message;
             respond(arm, &call, async |task| {
                 if task.propose(price, PATIENCE).await? {
                     return Ok(Reply::Inform("carried".into()));
@@ -324,7 +330,7 @@ async fn a_contract_net_with_several_participants() {
             .unwrap();
         };
         let refuse = async |arm: &Agent| {
-            let call = arm.receive().await.unwrap().message;
+            let call = heard(arm).await.unwrap().message;
             let answer = respond(arm, &call, async |_| Ok(Reply::Refuse("no".into())));
             answer.await.unwrap();
         };
@@ -366,7 +372,7 @@ async fn enforcing_stops_what_would_break_a_protocol() {
         .send(in_protocol(&rover, Performative::Cfp, &arm, "c"))
         .await
         .unwrap();
-    arm.receive().await.unwrap();
+    heard(&arm).await.unwrap();
     let early = arm
         .send(in_protocol(&arm, Performative::Inform, &rover, "c"))
         .await;
@@ -380,7 +386,7 @@ async fn enforcing_stops_what_would_break_a_protocol() {
         .build()
         .unwrap();
     arm.send(note).await.unwrap();
-    assert_eq!(text(&rover.receive().await.unwrap().message), "hello");
+    assert_eq!(text(&heard(&rover).await.unwrap().message), "hello");
 }
 
 /// One process that checks, and one that does not.
@@ -403,11 +409,11 @@ async fn what_comes_and_breaks_a_protocol_is_handed_over_as_such() {
         .send(in_protocol(&rover, Performative::Cfp, &arm, "c"))
         .await
         .unwrap();
-    arm.receive().await.unwrap();
+    heard(&arm).await.unwrap();
     arm.send(in_protocol(&arm, Performative::Inform, &rover, "c"))
         .await
         .unwrap();
-    match rover.receive().await {
+    match heard(&rover).await {
         Err(ReceiveError::Violation {
             violation,
             incoming,
@@ -417,7 +423,7 @@ async fn what_comes_and_breaks_a_protocol_is_handed_over_as_such() {
         }
         other => panic!("{other:?}"),
     }
-    let answer = arm.receive().await.unwrap().message;
+    let answer = heard(&arm).await.unwrap().message;
     assert_eq!(*answer.performative(), Performative::NotUnderstood);
     assert!(text(&answer).contains("expected refuse, propose from arm to rover"));
 }
@@ -429,15 +435,15 @@ async fn warning_lets_everything_pass() {
         .send(in_protocol(&rover, Performative::Cfp, &arm, "c"))
         .await
         .unwrap();
-    arm.receive().await.unwrap();
+    heard(&arm).await.unwrap();
     arm.send(in_protocol(&arm, Performative::Inform, &rover, "c"))
         .await
         .unwrap();
-    let incoming = rover.receive().await.unwrap();
+    let incoming = heard(&rover).await.unwrap();
     assert_eq!(incoming.violation.unwrap().kind, ViolationKind::OutOfOrder);
     let illegal = in_protocol(&rover, Performative::AcceptProposal, &arm, "c");
     rover.send(illegal).await.unwrap();
-    let incoming = arm.receive().await.unwrap();
+    let incoming = heard(&arm).await.unwrap();
     assert_eq!(
         *incoming.message.performative(),
         Performative::AcceptProposal
@@ -464,7 +470,7 @@ async fn protocols_of_ones_own_are_read_and_checked() {
         .send(say(&rover, Performative::Propose, &arm))
         .await
         .unwrap();
-    arm.receive().await.unwrap();
+    heard(&arm).await.unwrap();
     let wrong = arm
         .send(say(&arm, Performative::AcceptProposal, &rover))
         .await;
@@ -472,7 +478,7 @@ async fn protocols_of_ones_own_are_read_and_checked() {
     arm.send(say(&arm, Performative::Confirm, &rover))
         .await
         .unwrap();
-    rover.receive().await.unwrap();
+    heard(&rover).await.unwrap();
 
     // Its states are its own, whatever they are called.
     let named = r#"<scxml initial="1">
@@ -484,7 +490,7 @@ async fn protocols_of_ones_own_are_read_and_checked() {
     let (rover, arm) = pair(&[&set]).await;
     let propose = say(&rover, Performative::Propose, &arm);
     rover.send(propose).await.unwrap();
-    let first = arm.receive().await.unwrap().message;
+    let first = heard(&arm).await.unwrap().message;
     let mut task = arm.take_part(&first).unwrap();
     let inform = say(&rover, Performative::Inform, &arm);
     rover.send(inform).await.unwrap();

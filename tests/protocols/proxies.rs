@@ -31,7 +31,7 @@ fn query(from: &Agent, arm: &str) -> MessageBuilder {
 
 /// Agrees and answers, whoever wants to know.
 async fn answer(arm: &Agent) -> Message {
-    let first = arm.receive().await.unwrap().message;
+    let first = heard(arm).await.unwrap().message;
     assert_eq!(first.protocol(), Some("fipa-query"));
     respond(arm, &first, async |task| {
         task.agree("wait").await?;
@@ -59,7 +59,7 @@ async fn a_broker_passes_answers_back() {
         assert!(matches!(&failed, Err(DialogueError::Failed(why)) if text(why) == "no more"));
     };
     let goes_between = async {
-        let first = broker.receive().await.unwrap().message;
+        let first = heard(&broker).await.unwrap().message;
         let mut task = broker.take_part(&first).unwrap();
         // Not before it has agreed.
         let early = task.pass_on(query(&broker, "arm"), PATIENCE).await;
@@ -102,7 +102,7 @@ async fn the_recruited_answer_directly() {
     };
     let (early, answered) = tokio::sync::oneshot::channel();
     let goes_between = async {
-        let first = recruiter.receive().await.unwrap().message;
+        let first = heard(&recruiter).await.unwrap().message;
         let mut task = recruiter.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         task.pass_on(query(&recruiter, "arm"), PATIENCE)
@@ -124,7 +124,7 @@ async fn the_recruited_answer_directly() {
 
 /// Passes a call for proposals on, to an arm that agrees to be told by others what to do.
 async fn recruit(recruiter: &Agent, reply_to: Option<&Agent>) {
-    let first = recruiter.receive().await.unwrap().message;
+    let first = heard(recruiter).await.unwrap().message;
     let mut task = recruiter.take_part(&first).unwrap();
     task.agree("").await.unwrap();
     let mut call = recruiter
@@ -140,7 +140,7 @@ async fn recruit(recruiter: &Agent, reply_to: Option<&Agent>) {
 }
 
 async fn propose(arm: &Agent) {
-    let first = arm.receive().await.unwrap().message;
+    let first = heard(arm).await.unwrap().message;
     respond(arm, &first, async |task| {
         assert!(task.propose("20", PATIENCE).await?);
         Ok(Reply::Inform(task.message().content().unwrap().clone()))
@@ -178,7 +178,7 @@ async fn whom_the_recruited_are_told_to_answer_accepts_a_proposal() {
         let _answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
     };
     let designated = async {
-        let proposal = base.receive().await.unwrap().message;
+        let proposal = heard(&base).await.unwrap().message;
         assert_eq!(*proposal.performative(), Performative::Propose);
         let accept = base.reply(&proposal, Performative::AcceptProposal);
         let accept = accept.content("do").build().unwrap();
@@ -186,7 +186,7 @@ async fn whom_the_recruited_are_told_to_answer_accepts_a_proposal() {
         // It is enforced as with those who began.
         let again = base.send(accept).await;
         assert!(matches!(again, Err(SendError::Violation(_))), "{again:?}");
-        let done = base.receive().await.unwrap().message;
+        let done = heard(&base).await.unwrap().message;
         assert_eq!(*done.performative(), Performative::Inform);
     };
     let goes_between = recruit(&recruiter, Some(&base));
@@ -202,7 +202,7 @@ async fn the_recruited_answer_whom_they_are_told_to() {
         let _answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
     };
     let goes_between = async {
-        let first = recruiter.receive().await.unwrap().message;
+        let first = heard(&recruiter).await.unwrap().message;
         let mut task = recruiter.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         let query = query(&recruiter, "arm").reply_to(base.id().clone());
@@ -211,7 +211,7 @@ async fn the_recruited_answer_whom_they_are_told_to() {
     };
     let designated = async {
         for act in [Performative::Agree, Performative::Inform] {
-            let answer = base.receive().await.unwrap().message;
+            let answer = heard(&base).await.unwrap().message;
             assert_eq!(*answer.performative(), act);
             assert_eq!(answer.sender().unwrap().name(), "arm");
         }
@@ -232,11 +232,11 @@ async fn who_asks_for_others_may_refuse_and_find_nobody() {
         assert!(matches!(silent.err(), Some(DialogueError::TimedOut)));
     };
     let goes_between = async {
-        let first = broker.receive().await.unwrap().message;
+        let first = heard(&broker).await.unwrap().message;
         respond(&broker, &first, async |_| Ok(Reply::Refuse("no".into())))
             .await
             .unwrap();
-        let first = broker.receive().await.unwrap().message;
+        let first = heard(&broker).await.unwrap().message;
         respond(&broker, &first, async |task| {
             task.agree("").await?;
             Ok(Reply::Failure("no match".into()))
@@ -256,7 +256,7 @@ async fn brokering_is_cancelled() {
         answers.cancel(PATIENCE).await.unwrap();
     };
     let goes_between = async {
-        let first = broker.receive().await.unwrap().message;
+        let first = heard(&broker).await.unwrap().message;
         let mut task = broker.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         task.pass_on(query(&broker, "arm"), PATIENCE).await.unwrap();

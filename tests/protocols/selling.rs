@@ -32,7 +32,7 @@ async fn an_iterated_contract_net_goes_on_with_some() {
     let called = ids(&arms);
     // Proposes these prices one after the other; how often it was called.
     let bid = async |arm: &Agent, prices: &[&'static str]| {
-        let call = arm.receive().await.unwrap().message;
+        let call = heard(arm).await.unwrap().message;
         let mut task = arm.take_part(&call).unwrap();
         let mut calls = 1;
         for price in prices {
@@ -119,12 +119,12 @@ async fn who_breaks_a_contract_net_spoils_it_for_nobody_else() {
     let arms = ["wild", "tame"].map(|name| there.register(name).unwrap());
     let [wild, tame] = &arms;
     let participants = async {
-        let call = wild.receive().await.unwrap().message;
+        let call = heard(wild).await.unwrap().message;
         let early = wild.reply(&call, Performative::Inform).build().unwrap();
         wild.send(early).await.unwrap();
         let late = wild.reply(&call, Performative::Propose).build().unwrap();
         wild.send(late).await.unwrap();
-        let call = tame.receive().await.unwrap().message;
+        let call = heard(tame).await.unwrap().message;
         let mut task = tame.take_part(&call).unwrap();
         assert!(task.propose("10", PATIENCE).await.unwrap());
         // In the middle of the work of the other.
@@ -167,7 +167,7 @@ async fn winners_do_not_wait_for_losers() {
     let (proposed, first) = tokio::sync::oneshot::channel();
     let (done, told) = tokio::sync::oneshot::channel();
     let loses = async {
-        let call = loser.receive().await.unwrap().message;
+        let call = heard(loser).await.unwrap().message;
         let bid = loser.reply(&call, Performative::Propose).build().unwrap();
         loser.send(bid).await.unwrap();
         // Its queue is full, so that the rejection has to wait.
@@ -176,12 +176,12 @@ async fn winners_do_not_wait_for_losers() {
         loser.send(full.build().unwrap()).await.unwrap();
         proposed.send(()).unwrap();
         told.await.unwrap();
-        assert_eq!(text(&loser.receive().await.unwrap().message), "full");
-        let rejected = loser.receive().await.unwrap().message;
+        assert_eq!(text(&heard(loser).await.unwrap().message), "full");
+        let rejected = heard(loser).await.unwrap().message;
         assert_eq!(*rejected.performative(), Performative::RejectProposal);
     };
     let wins = async {
-        let call = winner.receive().await.unwrap().message;
+        let call = heard(winner).await.unwrap().message;
         first.await.unwrap();
         let mut task = winner.take_part(&call).unwrap();
         assert!(task.propose("10", PATIENCE).await.unwrap());
@@ -207,7 +207,7 @@ async fn a_contract_net_is_cancelled_with_all_with_whom_it_goes_on() {
     let (rover, arms) = rover_and(["waiting", "thinking", "refusing"]).await;
     let [waiting, thinking, refusing] = &arms;
     let waits = async {
-        let call = waiting.receive().await.unwrap().message;
+        let call = heard(waiting).await.unwrap().message;
         let mut task = waiting.take_part(&call).unwrap();
         let cancelled = task.propose("10", PATIENCE).await;
         assert!(matches!(cancelled, Err(DialogueError::Cancelled(_))));
@@ -215,14 +215,14 @@ async fn a_contract_net_is_cancelled_with_all_with_whom_it_goes_on() {
         task.reply(nothing).await.unwrap();
     };
     let thinks = async {
-        let call = thinking.receive().await.unwrap().message;
+        let call = heard(thinking).await.unwrap().message;
         let mut task = thinking.take_part(&call).unwrap();
         task.cancelled().await.unwrap();
         let nothing = task.confirm_cancel().await.unwrap();
         task.reply(nothing).await.unwrap();
     };
     let refuses = async {
-        let call = refusing.receive().await.unwrap().message;
+        let call = heard(refusing).await.unwrap().message;
         respond(refusing, &call, async |_| Ok(Reply::Refuse("no".into())))
             .await
             .unwrap();
@@ -247,7 +247,7 @@ async fn bidder(
     right: impl Fn(u32) -> bool,
     buys: usize,
 ) -> (usize, usize, Option<String>) {
-    let opening = agent.receive().await.unwrap().message;
+    let opening = heard(agent).await.unwrap().message;
     assert_eq!(text(&opening), "a crate");
     let mut task = agent.take_part(&opening).unwrap();
     let (mut calls, mut bought) = (0, 0);
@@ -384,7 +384,7 @@ async fn a_bid_that_crosses_the_next_call_does_not_count() {
         auction.ask_winner("take it").await.unwrap();
     };
     let participant = async {
-        let opening = arm.receive().await.unwrap().message;
+        let opening = heard(arm).await.unwrap().message;
         let mut task = arm.take_part(&opening).unwrap();
         task.next_call(PATIENCE).await.unwrap().unwrap();
         // The second call is on its way when this bid leaves.

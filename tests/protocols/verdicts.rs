@@ -65,10 +65,10 @@ async fn four_verdicts_for_a_request_and_its_inform() {
         .build()
         .unwrap();
     rover.send(ask).await.unwrap();
-    let asked = arm.receive().await.unwrap().message;
+    let asked = heard(&arm).await.unwrap().message;
     let done = arm.reply(&asked, Performative::Inform).build().unwrap();
     arm.send(done).await.unwrap();
-    rover.receive().await.unwrap();
+    heard(&rover).await.unwrap();
     assert_eq!(given("counted"), 4);
 
     // Those who lead a conversation check it as well, as they do when nothing is enforced; that
@@ -76,7 +76,7 @@ async fn four_verdicts_for_a_request_and_its_inform() {
     let lift = to(&rover, Performative::Request, &arm, "lift");
     let request = rover.request(lift, PATIENCE).await.unwrap();
     let id = request.conversation_id().to_owned();
-    let asked = arm.receive().await.unwrap().message;
+    let asked = heard(&arm).await.unwrap().message;
     let task = arm.take_part(&asked).unwrap();
     task.reply(Reply::Inform("done".into())).await.unwrap();
     request.result().await.unwrap();
