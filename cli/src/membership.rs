@@ -3,12 +3,16 @@
 
 use std::io::{self, IsTerminal};
 use std::pin::pin;
+use std::time::Duration;
 
 use fipa::{Agent, Config, Domain, ListenError, OpenError, RegisterError, RegisterOptions};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use crate::options;
 use crate::report::Failure;
+
+/// Within this time signals to end are one.
+const AT_ONCE: Duration = Duration::from_millis(500);
 
 /// The signals that tell a command to end: Ctrl-C, `kill`, and a terminal that closes.
 pub(crate) struct Stop {
@@ -70,6 +74,25 @@ impl Stop {
             _ = self.terminate.recv() => {}
             _ = self.hang_up.recv() => {}
         }
+    }
+
+    /// From now on the command ends, which takes a while when another process holds it up. Whoever
+    /// says once more that it is to end does not wait for that: what is left behind then is removed by
+    /// the next process of the domain.
+    pub(crate) fn ending() {
+        // On a thread and a runtime of its own: those of the command may all be held up.
+        std::thread::spawn(|| {
+            // Some say it twice at once, as `timeout` does.
+            std::thread::sleep(AT_ONCE);
+            let told = options::block_on(async {
+                let mut again = Self::listen()?;
+                again.requested().await;
+                Ok::<_, Failure>(())
+            });
+            if matches!(told, Ok(Ok(()))) {
+                std::process::exit(1);
+            }
+        });
     }
 }
 

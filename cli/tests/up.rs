@@ -293,3 +293,17 @@ fn a_hang_up_reads_the_configuration_again() {
     let (code, log) = gateway.signal("-TERM");
     assert_eq!(code, Some(0), "{log}");
 }
+
+/// What a process does when it joins, registers or leaves; but this one does not go on.
+#[test]
+fn who_is_told_twice_to_end_does_not_wait_for_who_was_stopped() {
+    let host = Host::new();
+    let mut echo = host.echo("arm");
+    let lock = host.path("run").join(&host.domain).join("directory/lock");
+    let stopped = std::fs::File::open(lock).unwrap();
+    stopped.lock().unwrap();
+    while !echo.has_ended() {
+        echo.send_signal("-INT");
+    }
+    assert_eq!(echo.end().0, Some(1));
+}

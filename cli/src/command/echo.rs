@@ -65,6 +65,7 @@ async fn serve(arguments: Arguments, config: &Config) -> Result<(), Failure> {
         ended = answer_all(&agent, arguments.count) => ended,
         () = stop.requested() => Ok(()),
     };
+    Stop::ending();
     drop(agent);
     domain.close().await;
     ended

@@ -85,6 +85,7 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
         }
     }
     tracing::info!("ending");
+    Stop::ending();
     gateway.close().await;
     Ok(())
 }

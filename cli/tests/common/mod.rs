@@ -237,6 +237,15 @@ impl Running {
         assert!(sent.success());
     }
 
+    /// Whether it ends within a moment.
+    pub(crate) fn has_ended(&mut self) -> bool {
+        match self.errors.recv_timeout(Duration::from_millis(100)) {
+            Ok(line) => self.told.push_str(&format!("{line}\n")),
+            Err(error) => return error == RecvTimeoutError::Disconnected,
+        }
+        false
+    }
+
     /// Waits for its end, and returns the exit code and all of standard error.
     #[track_caller]
     pub(crate) fn end(&mut self) -> (Option<i32>, String) {

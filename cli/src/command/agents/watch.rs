@@ -47,6 +47,7 @@ pub(super) fn run(filter: &Filter, config: &Config, json: bool) -> Result<(), Fa
                 },
             }
         }
+        Stop::ending();
         domain.close().await;
         told
     })?

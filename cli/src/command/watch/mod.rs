@@ -189,6 +189,7 @@ async fn watch(arguments: &Arguments, judge: Judge, config: &Config) -> Result<(
             show.event(&event)?;
         }
     }
+    Stop::ending();
     drop(watcher);
     show.end(arguments.mermaid.as_deref())
 }
