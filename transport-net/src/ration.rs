@@ -108,6 +108,11 @@ impl Ration {
     }
 }
 
+/// Whether an address is that of one peer: the processes of this host are many at one address.
+pub(crate) fn is_one_peer(ip: IpAddr) -> bool {
+    !ip.to_canonical().is_loopback()
+}
+
 /// The address that stands for a peer: of IPv6, where everybody has many, the network of the host.
 pub(crate) fn whose(ip: IpAddr) -> IpAddr {
     match ip.to_canonical() {

@@ -4,7 +4,7 @@ use std::net::IpAddr;
 use std::time::Duration;
 
 use crate::Identity;
-use crate::ration::Rates;
+use crate::ration::{Rates, is_one_peer};
 
 /// Configuration of a [`TcpTransport`](crate::TcpTransport).
 #[derive(Debug, Clone)]
@@ -34,8 +34,8 @@ impl TcpConfig {
         true
     }
 
-    /// Whether there are limits to what whoever is at this address may have. The processes of this
-    /// host are many at one address.
+    /// Whether there are limits to what whoever is at this address may have: if it is one peer, or has
+    /// to prove who it is.
     pub(crate) fn limits_peer_at(&self, ip: IpAddr) -> bool {
         #[cfg(feature = "secure")]
         if let Some(security) = &self.security
@@ -43,7 +43,7 @@ impl TcpConfig {
         {
             return true;
         }
-        !ip.to_canonical().is_loopback()
+        is_one_peer(ip)
     }
 
     /// Whether letters may go to an old peer at this address, which cannot prove anything.

@@ -29,7 +29,7 @@ use super::counters::UdpCounters;
 use super::packet::{self, Datagram};
 use crate::Identity;
 use crate::end::End;
-use crate::ration::{Ration, Rations};
+use crate::ration::{Ration, Rations, is_one_peer};
 use crate::seldom::warn_seldom;
 
 /// Numbers of connections stay below this (see [`Core::ticket`]).
@@ -119,12 +119,6 @@ struct Inbound {
     dialled: String,
 }
 
-/// Whether there are limits to what whoever is at this address may have. The processes of this host
-/// are many at one address.
-fn limits_peer_at(ip: IpAddr) -> bool {
-    !ip.to_canonical().is_loopback()
-}
-
 impl Core {
     pub(crate) fn new(
         identity: Identity,
@@ -165,7 +159,7 @@ impl Core {
 
     /// What whoever is at this address may still send, if that is limited.
     fn ration(&self, ip: IpAddr, now: Instant) -> Option<Arc<Ration>> {
-        limits_peer_at(ip).then(|| self.rations.of(ip, self.limits.rates(), now))?
+        is_one_peer(ip).then(|| self.rations.of(ip, self.limits.rates(), now))?
     }
 
     /// Takes a parcel for sending. When the connection has just been made up, its number is

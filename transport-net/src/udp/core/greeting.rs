@@ -7,11 +7,11 @@ use fipa_transport::{Hop, Kind, Location};
 
 use super::super::connection::{Connection, Path};
 use super::super::packet::{self, NO_COOKIE};
-use super::{Core, Inbound, MAX_OUTBOX, limits_peer_at};
+use super::{Core, Inbound, MAX_OUTBOX};
 use crate::address;
 use crate::end::End;
 use crate::hello::Hello;
-use crate::ration::whose;
+use crate::ration::{is_one_peer, whose};
 
 impl Core {
     /// A stranger says hello.
@@ -59,7 +59,7 @@ impl Core {
         }
         let home = whose(from.ip());
         let same_address = self.greeted.keys().filter(|(a, _)| whose(a.ip()) == home);
-        let greedy = limits_peer_at(home) && same_address.count() >= self.limits.max_per_address;
+        let greedy = is_one_peer(home) && same_address.count() >= self.limits.max_per_address;
         if greedy || self.connections.len() >= self.limits.max_connections {
             self.counters.refused_crowd += 1;
             self.reply(path, packet::refused(initiator));
