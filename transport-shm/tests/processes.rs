@@ -463,6 +463,38 @@ fn a_connection_that_nobody_has_an_end_of_is_removed() {
     assert_eq!(place.traces(), Vec::<String>::new());
 }
 
+/// What iceoryx2 leaves of a mailbox when whoever takes the last node out of it is killed at that
+/// moment: nobody says any more that it is used.
+#[test]
+fn a_mailbox_that_nobody_uses_is_removed() {
+    let place = Place::new();
+    let (living, _) = place.listening();
+    let traces = || {
+        let mut traces = place.traces();
+        traces.sort();
+        traces
+    };
+    let of_the_living = traces();
+    let made_since = |end: &str| {
+        let mut made = traces();
+        made.retain(|file| file.ends_with(end) && !of_the_living.contains(file));
+        made
+    };
+    let mut receiver = Process::start(&place, "receive", Incarnation::from_u64(1));
+    wait_for("mailbox", || !made_since(".port_tag").is_empty());
+    receiver.kill();
+    assert_eq!(made_since(".dynamic").len(), 1);
+    // What is removed before: its ports, and that its node has a part in it.
+    for end in [".data", ".port_tag", ".service_tag"] {
+        for file in made_since(end) {
+            std::fs::remove_file(file).unwrap();
+        }
+    }
+    cleanup_dead(&place.config()).unwrap();
+    assert_eq!(traces(), of_the_living);
+    living.close();
+}
+
 #[test]
 fn whoever_starts_later_removes_it_too() {
     let place = Place::new();
