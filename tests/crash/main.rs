@@ -31,13 +31,13 @@ fn a_process_of_its_own() {
 
 #[test]
 fn survivors_notice_nothing() {
-    run(300, 2);
+    run(300, 2, false);
 }
 
 #[test]
 #[ignore = "takes a quarter of an hour; see CONTRIBUTING"]
 fn soak() {
-    run(5000, 4);
+    run(5000, 4, true);
 }
 
 fn number(variable: &str) -> Option<u64> {
@@ -45,7 +45,8 @@ fn number(variable: &str) -> Option<u64> {
 }
 
 /// Rounds of all cells on some stages at the same time, until enough processes have been killed.
-fn run(kills: u64, stages: u64) {
+/// `tells` of every round, for who watches; else only of the one that fails.
+fn run(kills: u64, stages: u64, tells: bool) {
     let seed = number("FIPA_CRASH_SEED").unwrap_or_else(|| fastrand::u64(..));
     let kills = number("FIPA_CRASH_KILLS").unwrap_or(kills);
     println!("FIPA_CRASH_SEED={seed} FIPA_CRASH_KILLS={kills}");
@@ -54,7 +55,7 @@ fn run(kills: u64, stages: u64) {
             .map(|stage| {
                 let random = fastrand::Rng::with_seed(seed.wrapping_add(stage));
                 let quota = kills.div_ceil(stages) as usize;
-                scope.spawn(move || act(stage, random, quota))
+                scope.spawn(move || act(stage, random, quota, tells))
             })
             .collect();
         for stage in stages {
@@ -66,7 +67,7 @@ fn run(kills: u64, stages: u64) {
     });
 }
 
-fn act(number: u64, mut random: fastrand::Rng, kills: usize) {
+fn act(number: u64, mut random: fastrand::Rng, kills: usize, tells: bool) {
     let mut stage = Stage::new();
     let began = Instant::now();
     let mut rounds = 0;
@@ -74,17 +75,37 @@ fn act(number: u64, mut random: fastrand::Rng, kills: usize) {
         let mut cells: Vec<(&str, Cell)> = CELLS.to_vec();
         random.shuffle(&mut cells);
         for (name, cell) in cells {
-            // Seen when a round fails, or with --nocapture.
-            println!(
-                "stage {number}, round {rounds}, {} killed, {:.0?}: {name}",
-                stage.kills,
-                began.elapsed()
-            );
+            let round = Round {
+                tells,
+                line: format!(
+                    "stage {number}, round {rounds}, {} killed, {:.0?}: {name}",
+                    stage.kills,
+                    began.elapsed()
+                ),
+            };
             cell(&mut stage, &mut random);
             stage.check();
+            drop(round);
             rounds += 1;
         }
     }
     println!("stage {number}: {} killed in {rounds} rounds", stage.kills);
     stage.close();
+}
+
+/// Says what was played when it ends.
+struct Round {
+    tells: bool,
+    line: String,
+}
+
+impl Drop for Round {
+    fn drop(&mut self) {
+        let outcome = match std::thread::panicking() {
+            true => "FAILED",
+            false if self.tells => "ok",
+            false => return,
+        };
+        println!("{} ... {outcome}", self.line);
+    }
 }
