@@ -17,7 +17,7 @@ use iceoryx2::node::{Node, NodeState, NodeView};
 use iceoryx2::prelude::{CallbackProgression, Config};
 use iceoryx2::service::Service;
 use parking_lot::Mutex;
-use rustix::fs::{FlockOperation, Mode, OFlags, fchmod, fstat, open, stat};
+use rustix::fs::{FlockOperation, Mode, OFlags, fchmod, fstat, open};
 use rustix::io::Errno;
 
 use crate::layout::Svc;
@@ -110,31 +110,17 @@ impl Domain {
         loop {
             tries += 1;
             match self.try_enter() {
-                Ok(Some(lock)) => return Ok(lock),
-                Err(error) if tries >= ENTERING || !error.is_missing_file() => return Err(error),
-                Ok(None) if tries >= ENTERING => {
-                    let gone = std::io::ErrorKind::NotFound;
-                    let root = &self.config.root;
-                    return Err(file_error("others keep removing", root, gone));
-                }
-                _ => {}
+                Err(error) if error.is_missing_file() && tries < ENTERING => {}
+                entered => return entered,
             }
         }
     }
 
-    /// None when the root was removed before it was locked.
-    fn try_enter(&self) -> Result<Option<OwnedFd>, ShmError> {
-        let root = self.config.root.as_path();
-        make_private(root)?;
+    fn try_enter(&self) -> Result<OwnedFd, ShmError> {
+        make_private(&self.config.root)?;
         let lock = self.lock()?;
-        let cannot = |e| file_error("cannot look at the directory", root, e);
-        let locked = fstat(&lock).map_err(cannot)?;
-        let there = stat(root).map_err(cannot)?;
-        if (locked.st_dev, locked.st_ino) != (there.st_dev, there.st_ino) {
-            return Ok(None);
-        }
         make_private(self.names.directory())?;
-        Ok(Some(lock))
+        Ok(lock)
     }
 
     /// Excludes others from starting and cleaning until the result is dropped. The lock is on the
@@ -265,7 +251,11 @@ impl Domain {
         let Some(_cleaning) = self.cleaning.try_lock_for(PATIENCE) else {
             return Ok(cleaned);
         };
-        let lock = self.lock()?;
+        let lock = match self.lock() {
+            // Somebody else was the last, and has removed all.
+            Err(error) if error.is_missing_file() => return Ok(cleaned),
+            lock => lock?,
+        };
         for one in self.all()? {
             if self.names.is_alive(one) {
                 cleaned.alive += 1;

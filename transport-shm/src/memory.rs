@@ -13,7 +13,7 @@ use std::ptr::NonNull;
 use std::time::{Duration, Instant};
 
 use fipa_transport::{WayError, WayFault};
-use rustix::fs::{FlockOperation, Mode, OFlags, flock, open};
+use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, open, stat};
 use rustix::io::Errno;
 use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mmap, munmap};
 use rustix::param::page_size;
@@ -156,20 +156,29 @@ impl Budget {
 /// lock and was stopped must not stop everybody else: he is waited for as long as `patience` says,
 /// which is asked again and again.
 ///
+/// It is the directory of that name that is locked: whoever had the lock before may have removed
+/// it, and somebody else have made, and locked, a new one.
+///
 /// # Errors
-/// `WOULDBLOCK` when somebody else still has it then.
+/// `WOULDBLOCK` when somebody else still has it then, `NOENT` when it is gone.
 pub(crate) fn lock(
-    directory: &Path,
+    path: &Path,
     how: FlockOperation,
     patience: impl Fn() -> Duration,
 ) -> rustix::io::Result<OwnedFd> {
     let flags = OFlags::DIRECTORY | OFlags::RDONLY | OFlags::CLOEXEC;
-    let directory = open(directory, flags, Mode::empty())?;
     let began = Instant::now();
     let mut pause = FIRST_PAUSE;
+    let mut directory = open(path, flags, Mode::empty())?;
     loop {
         match flock(&directory, how) {
-            Ok(()) => return Ok(directory),
+            Ok(()) => {
+                let (locked, there) = (fstat(&directory)?, stat(path)?);
+                if (locked.st_dev, locked.st_ino) == (there.st_dev, there.st_ino) {
+                    return Ok(directory);
+                }
+                directory = open(path, flags, Mode::empty())?;
+            }
             Err(Errno::INTR) => {}
             Err(Errno::WOULDBLOCK) if began.elapsed() < patience() => {
                 std::thread::sleep(pause);

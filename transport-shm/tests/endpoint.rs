@@ -6,6 +6,7 @@ mod common;
 
 use std::fs::File;
 use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 use std::time::Duration;
@@ -13,7 +14,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use common::{Place, attempt, parcel, wait_for};
 use fipa_transport::{Incarnation, Transport, WayFault};
-use fipa_transport_shm::{ShmConfig, ShmError, ShmTransport};
+use fipa_transport_shm::{ShmConfig, ShmError, ShmTransport, cleanup_dead};
 
 #[test]
 fn nothing_is_left_behind() {
@@ -188,4 +189,37 @@ fn who_has_the_lock_and_was_stopped_holds_up_neither_letters_nor_the_end() {
     let (next, _) = place.listening();
     next.close();
     assert_eq!(place.traces(), Vec::<String>::new());
+}
+
+/// Whoever waits for the lock of a directory that is removed meanwhile must not clean up in the one
+/// that somebody else has made, and locked, in its place.
+#[test]
+fn who_waited_too_long_does_not_clean_up_after_those_who_start_anew() {
+    let place = Place::new();
+    place.endpoint().close();
+    let config = place.config();
+    let root = config.root.clone();
+    let leaving = File::open(&root).unwrap();
+    leaving.lock().unwrap();
+    let waiting = std::thread::spawn(move || cleanup_dead(&config));
+    let is_open = |directory: &Path| {
+        let open = std::fs::read_dir("/proc/self/fd").unwrap().flatten();
+        let open = open.filter_map(|file| std::fs::read_link(file.path()).ok());
+        open.filter(|file| file == directory).count() == 2
+    };
+    wait_for("whoever waits", || is_open(&root));
+    // Somebody starts anew, and has come as far as making this.
+    std::fs::remove_dir(&root).unwrap();
+    std::fs::create_dir(&root).unwrap();
+    let starting = File::open(&root).unwrap();
+    starting.lock().unwrap();
+    let nodes = root.join("nodes");
+    std::fs::create_dir(&nodes).unwrap();
+    drop(leaving);
+    wait_for("whoever waited", || waiting.is_finished() || is_open(&root));
+    assert!(nodes.exists());
+    drop(starting);
+    waiting.join().unwrap().unwrap();
+    // Nobody came.
+    assert!(!nodes.exists());
 }
