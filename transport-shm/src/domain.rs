@@ -401,16 +401,12 @@ impl Domain {
     /// before it locks that: who comes next finds no node to take out, and takes that for its not
     /// having been the last.
     fn remove_untagged(&self) {
-        let stem = |file: &std::fs::DirEntry, end: &str| {
-            let name = file.file_name();
-            let name = name.to_str()?.strip_prefix(&self.prefix())?;
-            name.strip_suffix(end).map(str::to_owned)
+        // Without all that are used nobody can say which are not.
+        let Ok(used) = self.tagged(".service_tag") else {
+            return;
         };
-        let nodes = files_in(&self.config.root.join("nodes"));
-        let tags = nodes.flat_map(|node| files_in(&node.path()));
-        let used: HashSet<String> = tags.filter_map(|tag| stem(&tag, ".service_tag")).collect();
         let untagged: HashMap<String, PathBuf> = files_in(&self.services())
-            .filter_map(|file| Some((stem(&file, ".service")?, file.path())))
+            .filter_map(|file| Some((self.id_of(&file, ".service")?, file.path())))
             .filter(|(service, _)| !used.contains(service))
             .collect();
         if untagged.is_empty() {
@@ -423,15 +419,17 @@ impl Domain {
             if untagged.contains_key(details.service_hash().as_str()) {
                 ids.insert(details.unique_service_id().value().to_string());
             }
-            CallbackProgression::Continue
+            match ids.len() < untagged.len() {
+                true => CallbackProgression::Continue,
+                false => CallbackProgression::Stop,
+            }
         });
         if listed.is_err() {
             return;
         }
         let shared = files_in(Path::new(SHM)).filter(|file| {
-            let id = stem(file, ".dynamic");
-            let id = id.as_deref().and_then(|name| name.rsplit('_').next());
-            id.is_some_and(|id| ids.contains(id))
+            let id = self.id_of(file, ".dynamic");
+            id.is_some_and(|id| ids.contains(&id))
         });
         for file in shared.map(|file| file.path()).chain(untagged.into_values()) {
             // Met again next time if it fails.
@@ -448,7 +446,7 @@ impl Domain {
     /// the file is gone.
     fn remove_orphans(&self) {
         // Without all the ports nobody can say whose is missing.
-        let Ok(ports) = self.ports() else {
+        let Ok(ports) = self.tagged(".port_tag") else {
             return;
         };
         for file in files_in(Path::new(SHM)) {
@@ -470,9 +468,9 @@ impl Domain {
         }
     }
 
-    /// The ports of all nodes, dead ones too.
-    fn ports(&self) -> std::io::Result<HashSet<String>> {
-        let mut ports = HashSet::new();
+    /// What all nodes, dead ones too, say they have or use, by tags with this ending.
+    fn tagged(&self, end: &str) -> std::io::Result<HashSet<String>> {
+        let mut tagged = HashSet::new();
         for node in std::fs::read_dir(self.config.root.join("nodes"))? {
             let node = node?;
             if !node.file_type()?.is_dir() {
@@ -485,14 +483,18 @@ impl Domain {
                 Err(e) => return Err(e),
             };
             for tag in tags {
-                let name = tag?.file_name();
-                let name = name.to_string_lossy();
-                let port = name.strip_suffix(".port_tag");
-                let port = port.and_then(|name| name.rsplit('_').next());
-                ports.extend(port.map(str::to_owned));
+                tagged.extend(self.id_of(&tag?, end));
             }
         }
-        Ok(ports)
+        Ok(tagged)
+    }
+
+    /// Of what in this domain a file with this ending is.
+    fn id_of(&self, file: &std::fs::DirEntry, end: &str) -> Option<String> {
+        let name = file.file_name();
+        let name = name.to_str()?.strip_prefix(&self.prefix())?;
+        let id = name.strip_suffix(end)?.rsplit('_').next()?;
+        Some(id.to_owned())
     }
 
     fn services(&self) -> PathBuf {

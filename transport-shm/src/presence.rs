@@ -115,9 +115,13 @@ impl Names {
     }
 
     /// Whether this process is there. To be asked under the domain's lock, or of a process that
-    /// is known to have been there.
+    /// is known to have been there. Whoever has no descriptors left to look with cannot tell that
+    /// somebody is not.
     pub(crate) fn is_alive(&self, of: Incarnation) -> bool {
-        open_live(&self.live(of)).is_ok_and(|live| !has_ended(&live))
+        match open_live(&self.live(of)) {
+            Ok(live) => !has_ended(&live),
+            Err(error) => error.kind() != ErrorKind::NotFound,
+        }
     }
 
     /// Wakes a process without keeping anything open.
@@ -492,5 +496,26 @@ impl Page {
         // as long as a pointer. The file is never shortened: its process does not, nobody but this
         // user can, and who opens it has looked at its length and owner.
         unsafe { self.0.start().cast::<Words>().as_ref() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test that cannot go on says so")]
+
+    use std::os::unix::fs::symlink;
+
+    use super::*;
+
+    #[test]
+    fn who_cannot_be_looked_at_is_not_dead() {
+        let root = tempfile::tempdir().unwrap();
+        let names = Names::new(root.path(), "fipatest-presence");
+        std::fs::create_dir(names.directory()).unwrap();
+        let (gone, hidden) = (Incarnation::from_u64(1), Incarnation::from_u64(2));
+        // What the kernel says instead of what is there, as when too many files are open.
+        symlink(names.live(hidden), names.live(hidden)).unwrap();
+        assert!(!names.is_alive(gone));
+        assert!(names.is_alive(hidden));
     }
 }

@@ -9,13 +9,16 @@
 mod common;
 
 use std::io::{BufRead, BufReader};
+use std::os::fd::AsRawFd;
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
+use std::sync::mpsc::TryRecvError;
 
 use bytes::Bytes;
 use common::{Place, attempt, location_of, parcel, wait_for};
 use fipa_transport::{Answer, Conclusion, Incarnation, Transport, WayFault};
 use fipa_transport_shm::{ShmConfig, ShmTransport, cleanup_dead};
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
 const ROLE: &str = "FIPA_SHM_TEST_ROLE";
 
@@ -27,7 +30,7 @@ struct Process {
 
 impl Process {
     /// Roles: `receive` what comes and keep it, or `drop` it; `tell` where its content lies, besides; `send` to
-    /// a process without end, or `many`, which is content for many.
+    /// a process without end, or `many`, which is content for many; `clean` up, and end.
     fn start(place: &Place, role: &str, to: Incarnation) -> Self {
         let config = place.config();
         let child = Command::new(std::env::current_exe().unwrap())
@@ -92,6 +95,9 @@ fn a_process_of_its_own() {
     let role = word();
     let config = ShmConfig::new(word(), word(), word().parse().unwrap());
     let to = location_of(word().parse().unwrap());
+    if role == "clean" {
+        return clean_without_descriptors(&config);
+    }
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(1)
         .enable_all()
@@ -461,6 +467,58 @@ fn a_connection_that_nobody_has_an_end_of_is_removed() {
     receiver.close();
     drop((sender, receiver));
     assert_eq!(place.traces(), Vec::<String>::new());
+}
+
+/// With few descriptors left, of which another thread takes one now and then.
+fn clean_without_descriptors(config: &ShmConfig) {
+    // What is opened gets the lowest number that is free.
+    let free = std::fs::File::open("/dev/null").unwrap().as_raw_fd();
+    let free = u64::try_from(free).unwrap();
+    let limits = getrlimit(Resource::Nofile);
+    let (stop, stopped) = std::sync::mpsc::channel::<()>();
+    let taking = std::thread::spawn(move || {
+        while stopped.try_recv() == Err(TryRecvError::Empty) {
+            drop(std::fs::File::open("/dev/null"));
+        }
+    });
+    for left in 0..200 {
+        let limit = Rlimit {
+            current: Some(free + left % 10),
+            ..limits
+        };
+        setrlimit(Resource::Nofile, limit).unwrap();
+        // Refused, or done.
+        let _ = cleanup_dead(config);
+    }
+    drop(stop);
+    taking.join().unwrap();
+}
+
+/// Who cannot open a file must not take its owner for dead.
+#[test]
+fn who_has_no_descriptors_left_removes_nothing_of_the_living() {
+    let place = Place::new();
+    let (receiver, _) = place.listening();
+    let exchange = || {
+        let (sender, told) = place.listening();
+        let (to, sent) = (receiver.location(), attempt());
+        sender.dispatch(sent, &to, parcel(Bytes::new())).unwrap();
+        wait_for("answer", || told.conclusion_of(sent).is_some());
+        sender
+    };
+    let living = exchange();
+    let traces = || {
+        let mut traces = place.traces();
+        traces.sort();
+        traces
+    };
+    let before = traces();
+    let mut cleaner = Process::start(&place, "clean", Incarnation::from_u64(1));
+    assert!(cleaner.child.wait().unwrap().success());
+    assert_eq!(traces(), before);
+    // Its mailbox can still be found.
+    exchange().close();
+    living.close();
 }
 
 /// What iceoryx2 leaves of a mailbox when whoever takes the last node out of it is killed at that

@@ -70,6 +70,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
                     config.domain,
                 ));
                 stop.requested().await;
+                Stop::ending();
                 told
             }
             Err(failure) => Err(failure),
