@@ -343,13 +343,8 @@ impl Domain {
                 continue;
             };
             let directory = self.config.root.join("nodes");
-            for file in files_in(&directory.join(dead.id().value().to_string())) {
-                let name = file.file_name();
-                let name = name.to_string_lossy();
-                let port = name.strip_prefix(&prefix);
-                let port = port.and_then(|name| name.strip_suffix(".port_tag"));
-                ports.extend(port.map(str::to_owned));
-            }
+            let tags = files_in(&directory.join(dead.id().value().to_string()));
+            ports.extend(tags.filter_map(|tag| self.id_of(&tag, ".port_tag")));
         }
         for file in files_in(Path::new(SHM)) {
             let name = file.file_name();

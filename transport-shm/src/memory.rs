@@ -167,9 +167,10 @@ pub(crate) fn lock(
     patience: impl Fn() -> Duration,
 ) -> rustix::io::Result<OwnedFd> {
     let flags = OFlags::DIRECTORY | OFlags::RDONLY | OFlags::CLOEXEC;
+    let opened = || open(path, flags, Mode::empty());
     let began = Instant::now();
     let mut pause = FIRST_PAUSE;
-    let mut directory = open(path, flags, Mode::empty())?;
+    let mut directory = opened()?;
     loop {
         match flock(&directory, how) {
             Ok(()) => {
@@ -177,7 +178,7 @@ pub(crate) fn lock(
                 if (locked.st_dev, locked.st_ino) == (there.st_dev, there.st_ino) {
                     return Ok(directory);
                 }
-                directory = open(path, flags, Mode::empty())?;
+                directory = opened()?;
             }
             Err(Errno::INTR) => {}
             Err(Errno::WOULDBLOCK) if began.elapsed() < patience() => {

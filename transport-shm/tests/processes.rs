@@ -12,7 +12,6 @@ use std::io::{BufRead, BufReader};
 use std::os::fd::AsRawFd;
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
-use std::sync::mpsc::TryRecvError;
 
 use bytes::Bytes;
 use common::{Place, attempt, location_of, parcel, wait_for};
@@ -440,7 +439,6 @@ fn a_connection_that_nobody_has_an_end_of_is_removed() {
     let connections = || {
         let mut found = place.traces();
         found.retain(|file| file.ends_with(".connection"));
-        found.sort();
         found
     };
     let of_the_living = connections();
@@ -475,9 +473,9 @@ fn clean_without_descriptors(config: &ShmConfig) {
     let free = std::fs::File::open("/dev/null").unwrap().as_raw_fd();
     let free = u64::try_from(free).unwrap();
     let limits = getrlimit(Resource::Nofile);
-    let (stop, stopped) = std::sync::mpsc::channel::<()>();
-    let taking = std::thread::spawn(move || {
-        while stopped.try_recv() == Err(TryRecvError::Empty) {
+    // Ends with the process.
+    std::thread::spawn(|| {
+        loop {
             drop(std::fs::File::open("/dev/null"));
         }
     });
@@ -490,8 +488,6 @@ fn clean_without_descriptors(config: &ShmConfig) {
         // Refused, or done.
         let _ = cleanup_dead(config);
     }
-    drop(stop);
-    taking.join().unwrap();
 }
 
 /// Who cannot open a file must not take its owner for dead.
@@ -507,15 +503,10 @@ fn who_has_no_descriptors_left_removes_nothing_of_the_living() {
         sender
     };
     let living = exchange();
-    let traces = || {
-        let mut traces = place.traces();
-        traces.sort();
-        traces
-    };
-    let before = traces();
+    let before = place.traces();
     let mut cleaner = Process::start(&place, "clean", Incarnation::from_u64(1));
     assert!(cleaner.child.wait().unwrap().success());
-    assert_eq!(traces(), before);
+    assert_eq!(place.traces(), before);
     // Its mailbox can still be found.
     exchange().close();
     living.close();
@@ -527,14 +518,9 @@ fn who_has_no_descriptors_left_removes_nothing_of_the_living() {
 fn a_mailbox_that_nobody_uses_is_removed() {
     let place = Place::new();
     let (living, _) = place.listening();
-    let traces = || {
-        let mut traces = place.traces();
-        traces.sort();
-        traces
-    };
-    let of_the_living = traces();
+    let of_the_living = place.traces();
     let made_since = |end: &str| {
-        let mut made = traces();
+        let mut made = place.traces();
         made.retain(|file| file.ends_with(end) && !of_the_living.contains(file));
         made
     };
@@ -549,7 +535,7 @@ fn a_mailbox_that_nobody_uses_is_removed() {
         }
     }
     cleanup_dead(&place.config()).unwrap();
-    assert_eq!(traces(), of_the_living);
+    assert_eq!(place.traces(), of_the_living);
     living.close();
 }
 

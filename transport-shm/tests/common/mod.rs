@@ -67,7 +67,7 @@ impl Place {
         (endpoint, told)
     }
 
-    /// All files of this domain.
+    /// All files of this domain, in order.
     pub(crate) fn traces(&self) -> Vec<String> {
         traces(self.directory.path(), &self.prefix)
     }
@@ -95,6 +95,7 @@ pub(crate) fn traces(root: &Path, prefix: &str) -> Vec<String> {
             found.push(format!("/dev/shm/{name}"));
         }
     }
+    found.sort();
     found
 }
 
