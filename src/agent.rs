@@ -10,7 +10,7 @@ use fipa_acl::{AgentId, DecodeError, Letter, Message, MessageBuilder, Performati
 use fipa_mts::core::Submission;
 use fipa_mts::{PostError, Sending, letter_around, letter_for};
 use fipa_sds::{DeregisterError, Directory};
-use fipa_transport::{Incarnation, Kind, LoanedContent, Outcome};
+use fipa_transport::{Forked, Incarnation, Kind, LoanedContent, Outcome};
 
 use crate::domain::Domain;
 
@@ -218,6 +218,7 @@ impl Agent {
     }
 
     fn check(&self, message: &Message) -> Result<(), SendError> {
+        self.domain.inner.owner.check()?;
         if message.receivers().is_empty() {
             return Err(SendError::NoReceiver);
         }
@@ -237,6 +238,7 @@ impl Agent {
     /// # Errors
     /// When the domain was closed, or the letter that came holds no message that can be decoded.
     pub async fn receive(&self) -> Result<Incoming, ReceiveError> {
+        self.domain.inner.owner.check()?;
         #[cfg(feature = "monitor")]
         return self.desk.next_other(self).await;
         #[cfg(not(feature = "monitor"))]
@@ -248,6 +250,7 @@ impl Agent {
     /// # Errors
     /// When the letter that came holds no message that can be decoded.
     pub fn try_receive(&self) -> Result<Option<Incoming>, ReceiveError> {
+        self.domain.inner.owner.check()?;
         self.domain.inner.service.mts.drive();
         #[cfg(feature = "monitor")]
         return self.desk.other_now(self);
@@ -257,6 +260,7 @@ impl Agent {
 
     /// The next message, whatever conversation it belongs to.
     pub(crate) async fn next_letter(&self) -> Result<Incoming, ReceiveError> {
+        self.domain.inner.owner.check()?;
         let mts = &self.domain.inner.service.mts;
         match mts.receive(self.incarnation).await {
             Some(received) => self.taken(received),
@@ -302,6 +306,7 @@ impl Agent {
     }
 
     fn leave(&mut self) -> Result<Vec<fipa_mts::core::Received>, DeregisterError> {
+        self.domain.inner.owner.check()?;
         self.registered = false;
         let service = &self.domain.inner.service;
         let left = service.host.deregister(&self.name, self.incarnation);
@@ -315,7 +320,8 @@ pub type Unread = Vec<Result<Incoming, ReceiveError>>;
 
 impl Drop for Agent {
     fn drop(&mut self) {
-        if self.registered {
+        // In a forked child it stays registered for the parent.
+        if self.registered && self.domain.inner.owner.is_this() {
             match self.leave() {
                 // The domain was closed before, and has taken the name with it.
                 Ok(_) | Err(DeregisterError::Closed) => {}
@@ -441,6 +447,9 @@ pub enum SendError {
     /// It cannot be encoded.
     #[error(transparent)]
     Post(#[from] PostError),
+    /// This process is a forked child of the one that registered the agent.
+    #[error(transparent)]
+    Forked(#[from] Forked),
 }
 
 /// Why no message was received.
@@ -450,6 +459,9 @@ pub enum ReceiveError {
     /// The domain was closed.
     #[error("the domain was closed")]
     Closed,
+    /// This process is a forked child of the one that registered the agent.
+    #[error(transparent)]
+    Forked(#[from] Forked),
     /// A letter came whose message cannot be decoded.
     #[error("a letter with a message that cannot be decoded: {source}")]
     Malformed {

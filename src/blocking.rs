@@ -6,6 +6,7 @@
 #[cfg(feature = "monitor")]
 mod protocol;
 
+use std::ops::Deref;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -13,6 +14,7 @@ use fipa_acl::{Message, MessageBuilder, Performative};
 use fipa_sds::{DeregisterError, Directory, RegisterError};
 use tokio::runtime::{Builder, Runtime};
 
+use crate::owner::Owner;
 use crate::{AgentId, Config, Deliveries, Incoming, Loan, ReceiveError, SendError, Unread};
 
 #[cfg(feature = "monitor")]
@@ -35,13 +37,51 @@ pub enum OpenError {
 pub struct Domain {
     // Dropped before the runtime it needs.
     domain: crate::Domain,
-    runtime: Arc<Runtime>,
+    runtime: Background,
 }
 
 /// See [`crate::Agent`].
 pub struct Agent {
     agent: crate::Agent,
+    runtime: Background,
+}
+
+/// The runtime with the hidden thread.
+#[derive(Clone)]
+struct Background {
     runtime: Arc<Runtime>,
+    owner: Owner,
+}
+
+impl Background {
+    fn start() -> std::io::Result<Self> {
+        let runtime = Builder::new_multi_thread()
+            .worker_threads(1)
+            .thread_name("fipa")
+            .enable_all()
+            .build()?;
+        Ok(Self {
+            runtime: Arc::new(runtime),
+            owner: Owner::this(),
+        })
+    }
+}
+
+impl Deref for Background {
+    type Target = Runtime;
+
+    fn deref(&self) -> &Runtime {
+        &self.runtime
+    }
+}
+
+impl Drop for Background {
+    fn drop(&mut self) {
+        if !self.owner.is_this() {
+            // In a forked child the thread is missing, and the runtime would wait for its end.
+            std::mem::forget(Arc::clone(&self.runtime));
+        }
+    }
 }
 
 impl Domain {
@@ -50,16 +90,9 @@ impl Domain {
     /// # Errors
     /// See [`crate::Domain::open`].
     pub fn open(config: &Config) -> Result<Self, OpenError> {
-        let runtime = Builder::new_multi_thread()
-            .worker_threads(1)
-            .thread_name("fipa")
-            .enable_all()
-            .build()?;
+        let runtime = Background::start()?;
         let domain = runtime.block_on(crate::Domain::open(config))?;
-        Ok(Self {
-            domain,
-            runtime: Arc::new(runtime),
-        })
+        Ok(Self { domain, runtime })
     }
 
     /// Registers an agent.
@@ -82,7 +115,7 @@ impl Domain {
         let agent = self.domain.register_with(name, options)?;
         Ok(Agent {
             agent,
-            runtime: Arc::clone(&self.runtime),
+            runtime: self.runtime.clone(),
         })
     }
 

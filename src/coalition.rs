@@ -183,7 +183,8 @@ impl Coalition {
 
 impl Drop for Coalition {
     fn drop(&mut self) {
-        if self.formed {
+        // In a forked child it stays formed for the parent.
+        if self.formed && self.domain.inner.owner.is_this() {
             match self.leave() {
                 // The domain was closed before, and has taken the name with it.
                 Ok(()) | Err(DeregisterError::Closed) => {}

@@ -16,6 +16,7 @@
 //! transports = ["shm", "tcp"]         # order of preference; what is not listed is off
 //! deadline = "5s"                     # per letter, unless the letter says otherwise
 //! queue = 256                         # letters waiting per agent before senders are held back
+//! queue_bytes = "64MiB"               # the same in bytes; also per sender and receiver at gateways
 //! [routes]                            # exceptions by receiver name or pattern, first match counts
 //! "camera_.*" = ["shm"]               # (none by default)
 //! [transport.shm]
@@ -67,6 +68,8 @@ use std::time::Duration;
 
 use fipa_transport::{Kind, Location};
 
+#[cfg(feature = "net")]
+pub(crate) use check::is_on_loopback;
 pub use effective::{Effective, Setting, Value};
 pub use error::{ConfigError, Mistake, Origin};
 pub use sources::Sources;
@@ -110,6 +113,10 @@ pub struct Mts {
     /// `queue`: letters that wait in the queue of one agent before its senders are held back, 1 to
     /// 65,536.
     pub queue: usize,
+    /// `queue_bytes`: bytes of letters that wait in the queue of one agent, and of letters from one
+    /// sender to one receiver that wait in a process or gateway, before their senders are held
+    /// back. One letter is always taken. 64 KiB to 1 TiB.
+    pub queue_bytes: u64,
 }
 
 /// One line of `[routes]`.
@@ -317,6 +324,7 @@ impl Config {
                 transports: vec![Kind::Shm, Kind::Tcp],
                 deadline: Duration::from_secs(5),
                 queue: 256,
+                queue_bytes: 64 << 20,
             },
             routes: Vec::new(),
             transport: Transports {

@@ -7,6 +7,7 @@ use fipa_transport::{Incarnation, Kind, ListenError};
 
 use crate::agent::Agent;
 use crate::config::ConfigError;
+use crate::owner::Owner;
 use crate::place::PlaceError;
 use crate::routes::{self, Report};
 use crate::service::{Role, Service};
@@ -16,6 +17,11 @@ use crate::{AgentId, AgentIdError, Config};
 ///
 /// Cheap to clone; ends when [`close`](Self::close) is called or the last clone and the last
 /// agent are dropped.
+///
+/// A child process that is forked without exec cannot use its parent's membership: calls fail with
+/// [`Forked`](crate::Forked), and dropping releases nothing. The child can open a domain of its own,
+/// on a runtime of its own. Until it ends or calls exec, it keeps its parent's locks, so that other
+/// processes notice the parent's end only afterwards.
 #[derive(Clone)]
 pub struct Domain {
     pub(crate) inner: Arc<Inner>,
@@ -23,6 +29,7 @@ pub struct Domain {
 
 pub(crate) struct Inner {
     pub(crate) service: Service,
+    pub(crate) owner: Owner,
     pub(crate) deadline: std::time::Duration,
     #[cfg(feature = "monitor")]
     pub(crate) rules: crate::checks::Rules,
@@ -30,7 +37,10 @@ pub(crate) struct Inner {
 
 impl Drop for Inner {
     fn drop(&mut self) {
-        self.service.abort();
+        // In a forked child everything stays the parent's.
+        if self.owner.is_this() {
+            self.service.abort();
+        }
     }
 }
 
@@ -127,6 +137,7 @@ impl Domain {
         Ok(Self {
             inner: Arc::new(Inner {
                 service,
+                owner: Owner::this(),
                 deadline,
                 #[cfg(feature = "monitor")]
                 rules,
@@ -152,6 +163,7 @@ impl Domain {
         name: &str,
         options: RegisterOptions,
     ) -> Result<Agent, RegisterError> {
+        self.inner.owner.check()?;
         let service = &self.inner.service;
         let id = AgentId::new(name)
             .map_err(|error: AgentIdError| RegisterError::Failed(Arc::new(error)))?;
@@ -162,7 +174,7 @@ impl Domain {
         let registration = Registration {
             agent_type: options.agent_type,
             description: options.description,
-            ..Registration::new(Arc::clone(&name), incarnation, service.locations.clone())
+            ..Registration::new(Arc::clone(&name), incarnation, service.locations())
         };
         match service.host.register(registration) {
             Ok(_) => Ok(Agent::new(self.clone(), id, name, incarnation)),
@@ -192,6 +204,9 @@ impl Domain {
     /// Leaves the domain: gives letters under way a moment to arrive, then ends. All agents of
     /// this process are deregistered.
     pub async fn close(self) {
+        if !self.inner.owner.is_this() {
+            return;
+        }
         self.inner.service.close().await;
     }
 }

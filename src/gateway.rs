@@ -15,8 +15,8 @@ use std::time::Instant;
 use fipa_mts::Contacts;
 use fipa_mts::core::Peer;
 use fipa_sds::{
-    ContactDirectory, Directory, MergedDirectory, RegisterError, Registration, Role as EntryRole,
-    StaticDirectory,
+    ContactDirectory, Directory, Entry, MergedDirectory, RegisterError, Registration,
+    Role as EntryRole, StaticDirectory,
 };
 use fipa_transport::{Incarnation, Introduction, Kind, Location, Signature};
 use parking_lot::Mutex;
@@ -31,6 +31,7 @@ use self::neighbours::{Neighbours, View};
 use self::publisher::{Keeper, Publisher};
 use crate::config::ConfigError;
 use crate::domain::OpenError;
+use crate::owner::Owner;
 use crate::service::{Role, Service};
 use crate::{AgentId, Config};
 
@@ -38,6 +39,7 @@ use crate::{AgentId, Config};
 pub struct Gateway {
     config: Config,
     service: Arc<Service>,
+    owner: Owner,
     network: Option<Arc<dyn Network>>,
     view: Arc<dyn Directory>,
     neighbours: Arc<Neighbours>,
@@ -95,6 +97,7 @@ impl Gateway {
         let mut gateway = Self {
             config: config.clone(),
             service: Arc::new(service),
+            owner: Owner::this(),
             network,
             view,
             neighbours: Arc::clone(&contacts.neighbours),
@@ -114,13 +117,19 @@ impl Gateway {
             network: gateway.network.clone().map(Network::directory),
             known: Arc::clone(&known),
             contacts: Arc::clone(&contacts.directory),
-            locations: gateway.service.locations.clone(),
+            service: Arc::clone(&gateway.service),
+            only_loopback: speaks_on_loopback_only(config),
         });
         // From now on, who writes becomes known on this host before its letter arrives there.
         *contacts.publisher.lock() = Some(Arc::clone(&publisher));
         contacts.network.lock().clone_from(&gateway.network);
-        let keeper = Keeper::new(publisher);
+        let keeper = Keeper::new(publisher, gateway.network.clone());
         gateway.tasks.push(tokio::spawn(keeper.run()));
+        let follow = follow_locations(
+            Arc::clone(&gateway.service),
+            Arc::clone(&gateway.neighbours),
+        );
+        gateway.tasks.push(tokio::spawn(follow));
         gateway.open_for_letters(config, known)?;
         #[cfg(feature = "secure")]
         gateway
@@ -166,16 +175,7 @@ impl Gateway {
     /// Registers the gateway itself, so that the processes of this host find it.
     fn enter(&self) -> Result<(), OpenError> {
         let service = &self.service;
-        let own = service.host.register(Registration {
-            role: EntryRole::Gateway,
-            agent_type: "fipa-mts".to_owned(),
-            description: "message transport service".to_owned(),
-            ..Registration::new(
-                Arc::clone(&service.own.name),
-                service.own.incarnation,
-                service.locations.clone(),
-            )
-        });
+        let own = register(service);
         let own = own.map_err(|error| match error {
             RegisterError::AlreadyRegistered { holder } if holder.role == EntryRole::Gateway => {
                 OpenError::GatewayRunning(holder.name.to_string())
@@ -206,10 +206,10 @@ impl Gateway {
         self.service.own.incarnation
     }
 
-    /// Where it can be reached.
+    /// Where it can be reached at present.
     #[must_use]
-    pub fn locations(&self) -> &[Location] {
-        &self.service.locations
+    pub fn locations(&self) -> Vec<Location> {
+        self.service.locations()
     }
 
     /// Who is there, on this host and on others.
@@ -280,6 +280,9 @@ impl Gateway {
     /// Ends the gateway: says goodbye to the network and gives letters under way a moment to
     /// arrive.
     pub async fn close(mut self) {
+        if !self.owner.is_this() {
+            return;
+        }
         for task in self.tasks.drain(..) {
             task.abort();
         }
@@ -297,6 +300,11 @@ impl Gateway {
     }
 
     fn abort(&mut self) {
+        if !self.owner.is_this() {
+            // In a forked child: saying goodbye to the network would be in the parent's name.
+            std::mem::forget(self.network.take());
+            return;
+        }
         for task in self.tasks.drain(..) {
             task.abort();
         }
@@ -311,6 +319,53 @@ impl Drop for Gateway {
     fn drop(&mut self) {
         self.abort();
     }
+}
+
+/// Registers the gateway with its present locations.
+fn register(service: &Service) -> Result<Arc<Entry>, RegisterError> {
+    service.host.register(Registration {
+        role: EntryRole::Gateway,
+        agent_type: "fipa-mts".to_owned(),
+        description: "message transport service".to_owned(),
+        ..Registration::new(
+            Arc::clone(&service.own.name),
+            service.own.incarnation,
+            service.locations(),
+        )
+    })
+}
+
+/// Keeps the gateway's own entry right, and says hello to its neighbours from where it is now: they
+/// cannot all be told by the directory of the network. The rest is up to [`Keeper`].
+async fn follow_locations(service: Arc<Service>, neighbours: Arc<Neighbours>) {
+    let mut locations = service.follow_locations();
+    while locations.changed().await.is_ok() {
+        let now: Vec<String> = service
+            .locations()
+            .iter()
+            .map(ToString::to_string)
+            .collect();
+        tracing::info!(
+            locations = now.join(" "),
+            "this gateway is reached elsewhere now"
+        );
+        if let Err(error) = register(&service) {
+            tracing::warn!(%error, "the processes of this host are not told where the gateway is");
+        }
+        service.mts.greet(neighbours.to_greet(Instant::now()));
+    }
+}
+
+/// Whether the directory of the network is announced on loopback only. An interface by name counts
+/// when it is the one called `lo`.
+fn speaks_on_loopback_only(config: &Config) -> bool {
+    let interfaces = &config.discovery.interfaces;
+    let is_loopback = |interface: &crate::config::Interface| {
+        let text = interface.to_string();
+        let address = text.parse::<std::net::IpAddr>();
+        address.map_or(text == "lo", |address| address.is_loopback())
+    };
+    !interfaces.is_empty() && interfaces.iter().all(is_loopback)
 }
 
 /// Whether a line of `discovery.static` names an agent of an old peer, not a gateway.
@@ -343,6 +398,8 @@ trait Network: Send + Sync {
     fn problem(&self) -> Option<String>;
     /// Finds out whether this gateway is still there.
     fn doubt(&self, gateway: Incarnation);
+    /// The interfaces of this host have changed: others are spoken to on the new ones at once.
+    fn interfaces_changed(&self);
     fn close(&self);
 }
 
@@ -358,6 +415,10 @@ impl Network for fipa_sds::MdnsDirectory {
 
     fn doubt(&self, gateway: Incarnation) {
         self.verify_gateway(gateway);
+    }
+
+    fn interfaces_changed(&self) {
+        Self::interfaces_changed(self);
     }
 
     fn close(&self) {
@@ -424,6 +485,6 @@ impl Contacts for Acquaintances {
     }
 
     fn parted(&self, peer: &Introduction) {
-        self.neighbours.parted(peer);
+        self.neighbours.parted(Instant::now(), peer);
     }
 }

@@ -50,8 +50,10 @@ mod domain;
 mod gate;
 #[cfg(feature = "net")]
 mod gateway;
+mod keeper;
 #[cfg(feature = "secure")]
 pub mod keys;
+mod owner;
 mod place;
 #[cfg(feature = "monitor")]
 pub mod protocol;
@@ -76,8 +78,8 @@ pub use fipa_sds::{
     RegisterError, Role, Source, Watch, is_pattern,
 };
 pub use fipa_transport::{
-    Attempt, FailureReason, Incarnation, Kind, ListenError, Location, Outcome, Signature, WayError,
-    WayFault,
+    Attempt, FailureReason, Forked, Incarnation, Kind, ListenError, Location, Outcome, Signature,
+    WayError, WayFault,
 };
 #[cfg(feature = "net")]
 pub use gateway::{Gateway, Neighbour};

@@ -9,12 +9,14 @@ use fipa_mts::{Contacts, Gate, Mts, RuntimeConfig, Started};
 use fipa_sds::{Directory, Entry, HostConfig, HostDirectory, HostError, Pattern};
 use fipa_transport::{Incarnation, Kind, Location, Transport};
 use tokio::runtime::Handle;
+use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 use crate::Config;
 use crate::access::Access;
 use crate::domain::OpenError;
 use crate::gate::{Door, Of};
+use crate::keeper::Keeper;
 use crate::place::{Place, RETRIES};
 use crate::routes::Report;
 use crate::watch::Taps;
@@ -32,12 +34,14 @@ pub(crate) const CLOSING_PATIENCE: Duration = Duration::from_secs(1);
 pub(crate) struct Service {
     pub(crate) mts: Mts,
     pub(crate) host: Arc<HostDirectory>,
-    pub(crate) locations: Vec<Location>,
+    /// Where the service is reached at present.
+    locations: watch::Receiver<Arc<[Location]>>,
     /// The service as the directory names it.
     pub(crate) own: fipa_sds::Mts,
     place: Place,
     /// Serves those who watch.
     tapped: JoinHandle<()>,
+    keeper: JoinHandle<()>,
 }
 
 /// What differs between a robot process and the gateway.
@@ -70,20 +74,16 @@ impl Service {
         let gate = gate(config, &role, &host).inspect_err(|_| place.leave())?;
         let taps = Arc::new(Taps::new(&own, role.gateway));
         let mut refused = Vec::new();
+        let mut keeper = Keeper::new(place.clone(), Arc::clone(&host));
         let transports = transports(
             config,
             &role,
-            &place,
-            &host,
+            &mut keeper,
             incarnation,
             &handle,
             &mut refused,
         );
-        let Started {
-            mts,
-            locations,
-            failed,
-        } = Mts::start(
+        let Started { mts, failed, .. } = Mts::start(
             core_config(config, &role, incarnation),
             RuntimeConfig {
                 spin: config.transport.shm.spin,
@@ -100,9 +100,10 @@ impl Service {
         let tapped = handle.spawn(taps.run(Arc::clone(&host), mts.clone(), begun));
         let service = Self {
             tapped,
+            locations: mts.locations(),
+            keeper: handle.spawn(keeper.run()),
             mts,
             host,
-            locations,
             own,
             place,
         };
@@ -116,7 +117,7 @@ impl Service {
             }
             refused.push((kind, error.to_string()));
         }
-        if service.locations.is_empty() {
+        if service.locations().is_empty() {
             service.abort();
             return Err(OpenError::NoTransport(told(&refused)));
         }
@@ -126,12 +127,28 @@ impl Service {
         Ok(service)
     }
 
+    /// Where the service is reached at present: as many locations as an entry of the directory has.
+    pub(crate) fn locations(&self) -> Vec<Location> {
+        let locations = self.locations.borrow();
+        locations
+            .iter()
+            .take(Entry::MAX_LOCATIONS)
+            .cloned()
+            .collect()
+    }
+
+    /// Tells of changes of the locations since the service has started.
+    #[cfg(feature = "net")]
+    pub(crate) fn follow_locations(&self) -> watch::Receiver<Arc<[Location]>> {
+        self.locations.clone()
+    }
+
     /// What this service does with letters to these agents now.
     pub(crate) fn report(&self, to: &[Arc<Entry>]) -> Report {
         Report {
             mts: self.own.name.to_string(),
             incarnation: self.own.incarnation,
-            locations: self.locations.clone(),
+            locations: self.locations(),
             routes: self.mts.routes(to),
             ways: self.mts.ways(),
             peers: self.mts.peers().into_iter().map(Into::into).collect(),
@@ -158,6 +175,7 @@ impl Service {
     /// Ends at once and leaves nothing behind.
     pub(crate) fn abort(&self) {
         self.tapped.abort();
+        self.keeper.abort();
         self.mts.abort();
         if let Err(error) = self.host.close() {
             tracing::warn!(%error, "could not leave the directory of this host in order");
@@ -191,14 +209,18 @@ pub(crate) fn enter(
     let mut tries = 0;
     loop {
         tries += 1;
-        let place = Place::prepare(domain)?;
+        let mut place = Place::prepare(domain)?;
         let joined = HostDirectory::open(HostConfig {
             dir: place.part("directory"),
             mts: own.clone(),
             gateway,
         });
         match joined {
-            Ok(host) => return Ok((place, Arc::new(host))),
+            Ok(host) => {
+                // Not before: an empty directory may still be removed by a process that leaves.
+                place.hold()?;
+                return Ok((place, Arc::new(host)));
+            }
             Err(error) if was_removed(&error) && tries < RETRIES => {}
             Err(error) => {
                 place.leave();
@@ -231,6 +253,8 @@ fn core_config(config: &Config, role: &Role<'_>, incarnation: Incarnation) -> Co
         forwards: role.gateway,
         routes: routes(config, &order),
         queue: config.mts.queue,
+        queue_bytes: usize::try_from(config.mts.queue_bytes).unwrap_or(usize::MAX),
+        lane_bytes: usize::try_from(config.mts.queue_bytes).unwrap_or(usize::MAX),
         ..CoreConfig::new(Arc::clone(&role.name), incarnation, order)
     }
 }
@@ -254,12 +278,7 @@ fn transports(
         expect(unused_variables, reason = "nothing listens")
     )]
     role: &Role<'_>,
-    place: &Place,
-    #[cfg_attr(
-        not(feature = "shm"),
-        expect(unused_variables, reason = "there is no shared memory")
-    )]
-    host: &HostDirectory,
+    keeper: &mut Keeper,
     incarnation: Incarnation,
     handle: &Handle,
     refused: &mut Vec<(Kind, String)>,
@@ -268,14 +287,14 @@ fn transports(
     for kind in &config.mts.transports {
         let made = match kind {
             #[cfg(feature = "shm")]
-            Kind::Shm => shm(config, place, host, incarnation, handle),
+            Kind::Shm => shm(config, keeper, incarnation, handle),
             #[cfg(feature = "net")]
-            Kind::Tcp => tcp(config, role, place, incarnation, handle),
+            Kind::Tcp => tcp(config, role, &keeper.place, incarnation, handle),
             #[cfg(feature = "net")]
-            Kind::Udp => udp(config, role, place, incarnation, handle),
+            Kind::Udp => udp(config, role, &keeper.place, incarnation, handle),
             #[cfg(feature = "quic")]
             Kind::Quic => match &role.security {
-                Some(security) => quic(config, role, security, place, incarnation, handle),
+                Some(security) => quic(config, role, security, &keeper.place, incarnation, handle),
                 // On this host other processes have no keys, and no need for them.
                 None => continue,
             },
@@ -296,8 +315,7 @@ fn transports(
 #[cfg(feature = "shm")]
 fn shm(
     config: &Config,
-    place: &Place,
-    host: &HostDirectory,
+    keeper: &mut Keeper,
     incarnation: Incarnation,
     handle: &Handle,
 ) -> Result<Arc<dyn Transport>, String> {
@@ -306,11 +324,12 @@ fn shm(
     let config = ShmConfig {
         capacity: settings.capacity,
         max_letter: usize::try_from(settings.max_letter).unwrap_or(usize::MAX),
-        ..ShmConfig::new(place.part("shm"), place.prefix(), incarnation)
+        ..ShmConfig::new(keeper.place.part("shm"), keeper.place.prefix(), incarnation)
     };
     let transport = ShmTransport::new(config, handle.clone()).map_err(|error| error.to_string())?;
     let transport = Arc::new(transport);
-    let (mut departures, there) = (host.departures(), Arc::downgrade(&transport));
+    keeper.shm = Some(Arc::downgrade(&transport));
+    let (mut departures, there) = (keeper.host.departures(), Arc::downgrade(&transport));
     // The directory notices the end of every process, the transport only of those it talks to.
     handle.spawn(async move {
         while departures.next().await {

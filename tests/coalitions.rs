@@ -30,7 +30,7 @@ impl Host {
             "discovery.mdns=false".to_owned(),
         ];
         if let Some(peer) = peer {
-            let mut ways = peer.gateway.locations().iter();
+            let mut ways = peer.gateway.locations().into_iter();
             let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
             let address = way.address();
             set.push(format!(

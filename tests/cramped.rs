@@ -22,16 +22,21 @@ fn inside_what_has_no_room_takes_the_next_way() {
     runtime.block_on(large_contents());
 }
 
-async fn large_contents() {
+/// A configuration for a domain with this random name. In namespaces process numbers repeat.
+fn config(name: u64, transports: &str) -> Config {
     let config = Config::load(&Sources {
         set: vec![
-            format!("domain=cramped-{}", std::process::id()),
+            format!("domain=cramped-{name:x}"),
             "discovery.mdns=false".into(),
-            "mts.transports=shm,tcp".into(),
+            format!("mts.transports={transports}"),
         ],
         ..Sources::default()
     });
-    let config = config.unwrap();
+    config.unwrap()
+}
+
+async fn large_contents() {
+    let config = config(fastrand::u64(..), "shm,tcp");
     let here = Domain::open(&config).await.unwrap();
     let there = Domain::open(&config).await.unwrap();
     let rover = here.register("rover").unwrap();
@@ -87,4 +92,72 @@ async fn large_contents() {
         .build()
         .unwrap();
     assert!(rover.send(message).await.unwrap().all_succeeded());
+}
+
+#[test]
+fn a_full_file_system_is_a_failed_attempt() {
+    fipa_testbed::isolated("inside_a_full_file_system_is_a_failed_attempt", &[]);
+}
+
+#[test]
+#[ignore = "is run by the other test in namespaces of its own"]
+fn inside_a_full_file_system_is_a_failed_attempt() {
+    fipa_testbed::enter();
+    fipa_testbed::run("mount -t tmpfs -o size=16M tmpfs /dev/shm");
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .unwrap();
+    runtime.block_on(full());
+}
+
+/// Another program takes all but this much of the file system, in bytes; or frees it.
+fn leave(free: Option<u64>) {
+    let outsider = std::fs::File::create("/dev/shm/outsider").unwrap();
+    let Some(left) = free else {
+        return;
+    };
+    let found = rustix::fs::statvfs("/dev/shm").unwrap();
+    let taken = found.f_bavail * found.f_frsize - left;
+    rustix::fs::fallocate(&outsider, rustix::fs::FallocateFlags::empty(), 0, taken).unwrap();
+}
+
+async fn full() {
+    let name = fastrand::u64(..);
+    let here = Domain::open(&config(name, "shm,tcp")).await.unwrap();
+    let there = Domain::open(&config(name, "shm,tcp")).await.unwrap();
+    let rover = here.register("rover").unwrap();
+    let arm = there.register("arm").unwrap();
+    let letter = async || {
+        let message = rover
+            .message(Performative::Inform)
+            .receiver(AgentId::new("arm").unwrap())
+            .content(vec![1; 5000])
+            .build()
+            .unwrap();
+        let sent = rover.send(message).await.unwrap();
+        arm.receive().await.unwrap();
+        let delivery = sent.0.into_iter().next().unwrap();
+        let Outcome::Delivered { via, attempts } = delivery.outcome else {
+            panic!("{}", delivery.outcome);
+        };
+        let attempts = attempts.iter().map(ToString::to_string);
+        (via, attempts.collect::<Vec<_>>().join("; "))
+    };
+    // First contact, for which there is no room at all.
+    leave(Some(0));
+    let (via, attempts) = letter().await;
+    assert_eq!(via, Kind::Tcp);
+    assert!(attempts.contains("/dev/shm"), "{attempts}");
+    // A process starts without shared memory, if it has another transport.
+    let late = Domain::open(&config(name, "shm,tcp")).await.unwrap();
+    drop(late);
+    let error = Domain::open(&config(name, "shm")).await.err().unwrap();
+    assert!(error.to_string().contains("/dev/shm"), "{error}");
+    // The file system is large enough again.
+    leave(None);
+    let began = std::time::Instant::now();
+    while letter().await.0 != Kind::Shm {
+        assert!(began.elapsed() < std::time::Duration::from_secs(60));
+    }
 }

@@ -268,13 +268,13 @@ async fn a_domain_has_one_gateway_and_a_port_one_owner() {
         Gateway::open(&another).await,
         Err(OpenError::GatewayRunning(name)) if name == gateway.name()
     ));
-    let mut ways = gateway.locations().iter();
-    let address = ways.find(|way| way.kind() == Kind::Tcp).unwrap().address();
-    let taken = format!("transport.tcp.listen={address}");
+    let mut ways = gateway.locations().into_iter();
+    let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
+    let taken = format!("transport.tcp.listen={}", way.address());
     let other = Host::new(&["discovery.mdns=false", &taken]);
     match Gateway::open(&other.config).await {
         Err(error @ OpenError::Listen { .. }) => {
-            assert!(error.to_string().contains(address), "{error}");
+            assert!(error.to_string().contains(way.address()), "{error}");
         }
         Err(other) => panic!("{other}"),
         Ok(_) => panic!("two on one port"),

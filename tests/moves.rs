@@ -64,9 +64,10 @@ impl Host {
         }
     }
 
-    fn address(&self) -> &str {
-        let mut ways = self.gateway.locations().iter();
-        ways.find(|way| way.kind() == Kind::Tcp).unwrap().address()
+    fn address(&self) -> String {
+        let mut ways = self.gateway.locations().into_iter();
+        let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
+        way.address().to_owned()
     }
 
     /// The agent registers here as soon as this host knows that it has left the other.

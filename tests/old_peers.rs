@@ -74,7 +74,7 @@ impl Host {
     }
 
     fn address(&self) -> String {
-        let mut ways = self.gateway.locations().iter();
+        let mut ways = self.gateway.locations().into_iter();
         let tcp = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
         tcp.address().to_owned()
     }

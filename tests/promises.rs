@@ -1,6 +1,9 @@
-//! The promises of the delivery simulation, on real sockets with QUIC in the order: links are cut and
-//! transports stopped at random moments while letters flow. Each letter has one outcome, which says
-//! the way; what was delivered is taken, and nothing else; nothing is taken twice or out of order.
+//! The promises of the delivery simulation, on real sockets with QUIC in the order: links between two
+//! gateways are cut and transports stopped at random moments while letters of two streams go from a
+//! process through both gateways to another process. Their deadlines lie between 10 ms and 60 s, some
+//! are large, and the far gateway refuses some. Each letter has one outcome, which says the way; what
+//! was delivered is taken, and nothing else; nothing is taken twice or out of order. After the last
+//! fault, every stream delivers everything.
 //!
 //! `FIPA_PROMISES_SEED` repeats the decisions of a run, which a failing one prints, and
 //! `FIPA_PROMISES_SEEDS` is the number of runs.
@@ -13,12 +16,12 @@ use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use fastrand::Rng;
-use fipa::{FailureReason, Kind, Letter, Outcome};
-use fipa_mts::Sending;
+use fipa::{AgentId, FailureReason, Kind, Letter, Message, Outcome, Performative};
 use fipa_mts::core::Submission;
+use fipa_mts::{Gate, Sending, letter_for};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Parcel, Sink, Stream, Transport,
     Verdict,
@@ -32,30 +35,95 @@ use tokio::task::spawn_blocking;
 use tokio::time::{sleep, timeout};
 
 const ORDER: [Kind; 3] = [Kind::Shm, Kind::Quic, Kind::Tcp];
-/// Letters under way.
+/// Between the gateways.
+const OUTSIDE: [Kind; 2] = [Kind::Quic, Kind::Tcp];
+/// The agents that send, each a stream of its own to the arm.
+const SENDERS: [(&str, Incarnation); 2] =
+    [("rover", ROVER), ("scout", Incarnation::from_u64(0x5c0))];
+/// Letters of a stream under way.
 const WINDOW: usize = 8;
-/// What a letter has: shorter than some cuts last.
-const DEADLINE: Duration = Duration::from_millis(400);
+/// Deadlines that are longer than any cut lasts.
+const AMPLE: Duration = Duration::from_secs(10);
 /// Changes of the weather.
 const CHANGES: usize = 12;
-/// Letters delivered in a row that count as traffic that goes on.
+/// Letters of each stream delivered in a row that count as traffic that goes on.
 const IN_A_ROW: usize = 20;
+/// Letters of each stream after the last fault, all of which are delivered or refused.
+const LAST: usize = 100;
+/// Failed attempts of such a letter.
+const RETRIES: usize = 8;
 const WATCHDOG: Duration = Duration::from_secs(120);
 
-/// What happened.
+/// A letter to be sent.
+#[derive(Debug, Clone, Copy)]
+struct Draft {
+    deadline: Duration,
+    size: usize,
+    /// Whether the far gateway refuses it.
+    refused: bool,
+}
+
+impl Draft {
+    fn new(random: &mut Rng) -> Self {
+        // As many between 10 and 100 ms as between 1 and 10 s.
+        let milliseconds = 10.0 * 6000_f64.powf(random.f64());
+        Self {
+            deadline: Duration::from_millis(milliseconds as u64),
+            size: match random.u8(..) {
+                0 => 2_000_000,
+                1..4 => 100_000,
+                _ => 0,
+            },
+            refused: random.u8(..20) == 0,
+        }
+    }
+
+    fn letter(self, sender: &str, number: usize) -> Letter {
+        let performative = match self.refused {
+            true => Performative::Cancel,
+            false => Performative::Inform,
+        };
+        // The number can be read from any length.
+        let content = format!("{}{number}", "0".repeat(self.size));
+        let message = Message::builder(performative)
+            .sender(AgentId::new(sender).unwrap())
+            .receiver(AgentId::new("arm").unwrap())
+            .content(content)
+            .build();
+        letter_for(&message.unwrap(), SystemTime::now()).unwrap()
+    }
+}
+
+/// Access rules of the far gateway.
+struct NoCancel;
+
+impl Gate for NoCancel {
+    fn admits(&self, _: Instant, _: &str, letter: &Letter) -> Result<(), String> {
+        let message = Message::decode(letter.payload()).map_err(|error| error.to_string())?;
+        match *message.performative() == Performative::Cancel {
+            true => Err("cancel is not allowed here".to_owned()),
+            false => Ok(()),
+        }
+    }
+}
+
+/// What happened to the letters of one stream.
 #[derive(Default)]
 struct Account {
     outcomes: BTreeMap<usize, Outcome>,
     taken: Vec<usize>,
+    refused: usize,
     in_a_row: usize,
 }
 
 impl Account {
-    fn note(&mut self, number: usize, outcome: Outcome) {
+    fn note(&mut self, number: usize, draft: Draft, outcome: Outcome) {
         self.in_a_row = match outcome {
             Outcome::Delivered { .. } => self.in_a_row + 1,
+            _ if draft.refused || draft.deadline < AMPLE => self.in_a_row,
             _ => 0,
         };
+        self.refused += usize::from(is_refusal(&outcome));
         assert_eq!(self.outcomes.insert(number, outcome), None);
     }
 
@@ -80,10 +148,86 @@ impl Account {
         }
     }
 
+    /// Whether everything that was delivered is taken.
+    fn is_taken(&self) -> bool {
+        let delivered = self.outcomes.iter();
+        let mut delivered = delivered.filter(|(_, it)| matches!(it, Outcome::Delivered { .. }));
+        delivered.all(|(number, _)| self.taken.contains(number))
+    }
+
     fn went_by(&self, kind: Kind) -> usize {
         let outcomes = self.outcomes.values();
         outcomes.filter(|it| it.via() == Some(kind)).count()
     }
+}
+
+fn is_refusal(outcome: &Outcome) -> bool {
+    let refused = FailureReason::Refused;
+    matches!(outcome, Outcome::Failed { reason, .. } if *reason == refused)
+}
+
+/// The streams' accounts, in the order of [`SENDERS`].
+type Accounts = Arc<Mutex<[Account; SENDERS.len()]>>;
+
+/// Sends letters of one stream until told to stop.
+async fn send_all(
+    mts: fipa_mts::Mts,
+    stream: usize,
+    mut random: Rng,
+    stop: Arc<AtomicBool>,
+    accounts: Accounts,
+) {
+    let mut under_way = VecDeque::new();
+    let mut last = LAST;
+    for number in 0.. {
+        let mut draft = Draft::new(&mut random);
+        let stops = stop.load(Ordering::Acquire);
+        if stops {
+            let Some(left) = last.checked_sub(1) else {
+                break;
+            };
+            last = left;
+            draft.deadline = Duration::from_secs(60);
+        }
+        under_way.push_back((number, draft, stops, send(&mts, stream, number, draft)));
+        if under_way.len() >= WINDOW
+            && let Some(oldest) = under_way.pop_front()
+        {
+            note(&accounts, stream, oldest).await;
+        }
+        sleep(Duration::from_millis(1)).await;
+    }
+    for sent in under_way {
+        note(&accounts, stream, sent).await;
+    }
+}
+
+fn send(mts: &fipa_mts::Mts, stream: usize, number: usize, draft: Draft) -> Sending {
+    let (name, sender) = SENDERS[stream];
+    mts.send(Submission {
+        sender,
+        letter: draft.letter(name, number),
+        receivers: vec!["arm".into()],
+        deadline: draft.deadline,
+    })
+}
+
+async fn note(
+    accounts: &Accounts,
+    stream: usize,
+    (number, draft, last, sending): (usize, Draft, bool, Sending),
+) {
+    let outcome = outcome(sending).await;
+    if last {
+        let expected =
+            outcome.is_success() != draft.refused && is_refusal(&outcome) == draft.refused;
+        let retries = outcome.attempts().len();
+        assert!(
+            expected && retries <= RETRIES,
+            "{number}, after the last fault: {outcome}"
+        );
+    }
+    accounts.lock()[stream].note(number, draft, outcome);
 }
 
 async fn until(what: &str, condition: impl Fn() -> bool) {
@@ -103,60 +247,73 @@ async fn outcome(sending: Sending) -> Outcome {
 /// Sends letters through this weather; says how many went which way.
 async fn through(seed: u64) -> String {
     let mut random = Rng::with_seed(seed);
-    let here = host();
-    let [ours, theirs] = friends(here.path(), ["rovers", "arms"]);
-    let start = |name, keys| Place::with_keys(here.path(), name, &ORDER, false, Some(keys));
-    let (rovers, arms) = (start("rovers", ours), start("arms", theirs));
-    let quic = Link::before(&arms.at(Kind::Quic)).await;
-    let tcp = Link::before(&arms.at(Kind::Tcp)).await;
-    let links = [quic.location.clone(), tcp.location.clone()];
-    rovers.knows_arm_at([&[arms.at(Kind::Shm)], &links[..]].concat());
+    let (here, there) = (host(), host());
+    let [_, near_keys, far_keys, arm_keys] =
+        friends(here.path(), ["rovers", "near", "far", "arms"]);
+    let rovers = Place::start(here.path(), "rovers", &[Kind::Shm], false);
+    let near = Place::with_keys(here.path(), "near", &ORDER, true, Some(near_keys));
+    let far = Place::with_gate(there.path(), "far", &ORDER, far_keys, Arc::new(NoCancel));
+    let arms = Place::with_keys(there.path(), "arms", &ORDER, false, Some(arm_keys));
+    let quic = Link::before(&far.at(Kind::Quic)).await;
+    let tcp = Link::before(&far.at(Kind::Tcp)).await;
+    rovers.knows_arm_at(vec![near.at(Kind::Shm)]);
+    near.knows_arm_at(vec![quic.location.clone(), tcp.location.clone()]);
+    far.knows_arm_at(vec![arms.at(Kind::Shm), arms.at(Kind::Tcp)]);
     arms.knows_arm_at(arms.everywhere());
-    rovers.mts.register("rover".into(), ROVER);
+    for (name, sender) in SENDERS {
+        rovers.mts.register(name.into(), sender);
+    }
     arms.mts.register("arm".into(), ARM);
 
-    let account: Arc<Mutex<Account>> = Arc::default();
-    let (receiver, taken) = (arms.mts.clone(), account.clone());
+    let accounts = Accounts::default();
+    let (receiver, taken) = (arms.mts.clone(), accounts.clone());
     let receiving = tokio::spawn(async move {
         while let Some(letter) = receiver.receive(ARM).await {
-            taken.lock().taken.push(number(&letter.letter));
+            let message = Message::decode(letter.letter.payload()).unwrap();
+            let sender = message.sender().unwrap().name();
+            let stream = SENDERS.iter().position(|(name, _)| *name == sender);
+            taken.lock()[stream.unwrap()]
+                .taken
+                .push(number(&letter.letter));
         }
     });
     let stop = Arc::new(AtomicBool::new(false));
-    let (sender, ended, noted) = (rovers.mts.clone(), stop.clone(), account.clone());
-    let sending = tokio::spawn(async move {
-        let mut under_way = VecDeque::new();
-        for number in 0.. {
-            if ended.load(Ordering::Acquire) {
-                break;
-            }
-            let submission = Submission {
-                sender: ROVER,
-                letter: letter(number),
-                receivers: vec!["arm".into()],
-                deadline: DEADLINE,
-            };
-            under_way.push_back((number, sender.send(submission)));
-            if under_way.len() >= WINDOW
-                && let Some((number, sending)) = under_way.pop_front()
-            {
-                let outcome = outcome(sending).await;
-                noted.lock().note(number, outcome);
-            }
-            sleep(Duration::from_millis(1)).await;
-        }
-        for (number, sending) in under_way {
-            let outcome = outcome(sending).await;
-            noted.lock().note(number, outcome);
-        }
-    });
+    let sending: Vec<_> = (0..SENDERS.len())
+        .map(|stream| {
+            let (mts, random) = (rovers.mts.clone(), random.fork());
+            let sending = send_all(mts, stream, random, stop.clone(), accounts.clone());
+            tokio::spawn(sending)
+        })
+        .collect();
     let goes_on = async || {
-        account.lock().in_a_row = 0;
-        until("letters arrive", || account.lock().in_a_row >= IN_A_ROW).await;
+        for account in &mut *accounts.lock() {
+            account.in_a_row = 0;
+        }
+        until("letters arrive", || {
+            let ended = sending.iter().any(|it| it.is_finished());
+            assert!(!ended, "a sender has failed; see above");
+            let accounts = accounts.lock();
+            accounts.iter().all(|account| account.in_a_row >= IN_A_ROW)
+        })
+        .await;
+    };
+    let went_by = |kind: Kind| {
+        let accounts = accounts.lock();
+        accounts
+            .iter()
+            .map(|account| account.went_by(kind))
+            .sum::<usize>()
+    };
+    let goes_by = async |kind: Kind| {
+        let before = went_by(kind);
+        until(&format!("letters go by {kind}"), || {
+            went_by(kind) > before + IN_A_ROW
+        })
+        .await;
     };
 
     goes_on().await;
-    // Letters flow through shared memory until it is taken away, early or late.
+    // The receiver's process loses its shared memory, early or late.
     let shm_until = random.usize(..CHANGES / 2);
     let mut closing = Vec::new();
     for change in 0..CHANGES {
@@ -175,11 +332,7 @@ async fn through(seed: u64) -> String {
     goes_on().await;
     // Letters arrive by TCP and their answers do not, then it breaks: they go again, by QUIC.
     quic.turn(Sky::Silent);
-    let before = account.lock().went_by(Kind::Tcp);
-    until("letters go by TCP", || {
-        account.lock().went_by(Kind::Tcp) > before + IN_A_ROW
-    })
-    .await;
+    goes_by(Kind::Tcp).await;
     quic.turn(Sky::Clear);
     tcp.turn(Sky::Unanswered);
     sleep(Duration::from_millis(random.u64(1..100))).await;
@@ -188,39 +341,43 @@ async fn through(seed: u64) -> String {
     tcp.turn(Sky::Clear);
     goes_on().await;
     // Until QUIC has been tried again.
-    let before = account.lock().went_by(Kind::Quic);
-    until("letters go by QUIC", || {
-        account.lock().went_by(Kind::Quic) > before + IN_A_ROW
-    })
-    .await;
-    let plug = arms.transport(Kind::Quic);
+    goes_by(Kind::Quic).await;
+    let plug = far.transport(Kind::Quic);
     closing.push(spawn_blocking(move || plug.close()));
     goes_on().await;
     stop.store(true, Ordering::Release);
-    timeout(WATCHDOG, sending).await.unwrap().unwrap();
+    for sending in sending {
+        timeout(WATCHDOG, sending).await.unwrap().unwrap();
+    }
     until("what was delivered is taken", || {
-        let account = account.lock();
-        let delivered = account.outcomes.iter();
-        let mut delivered = delivered.filter(|(_, it)| matches!(it, Outcome::Delivered { .. }));
-        delivered.all(|(number, _)| account.taken.contains(number))
+        accounts.lock().iter().all(Account::is_taken)
     })
     .await;
     receiving.abort();
     let told = {
-        let account = account.lock();
-        account.check();
-        let by = ORDER.map(|kind| (kind, account.went_by(kind)));
-        let failed = account.outcomes.values().filter(|it| !it.is_success());
-        format!("{by:?}, {} failed", failed.count())
+        let accounts = accounts.lock();
+        for account in &*accounts {
+            account.check();
+            assert!(account.refused > 0, "nothing was refused");
+        }
+        let outcomes = accounts
+            .iter()
+            .flat_map(|account| account.outcomes.values());
+        let failed = outcomes.clone().filter(|it| !it.is_success()).count();
+        let sent = outcomes.count();
+        let refused: usize = accounts.iter().map(|account| account.refused).sum();
+        drop(accounts);
+        let by = OUTSIDE.map(|kind| (kind, went_by(kind)));
+        format!("{sent} letters, {by:?}, {failed} failed, {refused} of them refused")
     };
     for closing in closing {
         timeout(WATCHDOG, closing).await.unwrap().unwrap();
     }
-    for place in [&rovers, &arms] {
+    for place in [&rovers, &near, &far, &arms] {
         place.mts.close(Duration::from_secs(1)).await;
     }
-    for kind in ORDER {
-        assert!(account.lock().went_by(kind) > 0, "nothing went by {kind}");
+    for kind in OUTSIDE {
+        assert!(went_by(kind) > 0, "nothing went by {kind}");
     }
     told
 }
@@ -358,7 +515,7 @@ impl Parrot {
             sequence,
             after: sequence - 1,
             remaining: Duration::from_secs(30),
-            hops: 0,
+            transfer: 0,
             body: Body::Letter(letter(sequence as usize)),
         };
         let attempt = AttemptId(attempt);

@@ -28,7 +28,7 @@ fn config(set: &[String]) -> Config {
 }
 
 fn address(gateway: &Gateway) -> String {
-    let mut ways = gateway.locations().iter();
+    let mut ways = gateway.locations().into_iter();
     let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
     way.address().to_owned()
 }

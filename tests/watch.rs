@@ -390,8 +390,9 @@ async fn known(domain: &Domain, name: &str) {
 #[tokio::test(flavor = "multi_thread")]
 async fn between_hosts_each_watcher_sees_a_letter_once_with_its_gateway() {
     let (far, abroad, mut watching_far) = watched(None).await;
-    let mut ways = far.locations().iter();
-    let at = ways.find(|way| way.kind() == Kind::Tcp).unwrap().address();
+    let mut ways = far.locations().into_iter();
+    let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
+    let at = way.address();
     let (near, at_home, mut watching_near) = watched(Some(at)).await;
     let rover = at_home.register("rover").unwrap();
     let arm = abroad.register("arm").unwrap();

@@ -46,6 +46,8 @@ const PATHS: &[Path] = &[
     ("xml/view/1KB", || view(Representation::Xml, 1 << 10)),
     ("xml/decode/1B", || decode(Representation::Xml, 1)),
     ("xml/decode/1KB", || decode(Representation::Xml, 1 << 10)),
+    ("xml/encode/1KB", || encode_xml(1 << 10)),
+    ("xml/encode/1MB", || encode_xml(1 << 20)),
     ("envelope/view", || {
         let bytes = envelope().encode_standard().expect("an envelope");
         measured(|| EnvelopeView::parse(black_box(&bytes)).is_ok());
@@ -105,6 +107,13 @@ fn encode(content_len: usize) {
     let mut out = BytesMut::with_capacity(bitefficient::encoded_len(&message));
     measured(|| bitefficient::encode(black_box(&message), &mut out));
     black_box(&out);
+}
+
+fn encode_xml(content_len: usize) {
+    let message = message(content_len);
+    let (xml, dialect) = (Representation::Xml, Dialect::Standard);
+    let encoded = measured(|| black_box(&message).encode(xml, dialect));
+    black_box(&encoded.expect("a message"));
 }
 
 fn decode(representation: Representation, content_len: usize) {

@@ -44,7 +44,10 @@ impl Message {
             return Ok(self.to_payload().to_bytes());
         }
         let content_len = self.content().map_or(0, Bytes::len);
-        let mut out = Vec::with_capacity(content_len.saturating_add(512));
+        // Room for the other parameters and some escaped characters: moving long content to larger
+        // memory takes longer than encoding it.
+        let room = (content_len / 16).saturating_add(1024);
+        let mut out = Vec::with_capacity(content_len.saturating_add(room));
         self.write(representation, dialect, &mut out)?;
         Ok(out.into())
     }

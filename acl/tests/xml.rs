@@ -293,6 +293,128 @@ fn jade_sends_bytes_as_base64() {
     assert_eq!(problem(wrong), Problem::Base64);
 }
 
+/// fipa_services writes content into one CDATA section, `]]>` included.
+#[test]
+fn the_end_of_a_cdata_section_in_content_makes_no_third_text() {
+    let content = |inside: &str| {
+        let xml = format!("<fipa-message act='inform'><content>{inside}</content></fipa-message>");
+        Message::decode(&Payload::from(Bytes::from(xml)))
+            .map(|message| message.content().cloned().unwrap_or_default())
+    };
+    for broken in ["<![CDATA[a]]>b]]>", "<![CDATA[]]>]]>", "<![CDATA[a]]]]>]]>"] {
+        let error = content(broken).unwrap_err();
+        assert!(error.to_string().contains("CDATA"), "{error}");
+        assert!(matches!(error.problem(), Problem::Xml(_)), "{error}");
+    }
+    assert_eq!(content("a]]>b").unwrap(), "a]]>b");
+    assert_eq!(content("a]]&gt;b<![CDATA[]]]]>").unwrap(), "a]]>b]]");
+    assert_eq!(content("<![CDATA[a]]]]><![CDATA[>b]]>").unwrap(), "a]]>b");
+}
+
+#[test]
+fn long_content_is_written_whole_wherever_its_pieces_end() {
+    for dialect in [Dialect::Standard, Dialect::FipaServices] {
+        for (len, odd) in (4080..4112).flat_map(|len| {
+            [
+                "\u{e4}",
+                "\u{1F980}",
+                "<",
+                "&\r",
+                "  ",
+                " ",
+                "\n\t\"",
+                "\u{fffd}",
+            ]
+            .map(|odd| (len, odd))
+        }) {
+            let text = format!("{}{odd}{}{odd}", "x".repeat(len), "y".repeat(len));
+            let message = Message::builder(Performative::Inform)
+                .content(text.clone())
+                .build()
+                .unwrap();
+            let bytes = message.encode(Representation::Xml, dialect).unwrap();
+            let len = message.encoded_len(Representation::Xml, dialect).unwrap();
+            assert_eq!(len, bytes.len());
+            let read = Message::decode(&Payload::from(bytes.clone())).unwrap();
+            assert_eq!(read.content().unwrap(), &text);
+            if dialect == Dialect::FipaServices {
+                let condensed = bytes.windows(2).any(|two| two == b"  ");
+                assert!(!condensed, "its reader would take one space for two");
+            }
+        }
+        for wrong in [&b"\xff"[..], b"\xf0\x9f", b"\x01", "\u{fffe}".as_bytes()] {
+            for len in 4090..4100 {
+                let content = [vec![b'x'; len], wrong.to_vec()].concat();
+                let message = Message::builder(Performative::Inform)
+                    .content(content)
+                    .build()
+                    .unwrap();
+                assert!(matches!(
+                    message.encode(Representation::Xml, dialect),
+                    Err(EncodeError::Unrepresentable {
+                        what: "content",
+                        ..
+                    })
+                ));
+            }
+        }
+    }
+}
+
+/// The C++ library reads no `<X-role>` inside of agent identifiers.
+#[test]
+fn fipa_services_gets_what_it_reads_or_a_refusal_with_the_reason() {
+    let agent = |value: &str| {
+        let agent = AgentId::new("arm").unwrap();
+        agent.with_user_defined("role", value).unwrap()
+    };
+    let message = |value| {
+        Message::builder(Performative::Inform)
+            .receiver(agent(value))
+            .build()
+            .unwrap()
+    };
+    let encoded = |value, representation| {
+        let bytes = message(value).encode(representation, Dialect::FipaServices);
+        bytes.map(|bytes| String::from_utf8(bytes.to_vec()).unwrap())
+    };
+    let xml = encoded("lifts", Representation::Xml).unwrap();
+    let element = "<user-defined href=\"X-role\" type=\"string\">lifts</user-defined>";
+    assert!(xml.contains(element), "{xml}");
+    assert!(!xml.contains("<X-role"), "{xml}");
+    let refused = encoded("", Representation::Xml).unwrap_err();
+    assert!(refused.to_string().contains("empty"), "{refused}");
+    let refused = encoded("lifts", Representation::String).unwrap_err();
+    assert!(refused.to_string().contains("string message"), "{refused}");
+    let empty = Message::builder(Performative::Inform)
+        .user_defined("mode", "")
+        .build()
+        .unwrap();
+    let refused = empty.encode(Representation::Xml, Dialect::FipaServices);
+    assert!(refused.is_err());
+    assert!(
+        message("")
+            .encode(Representation::Xml, Dialect::Standard)
+            .is_ok()
+    );
+
+    let base = EnvelopeParams {
+        to: vec![agent("lifts")],
+        acl_representation: Some(AclRepresentation::Xml),
+        date: Some("20000508T042651481Z".parse().unwrap()),
+        ..EnvelopeParams::default()
+    };
+    let envelope = Envelope {
+        base,
+        extensions: Vec::new(),
+    };
+    let xml = envelope
+        .encode(Representation::Xml, Dialect::FipaServices)
+        .unwrap();
+    let xml = String::from_utf8(xml.to_vec()).unwrap();
+    assert!(xml.contains(element), "{xml}");
+}
+
 #[test]
 fn plain_content_is_not_copied() {
     for text in ["<![CDATA[a & \u{1}]]>", "plain"] {

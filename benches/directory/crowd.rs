@@ -23,7 +23,6 @@ const WATCHDOG: Duration = Duration::from_secs(120);
 /// Measures, within namespaces of its own, and prints.
 pub(crate) fn measure() {
     fipa_testbed::enter();
-    fipa_testbed::run("mount -t tmpfs tmpfs /tmp");
     fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     let network = Network::new(2);
     let started = Instant::now();

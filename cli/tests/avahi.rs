@@ -29,7 +29,6 @@ const SECOND: &str = "camera";
 #[ignore = "is run by the other test in a network namespace"]
 fn in_the_namespace() {
     enter();
-    fipa_testbed::run("mount -t tmpfs tmpfs /tmp");
     fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     let network = Network::new(2);
     let avahi = Avahi::start(network.host(1));

@@ -92,6 +92,7 @@ name = \"sherpa\"                      # fipa.toml:3
 transports = [\"shm\", \"tcp\"]          # default
 deadline = \"9s\"                      # --set
 queue = 256                          # default
+queue_bytes = \"64MiB\"                # default
 
 [transport.shm]
 capacity = \"256MiB\"                  # default
@@ -219,7 +220,7 @@ fn mistakes_are_told_with_place_and_advice() {
     let told = "\
 error: unknown key `mts.deadlin`
 where: fipa.toml:2
-   do: did you mean `mts.deadline`? (known in [mts]: name, transports, deadline, queue)
+   do: did you mean `mts.deadline`? (known in [mts]: name, transports, deadline, queue, queue_bytes)
 error: `mts.queue` is wrong: \"x\": a string cannot stand here
 where: fipa.toml:3
    do: expected a number of letters such as 256
@@ -234,7 +235,7 @@ where: fipa.toml:3
         json!({ "ok": false, "mistakes": [
             { "what": "unknown key `mts.deadlin`",
               "help": "did you mean `mts.deadline`? \
-                       (known in [mts]: name, transports, deadline, queue)",
+                       (known in [mts]: name, transports, deadline, queue, queue_bytes)",
               "place": { "from": "file", "path": "fipa.toml", "line": 2 } },
             { "what": "`mts.queue` is wrong: \"x\": a string cannot stand here",
               "help": "expected a number of letters such as 256",

@@ -1,13 +1,15 @@
 //! `fipa doctor`, as a shell runs it.
 
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::print_stderr, reason = "a skipped test says so")]
 
 mod common;
 
 use std::fs::{Permissions, set_permissions};
 use std::os::unix::fs::PermissionsExt;
+use std::process::{Command, Stdio};
 
-use common::Host;
+use common::{Host, Running};
 use serde_json::Value;
 
 /// The verdict and the finding of a check.
@@ -37,6 +39,7 @@ fn a_machine_in_order_is_found_so_and_left_so() {
         "size of /dev/shm",
         "traces of the dead",
         "permissions in /dev/shm",
+        "memory of waiting letters",
     ] {
         assert_eq!(check(&report, name).0, "fine", "{report}");
     }
@@ -87,4 +90,55 @@ fn a_directory_that_others_may_enter_is_bad() {
     assert_eq!(check(&report, "directory of the domain").0, "bad");
     assert!(complaint.contains("directory of the domain"), "{complaint}");
     set_permissions(&domain, Permissions::from_mode(0o700)).unwrap();
+}
+
+/// Makes the command that is run in a user namespace without inotify instances. None where this
+/// user may not make one; fails then if `CI=true`.
+fn without_inotify(command: &Command) -> Option<Command> {
+    let unshare = || {
+        let mut unshare = Command::new("unshare");
+        let limit = "echo 0 >/proc/sys/user/max_inotify_instances && exec \"$@\"";
+        unshare.args(["--user", "--map-root-user", "sh", "-c", limit, "sh"]);
+        unshare
+    };
+    let can = unshare().arg("true").status();
+    if !can.is_ok_and(|status| status.success()) {
+        let in_ci = std::env::var("CI").as_deref() == Ok("true");
+        assert!(!in_ci, "needs user namespaces");
+        eprintln!("SKIPPED, not a success: needs user namespaces");
+        return None;
+    }
+    let mut wrapped = unshare();
+    wrapped.arg(command.get_program()).args(command.get_args());
+    wrapped.env_clear().stdin(Stdio::null());
+    for (name, value) in command.get_envs() {
+        if let Some(value) = value {
+            wrapped.env(name, value);
+        }
+    }
+    wrapped.env("PATH", std::env::var_os("PATH").unwrap());
+    Some(wrapped)
+}
+
+#[test]
+fn without_inotify_agents_are_reached_and_the_doctor_names_the_sysctl() {
+    let host = Host::new();
+    let Some(echo) = without_inotify(&host.command(&["echo", "parrot"])) else {
+        return;
+    };
+    let parrot = Running::new(echo);
+    let letter = ["send", "--to", "parrot", "--content", "hello"];
+    let sent = host.run(&letter).done();
+    assert!(sent.contains("delivered"), "{sent}");
+    let doctor = without_inotify(&host.command(&["doctor", "--json"]));
+    let report = doctor.unwrap().output().unwrap().stdout;
+    let report: Value = serde_json::from_slice(&report).unwrap();
+    let (verdict, found) = check(&report, "inotify instances");
+    assert_eq!(verdict, "doubtful", "{found}");
+    assert!(found.contains("poll the directory"), "{found}");
+    assert!(report.to_string().contains("fs.inotify.max_user_instances"));
+    let (code, told) = parrot.signal("-INT");
+    assert_eq!(code, Some(0), "{told}");
+    let times = told.matches("fs.inotify.max_user_instances").count();
+    assert_eq!(times, 1, "{told}");
 }

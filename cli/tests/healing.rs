@@ -7,7 +7,6 @@
 #![allow(clippy::print_stdout, reason = "how long it took is worth knowing")]
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 use fipa::config::Sources;
@@ -26,7 +25,6 @@ fn processes_agree_after_every_healing() {
 #[ignore = "is run by the other test in namespaces of its own"]
 fn inside_processes_agree_after_every_healing() {
     enter();
-    fipa_testbed::run("mount -t tmpfs tmpfs /tmp");
     fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     let seed = std::env::var("FIPA_LINKS_SEED").ok();
     let seed = seed.map_or(3, |seed| seed.parse().unwrap());
@@ -113,7 +111,7 @@ impl Robot {
         for setting in &set {
             up.args(["--set", setting]);
         }
-        let gateway = Running::start(up.arg("up").stdout(Stdio::null()).stderr(Stdio::null()));
+        let (gateway, _ready) = Running::until_ready(up.arg("up"));
         let runtime = Builder::new_multi_thread()
             .worker_threads(1)
             .enable_all()

@@ -3,7 +3,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
 
-use std::process::{Command, Stdio};
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use fipa_testbed::{Host, Network, Running, enter, isolated};
@@ -18,7 +18,6 @@ fn the_doctor_says_what_the_network_does() {
 #[ignore = "is run by the other test in namespaces of its own"]
 fn inside_the_doctor_says_what_the_network_does() {
     enter();
-    fipa_testbed::run("mount -t tmpfs tmpfs /tmp");
     fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     let network = Network::new(2);
     let (here, there) = (network.host(0), network.host(1));
@@ -28,10 +27,10 @@ fn inside_the_doctor_says_what_the_network_does() {
     assert!(found.contains("nobody answered"), "{found}");
 
     let mut up = fipa(there, "there");
-    let _gateway = Running::start(up.arg("up").stdout(Stdio::null()));
+    let _gateway = Running::until_ready(up.arg("up"));
     // Who has nothing to announce has nothing to answer.
     let mut echo = fipa(there, "there");
-    let _agent = Running::start(echo.args(["echo", "parrot"]).stdout(Stdio::null()));
+    let _agent = Running::until_ready(echo.args(["echo", "parrot"]));
     let deadline = Instant::now() + Duration::from_secs(60);
     let found = loop {
         let (verdict, found) = multicast(here);
@@ -65,6 +64,9 @@ fn inside_the_doctor_says_what_the_network_does() {
 fn fipa(host: &Host, domain: &str) -> Command {
     let mut command = host.command(env!("CARGO_BIN_EXE_fipa"));
     command.args(["--set", &format!("domain={domain}")]);
+    // A gateway that listens on loopback announces nothing.
+    let open = ["security.insecure=true", "transport.tcp.listen=0.0.0.0:0"];
+    command.args(open.iter().flat_map(|setting| ["--set", setting]));
     command
 }
 
@@ -72,7 +74,8 @@ fn fipa(host: &Host, domain: &str) -> Command {
 fn multicast(host: &Host) -> (String, String) {
     let output = fipa(host, "here").args(["doctor", "--json"]).output();
     let output = output.unwrap();
-    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let report: Value = serde_json::from_slice(&output.stdout)
+        .unwrap_or_else(|error| panic!("{error}: {output:?}"));
     let checks = report["checks"].as_array().unwrap();
     let mut checks = checks.iter().filter(|check| check["check"] == "multicast");
     let check = checks

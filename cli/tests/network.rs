@@ -7,6 +7,7 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
 
 mod fleet;
+mod hosts;
 
 use std::time::Duration;
 

@@ -30,14 +30,15 @@ struct User<'a> {
 
 impl User<'_> {
     fn home(&self) -> PathBuf {
-        Path::new("/tmp").join(self.name)
+        fipa_testbed::directory().join(self.name)
     }
 
     /// A shell on that host, in the user's home, about to run this line.
     fn shell(&self, line: &str) -> Command {
         let programs = Path::new(env!("CARGO_BIN_EXE_fipa")).parent().unwrap();
         let path = format!(
-            "/tmp/bin:{}:{}",
+            "{}:{}:{}",
+            fipa_testbed::directory().join("bin").display(),
             programs.display(),
             std::env::var("PATH").unwrap()
         );
@@ -69,13 +70,17 @@ fn two_hosts_are_secured_in_under_ten_commands() {
 #[ignore = "is run by the other test in namespaces of its own"]
 fn inside_two_hosts_are_secured() {
     enter();
-    fipa_testbed::run("mount -t tmpfs tmpfs /tmp");
     fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     // What would copy to another host copies to the other user's home.
-    fs::create_dir("/tmp/bin").unwrap();
-    let scp = "#!/bin/sh\nexec cp \"$1\" \"/tmp/${2%%:*}/${2#*:}\"\n";
-    fs::write("/tmp/bin/scp", scp).unwrap();
-    fipa_testbed::run("chmod +x /tmp/bin/scp");
+    let homes = fipa_testbed::directory();
+    let bin = homes.join("bin");
+    fs::create_dir(&bin).unwrap();
+    let copy = format!(
+        "exec cp \"$1\" \"{}/${{2%%:*}}/${{2#*:}}\"",
+        homes.display()
+    );
+    fs::write(bin.join("scp"), format!("#!/bin/sh\n{copy}\n")).unwrap();
+    fipa_testbed::run(&format!("chmod +x {}", bin.join("scp").display()));
 
     let network = Network::new(2);
     let users = ["rover", "crex"].map(|name| {
@@ -104,10 +109,9 @@ fn inside_two_hosts_are_secured() {
         crex.types(theirs);
     }
     let gateways = [(rover, *last), (crex, also[before.len()].as_str())];
-    let _gateways = gateways.map(|(user, line)| {
-        Running::start(user.shell(&format!("exec {line}")).stdout(Stdio::null()))
-    });
-    let _arm = Running::start(crex.shell("exec fipa echo arm_1").stdout(Stdio::null()));
+    let _gateways =
+        gateways.map(|(user, line)| Running::until_ready(&mut user.shell(&format!("exec {line}"))));
+    let _arm = Running::until_ready(&mut crex.shell("exec fipa echo arm_1"));
     let begun = Instant::now();
     loop {
         let sent = rover
@@ -119,7 +123,7 @@ fn inside_two_hosts_are_secured() {
             assert!(told.contains("delivered via tcp"), "{told}");
             return;
         }
-        assert!(begun.elapsed() < Duration::from_secs(60), "never: {told}");
+        assert!(begun.elapsed() < Duration::from_secs(60), "never: {sent:?}");
         std::thread::sleep(Duration::from_millis(50));
     }
 }

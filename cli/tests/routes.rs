@@ -48,6 +48,7 @@ fn which_way_letters_would_go() {
     assert!(table.starts_with("TO "), "{table}");
     assert!(!table.contains("fipa-routes-"), "{table}");
     assert!(table.contains("The gateway sherpa:"), "{table}");
+    assert!(table.contains("takes letters at "), "{table}");
     assert!(table.contains("static peer crex: "), "{table}");
 }
 

@@ -6,6 +6,7 @@ mod common;
 
 use std::net::TcpListener;
 use std::path::PathBuf;
+use std::time::{Duration, Instant};
 
 use common::Host;
 use serde_json::{Value, json};
@@ -51,6 +52,43 @@ fn who_joins_and_leaves_is_logged() {
     gateway.tells(&["INFO", "left", "arm_2"]);
     let (code, log) = gateway.signal("-INT");
     assert_eq!(code, Some(0), "{log}");
+}
+
+#[test]
+fn a_removed_runtime_directory_is_logged_once_and_joined_again() {
+    let host = Host::new();
+    let mut gateway = host.start(&["up", "--json", "--set", "mts.name=sherpa"]);
+    let mut parrot = host.echo("parrot");
+    // An error is that the processes are back before all is removed.
+    let _ = std::fs::remove_dir_all(host.path("run"));
+    for process in [&mut gateway, &mut parrot] {
+        process.tells(&["WARN", "were removed", "joining the domain again"]);
+    }
+    let watchdog = Instant::now() + Duration::from_secs(60);
+    loop {
+        let listed = host.run(&["agents", "--json"]).done_json();
+        let names = listed["agents"].as_array().unwrap().iter();
+        let names: Vec<&str> = names.filter_map(|entry| entry["name"].as_str()).collect();
+        if names.contains(&"parrot") && names.contains(&"sherpa") {
+            break;
+        }
+        assert!(Instant::now() < watchdog, "never: {listed}");
+    }
+    loop {
+        let letter = ["send", "--to", "parrot", "--content", "hello"];
+        let sent = host.run(&letter);
+        if sent.code == Some(0) {
+            break;
+        }
+        assert!(Instant::now() < watchdog, "never: {sent:?}");
+    }
+    for process in [gateway, parrot] {
+        let (code, log) = process.signal("-INT");
+        assert_eq!(code, Some(0), "{log}");
+        assert_eq!(log.matches("were removed by").count(), 1, "{log}");
+        assert!(!log.contains("ERROR"), "{log}");
+    }
+    assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
 }
 
 #[test]
@@ -225,7 +263,7 @@ fn an_agent_of_another_host() {
         if !listed.is_null() {
             break;
         }
-        std::thread::sleep(std::time::Duration::from_millis(50));
+        std::thread::sleep(Duration::from_millis(50));
     }
     assert_eq!(listed["reach"], "remote", "{listed}");
     assert_eq!(
@@ -275,7 +313,7 @@ fn a_hang_up_reads_the_configuration_again() {
     let peer = "[discovery.static]\ncrex = [\"tcp://127.0.0.1:9\"]\n";
     std::fs::write(&file, port(1) + peer).unwrap();
     gateway.send_signal("-HUP");
-    let started = std::time::Instant::now();
+    let started = Instant::now();
     while peers()[0]["name"] != "crex" {
         assert!(started.elapsed().as_secs() < 60, "never: the new peer");
     }

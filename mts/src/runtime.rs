@@ -18,12 +18,12 @@ use std::time::{Duration, Instant};
 
 use fipa_sds::{Change, Directory, Entry, Pattern};
 use fipa_transport::{
-    Conclusion, Incarnation, Introduction, Kind, ListenError, Location, Outcome, Transport,
-    WayError, WayFault,
+    Abandoned, Conclusion, Incarnation, Introduction, Kind, ListenError, Location, Outcome,
+    OwnerProcess, Transport, WayError, WayFault,
 };
 use parking_lot::{Mutex, MutexGuard};
 use tokio::runtime::Handle;
-use tokio::sync::Notify;
+use tokio::sync::{Notify, watch};
 use tokio::task::JoinHandle;
 
 use self::receiving::Receiving;
@@ -94,6 +94,10 @@ struct Shared {
     timer: Arc<Notify>,
     closed: AtomicBool,
     tasks: Mutex<Vec<JoinHandle<()>>>,
+    /// Where each transport is reached at present, in their order.
+    locations: Mutex<Vec<(Kind, Vec<Location>)>>,
+    located: watch::Sender<Arc<[Location]>>,
+    owner: OwnerProcess,
 }
 
 struct State {
@@ -153,7 +157,8 @@ impl Slot {
 pub struct Started {
     /// The service.
     pub mts: Mts,
-    /// Where it can be reached, in the order of its transports.
+    /// Where it can be reached at its start, in the order of its transports; later see
+    /// [`Mts::locations`].
     pub locations: Vec<Location>,
     /// Transports that could not be opened; the service runs without them.
     pub failed: Vec<(Kind, ListenError)>,
@@ -186,8 +191,16 @@ impl Mts {
             timer: Arc::default(),
             closed: AtomicBool::new(false),
             tasks: Mutex::default(),
+            locations: Mutex::new(
+                transports
+                    .iter()
+                    .map(|it| (it.kind(), Vec::new()))
+                    .collect(),
+            ),
+            located: watch::Sender::new(Arc::default()),
+            owner: OwnerProcess::this(),
         });
-        let (mut locations, mut failed) = (Vec::new(), Vec::new());
+        let mut failed = Vec::new();
         for transport in &transports {
             let sink = Arc::new(Receiving {
                 shared: Arc::downgrade(&shared),
@@ -195,10 +208,11 @@ impl Mts {
                 answers_at_once: transport.answers_at_once(),
             });
             match transport.listen(sink) {
-                Ok(found) => locations.extend(found),
+                Ok(found) => shared.locate(transport.kind(), found, false),
                 Err(error) => failed.push((transport.kind(), error)),
             }
         }
+        let locations = shared.located.borrow().to_vec();
         let tasks = [
             handle.spawn(keep_time(
                 Arc::downgrade(&shared),
@@ -212,6 +226,21 @@ impl Mts {
             locations,
             failed,
         }
+    }
+
+    /// Where the service can be reached, in the order of its transports. The list changes when the
+    /// addresses of this host do.
+    #[must_use]
+    pub fn locations(&self) -> watch::Receiver<Arc<[Location]>> {
+        self.shared.located.subscribe()
+    }
+
+    /// Opens connections to these services, by name and location, so that their hellos say where
+    /// this service is; see [`Core::greet`].
+    pub fn greet(&self, services: Vec<(Arc<str>, Location)>) {
+        let mut state = self.shared.state.lock();
+        state.core.greet(services);
+        self.shared.carry_out(state);
     }
 
     /// Letters for this agent are taken from now on. It must be in the directory, or about to be.
@@ -230,7 +259,7 @@ impl Mts {
     pub fn deregister(&self, incarnation: Incarnation) -> Vec<Received> {
         let mut state = self.shared.state.lock();
         let unread = std::iter::from_fn(|| state.core.take(incarnation)).collect();
-        state.core.deregister(incarnation);
+        state.core.deregister(Now::read(), incarnation);
         if let Some(door) = state.agents.remove(&incarnation) {
             door.close();
         }
@@ -263,10 +292,6 @@ impl Mts {
         slot.outcomes.lock().expected = expected;
         if expected > 0 {
             state.sends.insert(id, Arc::clone(&slot));
-        }
-        if self.shared.closed.load(Ordering::Acquire) {
-            // Nobody keeps time any more.
-            state.core.give_up();
         }
         self.shared.carry_out(state);
         Sending {
@@ -408,7 +433,7 @@ impl Mts {
             task.abort();
         }
         let mut state = self.shared.state.lock();
-        state.core.give_up();
+        state.core.give_up(Now::read());
         for door in state.agents.values() {
             door.close();
         }
@@ -420,6 +445,21 @@ impl Mts {
 }
 
 impl Shared {
+    /// A transport is reached at these locations from now on, unless it has said otherwise
+    /// meanwhile: `moved` is whether this comes from [`Sink::relocated`](fipa_transport::Sink::relocated),
+    /// which may be called before `listen` has returned.
+    fn locate(&self, kind: Kind, found: Vec<Location>, moved: bool) {
+        let mut locations = self.locations.lock();
+        let place = locations.iter_mut().find(|(other, _)| *other == kind);
+        if let Some((_, place)) = place
+            && (moved || place.is_empty())
+        {
+            *place = found;
+        }
+        let all = locations.iter().flat_map(|(_, of_one)| of_one).cloned();
+        self.located.send_replace(all.collect());
+    }
+
     fn transport(&self, kind: Kind) -> Option<&Arc<dyn Transport>> {
         self.transports
             .iter()
@@ -455,10 +495,19 @@ impl Shared {
                             .handle_conclusion(Now::read(), attempt, conclusion);
                     }
                 }
-                Action::Abandon { kind, attempt } => {
-                    if let Some(transport) = self.transport(kind) {
-                        transport.abandon(attempt);
-                    }
+                Action::Abandon {
+                    kind,
+                    attempt,
+                    error,
+                } => {
+                    let end = match self.transport(kind) {
+                        Some(transport) => transport.abandon(attempt),
+                        None => Abandoned::Unconfirmed,
+                    };
+                    let conclusion = end.conclusion(error);
+                    state
+                        .core
+                        .handle_conclusion(Now::read(), attempt, conclusion);
                 }
                 Action::Answer {
                     kind,
@@ -533,6 +582,11 @@ impl Shared {
 
 impl Drop for Shared {
     fn drop(&mut self) {
+        if !self.owner.is_this() {
+            // In a forked child: closing the transports would end the parent's connections.
+            std::mem::forget(std::mem::take(&mut self.transports));
+            return;
+        }
         self.timer.notify_one();
     }
 }

@@ -38,15 +38,6 @@ pub(crate) fn carries(
         .any(|stamp| stamp.by().as_str() == name && stamp.id().is_some_and(|it| it.as_str() == id)))
 }
 
-/// Whether the letter carries the stamp of a service with this incarnation, whatever its name.
-pub(crate) fn passed(letter: &Letter, incarnation: Incarnation) -> Result<bool, DecodeError> {
-    let envelope = letter.envelope();
-    let view = EnvelopeView::parse(&envelope)?;
-    let id = incarnation.to_string();
-    let mut stamps = view.stamps();
-    Ok(stamps.any(|stamp| stamp.id().is_some_and(|it| it.as_str() == id)))
-}
-
 /// How many services have stamped the letter.
 pub(crate) fn count(letter: &Letter) -> Result<usize, DecodeError> {
     let envelope = letter.envelope();

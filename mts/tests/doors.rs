@@ -8,8 +8,8 @@ use fipa_mts::core::CoreConfig;
 use fipa_mts::{Mts, RuntimeConfig};
 use fipa_sds::MemoryDirectory;
 use fipa_transport::{
-    Answer, AttemptId, Incarnation, Kind, ListenError, Location, Parcel, Sink, Ticket, Transport,
-    WayError, WayFault,
+    Abandoned, Answer, AttemptId, Incarnation, Kind, ListenError, Location, Parcel, Sink, Ticket,
+    Transport, WayError, WayFault,
 };
 
 const ARM: Incarnation = Incarnation::from_u64(0xa);
@@ -42,7 +42,9 @@ impl Transport for Slow {
         Err(WayError::new(WayFault::Unreachable, "nobody is there"))
     }
 
-    fn abandon(&self, _: AttemptId) {}
+    fn abandon(&self, _: AttemptId) -> Abandoned {
+        Abandoned::Unconfirmed
+    }
 
     fn answer(&self, _: Ticket, _: Answer) {}
 

@@ -12,7 +12,7 @@ use fipa_mts::letter_for;
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
-    Outcome, Parcel, Stream, Ticket, Verdict,
+    Outcome, Parcel, Report, Stream, Ticket, Verdict,
 };
 
 const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
@@ -143,8 +143,8 @@ fn parcel(sequence: u64, letter: Letter) -> Parcel {
         },
         sequence,
         after: 0,
+        transfer: 1,
         remaining: Duration::from_secs(2),
-        hops: 1,
         body: Body::Letter(letter),
     }
 }
@@ -158,7 +158,7 @@ fn the_answer_to_a_peer_waits_for_the_outcome() {
     );
     let (attempt, location, passed_on) = gateway.dispatched();
     assert_eq!(location, shm(0x9));
-    assert_eq!((passed_on.sequence, passed_on.hops), (1, 1));
+    assert_eq!((passed_on.sequence, passed_on.after), (1, 0));
     assert!(
         passed_on.remaining < Duration::from_secs(2),
         "those further down give up earlier"
@@ -186,7 +186,7 @@ fn a_slow_receiver_makes_it_custody_and_a_report() {
     assert_eq!(back, tcp(0x1));
     assert_eq!(report.sequence, 1);
     match report.body {
-        Body::Report(report) => assert_eq!(report.outcome.via(), Some(Kind::Shm)),
+        Body::Report(Report::Settled(outcome)) => assert_eq!(outcome.via(), Some(Kind::Shm)),
         other => panic!("{other:?}"),
     }
 }
@@ -200,8 +200,8 @@ fn over_shared_memory_custody_is_answered_at_once() {
     gateway.conclude(1, attempt, Answer::failed(FailureReason::Refused, "no"));
     let (attempt, _, report) = gateway.dispatched();
     match report.body {
-        Body::Report(report) => assert!(matches!(
-            report.outcome,
+        Body::Report(Report::Settled(outcome)) => assert!(matches!(
+            outcome,
             Outcome::Failed {
                 reason: FailureReason::Refused,
                 ..
@@ -325,7 +325,7 @@ fn a_lane_that_is_full_holds_back_and_gives_credit() {
         match parcel.body {
             Body::Letter(_) => delivered += 1,
             Body::Credit => credits += 1,
-            Body::Report(_) => {}
+            Body::Report(_) | Body::Predecessor => {}
         }
         gateway.conclude(1, attempt, Answer::Accepted);
     }
@@ -445,12 +445,11 @@ fn a_stranger_that_writes_can_be_answered() {
     ));
 }
 
-/// Whoever hands a letter over says which one it comes after, and the gateway follows that from letter
-/// to letter; in a circle it would for ever.
+/// A letter names a predecessor below itself, and sequences begin at 1.
 #[test]
-fn a_letter_that_comes_after_itself_is_refused() {
+fn a_letter_whose_predecessor_is_not_below_it_is_refused() {
     let mut gateway = Gateway::new(true);
-    for (sequence, after) in [(5, 5), (5, 7), (7, 5)] {
+    for (sequence, after) in [(5, 5), (5, 7), (0, 0), (0, 3), (7, 5)] {
         let parcel = Parcel {
             after,
             ..parcel(sequence, letter())
@@ -465,9 +464,16 @@ fn a_letter_that_comes_after_itself_is_refused() {
         };
         assert_eq!(reason, FailureReason::Refused);
     }
-    // What it was told of those that failed is all there is to follow.
     let (_, _, first) = gateway.dispatched();
     assert_eq!((first.sequence, first.after), (7, 5));
+}
+
+/// A custodian passes the predecessor on as it was told, also when the predecessor failed here.
+#[test]
+fn a_custodian_never_lowers_a_predecessor_by_itself() {
+    let mut gateway = Gateway::new(true);
+    gateway.arrive(0, Kind::Tcp, parcel(7, letter()));
+    gateway.dispatched();
     gateway.time(2500);
     let next = Parcel {
         after: 7,
@@ -481,5 +487,95 @@ fn a_letter_that_comes_after_itself_is_refused() {
         _ => None,
     });
     let passed_on = passed_on.unwrap();
-    assert_eq!((passed_on.sequence, passed_on.after), (8, 5));
+    assert_eq!((passed_on.sequence, passed_on.after), (8, 7));
+}
+
+/// A letter whose predecessor does not come is handed back, and waits no longer.
+#[test]
+fn a_letter_without_its_predecessor_is_returned() {
+    let mut gateway = Gateway::new(true);
+    let orphan = Parcel {
+        after: 7,
+        ..parcel(8, letter())
+    };
+    assert_eq!(gateway.arrive(0, Kind::Tcp, orphan), Verdict::Later);
+    let (attempt, ..) = gateway.dispatched();
+    gateway.conclude(1, attempt, Answer::OutOfOrder { last: 3 });
+    gateway.nothing_to_do();
+    gateway.time(49);
+    gateway.nothing_to_do();
+    gateway.time(51);
+    assert_eq!(gateway.answered(), Answer::Returned { uncertain: false });
+    gateway.nothing_to_do();
+}
+
+/// The same letter waits for its predecessor when that comes in time.
+#[test]
+fn a_letter_waits_for_a_predecessor_that_comes() {
+    let mut gateway = Gateway::new(true);
+    let early = Parcel {
+        after: 7,
+        ..parcel(8, letter())
+    };
+    gateway.arrive(0, Kind::Tcp, early);
+    let (attempt, ..) = gateway.dispatched();
+    gateway.conclude(1, attempt, Answer::OutOfOrder { last: 3 });
+    gateway.arrive(20, Kind::Tcp, parcel(7, letter()));
+    // The letter leaves behind its predecessor, on the same way.
+    let (first, _, parcel) = gateway.dispatched();
+    assert_eq!(parcel.sequence, 7);
+    let (second, _, parcel) = gateway.dispatched();
+    assert_eq!((parcel.sequence, parcel.after), (8, 7));
+    gateway.conclude(21, first, Answer::Accepted);
+    assert_eq!(gateway.answered(), Answer::Accepted);
+    gateway.conclude(22, second, Answer::Accepted);
+    assert_eq!(gateway.answered(), Answer::Accepted);
+    gateway.time(60);
+    gateway.nothing_to_do();
+}
+
+/// A letter that came back although its predecessor is under way waits for the end of that attempt.
+#[test]
+fn a_letter_waits_while_its_predecessor_is_under_way() {
+    let mut gateway = Gateway::new(true);
+    gateway.arrive(0, Kind::Tcp, parcel(7, letter()));
+    let (first, ..) = gateway.dispatched();
+    let behind = Parcel {
+        after: 7,
+        ..parcel(8, letter())
+    };
+    gateway.arrive(0, Kind::Tcp, behind);
+    let (second, ..) = gateway.dispatched();
+    gateway.conclude(1, second, Answer::OutOfOrder { last: 3 });
+    gateway.time(100);
+    gateway.nothing_to_do();
+    gateway.conclude(101, first, Answer::Accepted);
+    assert_eq!(gateway.answered(), Answer::Accepted);
+    let (_, _, again) = gateway.dispatched();
+    assert_eq!((again.sequence, again.after), (8, 7));
+}
+
+/// The sender's process tells a custodian that the predecessor of a letter has failed: the letter
+/// goes on without waiting to be handed back.
+#[test]
+fn a_note_lowers_the_predecessor_of_a_held_letter() {
+    let mut gateway = Gateway::new(true);
+    let held = Parcel {
+        after: 7,
+        ..parcel(8, letter())
+    };
+    gateway.arrive(0, Kind::Tcp, held);
+    let (attempt, ..) = gateway.dispatched();
+    gateway.conclude(1, attempt, Answer::OutOfOrder { last: 3 });
+    let note = Parcel {
+        after: 3,
+        body: Body::Predecessor,
+        ..parcel(8, letter())
+    };
+    assert_eq!(
+        gateway.arrive(2, Kind::Tcp, note),
+        Verdict::Now(Answer::Accepted)
+    );
+    let (_, _, again) = gateway.dispatched();
+    assert_eq!((again.sequence, again.after), (8, 3));
 }

@@ -55,7 +55,7 @@ fn arrival(to: Incarnation, called: &str, sequence: u64) -> Arrival {
         sequence,
         after: sequence - 1,
         remaining: Duration::from_secs(5),
-        hops: 0,
+        transfer: 0,
         body: Body::Letter(letter_for(&message, SystemTime::UNIX_EPOCH).unwrap()),
     };
     let location: Location = "shm://1#0000000000000001".parse().unwrap();

@@ -237,6 +237,40 @@ fn who_is_refused_is_told_in_its_own_words_and_not_without_end() {
     assert_eq!(told, 20, "as many as a second has");
 }
 
+/// The directory of a host on which one agent is registered.
+fn host_of(agent: &str) -> Arc<dyn Directory> {
+    let directory = MemoryDirectory::new(Mts::new("process", Incarnation::from_u64(9)));
+    let at = "shm://9#0000000000000009".parse().unwrap();
+    let agent = Registration::new(agent, Incarnation::from_u64(5), vec![at]);
+    directory.register(agent).unwrap();
+    Arc::new(directory)
+}
+
+/// The recorded letter to an agent with another name, as the C++ library writes it.
+fn recorded_to(receiver: &str) -> Letter {
+    let (mut envelope, letter) = Letter::decode(Bytes::from_static(LETTER)).unwrap();
+    envelope.extensions.clear();
+    envelope.base.to = vec![AgentId::new(receiver).unwrap()];
+    envelope.base.intended_receivers = envelope.base.to.clone();
+    let payload = letter.payload().clone();
+    Letter::new(envelope.encode_standard().unwrap(), payload)
+}
+
+#[test]
+fn a_name_with_a_dot_is_reached_as_legacy_peers_write_it() {
+    let config = CoreConfig {
+        forwards: true,
+        ..CoreConfig::new("gateway", Incarnation::from_u64(7), vec![Kind::Shm])
+    };
+    let mut core = Core::new(config, host_of("arm.left"));
+    let deadline = Duration::from_secs(5);
+    core.handle_unframed(now(), deadline, recorded_to("arm?left"), Kind::Tcp, HERE);
+    let (_, location, parcel) = dispatched(&mut core).unwrap();
+    assert_eq!(location.kind(), Kind::Shm);
+    assert_eq!(&*parcel.receiver, "arm.left");
+    assert!(core.poll_action().is_none());
+}
+
 #[test]
 fn failure_messages_that_nobody_takes_are_bounded() {
     let mut core = core(true, &[]);

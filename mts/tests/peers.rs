@@ -5,8 +5,10 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_mts::core::{Action, Core, CoreConfig, Now, Peer};
-use fipa_sds::{MemoryDirectory, Mts};
+use fipa_acl::{AgentId, Message, Performative};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Peer, Submission};
+use fipa_mts::letter_for;
+use fipa_sds::{Directory as _, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
     Answer, AttemptId, Body, Conclusion, Incarnation, Kind, Location, WayError, WayFault,
 };
@@ -155,4 +157,94 @@ fn other_peers_replace_those_before_and_the_same_stay() {
         Some(Action::Abandon { .. })
     ));
     assert_eq!(bench.core.poll_timeout(), None);
+}
+
+#[test]
+fn a_change_of_the_network_has_peers_asked_at_once() {
+    let mut bench = Bench::new();
+    bench
+        .core
+        .keep_in_touch(bench.now, vec![peer(&["tcp://a:2"])]);
+    for _ in 0..9 {
+        let (attempt, _) = bench.asked().unwrap();
+        bench.fails(attempt);
+        bench.wait();
+    }
+    let (attempt, _) = bench.asked().unwrap();
+    bench.fails(attempt);
+    bench.now.instant += Duration::from_millis(1);
+    assert!(bench.asked().is_none());
+    bench.core.handle_reachable(bench.now, None);
+    let (attempt, asked) = bench.asked().unwrap();
+    assert_eq!(asked, "tcp://a:2");
+    // The pauses start from the shortest again.
+    bench.fails(attempt);
+    assert_eq!(bench.wait(), Duration::from_millis(100));
+}
+
+#[test]
+fn a_greeting_opens_a_connection_and_is_not_repeated() {
+    let mut bench = Bench::new();
+    let at: Location = "tcp://a:2".parse().unwrap();
+    bench.core.greet(vec![("crex".into(), at)]);
+    let (attempt, asked) = bench.asked().unwrap();
+    assert_eq!(asked, "tcp://a:2");
+    bench.fails(attempt);
+    assert!(bench.asked().is_none());
+    assert_eq!(bench.core.poll_timeout(), None);
+}
+
+#[test]
+fn letters_that_wait_go_when_their_receiver_is_reachable_again() {
+    let gateway = Incarnation::from_u64(7);
+    let directory = Arc::new(MemoryDirectory::new(Mts::new(
+        "mts",
+        Incarnation::from_u64(1),
+    )));
+    let at: Location = "tcp://10.0.0.2:1".parse().unwrap();
+    let at = at.with_incarnation(gateway);
+    let arm = Registration::new("arm", Incarnation::from_u64(3), vec![at.clone()]);
+    directory.register(arm).unwrap();
+    let mut bench = Bench::new();
+    let config = bench.core.config().clone();
+    bench.core = Core::new(config, directory);
+    let rover = Incarnation::from_u64(2);
+    bench.core.register("rover".into(), rover);
+    let message = Message::builder(Performative::Inform)
+        .sender(AgentId::new("rover").unwrap())
+        .receiver(AgentId::new("arm").unwrap())
+        .build()
+        .unwrap();
+    let submission = Submission {
+        sender: rover,
+        letter: letter_for(&message, bench.now.utc).unwrap(),
+        receivers: vec!["arm".into()],
+        deadline: Duration::from_secs(60),
+    };
+    bench.core.send(bench.now, submission);
+    let dispatched = |bench: &mut Bench| loop {
+        match bench.core.poll_action()? {
+            Action::Dispatch { attempt, .. } => return Some(attempt),
+            Action::Outcome { outcome, .. } => panic!("{outcome:?}"),
+            _ => {}
+        }
+    };
+    // Until the pause is a long one.
+    let mut waited = Duration::ZERO;
+    while waited < Duration::from_millis(200) {
+        let attempt = dispatched(&mut bench);
+        match attempt {
+            Some(attempt) => bench.fails(attempt),
+            None => waited = bench.wait(),
+        }
+    }
+    if let Some(attempt) = dispatched(&mut bench) {
+        bench.fails(attempt);
+    }
+    assert_eq!(dispatched(&mut bench), None);
+    let other = Some(Incarnation::from_u64(8));
+    bench.core.handle_reachable(bench.now, other);
+    assert_eq!(dispatched(&mut bench), None, "another service");
+    bench.core.handle_reachable(bench.now, Some(gateway));
+    assert!(dispatched(&mut bench).is_some());
 }

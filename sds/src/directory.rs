@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use fipa_transport::Incarnation;
+use fipa_transport::{Forked, Incarnation};
 
 use crate::{Entry, EntryError, Query, Registration, Subscriber, Watch};
 
@@ -143,6 +143,9 @@ pub enum RegisterError {
     /// The back end has been closed.
     #[error("the directory has been closed")]
     Closed,
+    /// This process is a forked child of the one that opened the directory.
+    #[error(transparent)]
+    Forked(#[from] Forked),
     /// The back end could not be written.
     #[error("cannot register in the directory: {0}")]
     Failed(Arc<dyn std::error::Error + Send + Sync>),
@@ -161,6 +164,9 @@ pub enum DeregisterError {
     /// The back end has been closed, and its registrations with it.
     #[error("the directory has been closed")]
     Closed,
+    /// This process is a forked child of the one that opened the directory.
+    #[error(transparent)]
+    Forked(#[from] Forked),
     /// The back end could not be written.
     #[error("cannot deregister from the directory: {0}")]
     Failed(Arc<dyn std::error::Error + Send + Sync>),

@@ -59,6 +59,36 @@ pub fn resolve(
     })
 }
 
+/// Resolves the receiver of a legacy peer's letter: as [`resolve`] does, and when that finds nothing,
+/// as a name in which each `?` stands for itself or for a dot. fipa_services announces and asks for
+/// names whose dots are replaced by `?`.
+///
+/// # Errors
+/// When the name is a pattern that is not valid and no such name exists.
+pub fn resolve_legacy(
+    directory: &dyn Directory,
+    receiver: &str,
+    sender: &str,
+) -> Result<Resolution, PatternError> {
+    let resolved = resolve(directory, receiver, sender);
+    let found = !matches!(resolved, Ok(Resolution::None) | Err(_));
+    if found || !receiver.contains('?') {
+        return resolved;
+    }
+    let dotted = receiver.replace('?', ".");
+    if directory.lookup(&dotted).is_some() {
+        return resolve(directory, &dotted, sender);
+    }
+    // Some of its question marks are its own.
+    let entries = directory.entries();
+    let means = |entry: &&Arc<Entry>| entry.name.replace('.', "?") == receiver;
+    let mut meant = entries.iter().filter(means);
+    match (meant.next(), meant.next()) {
+        (Some(entry), None) => resolve(directory, &entry.name, sender),
+        _ => resolved,
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use fipa_transport::Incarnation;
@@ -112,6 +142,29 @@ mod tests {
         assert_eq!(nobody, Resolution::None);
         let gateway = resolve(&directory, "arm_gateway", "camera").unwrap();
         assert_eq!(names(&gateway), ["arm_gateway"]);
+    }
+
+    #[test]
+    fn a_question_mark_of_a_legacy_peer_means_a_dot_when_nothing_else_matches() {
+        let directory = directory(&[
+            "arm.left",
+            "armright",
+            "arm?up",
+            "arm.up",
+            "who?is.it",
+            "?.x",
+        ]);
+        let legacy = |name: &str| names(&resolve_legacy(&directory, name, "me").unwrap()).join(" ");
+        assert_eq!(legacy("arm?left"), "arm.left");
+        assert_eq!(legacy("arm?right"), "armright", "a pattern comes first");
+        assert_eq!(legacy("arm?up"), "arm?up", "an exact name comes first");
+        assert_eq!(legacy("who?is?it"), "who?is.it");
+        // It is no valid pattern.
+        assert_eq!(legacy("??x"), "?.x");
+        assert_eq!(legacy("arm?down"), "");
+        assert!(resolve_legacy(&directory, "?down", "me").is_err());
+        let resolved = resolve(&directory, "arm?left", "me").unwrap();
+        assert_eq!(resolved, Resolution::None, "only for legacy peers");
     }
 
     #[test]

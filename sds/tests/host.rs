@@ -59,8 +59,38 @@ impl Process {
         process
     }
 
+    /// A process that gets no inotify instance, like the 119th of a user. None, and says so, where
+    /// this user may not make user namespaces; fails then if `CI=true`.
+    fn start_without_inotify(dir: &Path) -> Option<Self> {
+        let unshare = || {
+            let mut unshare = Command::new("unshare");
+            let limit = "echo 0 >/proc/sys/user/max_inotify_instances && exec \"$@\"";
+            unshare.args(["--user", "--map-root-user", "sh", "-c", limit, "sh"]);
+            unshare
+        };
+        if !unshare()
+            .arg("true")
+            .status()
+            .is_ok_and(|status| status.success())
+        {
+            let in_ci = std::env::var("CI").as_deref() == Ok("true");
+            assert!(!in_ci, "needs user namespaces");
+            eprintln!("SKIPPED, not a success: needs user namespaces");
+            return None;
+        }
+        let mut command = unshare();
+        command.arg(std::env::current_exe().unwrap());
+        let mut process = Self::run(command, dir);
+        assert_eq!(process.answer(), "ready");
+        Some(process)
+    }
+
     fn start_unready(dir: &Path) -> Self {
-        let mut child = Command::new(std::env::current_exe().unwrap())
+        Self::run(Command::new(std::env::current_exe().unwrap()), dir)
+    }
+
+    fn run(mut command: Command, dir: &Path) -> Self {
+        let mut child = command
             .args(["--exact", "child_process", "--ignored", "--nocapture", "-q"])
             .env(DIR_VARIABLE, dir)
             .stdin(Stdio::piped())
@@ -133,6 +163,11 @@ fn child_process() {
                 failed.map_or("ok".to_owned(), |error| error.to_string())
             }
             "lookup" => directory.lookup(name).is_some().to_string(),
+            // Unlike a lookup, it reads nothing: only the task has found out what there is.
+            "sees" => {
+                let entries = directory.search(&fipa_sds::Query::all());
+                entries.iter().any(|entry| &*entry.name == name).to_string()
+            }
             "churn" => {
                 for round in 0..25 {
                     let visitor = open(&dir);
@@ -317,6 +352,39 @@ async fn the_end_of_every_process_is_told() {
     assert!(told(&mut departures).await);
     drop(here);
     while told(&mut departures).await {}
+}
+
+#[tokio::test]
+async fn without_inotify_the_directory_is_polled() {
+    let (_parent, dir) = place();
+    let Some(mut polling) = Process::start_without_inotify(&dir) else {
+        return;
+    };
+    let here = open(&dir);
+    here.register(registration("arm")).unwrap();
+    while polling.ask("sees arm") == "false" {}
+    assert_eq!(polling.ask("register leg"), "ok");
+    assert!(here.lookup("leg").is_some());
+    let _listening = here.listen().unwrap();
+    assert_eq!(polling.ask("connect"), "ok");
+    // An end in order,
+    drop(here);
+    while polling.ask("sees arm") == "true" {}
+    // and ends that no other process tells of: more than one poll asks for.
+    let mut victims: Vec<Process> = (0..10).map(|_| Process::start(&dir)).collect();
+    for (number, victim) in victims.iter_mut().enumerate() {
+        assert_eq!(victim.ask(&format!("register agent_{number}")), "ok");
+        while polling.ask(&format!("sees agent_{number}")) == "false" {}
+    }
+    victims.iter_mut().for_each(Process::kill);
+    for number in 0..victims.len() {
+        while polling.ask(&format!("sees agent_{number}")) == "true" {}
+    }
+    // The remains of the dead are removed: the lock, and two files of the process itself.
+    eventually("their files are removed", || {
+        (files(&dir).len() == 3).then_some(())
+    })
+    .await;
 }
 
 #[tokio::test]
@@ -615,4 +683,102 @@ async fn what_is_no_socket_of_ours_is_not_connected_to() {
         one.connect(socket),
         Err(HostError::NotPrivate { .. })
     ));
+}
+
+#[tokio::test]
+async fn a_directory_that_was_removed_is_joined_again() {
+    let (_parent, dir) = place();
+    let (one, two) = (open(&dir), open(&dir));
+    let arm = registration("arm");
+    one.register(arm.clone()).unwrap();
+    two.register(registration("leg")).unwrap();
+    assert!(one.is_there().unwrap());
+    assert!(!one.rejoin().unwrap());
+    for way in ["removed", "moved away", "one file removed"] {
+        // What is told of the removal of a file is told for each process.
+        match way {
+            "removed" => std::fs::remove_dir_all(&dir).unwrap(),
+            "moved away" => std::fs::rename(&dir, dir.with_extension(way)).unwrap(),
+            _ => {
+                let mut files = files(&dir).into_iter();
+                let entries = files.find(|name| name.ends_with(".entries"));
+                std::fs::remove_file(dir.join(entries.unwrap())).unwrap();
+            }
+        }
+        if way == "removed" {
+            one.disturbed().await;
+        }
+        let rejoined = [&one, &two].map(|directory| directory.rejoin().unwrap());
+        let needed = if way == "one file removed" { 1 } else { 2 };
+        assert_eq!(rejoined.iter().filter(|it| **it).count(), needed, "{way}");
+        for directory in [&one, &two] {
+            assert!(directory.is_there().unwrap(), "{way}");
+            for name in ["arm", "leg"] {
+                eventually(name, || directory.lookup(name).map(|_| ())).await;
+            }
+        }
+        let newcomer = open(&dir);
+        assert!(newcomer.lookup("arm").is_some() && newcomer.lookup("leg").is_some());
+        newcomer.register(registration(way)).unwrap();
+        assert!(one.lookup(way).is_some());
+        drop(newcomer);
+        // The watcher of the new directory.
+        let mut victim = Process::start(&dir);
+        assert_eq!(victim.ask("register foot"), "ok");
+        assert!(one.lookup("foot").is_some());
+        victim.kill();
+        eventually("its end is noticed", || {
+            one.known("foot").is_none().then_some(())
+        })
+        .await;
+    }
+    one.deregister("arm", arm.incarnation).unwrap();
+    drop(one);
+    drop(two);
+    assert_eq!(files(&dir), Vec::<String>::new());
+}
+
+#[tokio::test]
+async fn a_name_that_was_registered_meanwhile_is_lost() {
+    let (_parent, dir) = place();
+    let here = open(&dir);
+    let ours = registration("arm");
+    here.register(ours.clone()).unwrap();
+    here.register(registration("leg")).unwrap();
+    std::fs::remove_dir_all(&dir).unwrap();
+    let newcomer = open(&dir);
+    let theirs = registration("arm");
+    newcomer.register(theirs.clone()).unwrap();
+    assert!(here.rejoin().unwrap());
+    for directory in [&here, &newcomer] {
+        assert_eq!(
+            directory.lookup("arm").unwrap().incarnation,
+            theirs.incarnation
+        );
+        assert!(directory.lookup("leg").is_some());
+    }
+    assert!(here.deregister("arm", ours.incarnation).is_err());
+}
+
+#[tokio::test]
+async fn what_changes_while_the_directory_is_gone_is_written_afterwards() {
+    let (_parent, dir) = place();
+    let gateway = HostDirectory::open(HostConfig {
+        gateway: true,
+        ..config(&dir)
+    })
+    .unwrap();
+    let arm = registration("arm");
+    let entry = gateway.register(arm.clone()).unwrap();
+    std::fs::remove_dir_all(&dir).unwrap();
+    let remote = Entry {
+        name: "far".into(),
+        ..Entry::clone(&entry)
+    };
+    gateway.publish_remote(vec![remote]).unwrap();
+    gateway.deregister("arm", arm.incarnation).unwrap();
+    assert!(gateway.rejoin().unwrap());
+    let newcomer = open(&dir);
+    assert!(newcomer.lookup("far").is_some());
+    assert!(newcomer.lookup("arm").is_none());
 }

@@ -23,6 +23,8 @@ const MAX_MTS_NAME: usize = 255;
 const MAX_DEADLINE: Duration = MAX_REMAINING;
 /// Most letters in the queue of one agent.
 const MAX_QUEUE: usize = 65_536;
+/// Bytes in the queue of one agent.
+const QUEUE_BYTES: RangeInclusive<u64> = 64 << 10..=1 << 40;
 /// Most lines of `[routes]`, `access.allow` and `access.deny`.
 const MAX_ROUTES: usize = 256;
 /// Most letters a second.
@@ -249,6 +251,13 @@ impl Findings {
                 format!("use 1 to {} letters", MAX_QUEUE),
             );
         }
+        if !QUEUE_BYTES.contains(&mts.queue_bytes) {
+            self.add(
+                &["mts", "queue_bytes"],
+                format_args!("cannot be {} bytes", mts.queue_bytes),
+                "use 64KiB to 1TiB",
+            );
+        }
     }
 
     fn name(&mut self, path: &[&str], name: &str) {
@@ -459,7 +468,7 @@ impl Findings {
 }
 
 /// Whether an address with port, as text, is one of this host only.
-fn is_on_loopback(text: &str) -> bool {
+pub(crate) fn is_on_loopback(text: &str) -> bool {
     let address = text.parse::<SocketAddr>();
     address.is_ok_and(|address| address.ip().to_canonical().is_loopback())
 }

@@ -95,6 +95,13 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::Number(config.mts.queue),
     },
     Key {
+        path: &["mts", "queue_bytes"],
+        shape: Shape::Text,
+        expected: SIZE,
+        write: |config, value| size(value).map(|size| config.mts.queue_bytes = size),
+        read: |config| size_text(config.mts.queue_bytes),
+    },
+    Key {
         path: &["transport", "shm", "capacity"],
         shape: Shape::Text,
         expected: SIZE,

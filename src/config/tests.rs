@@ -282,6 +282,7 @@ name = "sherpa-mts"                  # default
 transports = ["shm", "tcp"]          # fipa.toml:4
 deadline = "1m 30s"                  # --set
 queue = 256                          # default
+queue_bytes = "64MiB"                # default
 
 [transport.shm]
 capacity = "256MiB"                  # default
@@ -358,6 +359,7 @@ prop_compose! {
         transports in kinds(),
         deadline in 1..=3_600_000_000_000_u64,
         queue in 1..=65_536_usize,
+        queue_bytes in 64_u64 << 10..=1 << 40,
         routes in prop::collection::btree_map("[a-zé\"'#= .\n-]{1,12}(\\.\\*)?", kinds(), 0..5),
         capacity in 1_u64 << 20..=1 << 40,
         letter in 4096_u64..=1 << 20,
@@ -375,6 +377,7 @@ prop_compose! {
         config.mts.transports = transports;
         config.mts.deadline = Duration::from_nanos(deadline);
         config.mts.queue = queue;
+        config.mts.queue_bytes = queue_bytes;
         config.routes = routes
             .into_iter()
             .map(|(receiver, transports)| Route { receiver, transports })

@@ -4,8 +4,11 @@
 //! a file here and a line in [`examine`]. Examining changes nothing; the
 //! network is asked who is there.
 
+#[cfg(feature = "net")]
+mod locations;
 #[cfg(feature = "mdns")]
 mod network;
+mod queues;
 #[cfg(feature = "net")]
 mod security;
 #[cfg(feature = "shm")]
@@ -49,10 +52,6 @@ pub enum Verdict {
 /// seconds when `discovery.mdns` is on, while it listens to the network.
 #[must_use]
 pub fn examine(config: &Config) -> Vec<Check> {
-    #[cfg_attr(
-        not(any(feature = "shm", feature = "net")),
-        expect(unused_mut, reason = "nothing is examined")
-    )]
     let mut checks = Vec::new();
     #[cfg(feature = "shm")]
     if config.mts.transports.contains(&crate::Kind::Shm) {
@@ -63,17 +62,16 @@ pub fn examine(config: &Config) -> Vec<Check> {
         network::examine(config, &mut checks);
     }
     #[cfg(feature = "net")]
+    locations::examine(config, &mut checks);
+    #[cfg(feature = "net")]
     security::examine(config, &mut checks);
-    #[cfg(not(any(feature = "shm", feature = "net")))]
-    let _ = config;
+    queues::examine(config, &mut checks);
     checks
 }
 
 /// Makes the checks of one area.
-#[cfg(any(feature = "shm", feature = "net"))]
 pub(crate) struct Area(pub(crate) &'static str);
 
-#[cfg(any(feature = "shm", feature = "net"))]
 impl Area {
     pub(crate) fn fine(&self, check: &'static str, found: impl Into<String>) -> Check {
         Check {

@@ -5,6 +5,7 @@ use std::path::Path;
 use bytesize::ByteSize;
 use fipa_transport::Incarnation;
 use fipa_transport_shm::{Inspection, ShmConfig, inspect};
+use rustix::fs::inotify;
 use rustix::process::{Resource, geteuid, getrlimit};
 
 use super::{Area, Check, Verdict};
@@ -16,6 +17,9 @@ const AREA: Area = Area("shared memory");
 /// What a process needs of descriptors: some of its own, and some per process it talks to.
 const OWN_DESCRIPTORS: u64 = 40;
 const DESCRIPTORS_PER_PEER: u64 = 10;
+
+/// Bytes of shared memory that must be free for a process to talk to another one for the first time.
+const PER_CONNECTION: u64 = 1 << 20;
 
 /// With fewer processes to talk to than this, the limit of descriptors is doubtful.
 const FEW_PEERS: u64 = 32;
@@ -72,7 +76,11 @@ fn directory(place: &Place) -> Check {
 fn size(found: &Inspection, capacity: u64) -> Check {
     const CHECK: &str = "size of /dev/shm";
     let [total, free, need] = [found.total, found.free, capacity].map(ByteSize::b);
-    let text = format!("{total}, of which {free} are free; capacity of the domain: {need}");
+    let connections = room(found, capacity) / PER_CONNECTION;
+    let text = format!(
+        "{total}, of which {free} are free; capacity of the domain: {need}; room for {connections} more \
+         connections, beyond which letters take the next route"
+    );
     let advice = "enlarge it (mount -o remount,size=512M /dev/shm; for containers --shm-size=512m), or \
                   lower transport.shm.capacity";
     // Less than this and no process can start.
@@ -83,6 +91,11 @@ fn size(found: &Inspection, capacity: u64) -> Check {
     } else {
         AREA.fine(CHECK, text)
     }
+}
+
+/// Returns the bytes that the domain can still take.
+fn room(found: &Inspection, capacity: u64) -> u64 {
+    found.free.min(capacity.saturating_sub(found.used))
 }
 
 fn traces(found: &Inspection) -> Check {
@@ -131,15 +144,27 @@ fn descriptors() -> Check {
 }
 
 fn instances() -> Option<Check> {
-    const CHECK: &str = "inotify instances";
     const FILE: &str = "/proc/sys/fs/inotify/max_user_instances";
     let limit: u64 = std::fs::read_to_string(FILE).ok()?.trim().parse().ok()?;
+    // Of this process, which gives it back at once.
+    let one_more = inotify::init(inotify::CreateFlags::CLOEXEC);
+    Some(instances_left(limit, one_more.is_ok()))
+}
+
+fn instances_left(limit: u64, one_more: bool) -> Check {
+    const CHECK: &str = "inotify instances";
+    let advice = "sysctl fs.inotify.max_user_instances=512";
+    if !one_more {
+        let text = format!(
+            "all {limit} are in use: processes without one poll the directory of the domain every 100 ms"
+        );
+        return AREA.wrong(CHECK, Verdict::Doubtful, text, advice);
+    }
     let text = format!("{limit}, and every process of this user needs one");
     if limit >= FEW_INSTANCES {
-        return Some(AREA.fine(CHECK, text));
+        return AREA.fine(CHECK, text);
     }
-    let advice = "sysctl fs.inotify.max_user_instances=512";
-    Some(AREA.wrong(CHECK, Verdict::Doubtful, text, advice))
+    AREA.wrong(CHECK, Verdict::Doubtful, text, advice)
 }
 
 /// None where systemd does not run.
@@ -212,6 +237,16 @@ mod tests {
         let part = root.join("etc/systemd/logind.conf.d/50-robot.conf");
         fs::write(part, "[Login]\nRemoveIPC=yes\n").unwrap();
         assert_eq!(verdict(1000), Verdict::Doubtful);
+    }
+
+    #[test]
+    fn a_lack_of_inotify_instances_names_the_sysctl() {
+        assert_eq!(instances_left(128, true).verdict, Verdict::Fine);
+        for lacking in [instances_left(128, false), instances_left(16, true)] {
+            assert_eq!(lacking.verdict, Verdict::Doubtful);
+            let advice = lacking.advice.unwrap();
+            assert!(advice.contains("fs.inotify.max_user_instances"), "{advice}");
+        }
     }
 
     #[test]

@@ -5,9 +5,9 @@
 //! between them. A neighbour can be written to, gateway to gateway, by its incarnation; by name it
 //! cannot, because two robots may give their gateways one name.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
-use std::time::SystemTime;
+use std::time::{Duration, Instant, SystemTime};
 
 use fipa_mts::core::Peer;
 use fipa_sds::{
@@ -31,7 +31,16 @@ pub(crate) struct Neighbours {
 struct State {
     present: HashMap<Incarnation, Neighbour>,
     peers: Vec<Peer>,
+    /// Those whose last connection has ended, and when, the latest last.
+    parted: VecDeque<(Instant, Arc<Entry>)>,
 }
+
+/// For how long a neighbour that has parted is greeted when this host moves: the connections may
+/// have ended because it lost its address, long before it gets another.
+const PARTED: Duration = Duration::from_secs(600);
+
+/// Most parted neighbours that are remembered.
+const MAX_PARTED: usize = 64;
 
 /// A gateway of another host that a connection is open with.
 #[derive(Debug, Clone)]
@@ -40,6 +49,11 @@ pub struct Neighbour {
     /// The gateway as the directory has it, registered when it was first connected. Its locations
     /// are those of all its agents.
     pub entry: Arc<Entry>,
+    /// The locations of the configuration, with its incarnation.
+    configured: Vec<Location>,
+    /// Where it takes letters by what its open connections show, one location for each, the latest
+    /// last.
+    hops: Vec<Location>,
     /// How many connections are open with it.
     pub connections: usize,
     /// What `discovery.static` calls it, if it stands there.
@@ -84,44 +98,76 @@ impl Neighbours {
             return;
         }
         let mut state = self.state.lock();
-        if let Some(known) = state.present.get_mut(&incarnation) {
-            known.connections += 1;
-            if known.peer.is_some() || peer.dialled.is_none() {
-                return;
-            }
-        }
-        let connections = state
-            .present
-            .get(&incarnation)
-            .map_or(1, |it| it.connections);
-        let neighbour = state.neighbour(peer, connections);
+        let before = state.present.get(&incarnation);
+        let neighbour = state.neighbour(peer, before);
         if let Err(error) = neighbour.entry.check() {
             tracing::info!(%error, at = %peer.hop.location, "a gateway that cannot be written to");
             return;
         }
-        tracing::info!(name = %peer.name, at = %peer.hop.location, "connected with a gateway");
+        let changed = before.is_none_or(|before| !Arc::ptr_eq(&before.entry, &neighbour.entry));
+        if before.is_none() {
+            tracing::info!(name = %peer.name, at = %peer.hop.location, "connected with a gateway");
+        }
         state.present.insert(incarnation, neighbour);
-        self.changed.notify_one();
+        state
+            .parted
+            .retain(|(_, entry)| entry.incarnation != incarnation);
+        if changed {
+            self.changed.notify_one();
+        }
     }
 
-    pub(super) fn parted(&self, peer: &Introduction) {
+    pub(super) fn parted(&self, now: Instant, peer: &Introduction) {
         let incarnation = peer.hop.location.incarnation();
         let mut state = self.state.lock();
         let Some(known) = state.present.get_mut(&incarnation) else {
             return;
         };
+        if let Some(place) = known.hops.iter().position(|hop| *hop == peer.hop.location) {
+            known.hops.remove(place);
+        }
         known.connections -= 1;
         if known.connections > 0 {
+            // A location that only this connection has shown is not known any more.
+            if known.locate() {
+                self.changed.notify_one();
+            }
             return;
         }
-        state.present.remove(&incarnation);
+        if let Some(gone) = state.present.remove(&incarnation) {
+            if state.parted.len() >= MAX_PARTED {
+                state.parted.pop_front();
+            }
+            state.parted.push_back((now, gone.entry));
+        }
         self.changed.notify_one();
         tracing::info!(name = %peer.name, at = %peer.hop.location, "no longer connected");
+    }
+
+    /// The gateways that are to be told where this one is now, by name and location: those that are
+    /// connected, and those that were a while ago.
+    pub(super) fn to_greet(&self, now: Instant) -> Vec<(Arc<str>, Location)> {
+        let mut state = self.state.lock();
+        state.parted.retain(|(since, _)| *since + PARTED > now);
+        let present = state.present.values().map(|neighbour| &neighbour.entry);
+        let parted = state.parted.iter().map(|(_, entry)| entry);
+        let all = present.chain(parted).flat_map(|entry| {
+            // The transports race the locations of one kind.
+            let mut kinds = Vec::new();
+            let of_kind = entry.locations.iter().filter(move |location| {
+                let first = !kinds.contains(&location.kind());
+                kinds.push(location.kind());
+                first
+            });
+            of_kind.map(|location| (Arc::clone(&entry.name), location.clone()))
+        });
+        all.collect()
     }
 }
 
 impl State {
-    fn neighbour(&self, peer: &Introduction, connections: usize) -> Neighbour {
+    /// What is known of a neighbour when a connection with it has been opened.
+    fn neighbour(&self, peer: &Introduction, before: Option<&Neighbour>) -> Neighbour {
         let incarnation = peer.hop.location.incarnation();
         let named = |listed: &&Peer| {
             let dialled = peer.dialled.as_ref();
@@ -135,19 +181,16 @@ impl State {
             tracing::info!(%name, %says, "a static peer calls itself by another name");
         }
         let configured = listed.iter().flat_map(|listed| &listed.locations);
-        let mut locations: Vec<Location> = configured
+        let configured: Vec<Location> = configured
             .map(|location| location.clone().with_incarnation(incarnation))
             .take(Entry::MAX_LOCATIONS - 1)
             .collect();
-        if !locations.contains(&peer.hop.location) {
-            locations.push(peer.hop.location.clone());
-        }
         let entry = Entry {
             name: Arc::clone(&peer.name),
             agent_type: "fipa-mts".to_owned(),
             incarnation,
             mts: Mts::new(Arc::clone(&peer.name), incarnation),
-            locations,
+            locations: Vec::new(),
             description: String::new(),
             registered: SystemTime::now(),
             source: if listed.is_some() {
@@ -160,11 +203,42 @@ impl State {
             },
             role: Role::Gateway,
         };
-        Neighbour {
+        let mut neighbour = before.cloned().unwrap_or_else(|| Neighbour {
             entry: Arc::new(entry),
-            connections,
-            peer: listed.map(|listed| Arc::clone(&listed.name)),
+            configured: Vec::new(),
+            hops: Vec::new(),
+            connections: 0,
+            peer: None,
+        });
+        if let Some(listed) = listed
+            && neighbour.peer.is_none()
+        {
+            neighbour.peer = Some(Arc::clone(&listed.name));
+            neighbour.configured = configured;
+            Arc::make_mut(&mut neighbour.entry).source = Source::Static;
         }
+        neighbour.connections += 1;
+        neighbour.hops.push(peer.hop.location.clone());
+        neighbour.locate();
+        neighbour
+    }
+}
+
+impl Neighbour {
+    /// Brings the locations of the entry up to date: those of the configuration, then those of the
+    /// open connections, the latest first. Says whether they have changed.
+    fn locate(&mut self) -> bool {
+        let mut locations = self.configured.clone();
+        for hop in self.hops.iter().rev() {
+            if locations.len() < Entry::MAX_LOCATIONS && !locations.contains(hop) {
+                locations.push(hop.clone());
+            }
+        }
+        if locations == self.entry.locations {
+            return false;
+        }
+        Arc::make_mut(&mut self.entry).locations = locations;
+        true
     }
 }
 
@@ -214,5 +288,87 @@ impl Directory for View {
 
     fn deregister(&self, name: &str, incarnation: Incarnation) -> Result<(), DeregisterError> {
         self.all.deregister(name, incarnation)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use fipa_transport::Hop;
+
+    use super::*;
+
+    const GATEWAY: Incarnation = Incarnation::from_u64(7);
+
+    fn at(address: &str) -> Location {
+        let location: Location = format!("tcp://{address}").parse().unwrap();
+        location.with_incarnation(GATEWAY)
+    }
+
+    /// The gateway introduces itself on a connection from this address.
+    fn introduction(address: &str, dialled: Option<&str>) -> Introduction {
+        Introduction {
+            name: "crex-mts".into(),
+            hop: Hop {
+                location: at(address),
+                remote: true,
+            },
+            dialled: dialled.map(|text| text.parse().unwrap()),
+        }
+    }
+
+    fn locations(neighbours: &Neighbours) -> Vec<Location> {
+        neighbours.all()[0].entry.locations.clone()
+    }
+
+    #[test]
+    fn a_neighbour_is_where_its_latest_connection_comes_from() {
+        let (neighbours, now) = (Neighbours::default(), Instant::now());
+        let (before, after) = (
+            introduction("10.0.0.2:1", None),
+            introduction("10.0.0.3:1", None),
+        );
+        neighbours.introduced(&before);
+        neighbours.introduced(&after);
+        assert_eq!(locations(&neighbours), [at("10.0.0.3:1"), at("10.0.0.2:1")]);
+        neighbours.introduced(&after);
+        neighbours.parted(now, &before);
+        neighbours.parted(now, &after);
+        assert_eq!(locations(&neighbours), [at("10.0.0.3:1")]);
+        assert_eq!(neighbours.all()[0].connections, 1);
+        neighbours.parted(now, &after);
+        assert!(neighbours.all().is_empty());
+    }
+
+    #[test]
+    fn what_the_configuration_says_stays() {
+        let (neighbours, now) = (Neighbours::default(), Instant::now());
+        neighbours.name_peers(vec![Peer {
+            name: "crex".into(),
+            locations: vec!["tcp://crex.local:1".parse().unwrap()],
+        }]);
+        let (accepted, dialled) = (
+            introduction("10.0.0.2:1", None),
+            introduction("10.0.0.2:1", Some("tcp://crex.local:1")),
+        );
+        neighbours.introduced(&accepted);
+        assert_eq!(neighbours.all()[0].peer, None);
+        neighbours.introduced(&dialled);
+        let known = [at("crex.local:1"), at("10.0.0.2:1")];
+        assert_eq!(locations(&neighbours), known);
+        assert_eq!(neighbours.all()[0].peer.as_deref(), Some("crex"));
+        neighbours.parted(now, &dialled);
+        assert_eq!(locations(&neighbours), known);
+    }
+
+    #[test]
+    fn those_that_have_parted_are_greeted_for_a_while() {
+        let (neighbours, now) = (Neighbours::default(), Instant::now());
+        let one = introduction("10.0.0.2:1", None);
+        let greeted = vec![("crex-mts".into(), at("10.0.0.2:1"))];
+        neighbours.introduced(&one);
+        assert_eq!(neighbours.to_greet(now), greeted);
+        neighbours.parted(now, &one);
+        assert_eq!(neighbours.to_greet(now + PARTED / 2), greeted);
+        assert_eq!(neighbours.to_greet(now + PARTED), []);
     }
 }

@@ -10,6 +10,10 @@ use fipa_sds::{
 };
 use fipa_transport::{Incarnation, Kind, Location};
 
+use super::Network;
+use crate::config::is_on_loopback;
+use crate::service::Service;
+
 /// Tells the processes of this host who is on others, as reachable through this gateway.
 pub(super) struct Publisher {
     pub(super) host: Arc<HostDirectory>,
@@ -18,19 +22,33 @@ pub(super) struct Publisher {
     /// Who is known of other hosts without having written.
     pub(super) known: Arc<MergedDirectory>,
     pub(super) contacts: Arc<ContactDirectory>,
-    /// Where this gateway takes letters: the locations of all that it stands for.
-    pub(super) locations: Vec<Location>,
+    /// Takes letters for all that this gateway stands for.
+    pub(super) service: Arc<Service>,
+    /// Whether what is announced stays on this host.
+    pub(super) only_loopback: bool,
 }
 
 impl Publisher {
+    /// The locations that mean something on other hosts. Loopback addresses do not: there they lead
+    /// to the other host itself.
+    fn announced_locations(&self) -> Vec<Location> {
+        let mut locations = self.service.locations();
+        locations.retain(|location| {
+            let stays_here = location.kind() == Kind::Shm;
+            !stays_here && (self.only_loopback || !is_on_loopback(location.address()))
+        });
+        locations
+    }
+
     pub(super) fn publish(&self) {
+        let locations = self.service.locations();
         let (heard, known) = (self.contacts.entries(), self.known.entries());
         // The later of one name counts: what is known, before what was heard.
         let all = heard.iter().chain(known.iter());
         let through_here = all
             .filter(|entry| entry.role != Role::Gateway)
             .map(|entry| Entry {
-                locations: self.locations.clone(),
+                locations: locations.clone(),
                 ..Entry::clone(entry)
             });
         if let Err(error) = self.host.publish_remote(through_here.collect()) {
@@ -76,16 +94,21 @@ pub(super) struct Contested {
 /// The task that does it.
 pub(super) struct Keeper {
     publisher: Arc<Publisher>,
+    network: Option<Arc<dyn Network>>,
     announced: HashMap<Arc<str>, Arc<Entry>>,
+    /// The locations with which they are announced.
+    locations: Vec<Location>,
     /// Those that could not be announced, which was said once.
     refused: HashMap<Arc<str>, Incarnation>,
 }
 
 impl Keeper {
-    pub(super) fn new(publisher: Arc<Publisher>) -> Self {
+    pub(super) fn new(publisher: Arc<Publisher>, network: Option<Arc<dyn Network>>) -> Self {
         Self {
             publisher,
+            network,
             announced: HashMap::new(),
+            locations: Vec::new(),
             refused: HashMap::new(),
         }
     }
@@ -94,6 +117,13 @@ impl Keeper {
         let publisher = Arc::clone(&self.publisher);
         let known = Arc::clone(&publisher.known);
         let (mut here, mut there) = (publisher.host.watch(), known.watch());
+        let mut located = publisher.service.follow_locations();
+        if publisher.network.is_some() && publisher.announced_locations().is_empty() {
+            tracing::info!(
+                "this gateway has no location that other hosts can use, so it announces nothing by \
+                 mDNS until it has one; see transport.tcp.listen and `ip address`"
+            );
+        }
         let mut forgetting = tokio::time::interval(ContactDirectory::MEMORY / 4);
         loop {
             if let Some(network) = &publisher.network {
@@ -106,6 +136,12 @@ impl Keeper {
             let goes_on = tokio::select! {
                 change = here.next() => change.is_some(),
                 change = there.next() => change.is_some(),
+                moved = located.changed() => {
+                    if let Some(network) = &self.network {
+                        network.interfaces_changed();
+                    }
+                    moved.is_ok()
+                }
                 _ = forgetting.tick() => true,
             };
             if !goes_on {
@@ -132,13 +168,18 @@ impl Keeper {
             stays
         });
         self.refused.retain(|name, _| mine.contains_key(name));
-        let locations = self.publisher.locations.iter();
-        let locations: Vec<Location> = locations
-            .filter(|location| location.kind() != Kind::Shm)
-            .cloned()
-            .collect();
+        let locations = self.publisher.announced_locations();
         let mut joining: Vec<(&Arc<str>, &Arc<Entry>)> = mine.into_iter().collect();
-        joining.retain(|(name, entry)| self.announced.get(*name) != Some(*entry));
+        // Without any, what is announced stays as it is, because the host may be about to get an
+        // address; what is not has to wait for that.
+        let relocated = self.locations != locations && !locations.is_empty();
+        joining.retain(|(name, entry)| {
+            let changed = relocated || self.announced.get(*name) != Some(*entry);
+            changed && !locations.is_empty()
+        });
+        if relocated {
+            self.locations.clone_from(&locations);
+        }
         if leaving.is_empty() && joining.is_empty() {
             return;
         }

@@ -29,6 +29,8 @@ use tokio::task::JoinHandle;
 use self::listening::Told;
 pub(crate) use self::taps::Taps;
 use crate::domain::OpenError;
+use crate::keeper::Keeper;
+use crate::owner::Owner;
 use crate::place::Place;
 use crate::{Config, service};
 
@@ -45,7 +47,9 @@ pub struct Watcher {
     joiner: Joiner,
     host: Arc<HostDirectory>,
     place: Place,
+    owner: Owner,
     listening: JoinHandle<()>,
+    keeper: JoinHandle<()>,
 }
 
 /// What processes have told and nobody has looked at yet, in records; then they are not listened
@@ -77,11 +81,14 @@ impl Watcher {
         let content = u32::try_from(options.content.min(MAX_CONTENT)).unwrap_or(u32::MAX);
         let (sender, told) = mpsc::channel(TOLD);
         let listening = tokio::spawn(listening::run(listener, Wish { content }, sender));
+        let keeper = Keeper::new(place.clone(), Arc::clone(&host));
         let mut watcher = Self {
             told,
             joiner: Joiner::new(),
             host,
+            keeper: tokio::spawn(keeper.run()),
             place,
+            owner: Owner::this(),
             listening,
         };
         // One that does not answer may be stopped; the others are watched all the same.
@@ -166,7 +173,12 @@ impl Watcher {
 
 impl Drop for Watcher {
     fn drop(&mut self) {
+        // In a forked child everything stays the parent's.
+        if !self.owner.is_this() {
+            return;
+        }
         self.listening.abort();
+        self.keeper.abort();
         leave(&self.host, &self.place);
     }
 }

@@ -49,13 +49,13 @@ impl<'a> Avahi<'a> {
         std::fs::write("/run/avahi.conf", settings).unwrap();
         let mut command = host.command("dbus-daemon");
         command.args(["--config-file=/run/bus.conf", "--nofork"]);
-        let bus = Running::start(&mut command);
-        until("the bus", || Path::new(BUS).exists());
+        let mut bus = Running::start(&mut command);
+        until("the bus", &mut bus, || Path::new(BUS).exists());
         let mut command = with_bus(host.command("avahi-daemon"));
         command.args(["--no-drop-root", "--no-chroot", "--no-rlimits"]);
         command.arg("--file=/run/avahi.conf");
-        let daemon = Running::start(&mut command);
-        until("Avahi", || {
+        let mut daemon = Running::start(&mut command);
+        until("Avahi", &mut daemon, || {
             let check = host.command("avahi-daemon").arg("--check").status();
             check.unwrap().success()
         });
@@ -109,9 +109,12 @@ fn with_bus(mut command: Command) -> Command {
     command
 }
 
-fn until(what: &str, condition: impl Fn() -> bool) {
+fn until(what: &str, of: &mut Running, condition: impl Fn() -> bool) {
     let give_up = Instant::now() + Duration::from_secs(60);
     while !condition() {
+        if let Some(status) = of.ended() {
+            panic!("{what} ended ({status}); its error is above");
+        }
         assert!(Instant::now() < give_up, "never came: {what}");
         std::thread::sleep(Duration::from_millis(10));
     }

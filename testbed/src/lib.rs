@@ -37,8 +37,10 @@ mod ghost;
 mod network;
 mod peer;
 
+use std::io::{self, BufRead as _, BufReader, Read as _};
 use std::path::PathBuf;
-use std::process::{Child, Command};
+use std::process::{Child, ChildStderr, Command, ExitStatus, Stdio};
+use std::thread::JoinHandle;
 
 pub use avahi::Avahi;
 pub use ghost::Ghost;
@@ -47,8 +49,10 @@ pub use network::{Host, Network};
 pub use peer::Anybody;
 pub use peer::{frame, frame_header};
 
-/// Tells the process in the namespaces that it is there.
+/// Environment variable that gives the process in the namespaces the directory of its test.
 const INSIDE: &str = "FIPA_TESTBED_INSIDE";
+/// Environment variable that gives processes of `fipa` their runtime directory.
+const RUNTIME_DIR: &str = "FIPA_RUNTIME_DIR";
 
 /// How long a test in namespaces may take, in seconds, before it counts as one that hangs. None needs
 /// half of it.
@@ -75,6 +79,8 @@ pub fn isolated(name: &str, tools: &[&str]) {
         eprintln!("SKIPPED, not a success: {name} needs {missing}");
         return;
     }
+    // The program under test may lie below /tmp, so nothing is mounted there.
+    let directory = tempfile::tempdir().unwrap();
     // What is started in there ends with it: the namespace of processes, too, is its own. What hangs is
     // killed, as `unshare` heeds nothing less, and with it all else.
     let status = Command::new("timeout")
@@ -83,22 +89,37 @@ pub fn isolated(name: &str, tools: &[&str]) {
         .args(["--mount-proc", "--"])
         .arg(std::env::current_exe().unwrap())
         .args(["--exact", name, "--ignored", "--nocapture"])
-        .env(INSIDE, "1")
+        .env(INSIDE, directory.path())
+        .env(RUNTIME_DIR, directory.path().join("run"))
+        .env("TMPDIR", directory.path())
         .status()
         .unwrap();
     assert!(status.success(), "{name} failed; see above");
 }
 
-/// Prepares the namespaces that [`isolated`] has made: an empty `/run`, and the loopback
-/// interface up.
+/// Prepares the namespaces that [`isolated`] has made: an empty `/run`, an empty
+/// [`directory`], and the loopback interface up.
 ///
 /// # Panics
 /// Outside of them.
 pub fn enter() {
-    let inside = std::env::var_os(INSIDE).is_some();
-    assert!(inside, "this test is started by another one");
+    let directory = directory();
     run("mount -t tmpfs tmpfs /run");
+    // Files of killed processes vanish with the namespace.
+    let directory = directory.to_str().unwrap();
+    run(&format!("mount -t tmpfs -o mode=0700 tmpfs {directory}"));
     run("ip link set lo up");
+}
+
+/// Returns the directory of the running test. Temporary directories, and the runtime directory
+/// of `fipa` unless a test names another one, lie in it.
+///
+/// # Panics
+/// Outside of the namespaces that [`isolated`] has made.
+#[must_use]
+pub fn directory() -> PathBuf {
+    let directory = std::env::var_os(INSIDE).map(PathBuf::from);
+    directory.expect("this test is started by another one")
 }
 
 /// Runs a command, its words separated by one blank each.
@@ -135,10 +156,60 @@ impl Running {
         Self(started.unwrap_or_else(|error| panic!("{command:?}: {error}")))
     }
 
+    /// Starts it, waits for its first line of output, and returns that line. Its standard error
+    /// is kept for the panic message, or shown when `FIPA_TEST_LOG` is set.
+    ///
+    /// # Panics
+    /// When it cannot be started, or ends before it prints a line: with its status and its
+    /// standard error.
+    pub fn until_ready(command: &mut Command) -> (Self, String) {
+        let shows_errors = std::env::var_os("FIPA_TEST_LOG").is_some();
+        command.stdout(Stdio::piped()).stderr(match shows_errors {
+            true => Stdio::inherit(),
+            false => Stdio::piped(),
+        });
+        let mut running = Self::start(command);
+        let errors = running.0.stderr.take().map(collect_last);
+        let mut stdout = BufReader::new(running.0.stdout.take().unwrap());
+        let mut ready = String::new();
+        stdout.read_line(&mut ready).unwrap();
+        if ready.is_empty() {
+            let status = running.0.wait().unwrap();
+            let errors = errors.map(|errors| errors.join().unwrap());
+            let errors = errors.unwrap_or_default();
+            panic!("{command:?} ended ({status}) before it was ready: {errors}");
+        }
+        // A full pipe would block the process, and a closed one would end it.
+        std::thread::spawn(move || io::copy(&mut stdout, &mut io::sink()));
+        (running, ready)
+    }
+
+    /// Returns the status of the process if it has ended.
+    ///
+    /// # Panics
+    /// When the kernel refuses to say.
+    pub fn ended(&mut self) -> Option<ExitStatus> {
+        self.0.try_wait().unwrap()
+    }
+
     /// The process.
     pub fn child(&mut self) -> &mut Child {
         &mut self.0
     }
+}
+
+/// Reads to the end, and returns the last few kilobytes.
+fn collect_last(mut from: ChildStderr) -> JoinHandle<String> {
+    const KEPT: usize = 8 << 10;
+    std::thread::spawn(move || {
+        let mut kept = Vec::new();
+        let mut part = [0; 1024];
+        while let Ok(read @ 1..) = from.read(&mut part) {
+            kept.extend(part.iter().take(read));
+            kept.drain(..kept.len().saturating_sub(KEPT));
+        }
+        String::from_utf8_lossy(&kept).into_owned()
+    })
 }
 
 impl Drop for Running {
@@ -146,5 +217,44 @@ impl Drop for Running {
         // It may have ended already, which is as good.
         let _ = self.0.kill();
         let _ = self.0.wait();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_program_under_test_is_not_hidden() {
+        isolated("tests::inside_the_program_under_test_is_not_hidden", &[]);
+    }
+
+    #[test]
+    #[ignore = "is run by the other test in namespaces of its own"]
+    fn inside_the_program_under_test_is_not_hidden() {
+        let outside = std::env::temp_dir().join("outside");
+        std::fs::write(&outside, "").unwrap();
+        enter();
+        assert!(std::env::current_exe().unwrap().exists());
+        assert_eq!(std::env::temp_dir(), directory());
+        let runtime_dir = PathBuf::from(std::env::var_os(RUNTIME_DIR).unwrap());
+        assert!(runtime_dir.starts_with(directory()));
+        assert!(!outside.exists(), "the directory is not this test's own");
+    }
+
+    #[test]
+    #[should_panic(expected = "before it was ready: no such luck")]
+    fn a_process_that_cannot_start_fails_the_test_with_its_error() {
+        let mut command = Command::new("sh");
+        Running::until_ready(command.args(["-c", "echo no such luck >&2; exit 3"]));
+    }
+
+    #[test]
+    fn a_process_is_ready_with_its_first_line() {
+        let mut command = Command::new("sh");
+        command.args(["-c", "echo here I am; exec cat /dev/zero"]);
+        let (mut running, ready) = Running::until_ready(&mut command);
+        assert_eq!(ready, "here I am\n");
+        assert!(running.ended().is_none());
     }
 }

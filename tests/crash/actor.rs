@@ -129,7 +129,7 @@ async fn gateway(part: &Part, mut queue: Receiver<String>) {
         opened = Gateway::open(&part.config()).await;
     }
     let gateway = opened.unwrap();
-    let mut ways = gateway.locations().iter();
+    let mut ways = gateway.locations().into_iter();
     let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
     say!("at {}", way.address());
     say!("ready");

@@ -9,7 +9,7 @@ use std::time::{Duration, SystemTime};
 
 use fipa::{AgentId, Kind, Letter, Message, Performative};
 use fipa_mts::core::CoreConfig;
-use fipa_mts::{Mts, RuntimeConfig, Started, letter_for};
+use fipa_mts::{Gate, Mts, RuntimeConfig, Started, letter_for};
 use fipa_sds::{Directory as _, MemoryDirectory, Registration};
 use fipa_transport::{Incarnation, Location, Transport};
 #[cfg(feature = "secure")]
@@ -61,6 +61,14 @@ pub(crate) struct Place {
     locations: Vec<Location>,
 }
 
+/// What a service takes.
+#[derive(Default)]
+struct Bounds {
+    /// Processes that can have its mailbox open.
+    clients: Option<usize>,
+    gate: Option<Arc<dyn Gate>>,
+}
+
 impl Place {
     /// A service of this host with these transports, in this order of preference.
     pub(crate) fn start(host: &Path, name: &str, order: &[Kind], forwards: bool) -> Self {
@@ -74,6 +82,41 @@ impl Place {
         order: &[Kind],
         forwards: bool,
         security: Option<Security>,
+    ) -> Self {
+        Self::build(host, name, order, forwards, security, Bounds::default())
+    }
+
+    /// A gateway with keys that refuses what this gate does not admit.
+    pub(crate) fn with_gate(
+        host: &Path,
+        name: &str,
+        order: &[Kind],
+        security: Security,
+        gate: Arc<dyn Gate>,
+    ) -> Self {
+        let bounds = Bounds {
+            gate: Some(gate),
+            ..Bounds::default()
+        };
+        Self::build(host, name, order, true, Some(security), bounds)
+    }
+
+    /// A service without leave to forward, whose mailbox so many processes can have open.
+    pub(crate) fn with_clients(host: &Path, name: &str, order: &[Kind], clients: usize) -> Self {
+        let bounds = Bounds {
+            clients: Some(clients),
+            ..Bounds::default()
+        };
+        Self::build(host, name, order, false, None, bounds)
+    }
+
+    fn build(
+        host: &Path,
+        name: &str,
+        order: &[Kind],
+        forwards: bool,
+        security: Option<Security>,
+        bounds: Bounds,
     ) -> Self {
         let mut limits = Limits::default();
         if security.is_some() {
@@ -96,7 +139,8 @@ impl Place {
         let has = |kind| order.contains(&kind);
         let shm = has(Kind::Shm).then(|| {
             let prefix = format!("fipa_{mark}_{}", std::process::id());
-            let config = ShmConfig::new(host.join("shm"), prefix, incarnation);
+            let mut config = ShmConfig::new(host.join("shm"), prefix, incarnation);
+            config.max_clients = bounds.clients.unwrap_or(config.max_clients);
             Arc::new(ShmTransport::new(config, handle.clone()).unwrap())
         });
         let tcp = has(Kind::Tcp).then(|| {
@@ -144,7 +188,7 @@ impl Place {
             unframed_deadline: Duration::from_secs(5),
             contacts: None,
             tap: None,
-            gate: None,
+            gate: bounds.gate,
         };
         let transports = transports.into_iter().flatten().collect();
         let Started {
@@ -203,17 +247,19 @@ impl Place {
     }
 }
 
-/// Keys of two services that trust each other, and nobody else.
+/// Keys of services that trust each other and no other service.
 #[cfg(feature = "secure")]
-pub(crate) fn friends(here: &Path, names: [&str; 2]) -> [Security; 2] {
+pub(crate) fn friends<const N: usize>(here: &Path, names: [&str; N]) -> [Security; N] {
     let keys = names.map(|name| fipa::keys::Keys::at(here.join(format!("keys-{name}"))));
     for (keys, name) in keys.iter().zip(names) {
         keys.init(name, &[], fipa::keys::VALID).unwrap();
     }
-    let [one, other] = &keys;
-    for (one, other) in [(one, other), (other, one)] {
-        one.trust(&std::fs::read(other.own_file()).unwrap())
-            .unwrap();
+    for (at, one) in keys.iter().enumerate() {
+        let others = keys.iter().enumerate().filter(|(other, _)| *other != at);
+        for (_, other) in others {
+            let pem = std::fs::read(other.own_file()).unwrap();
+            one.trust(&pem).unwrap();
+        }
     }
     let rules = fipa_transport_net::secure::Rules {
         loopback: true,

@@ -1,21 +1,25 @@
 //! Addresses as text: parsing with scopes, and which of this machine's addresses others can use.
 
+use std::collections::HashSet;
 use std::io;
 use std::net::{IpAddr, Ipv6Addr, SocketAddr, SocketAddrV6};
 
-use fipa_transport::ListenError;
+use fipa_transport::{Incarnation, Kind, ListenError, Location, LocationError};
 use if_addrs::{IfOperStatus, Interface};
 
 /// Why a text is not an address.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
-pub(crate) enum AddressError {
+pub enum AddressError {
+    /// It has another form.
     #[error(
         "not an address with a port (expected for example 127.0.0.1:7788 or [fe80::1%eth0]:7788): {0:?}"
     )]
     Syntax(String),
+    /// The scope names no interface of this host.
     #[error("no interface is called {0:?} (`ip link` lists them)")]
     NoSuchInterface(String),
+    /// The operating system does not list the interfaces.
     #[error("the interfaces of this machine cannot be listed: {0}")]
     Interfaces(String),
 }
@@ -68,6 +72,17 @@ pub(crate) fn numeric(text: &str) -> Result<SocketAddr, AddressError> {
     Ok(SocketAddrV6::new(ip, port, 0, scope).into())
 }
 
+/// Where other hosts reach an endpoint at present that listens on these addresses, best first. A
+/// port 0 stays 0.
+///
+/// # Errors
+/// When one is no address, or the interfaces cannot be listed.
+pub fn reachable_at(listen: &[String]) -> Result<Vec<SocketAddr>, AddressError> {
+    let bound = listen.iter().map(|text| numeric(text));
+    let listening = Listening::new(bound.collect::<Result<_, _>>()?)?;
+    Ok(listening.reachable)
+}
+
 /// Why an address cannot be listened on, with what to do.
 pub(crate) fn cannot_bind(text: &str, error: &io::Error) -> ListenError {
     let advice = match error.kind() {
@@ -99,16 +114,115 @@ fn interface_index(name: &str) -> Result<u32, AddressError> {
         .ok_or_else(|| AddressError::NoSuchInterface(name.chars().take(40).collect()))
 }
 
+/// The sockets that an endpoint listens on, and where others reach them at present.
+///
+/// A socket bound to an unspecified address is reached at the addresses of the interfaces that are
+/// up; these change while the endpoint runs ([`refresh`](Self::refresh)).
+#[derive(Debug, Default)]
+pub(crate) struct Listening {
+    bound: Vec<SocketAddr>,
+    /// Best first.
+    reachable: Vec<SocketAddr>,
+    /// The addresses of all interfaces.
+    assigned: HashSet<IpAddr>,
+}
+
+/// What a change of the interfaces means for an endpoint.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub(crate) struct Moved {
+    /// Whether others reach the endpoint elsewhere than before.
+    pub(crate) relocated: bool,
+    /// Addresses that this host has had and has no more.
+    pub(crate) lost: HashSet<IpAddr>,
+}
+
+impl Listening {
+    /// Sockets that are bound to these addresses.
+    ///
+    /// # Errors
+    /// When the interfaces are needed and cannot be listed.
+    pub(crate) fn new(bound: Vec<SocketAddr>) -> Result<Self, AddressError> {
+        let mut listening = Self {
+            bound,
+            ..Self::default()
+        };
+        if listening.depends_on_interfaces() {
+            listening.update(&interfaces()?);
+        } else {
+            listening.reachable.clone_from(&listening.bound);
+        }
+        Ok(listening)
+    }
+
+    /// Whether connections from other hosts are possible: an endpoint that listens on loopback only
+    /// need not watch the interfaces.
+    pub(crate) fn depends_on_interfaces(&self) -> bool {
+        self.bound.iter().any(|bound| !bound.ip().is_loopback())
+    }
+
+    /// Lists the interfaces again.
+    ///
+    /// # Errors
+    /// When that is impossible. Nothing has changed then.
+    pub(crate) fn refresh(&mut self) -> Result<Moved, AddressError> {
+        Ok(self.update(&interfaces()?))
+    }
+
+    fn update(&mut self, interfaces: &[Interface]) -> Moved {
+        let assigned: HashSet<IpAddr> = interfaces.iter().map(Interface::ip).collect();
+        let reachable: Vec<SocketAddr> = self
+            .bound
+            .iter()
+            .flat_map(|bound| reachable(*bound, interfaces))
+            .collect();
+        let lost = self.assigned.difference(&assigned).copied().collect();
+        let relocated = reachable != self.reachable;
+        (self.assigned, self.reachable) = (assigned, reachable);
+        Moved { relocated, lost }
+    }
+
+    /// What a hello says of it: unspecified addresses, by which the peer knows that the port is
+    /// open at whichever address a connection comes from, then those of the interfaces.
+    pub(crate) fn texts(&self) -> Vec<String> {
+        let any = self.bound.iter().filter(|it| it.ip().is_unspecified());
+        any.chain(&self.reachable)
+            .map(ToString::to_string)
+            .collect()
+    }
+
+    /// The addresses at which others reach the endpoint, best first.
+    #[cfg(test)]
+    pub(crate) fn reachable(&self) -> &[SocketAddr] {
+        &self.reachable
+    }
+
+    /// The locations of these addresses.
+    ///
+    /// # Errors
+    /// When an address is none of a location, which the standard library's are not.
+    pub(crate) fn locations(
+        &self,
+        kind: Kind,
+        incarnation: Incarnation,
+    ) -> Result<Vec<Location>, LocationError> {
+        let locations = self.reachable.iter().map(|address| {
+            let location = Location::new(kind, &address.to_string())?;
+            Ok(location.with_incarnation(incarnation))
+        });
+        locations.collect()
+    }
+}
+
 /// The addresses under which others reach a socket bound to `bound`, best first: `bound` itself,
 /// or for an unspecified address those of the interfaces that are up.
 ///
 /// Loopback and link-local addresses (whose scope means nothing on another host) are named only
 /// when there are no others.
-pub(crate) fn reachable(bound: SocketAddr) -> Result<Vec<SocketAddr>, AddressError> {
-    if !bound.ip().is_unspecified() {
-        return Ok(vec![bound]);
+fn reachable(bound: SocketAddr, interfaces: &[Interface]) -> Vec<SocketAddr> {
+    match bound.ip().is_unspecified() {
+        true => usable(bound, interfaces),
+        false => vec![bound],
     }
-    Ok(usable(bound, &interfaces()?))
 }
 
 fn usable(bound: SocketAddr, interfaces: &[Interface]) -> Vec<SocketAddr> {
@@ -145,20 +259,24 @@ fn usable(bound: SocketAddr, interfaces: &[Interface]) -> Vec<SocketAddr> {
 /// listens on and the one its connection comes from.
 ///
 /// The same machine may be known under addresses that lead to it from elsewhere only, so the one
-/// the connection was made with goes first, then one that is no loopback address when the peer is
-/// not on loopback either. A link-local address is taken with the scope as this host sees it.
+/// the connection was made with goes first: when it is listed, or when the peer listens on all of
+/// its addresses and may have got this one since it made the list. Then comes one that is no
+/// loopback address when the peer is not on loopback either. A link-local address is taken with the
+/// scope as this host sees it.
 pub(crate) fn way_back(listening: &[String], from: SocketAddr) -> SocketAddr {
-    let parsed: Vec<SocketAddr> = listening
+    let (any, parsed): (Vec<SocketAddr>, Vec<SocketAddr>) = listening
         .iter()
         .filter_map(|text| numeric_ignoring_scope(text))
-        .filter(|address| address.port() != 0 && !address.ip().is_unspecified())
-        .collect();
+        .filter(|address| address.port() != 0)
+        .partition(|address| address.ip().is_unspecified());
     let with_port = |port| {
         let mut address = from;
         address.set_port(port);
         address
     };
-    if let Some(same) = parsed.iter().find(|address| address.ip() == from.ip()) {
+    let listed = parsed.iter().find(|address| address.ip() == from.ip());
+    let any = any.iter().find(|any| any.is_ipv4() == from.is_ipv4());
+    if let Some(same) = listed.or(any) {
         return with_port(same.port());
     }
     parsed
@@ -188,6 +306,10 @@ fn is_link_local(ip: IpAddr) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use std::net::Ipv4Addr;
+
+    use if_addrs::{IfAddr, Ifv4Addr};
+
     use super::*;
 
     fn scope(text: &str) -> Result<u32, AddressError> {
@@ -242,14 +364,74 @@ mod tests {
     fn an_unspecified_address_becomes_those_of_the_interfaces() {
         for bound in ["0.0.0.0:7788", "[::]:7788"] {
             let bound: SocketAddr = bound.parse().unwrap();
-            for address in reachable(bound).unwrap() {
+            let listening = Listening::new(vec![bound]).unwrap();
+            for address in listening.reachable() {
                 assert!(!address.ip().is_unspecified());
                 assert_eq!(address.port(), 7788);
                 assert_eq!(address.is_ipv4(), bound.is_ipv4());
             }
+            assert_eq!(listening.texts()[0], bound.to_string());
         }
         let fixed = "127.0.0.1:7788".parse().unwrap();
-        assert_eq!(reachable(fixed), Ok(vec![fixed]));
+        assert_eq!(Listening::new(vec![fixed]).unwrap().reachable(), [fixed]);
+    }
+
+    /// An interface with this address.
+    fn interface(name: &str, index: u32, ip: Ipv4Addr) -> Interface {
+        Interface {
+            name: name.into(),
+            addr: IfAddr::V4(Ifv4Addr {
+                ip,
+                netmask: Ipv4Addr::new(255, 255, 255, 0),
+                prefixlen: 24,
+                broadcast: None,
+            }),
+            index: Some(index),
+            oper_status: IfOperStatus::Up,
+            is_p2p: false,
+        }
+    }
+
+    #[test]
+    fn what_is_reachable_follows_the_interfaces() {
+        let own = |last| Ipv4Addr::new(10, 0, 0, last);
+        let lo = interface("lo", 1, Ipv4Addr::LOCALHOST);
+        let ethernet = |last| [lo.clone(), interface("eth0", 2, own(last))];
+        let at = |ip| vec![SocketAddr::from((ip, 7788))];
+        let mut listening = Listening {
+            bound: at(Ipv4Addr::UNSPECIFIED),
+            ..Listening::default()
+        };
+        let started = listening.update(std::slice::from_ref(&lo));
+        assert!(started.relocated);
+        assert_eq!(listening.reachable(), at(Ipv4Addr::LOCALHOST));
+
+        let connected = listening.update(&ethernet(1));
+        assert!(connected.relocated && connected.lost.is_empty());
+        assert_eq!(listening.reachable(), at(own(1)));
+        assert_eq!(listening.texts(), ["0.0.0.0:7788", "10.0.0.1:7788"]);
+        assert_eq!(listening.update(&ethernet(1)), Moved::default());
+
+        let moved = listening.update(&ethernet(2));
+        assert!(moved.relocated);
+        assert_eq!(moved.lost, HashSet::from([own(1).into()]));
+        assert_eq!(listening.reachable(), at(own(2)));
+    }
+
+    #[test]
+    fn a_socket_with_an_address_of_its_own_does_not_move() {
+        let fixed = SocketAddr::from((Ipv4Addr::new(10, 0, 0, 1), 7788));
+        let mut listening = Listening {
+            bound: vec![fixed],
+            ..Listening::default()
+        };
+        let on = interface("eth0", 2, Ipv4Addr::new(10, 0, 0, 1));
+        listening.update(&[on]);
+        let gone = listening.update(&[]);
+        assert!(!gone.relocated);
+        assert_eq!(gone.lost, HashSet::from([fixed.ip()]));
+        assert_eq!(listening.reachable(), [fixed]);
+        assert_eq!(listening.texts(), ["10.0.0.1:7788"]);
     }
 
     #[test]
@@ -267,7 +449,10 @@ mod tests {
         assert_eq!(back(&["127.0.0.1:7"], "127.0.0.1:40000"), "127.0.0.1:7");
         assert_eq!(back(&["127.0.0.1:7"], from), from);
         assert_eq!(back(&[], from), from);
-        assert_eq!(back(&["nonsense", "0.0.0.0:7", "10.0.0.2:0"], from), from);
+        assert_eq!(back(&["nonsense", "[::]:7", "10.0.0.2:0"], from), from);
+        // It listens on all addresses, and has got this one since it made the list.
+        let any = ["0.0.0.0:7", "192.168.0.2:7"];
+        assert_eq!(back(&any, from), "10.0.0.2:7");
         assert_eq!(
             back(&["[fe80::2%wlan0]:7"], "[fe80::2%3]:40000"),
             "[fe80::2%3]:7"

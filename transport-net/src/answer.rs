@@ -1,8 +1,9 @@
 //! The body of an answer frame.
 //!
-//! One byte says which answer: 0 accepted, 1 in custody, 2 busy, 3 out of order, 4 failed. Behind
-//! 3 stands the last position taken (8 bytes, little-endian); behind 4 the code of the reason (one
-//! byte) and the detail (UTF-8 to the end).
+//! One byte says which answer: 0 accepted, 1 in custody, 2 busy, 3 out of order, 4 failed,
+//! 5 returned, 6 moved. Behind 3 stands the last position taken (8 bytes, little-endian); behind 4
+//! the code of the reason (one byte) and the detail (UTF-8 to the end); behind 5 whether the
+//! letter may have been delivered (one byte, 0 or 1).
 
 use bytes::{BufMut, BytesMut};
 use fipa_transport::Answer;
@@ -16,10 +17,13 @@ const CUSTODY: u8 = 1;
 const BUSY: u8 = 2;
 const OUT_OF_ORDER: u8 = 3;
 const FAILED: u8 = 4;
+const RETURNED: u8 = 5;
+const MOVED: u8 = 6;
 
 pub(crate) fn len(answer: &Answer) -> usize {
     match answer {
         Answer::OutOfOrder { .. } => 9,
+        Answer::Returned { .. } => 2,
         Answer::Failed { detail, .. } => 2 + truncated(detail, Answer::MAX_DETAIL).len(),
         _ => 1,
     }
@@ -37,6 +41,8 @@ pub(crate) fn encode(answer: &Answer, out: &mut BytesMut) {
             out.put_slice(&[FAILED, reason_code(*reason)]);
             out.put_slice(truncated(detail, Answer::MAX_DETAIL).as_bytes());
         }
+        Answer::Returned { uncertain } => out.put_slice(&[RETURNED, u8::from(*uncertain)]),
+        Answer::Moved => out.put_u8(MOVED),
         // Busy, and whatever may be added to the answers: "not now" is what an older peer does
         // least harm with.
         _ => out.put_u8(BUSY),
@@ -48,6 +54,10 @@ pub(crate) fn decode(body: &[u8]) -> Option<Answer> {
         [ACCEPTED] => Some(Answer::Accepted),
         [CUSTODY] => Some(Answer::Custody),
         [BUSY] => Some(Answer::Busy),
+        [MOVED] => Some(Answer::Moved),
+        [RETURNED, uncertain @ (0 | 1)] => Some(Answer::Returned {
+            uncertain: *uncertain == 1,
+        }),
         [OUT_OF_ORDER, position @ ..] => {
             let last = u64::from_le_bytes(position.try_into().ok()?);
             Some(Answer::OutOfOrder { last })
@@ -74,6 +84,9 @@ mod tests {
             Answer::Custody,
             Answer::Busy,
             Answer::OutOfOrder { last: u64::MAX },
+            Answer::Returned { uncertain: false },
+            Answer::Returned { uncertain: true },
+            Answer::Moved,
             Answer::failed(FailureReason::NoSuchAgent, "nobody is called béla"),
         ] {
             let mut body = BytesMut::new();
@@ -106,6 +119,9 @@ mod tests {
             &[4],
             &[4, 200],
             &[4, 0, 0xff],
+            &[5],
+            &[5, 2],
+            &[6, 0],
             &[9],
         ] {
             assert_eq!(decode(wrong), None, "{wrong:?}");

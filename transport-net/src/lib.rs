@@ -19,6 +19,7 @@ mod answer;
 mod end;
 mod hello;
 mod identity;
+mod interfaces;
 #[cfg(feature = "quic")]
 mod quic;
 mod ration;
@@ -28,6 +29,7 @@ mod seldom;
 mod tcp;
 mod udp;
 
+pub use address::{AddressError, reachable_at};
 pub use identity::Identity;
 #[cfg(feature = "quic")]
 pub use quic::{QuicConfig, QuicTransport};

@@ -314,7 +314,7 @@ fn nothing_is_said_in_the_clear_to_who_has_to_prove_who_he_is() {
     assert_refused(&plain, &to);
     assert_refused(&to, &plain);
     // An old peer's letter, and frames.
-    for first in [&b"\xfe\x10"[..], b"fipa\x01\x01\0\0", b"<?xml", b"garbage"] {
+    for first in [&b"\xfe\x10"[..], b"fipa\x02\x01\0\0", b"<?xml", b"garbage"] {
         let address = to.location().address().to_owned();
         let mut stream = TcpStream::connect(address).unwrap();
         stream.write_all(first).unwrap();

@@ -67,7 +67,7 @@ fn stranger(to: &Party) -> UdpSocket {
 }
 
 fn hello(number: u64, cookie: [u8; 16]) -> Vec<u8> {
-    let mut bytes = b"fipa\x01\x01\0\0".to_vec();
+    let mut bytes = b"fipa\x02\x01\0\0".to_vec();
     bytes.extend([0; 8]);
     bytes.extend(number.to_le_bytes());
     bytes.extend(cookie);
@@ -101,7 +101,7 @@ fn a_flood_of_garbage_stops_nobody_and_leaves_nothing() {
         for _ in 0..400 {
             let mut bytes: Vec<u8> = (0..random.usize(0..200)).map(|_| random.u8(..)).collect();
             if random.bool() && bytes.len() > 6 {
-                bytes[..5].copy_from_slice(b"fipa\x01");
+                bytes[..5].copy_from_slice(b"fipa\x02");
                 bytes[5] %= 8;
             }
             // What the other side's buffer has no room for is lost.
@@ -156,7 +156,7 @@ fn introduced(to: &Party, incarnation: u64) -> (UdpSocket, u64) {
 
 /// A data packet of a connection.
 fn packet(to: u64, number: u64, frames: &[u8]) -> Vec<u8> {
-    let mut bytes = b"fipa\x01\x06\0\0".to_vec();
+    let mut bytes = b"fipa\x02\x06\0\0".to_vec();
     bytes.extend(to.to_le_bytes());
     bytes.extend(number.to_le_bytes());
     bytes.extend(frames);

@@ -159,6 +159,19 @@ pub enum ShmError {
         /// How many are free.
         free: u64,
     },
+    /// The shared memory file system became full while the endpoint was opened.
+    #[error(
+        "{path} is full: {needed} more bytes are needed there ({source}): enlarge it \
+         (mount -o remount,size=512M {path}; for containers --shm-size=512m) or remove the transport \"shm\""
+    )]
+    Full {
+        /// Where shared memory lies.
+        path: &'static str,
+        /// How many bytes could not be had.
+        needed: u64,
+        /// What the operating system said.
+        source: std::io::Error,
+    },
     /// Something about a file or directory.
     #[error("{what} {path}: {source}")]
     File {

@@ -20,6 +20,7 @@ use parking_lot::Mutex;
 use rustix::fs::{FlockOperation, Mode, OFlags, fchmod, fstat, open};
 use rustix::io::Errno;
 
+use crate::fork::Owner;
 use crate::layout::Svc;
 use crate::memory::{SHM, lock};
 use crate::presence::{Names, Neighbour, wait_for_looks};
@@ -59,6 +60,7 @@ pub fn cleanup_dead(config: &ShmConfig) -> Result<Cleaned, ShmError> {
 pub(crate) struct Domain {
     /// Whether this is an endpoint's, which ends with it.
     member: bool,
+    owner: Owner,
     /// Somebody of this process is cleaning.
     cleaning: Mutex<()>,
     /// The endpoint closes: whoever is cleaning should come to an end, and nobody wait for long.
@@ -74,6 +76,7 @@ impl Domain {
     pub(crate) fn new(config: &ShmConfig) -> Result<Self, ShmError> {
         Ok(Self {
             member: false,
+            owner: Owner::this(),
             cleaning: Mutex::default(),
             closing: AtomicBool::new(false),
             held_up: AtomicBool::new(false),
@@ -93,6 +96,10 @@ impl Domain {
     pub(crate) fn leave(&self) -> Result<Cleaned, ShmError> {
         self.closing.store(true, Ordering::SeqCst);
         self.clean(true)
+    }
+
+    pub(crate) fn owner(&self) -> Owner {
+        self.owner
     }
 
     pub(crate) fn iceoryx(&self) -> &Config {
@@ -492,6 +499,17 @@ impl Domain {
         Some(id.to_owned())
     }
 
+    /// The files by which others find a process with this mailbox.
+    pub(crate) fn files_of(&self, process: Incarnation, service_hash: &str) -> Vec<PathBuf> {
+        let service = format!("{}{service_hash}.service", self.prefix());
+        vec![
+            self.names.live(process),
+            self.names.bell(process),
+            self.names.page(process),
+            self.services().join(service),
+        ]
+    }
+
     fn services(&self) -> PathBuf {
         self.config.root.join("services")
     }
@@ -566,7 +584,7 @@ impl Drop for Domain {
     /// Whoever goes last removes what is left, also when it held content for longer than its
     /// endpoint was open.
     fn drop(&mut self) {
-        if self.member && self.config.root.exists() {
+        if self.member && self.owner.is_this() && self.config.root.exists() {
             self.closing.store(true, Ordering::SeqCst);
             // Nobody to report to; what cannot be removed is removed by the next who starts.
             let _ = self.clean(true);

@@ -2,12 +2,13 @@
 
 use std::collections::BTreeMap;
 use std::io::ErrorKind;
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 use fipa_transport::{
-    AttemptId, Conclusion, Incarnation, Location, Parcel, Sink, WayError, WayFault,
+    Abandoned, AttemptId, Conclusion, Incarnation, Location, Parcel, Sink, WayError, WayFault,
 };
 use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::prelude::{ServiceName, SignalHandlingMode};
@@ -16,21 +17,26 @@ use tokio::runtime::Handle;
 
 use crate::counters::{Tally, count};
 use crate::domain::{Domain, file_error};
+use crate::fork::Owner;
 use crate::inbox::{Inbox, mailbox_name};
 use crate::layout::Svc;
 use crate::library::Library;
 use crate::loan::ShmLoan;
-use crate::memory::Budget;
+use crate::memory::{Budget, SHM};
 use crate::outbox::{Opening, Outbox, Posted};
 use crate::peers::Peer;
 use crate::pool::Pool;
 use crate::presence::{Bell, GLANCE, Neighbour, Presence, wait_for_looks};
 use crate::shift::Shift;
+use crate::storage::{self, Shortage};
 use crate::{ShmConfig, ShmError};
 
 /// What a transport and its tasks share.
 pub(crate) struct Endpoint {
     config: ShmConfig,
+    /// Files by which others find this process.
+    files: Vec<PathBuf>,
+    owner: Owner,
     runtime: Handle,
     sink: OnceLock<Arc<dyn Sink>>,
     closed: AtomicBool,
@@ -64,7 +70,6 @@ impl Endpoint {
     pub(crate) fn open(config: ShmConfig, runtime: Handle) -> Result<Arc<Self>, ShmError> {
         let domain = Domain::new(&config)?;
         let budget = Arc::new(Budget::new(&config));
-        budget.check_start()?;
         // Under the lock, so that nobody takes what is half made for the traces of the dead.
         let lock = domain.enter()?;
         let domain = Arc::new(domain.joined());
@@ -82,25 +87,38 @@ impl Endpoint {
         budget: Arc<Budget>,
         domain: Arc<Domain>,
     ) -> Result<Arc<Self>, ShmError> {
+        budget.check_start()?;
         let tally = Arc::new(Tally::default());
         let presence = Presence::create(domain.names().clone(), config.incarnation)
             .map_err(|e| file_error("cannot make files in", domain.names().directory(), e))?;
         let bell = presence.bell().clone();
-        let failed = |what: &'static str, reason: String| ShmError::Iceoryx {
-            what,
-            reason,
-            prefix: config.prefix.clone(),
+        let failed = |what: &'static str, reason: String, shortage: Option<Shortage>| {
+            if let Some(shortage) = shortage {
+                return ShmError::Full {
+                    path: SHM,
+                    needed: shortage.needed,
+                    source: shortage.error.into(),
+                };
+            }
+            ShmError::Iceoryx {
+                what,
+                reason,
+                prefix: config.prefix.clone(),
+            }
         };
-        let node = NodeBuilder::new()
-            .config(domain.iceoryx())
-            .signal_handling_mode(SignalHandlingMode::Disabled)
-            .create::<Svc>()
-            .map_err(|e| failed("cannot make a node", format!("{e:?}")))?;
+        let (node, shortage) = storage::watch(|| {
+            NodeBuilder::new()
+                .config(domain.iceoryx())
+                .signal_handling_mode(SignalHandlingMode::Disabled)
+                .create::<Svc>()
+        });
+        let node = node.map_err(|e| failed("cannot make a node", format!("{e:?}"), shortage))?;
         domain.close_to_others()?;
         let library = Arc::new(Library::new(domain.clone()));
         let told = (bell.clone(), presence.looks());
-        let inbox = Inbox::create(&config, &node, told, tally.clone(), library.clone())
-            .map_err(|reason| failed("cannot make the mailbox", reason))?;
+        let (inbox, shortage) =
+            storage::watch(|| Inbox::create(&config, &node, told, tally.clone(), library.clone()));
+        let inbox = inbox.map_err(|reason| failed("cannot make the mailbox", reason, shortage))?;
         let pool = Pool::new(
             config.incarnation,
             config.share_from,
@@ -108,7 +126,9 @@ impl Endpoint {
             domain.clone(),
         );
         Ok(Arc::new(Self {
+            files: domain.files_of(config.incarnation, inbox.service_hash()),
             config,
+            owner: domain.owner(),
             runtime,
             sink: OnceLock::new(),
             closed: AtomicBool::new(false),
@@ -135,6 +155,10 @@ impl Endpoint {
         &self.config
     }
 
+    pub(crate) fn owner(&self) -> Owner {
+        self.owner
+    }
+
     pub(crate) fn runtime(&self) -> &Handle {
         &self.runtime
     }
@@ -151,6 +175,24 @@ impl Endpoint {
         &self.tally
     }
 
+    /// Whether others can find this process, as far as can be told.
+    pub(crate) fn is_there(&self) -> bool {
+        let missing = |file: &PathBuf| {
+            let found = std::fs::symlink_metadata(file);
+            found.is_err_and(|error| error.kind() == ErrorKind::NotFound)
+        };
+        !self.files.iter().any(missing)
+    }
+
+    /// Removes what is left of these files after closing: iceoryx2 leaves a mailbox while content
+    /// from it is held.
+    pub(crate) fn remove_files(&self) {
+        for file in &self.files {
+            // Mostly they are gone.
+            let _ = std::fs::remove_file(file);
+        }
+    }
+
     pub(crate) fn is_closed(&self) -> bool {
         self.closed.load(Ordering::SeqCst)
     }
@@ -162,6 +204,9 @@ impl Endpoint {
 
     /// Works on the calling thread; meanwhile nobody needs to ring.
     pub(crate) fn drive(self: &Arc<Self>) -> bool {
+        if !self.owner.is_this() {
+            return false;
+        }
         let presence = self.presence.read();
         let Some(presence) = presence.as_ref() else {
             return false;
@@ -286,6 +331,7 @@ impl Endpoint {
         to: &Location,
         parcel: &Parcel,
     ) -> Result<(), WayError> {
+        self.check_owner()?;
         if self.sink.get().is_none() {
             return Err(closed());
         }
@@ -309,9 +355,11 @@ impl Endpoint {
         ))
     }
 
-    pub(crate) fn abandon(&self, attempt: AttemptId) {
+    /// Ends an attempt. The parcel lies in the other process's mailbox, and may be taken.
+    pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
         let peers = self.peers.read();
         let _known = peers.values().any(|peer| peer.abandon(attempt));
+        Abandoned::Unconfirmed
     }
 
     pub(crate) fn loan(
@@ -321,8 +369,19 @@ impl Endpoint {
         len: usize,
         tail_room: usize,
     ) -> Result<ShmLoan, WayError> {
+        self.check_owner()?;
         let peer = self.peer_at(to)?;
         self.outbox(&peer)?.loan(head_room, len, tail_room)
+    }
+
+    fn check_owner(&self) -> Result<(), WayError> {
+        match self.owner.is_this() {
+            true => Ok(()),
+            false => Err(WayError::new(
+                WayFault::Closed,
+                "this process was forked from the one that opened shared memory",
+            )),
+        }
     }
 
     /// Opens a mailbox if that was not done before.
@@ -482,7 +541,7 @@ impl Endpoint {
 
     /// Closes the endpoint. Must not be called by the sink while it is told something.
     pub(crate) fn close(&self) {
-        if self.closed.swap(true, Ordering::SeqCst) {
+        if !self.owner.is_this() || self.closed.swap(true, Ordering::SeqCst) {
             return;
         }
         // While others still know that this process is there.

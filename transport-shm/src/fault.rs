@@ -7,6 +7,8 @@ use iceoryx2::port::client::RequestSendError;
 use iceoryx2::service::builder::request_response::RequestResponseOpenError;
 use iceoryx2::service::port_factory::client::ClientCreateError;
 
+const MAILBOX_TAKEN: &str = ": too many processes have it open (max_clients of the other process)";
+
 pub(crate) fn too_large() -> WayError {
     WayError::new(WayFault::TooLarge, "")
 }
@@ -40,17 +42,19 @@ pub(crate) fn open_error(error: RequestResponseOpenError) -> WayError {
         | E::IncompatibleMessagingPattern => WayFault::Incompatible,
         _ => WayFault::Unreachable,
     };
+    let hint = match error {
+        E::ExceedsMaxNumberOfNodes => MAILBOX_TAKEN,
+        _ => "",
+    };
     WayError::new(
         fault,
-        format_args!("the mailbox cannot be opened: {error:?}"),
+        format_args!("the mailbox cannot be opened ({error:?}){hint}"),
     )
 }
 
 pub(crate) fn create_error(error: ClientCreateError) -> WayError {
     let hint = match error {
-        ClientCreateError::ExceedsMaxSupportedClients => {
-            ": too many processes have it open (max_clients of the other process)"
-        }
+        ClientCreateError::ExceedsMaxSupportedClients => MAILBOX_TAKEN,
         _ => ": often the limit of open files is too low, or shared memory is full",
     };
     WayError::new(

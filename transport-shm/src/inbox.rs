@@ -10,22 +10,25 @@ use fipa_transport::{
     Answer, Arrival, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Sink, Ticket, Verdict,
 };
 use iceoryx2::port::{DegradationAction, ReceiveError};
-use iceoryx2::prelude::{BackpressureStrategy, Node, ServiceName};
+use iceoryx2::prelude::{BackpressureStrategy, Node, PortFactory, ServiceName};
 use parking_lot::Mutex;
 
 use crate::ShmConfig;
 use crate::counters::{Tally, count};
 use crate::layout::{Ack, Active, BlankAck, Header, MailServer, Places, Svc};
 use crate::library::{Borrowed, Library, NotRead};
-use crate::memory::{Address, populate};
+use crate::memory::Address;
 use crate::presence::{Bell, Looks};
 use crate::segment::Reference;
+use crate::storage;
 
 /// How many parcels are taken before anything else is looked at.
 const BATCH: usize = 64;
 
 /// How many answers may be on their way to all senders together.
 const ANSWERS: usize = 1024;
+
+const _: () = assert!(ANSWERS <= storage::MAX_CHUNKS);
 
 /// The name of the mailbox of a process.
 pub(crate) fn mailbox_name(of: Incarnation) -> String {
@@ -44,6 +47,7 @@ pub(crate) fn location_of(of: Incarnation) -> Location {
 /// The server of this process's mailbox. Used by one thread at a time.
 pub(crate) struct Inbox {
     server: MailServer,
+    service_hash: String,
     lending: Arc<Lending>,
     looks: Looks,
     tally: Arc<Tally>,
@@ -55,6 +59,11 @@ pub(crate) struct Inbox {
 }
 
 impl Inbox {
+    /// The name of its service among the files of the domain.
+    pub(crate) fn service_hash(&self) -> &str {
+        &self.service_hash
+    }
+
     /// Makes the mailbox.
     pub(crate) fn create(
         config: &ShmConfig,
@@ -94,6 +103,7 @@ impl Inbox {
             .map_err(debug)?;
         Ok(Self {
             server,
+            service_hash: service.service_hash().as_str().to_owned(),
             lending: Arc::new(Lending {
                 per_sender: config.window - 1,
                 total: config.max_borrowed,
@@ -212,22 +222,11 @@ impl Inbox {
         let _ = blank.write_payload(Ack::new(answer, header.token())).send();
     }
 
-    /// Takes the pages of the answers, at the first one.
+    /// Takes the pages of all answers, at the first one, whose own page is there from the start.
     fn prepare_answers(&mut self, first: &BlankAck) -> bool {
         if !self.answers_ready {
             let chunk = std::ptr::from_ref(first.header()) as usize;
-            let ack = first.payload().as_ptr() as usize;
-            let stride = (ack - chunk + size_of::<Ack>()).next_multiple_of(8);
-            // What lies behind the end of the segment is an error without harm, so the error is
-            // looked at only for the part that is there for certain.
-            self.answers_ready = populate(chunk as *const u8, stride).is_ok();
-            let mut rest = stride;
-            while self.answers_ready && rest < ANSWERS * stride {
-                if populate((chunk + rest) as *const u8, stride).is_err() {
-                    break;
-                }
-                rest += 4096;
-            }
+            self.answers_ready = storage::allocate_all(chunk).is_ok();
         }
         self.answers_ready
     }
@@ -363,6 +362,11 @@ struct Held {
 
 impl Drop for Held {
     fn drop(&mut self) {
+        if !self.lending.library.owner().is_this() {
+            // In a forked child: giving it back would take it from the parent.
+            std::mem::forget(self.active.get_mut().take());
+            return;
+        }
         // First the memory, then the count: what is counted as free must be free.
         drop(self.active.get_mut().take());
         self.lending.end(self.sender);

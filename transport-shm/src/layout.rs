@@ -8,15 +8,15 @@ use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::client::Client;
 use iceoryx2::port::server::Server;
-use iceoryx2::prelude::{ZeroCopySend, ipc_threadsafe};
+use iceoryx2::prelude::ZeroCopySend;
 use iceoryx2::request_mut::RequestMut;
 use iceoryx2::request_mut_uninit::RequestMutUninit;
 use iceoryx2::response_mut_uninit::ResponseMutUninit;
 use zerocopy::{FromBytes, IntoBytes};
 
 use crate::segment::Reference;
+pub(crate) use crate::variant::Svc;
 
-pub(crate) type Svc = ipc_threadsafe::Service;
 pub(crate) type MailClient = Client<Svc, [u8], Header, Ack, ()>;
 pub(crate) type MailServer = Server<Svc, [u8], Header, Ack, ()>;
 pub(crate) type Blank = RequestMutUninit<Svc, [MaybeUninit<u8>], Header, Ack, ()>;
@@ -29,7 +29,7 @@ pub(crate) type BlankAck = ResponseMutUninit<Svc, MaybeUninit<Ack>, ()>;
 pub(crate) const ALIGNMENT: usize = 8;
 
 /// The version of this layout. Another one is another type to iceoryx2, and refused there.
-const VERSION: u32 = 2;
+const VERSION: u32 = 3;
 
 /// What stands in front of every parcel.
 ///
@@ -37,7 +37,7 @@ const VERSION: u32 = 2;
 /// parcel's body, without its content when that lies in a segment.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, ZeroCopySend)]
-#[type_name("fipa-mail-header-2")]
+#[type_name("fipa-mail-header-3")]
 pub(crate) struct Header {
     version: u32,
     start: u32,
@@ -123,7 +123,7 @@ impl Header {
 /// The answer to a parcel.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, ZeroCopySend)]
-#[type_name("fipa-mail-ack-1")]
+#[type_name("fipa-mail-ack-2")]
 pub(crate) struct Ack {
     code: u8,
     reason: u8,
@@ -139,6 +139,8 @@ const CUSTODY: u8 = 2;
 const BUSY: u8 = 3;
 const OUT_OF_ORDER: u8 = 4;
 const FAILED: u8 = 5;
+const RETURNED: u8 = 6;
+const MOVED: u8 = 7;
 
 impl Ack {
     /// The answer to the parcel with this token.
@@ -156,6 +158,11 @@ impl Ack {
             Answer::Accepted => ack.code = ACCEPTED,
             Answer::Custody => ack.code = CUSTODY,
             Answer::Busy => ack.code = BUSY,
+            Answer::Moved => ack.code = MOVED,
+            Answer::Returned { uncertain } => {
+                ack.code = RETURNED;
+                ack.last = u64::from(*uncertain);
+            }
             Answer::OutOfOrder { last } => {
                 ack.code = OUT_OF_ORDER;
                 ack.last = *last;
@@ -182,6 +189,10 @@ impl Ack {
             ACCEPTED => Answer::Accepted,
             CUSTODY => Answer::Custody,
             BUSY => Answer::Busy,
+            MOVED => Answer::Moved,
+            RETURNED => Answer::Returned {
+                uncertain: self.last != 0,
+            },
             OUT_OF_ORDER => Answer::OutOfOrder { last: self.last },
             FAILED => {
                 let detail = self.detail.get(..usize::from(self.detail_len))?;
@@ -258,6 +269,9 @@ mod tests {
             Answer::Custody,
             Answer::Busy,
             Answer::OutOfOrder { last: u64::MAX },
+            Answer::Returned { uncertain: false },
+            Answer::Returned { uncertain: true },
+            Answer::Moved,
             Answer::failed(FailureReason::Loop, "seen before"),
         ] {
             assert_eq!(Ack::new(&answer, 7).answer(7), Some(answer.clone()));

@@ -13,9 +13,11 @@
 //! side of mailboxes, `loan` memory handed out before it is sent, `segment` content that lies in
 //! memory once for many receivers (`pool` where it is sent, `library` where it is read),
 //! `presence` how processes wake each other and notice each other's end, `memory` where room comes
-//! from, `domain` the traces in the file system, `peers` the other processes known, `shift` who of
-//! several threads works, `fault` what the sender is told when a way fails, `endpoint` what ties
-//! all together. `raw` (feature `raw`) is the bare iceoryx2 that benches compare with.
+//! from, `storage` the files of iceoryx2 with their pages allocated, `variant` the iceoryx2 service
+//! that uses them, `domain` the traces in the file system, `peers` the other processes known,
+//! `shift` who of several threads works, `fault` what the sender is told when a way fails,
+//! `fork` how a forked child is recognized, `endpoint` what ties all together. `raw` (feature `raw`) is the bare iceoryx2 that benches
+//! compare with.
 //!
 //! What must not live here: routes, retries, names of agents, deduplication. And no `unsafe` that
 //! does not say why it is sound; no other crate of this project has any.
@@ -31,6 +33,7 @@ mod counters;
 mod domain;
 mod endpoint;
 mod fault;
+mod fork;
 mod inbox;
 mod inspect;
 mod layout;
@@ -45,10 +48,13 @@ mod presence;
 pub mod raw;
 mod segment;
 mod shift;
+mod storage;
 mod transport;
+mod variant;
 
 pub use config::{ShmConfig, ShmError};
 pub use counters::ShmCounters;
 pub use domain::{Cleaned, cleanup_dead};
+pub use fork::Owner;
 pub use inspect::{Inspection, inspect};
 pub use transport::ShmTransport;

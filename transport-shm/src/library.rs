@@ -8,6 +8,7 @@ use fipa_transport::Incarnation;
 use parking_lot::Mutex;
 
 use crate::domain::Domain;
+use crate::fork::Owner;
 use crate::segment::{Reference, SegmentFile};
 
 /// How many segments are kept open.
@@ -97,6 +98,10 @@ impl Library {
         Ok(volume)
     }
 
+    pub(crate) fn owner(&self) -> Owner {
+        self.domain.owner()
+    }
+
     /// A process has ended: what it had is kept only by those who read it.
     pub(crate) fn forget(&self, sender: Incarnation) {
         self.open.lock().retain(|one| one.sender != sender);
@@ -163,6 +168,10 @@ impl AsRef<[u8]> for Borrowed {
 
 impl Drop for Borrowed {
     fn drop(&mut self) {
+        if !self.library.owner().is_this() {
+            // In a forked child, whose lock is the parent's.
+            return;
+        }
         let Self {
             volume, library, ..
         } = self;

@@ -141,6 +141,16 @@ impl Loan {
 #[derive(Debug)]
 struct Place(Arc<Outbox>);
 
+impl Drop for Loan {
+    fn drop(&mut self) {
+        if !self.outbox.0.owner().is_this() {
+            // In a forked child: the request stays the parent's, and so does the outbox.
+            std::mem::forget(std::mem::replace(self.state.get_mut(), State::Lost));
+            std::mem::forget(Arc::clone(&self.outbox.0));
+        }
+    }
+}
+
 impl Drop for Place {
     fn drop(&mut self) {
         self.0.loan_ended();

@@ -3,7 +3,7 @@
 //!
 //! Shared memory files are sparse. Writing to a page of one when the file system is full raises
 //! SIGBUS, which ends the process. So pages are asked for with `MADV_POPULATE_WRITE` first, which
-//! reports an error instead.
+//! reports an error instead. `storage` does the same for what iceoryx2 writes by itself.
 
 use std::fs::{File, Metadata, OpenOptions};
 use std::os::fd::{AsFd, OwnedFd};
@@ -19,6 +19,7 @@ use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mmap, munmap};
 use rustix::param::page_size;
 
 use crate::presence::Names;
+use crate::storage::{self, Shortage};
 use crate::{ShmConfig, ShmError};
 
 /// Where POSIX shared memory lies on Linux.
@@ -66,7 +67,8 @@ impl Budget {
         self.capacity
     }
 
-    /// Whether an endpoint can be opened at all.
+    /// Whether an endpoint can be opened at all. To be called under the domain's lock, so that no
+    /// other process of the domain that starts takes the same room.
     pub(crate) fn check_start(&self) -> Result<(), ShmError> {
         let free = free_bytes().unwrap_or(0);
         if free < START {
@@ -218,6 +220,11 @@ pub(crate) fn no_room(need: u64, what: &str) -> WayError {
     )
 }
 
+/// The error of an attempt for which pages could not be allocated.
+pub(crate) fn lacking(shortage: Shortage) -> WayError {
+    no_room(shortage.needed, &format!("is full ({})", shortage.error))
+}
+
 fn free_bytes() -> std::io::Result<u64> {
     let stat = rustix::fs::statvfs(SHM)?;
     Ok(stat.f_bavail.saturating_mul(stat.f_frsize))
@@ -225,8 +232,8 @@ fn free_bytes() -> std::io::Result<u64> {
 
 /// Takes the pages of `len` bytes at `start`, so that writing there cannot fail.
 ///
-/// `start` must be in shared memory that is mapped for writing and stays mapped during the call;
-/// a range that is not merely gives an error.
+/// `start` must be in the memory of an outbox, which is mapped for writing and stays mapped during
+/// the call; a range that is not merely gives an error.
 pub(crate) fn populate(start: *const u8, len: usize) -> Result<(), WayError> {
     // The kernel's pages: it refuses what does not begin with one, which must not be taken for the
     // refusal of a kernel that cannot do it at all.
@@ -242,12 +249,9 @@ pub(crate) fn populate(start: *const u8, len: usize) -> Result<(), WayError> {
         return match done {
             Ok(()) => Ok(()),
             Err(Errno::INTR | Errno::AGAIN) => continue,
-            // Before Linux 5.14. What is free was checked; between the check and the write
-            // another program could still take it.
-            Err(Errno::INVAL) => match free_bytes() {
-                Ok(free) if free >= len as u64 + MARGIN => Ok(()),
-                _ => Err(no_room(len as u64, "is full")),
-            },
+            // Before Linux 5.14.
+            Err(Errno::INVAL) => storage::allocate(start as usize..end)
+                .map_err(|e| no_room(len as u64, &format!("is full ({e})"))),
             Err(e) => Err(no_room(len as u64, &format!("is full ({e})"))),
         };
     }

@@ -19,10 +19,12 @@ use crate::domain::Domain;
 use crate::fault::{
     create_error, loan_error, open_error, retired, send_error, too_large, window_full, wire_error,
 };
+use crate::fork::Owner;
 use crate::layout::{ALIGNMENT, Ack, Blank, Filled, Header, MailClient, Pending, Places, Svc};
 use crate::loan::{Loan, ShmLoan};
-use crate::memory::{Budget, populate};
+use crate::memory::{Budget, lacking, populate};
 use crate::pool::Pool;
+use crate::storage;
 
 /// Bytes of the first, small memory segment's chunks, headers included.
 const FIRST_CHUNK: usize = 4096;
@@ -62,7 +64,7 @@ pub(crate) struct Outbox {
     pool: Arc<Pool>,
     tally: Arc<Tally>,
     // After the client: the last of the process to go removes the domain's traces.
-    _domain: Arc<Domain>,
+    domain: Arc<Domain>,
 }
 
 #[derive(Debug, Default)]
@@ -83,6 +85,9 @@ struct Segment {
     stride: usize,
     /// Longest payload that fits a chunk.
     room: usize,
+    /// Whether the headers of all chunks have their pages. Until then no chunk but the first is
+    /// ever loaned: iceoryx2 loans the chunk that was returned last.
+    headers_ready: bool,
     /// By number of a chunk, how many bytes of its payload have their pages.
     ready: Vec<usize>,
 }
@@ -144,15 +149,19 @@ impl Outbox {
         let settings = service.static_config();
         let window = settings.max_active_requests_per_client();
         let most_loans = settings.max_loaned_requests();
-        let client = service
+        let builder = service
             .client_builder()
             .initial_max_slice_len(FIRST_CHUNK - header_len())
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .set_request_degradation_handler(|_, _| DegradationAction::Ignore)
-            .set_response_degradation_handler(|_, _| DegradationAction::Ignore)
-            .create()
-            .map_err(create_error)?;
+            .set_response_degradation_handler(|_, _| DegradationAction::Ignore);
+        let (client, shortage) = storage::watch(|| builder.create());
+        // iceoryx2 makes a client that reaches nobody when its connections have no room.
+        if let Some(shortage) = shortage {
+            return Err(lacking(shortage));
+        }
+        let client = client.map_err(create_error)?;
         let start = getrandom::u64()
             .map_err(|e| WayError::new(WayFault::Closed, format_args!("no random numbers: {e}")))?;
         let outbox = Self {
@@ -176,7 +185,7 @@ impl Outbox {
             budget: opening.budget,
             pool: opening.pool,
             tally: opening.tally,
-            _domain: opening.domain,
+            domain: opening.domain,
         };
         // Takes the pages of the first segment.
         drop(outbox.take(&mut outbox.state.lock(), 1)?);
@@ -413,6 +422,10 @@ impl Outbox {
         state.loans.insert(loan.address(), Arc::downgrade(loan));
     }
 
+    pub(crate) fn owner(&self) -> Owner {
+        self.domain.owner()
+    }
+
     pub(crate) fn loan_ended(&self) {
         self.loans.fetch_sub(1, Ordering::AcqRel);
     }
@@ -428,7 +441,11 @@ impl Outbox {
             let need = (len as u64).saturating_add(headers);
             _turn = Some(self.budget.reserve(need)?);
         }
-        let mut blank = self.client.loan_slice_uninit(len).map_err(loan_error)?;
+        let (blank, shortage) = storage::watch(|| self.client.loan_slice_uninit(len));
+        let mut blank = blank.map_err(|error| match shortage {
+            Some(shortage) => lacking(shortage),
+            None => loan_error(error),
+        })?;
         let chunk = std::ptr::from_ref(blank.header()) as usize;
         let payload = blank.payload_mut().as_ptr().cast::<u8>();
         let head = payload as usize - chunk;
@@ -443,10 +460,14 @@ impl Outbox {
             segment.room = segment.stride - head;
             segment.ready.clear();
             segment.ready.resize(self.chunks, 0);
+            segment.headers_ready = false;
+        }
+        if !segment.headers_ready {
             for number in 0..self.chunks {
                 let header = segment.base + number * segment.stride;
                 populate(header as *const u8, head)?;
             }
+            segment.headers_ready = true;
         }
         let number = (chunk - segment.base) / segment.stride;
         let ready = segment.ready.get_mut(number).ok_or_else(retired)?;

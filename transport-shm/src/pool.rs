@@ -3,7 +3,7 @@
 use std::cmp::Reverse;
 use std::io::ErrorKind;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 
 use bytes::Bytes;
 use fipa_transport::{Incarnation, LoanedContent, WayError, WayFault};
@@ -39,7 +39,6 @@ pub(crate) struct Pool {
 #[derive(Debug, Default)]
 struct State {
     slots: Vec<Slot>,
-    last_number: u64,
     closed: bool,
 }
 
@@ -126,8 +125,9 @@ impl Pool {
                 }
             }
         };
-        state.last_number += 1;
-        let number = state.last_number;
+        // Of the process, because others may still know the segments of an endpoint before.
+        static LAST_NUMBER: AtomicU64 = AtomicU64::new(0);
+        let number = LAST_NUMBER.fetch_add(1, Ordering::Relaxed) + 1;
         let made = self.make_file(number, room);
         drop(turn);
         let (file, generation) = made.inspect_err(|_| self.remove(number))?;
@@ -149,8 +149,9 @@ impl Pool {
             }
         };
         let file = SegmentFile::create(&path, room).map_err(cannot)?;
-        // The pages are there; this makes them ones that the sender need not fault in.
-        populate(file.mapping().start().as_ptr(), file.mapping().len())?;
+        // The pages are there; this makes them ones that the sender need not fault in. Before Linux
+        // 5.14 that is not possible, and the sender faults them in.
+        let _ = populate(file.mapping().start().as_ptr(), file.mapping().len());
         let begun = file.begin();
         let generation = begun.ok_or_else(|| cannot(ErrorKind::ResourceBusy.into()))?;
         Ok((file, generation))
@@ -333,7 +334,10 @@ struct Taken {
 
 impl Drop for Taken {
     fn drop(&mut self) {
-        self.pool.give_back(self);
+        // In a forked child it stays the parent's.
+        if self.pool.domain.owner().is_this() {
+            self.pool.give_back(self);
+        }
     }
 }
 

@@ -20,12 +20,14 @@ use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering, fence};
 use std::time::{Duration, Instant};
 
 use fipa_transport::Incarnation;
-use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
+use rustix::fs::{CWD, FileType, FlockOperation, Mode, OFlags, flock, mknodat};
+use rustix::io::Errno;
 use rustix::mm::ProtFlags;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
 use crate::domain::files_in;
+use crate::fork::Owner;
 use crate::memory::{Mapping, PAGE, SHM, open_ours};
 use crate::segment;
 
@@ -115,12 +117,25 @@ impl Names {
     }
 
     /// Whether this process is there. To be asked under the domain's lock, or of a process that
-    /// is known to have been there. Whoever has no descriptors left to look with cannot tell that
-    /// somebody is not.
+    /// is known to have been there. A process whose files cannot be examined, for example for lack
+    /// of descriptors, counts as alive.
     pub(crate) fn is_alive(&self, of: Incarnation) -> bool {
         match open_live(&self.live(of)) {
             Ok(live) => !has_ended(&live),
-            Err(error) => error.kind() != ErrorKind::NotFound,
+            Err(error) if error.kind() == ErrorKind::NotFound => self.holds_page(of),
+            Err(_) => true,
+        }
+    }
+
+    /// Whether this process has its page locked: then it is there, though another program has
+    /// removed its files from the directory.
+    fn holds_page(&self, of: Incarnation) -> bool {
+        match open_ours(&self.page(of), File::options().read(true)) {
+            // The lock ends with the descriptor, at once.
+            Ok((page, _)) => {
+                flock(&page, FlockOperation::NonBlockingLockShared) == Err(Errno::WOULDBLOCK)
+            }
+            Err(error) => !matches!(error.kind(), ErrorKind::NotFound | ErrorKind::InvalidData),
         }
     }
 
@@ -137,8 +152,11 @@ impl Names {
 pub(crate) struct Presence {
     names: Names,
     own: Incarnation,
+    owner: Owner,
     bell: Arc<Bell>,
     page: Arc<Page>,
+    /// Never read: locked for as long as the process lives.
+    _locked: File,
     // Last: the other files are there as long as this one is open.
     _live: File,
 }
@@ -168,12 +186,19 @@ impl Presence {
             .open(names.page(own))?;
         // Written, not just made longer: a full file system is an error here, and not a signal
         // later.
-        page.write_all(&[0; PAGE])?;
+        page.write_all(&[0; PAGE]).map_err(|e| {
+            let text = format!("cannot take a page in {SHM}: {e}");
+            io::Error::new(e.kind(), text)
+        })?;
+        // Says that the process runs where another program has removed `live`.
+        flock(&page, FlockOperation::NonBlockingLockExclusive)?;
         Ok(Self {
             names: names.clone(),
             own,
+            owner: Owner::this(),
             bell: Arc::new(Bell(bell)),
             page: Arc::new(Page::map(&page, ProtFlags::READ | ProtFlags::WRITE)?),
+            _locked: page,
             _live,
         })
     }
@@ -246,7 +271,9 @@ const GLANCES: usize = 16;
 
 impl Drop for Presence {
     fn drop(&mut self) {
-        self.names.remove(self.own);
+        if self.owner.is_this() {
+            self.names.remove(self.own);
+        }
     }
 }
 

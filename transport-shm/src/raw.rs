@@ -17,13 +17,15 @@ use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::server::Server;
 use iceoryx2::prelude::{
-    AllocationStrategy, BackpressureStrategy, ServiceName, SignalHandlingMode,
+    AllocationStrategy, BackpressureStrategy, ServiceName, SignalHandlingMode, ipc_threadsafe,
 };
 use iceoryx2::request_mut::RequestMut;
 
-use crate::layout::{self, Ack, Svc};
+use crate::layout::{self, Ack};
 use crate::memory::Budget;
 use crate::{ShmConfig, ShmError};
+
+type Svc = ipc_threadsafe::Service;
 
 /// As large as the transport's header.
 type Header = [u64; size_of::<layout::Header>() / 8];

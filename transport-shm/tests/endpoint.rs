@@ -12,8 +12,8 @@ use std::sync::mpsc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use common::{Place, attempt, parcel, wait_for};
-use fipa_transport::{Incarnation, Transport, WayFault};
+use common::{Place, Told, attempt, parcel, wait_for};
+use fipa_transport::{Answer, Conclusion, Incarnation, Transport, WayFault};
 use fipa_transport_shm::{ShmConfig, ShmError, ShmTransport, cleanup_dead};
 
 #[test]
@@ -222,4 +222,113 @@ fn who_waited_too_long_does_not_clean_up_after_those_who_start_anew() {
     waiting.join().unwrap().unwrap();
     // Nobody came.
     assert!(!nodes.exists());
+}
+
+/// Sends a letter until it was taken: those before fail, as others may not have joined again.
+fn until_answered(from: (&ShmTransport, &Told), to: &ShmTransport) {
+    wait_for("letter that is taken", || {
+        let one = attempt();
+        let content = Bytes::from(vec![3; 9000]);
+        if from
+            .0
+            .dispatch(one, &to.location(), parcel(content))
+            .is_err()
+        {
+            return false;
+        }
+        wait_for("conclusion", || from.1.conclusion_of(one).is_some());
+        matches!(
+            from.1.conclusion_of(one),
+            Some(Conclusion::Answered(Answer::Accepted))
+        )
+    });
+}
+
+#[test]
+fn a_domain_whose_files_were_removed_is_joined_again() {
+    let place = Place::new();
+    let (one, one_told) = place.listening();
+    let (two, two_told) = place.listening();
+    until_answered((&one, &one_told), &two);
+    let held = two_told.content(0);
+    assert!(one.is_there() && !one.rejoin().unwrap());
+    for round in 0..3 {
+        let root = place.config().root;
+        match round {
+            0 => std::fs::remove_dir_all(&root).unwrap(),
+            1 => std::fs::rename(&root, place.directory.path().join("away")).unwrap(),
+            // As at the end of a login session, by systemd's RemoveIPC.
+            _ => {
+                for file in std::fs::read_dir("/dev/shm").unwrap().flatten() {
+                    if file
+                        .file_name()
+                        .to_string_lossy()
+                        .starts_with(&place.prefix)
+                    {
+                        std::fs::remove_file(file.path()).unwrap();
+                    }
+                }
+            }
+        }
+        assert!(!one.is_there() && !two.is_there());
+        assert!(one.rejoin().unwrap());
+        // Between the two, a third process starts, and cleans up.
+        let (three, three_told) = place.listening();
+        until_answered((&one, &one_told), &three);
+        assert!(two.rejoin().unwrap());
+        assert!(one.is_there() && two.is_there());
+        for (from, to) in [
+            ((&*one, &*one_told), &two),
+            ((&two, &two_told), &one),
+            ((&three, &three_told), &two),
+            ((&two, &two_told), &three),
+        ] {
+            until_answered(from, to);
+        }
+        three.close();
+    }
+    assert_eq!(held[..], [3; 9000]);
+    drop(held);
+    for told in [&one_told, &two_told] {
+        told.arrived.lock().unwrap().clear();
+    }
+    // With the last content of a mailbox before, iceoryx2 removes the file of the present one.
+    for endpoint in [&one, &two] {
+        let needed = !endpoint.is_there();
+        assert_eq!(endpoint.rejoin().unwrap(), needed);
+        assert!(endpoint.is_there());
+    }
+    until_answered((&one, &one_told), &two);
+    until_answered((&two, &two_told), &one);
+    for told in [&one_told, &two_told] {
+        told.arrived.lock().unwrap().clear();
+    }
+    one.close();
+    two.close();
+    assert!(!one.rejoin().unwrap(), "a closed one stays so");
+    std::fs::remove_dir_all(place.directory.path().join("away")).unwrap();
+    assert_eq!(place.traces(), Vec::<String>::new());
+}
+
+#[test]
+fn a_process_whose_directory_was_removed_is_not_taken_for_dead() {
+    let place = Place::new();
+    let (one, _) = place.listening();
+    let (two, _) = place.listening();
+    let write_for_many = || {
+        let mut loan = one.loan_for_many(100_000).unwrap().unwrap();
+        loan.content_mut().fill(5);
+        loan.freeze()
+    };
+    // Leaves a segment that is not in use, which is emptied after the end of its process.
+    drop(write_for_many());
+    std::fs::remove_dir_all(place.config().root).unwrap();
+    let (three, _) = place.listening();
+    let cleaned = cleanup_dead(&place.config()).unwrap();
+    assert_eq!((cleaned.alive, cleaned.removed), (3, 0), "{cleaned:?}");
+    // A bus error, if the segment was emptied.
+    assert_eq!(write_for_many()[..], [5; 100_000]);
+    for endpoint in [one, two, three] {
+        endpoint.close();
+    }
 }

@@ -11,8 +11,8 @@ use parking_lot::Mutex;
 
 use crate::transport::LoanedContent;
 use crate::{
-    Answer, Arrival, Arriving, AttemptId, Conclusion, Introduction, Kind, ListenError, Location,
-    Parcel, Sink, Ticket, Transport, Verdict, WayError, WayFault,
+    Abandoned, Answer, Arrival, Arriving, AttemptId, Conclusion, Introduction, Kind, ListenError,
+    Location, Parcel, Sink, Ticket, Transport, Verdict, WayError, WayFault,
 };
 
 /// A way of failing.
@@ -155,13 +155,13 @@ impl Transport for Faulty {
         }
     }
 
-    fn abandon(&self, attempt: AttemptId) {
+    fn abandon(&self, attempt: AttemptId) -> Abandoned {
         self.shared.pending.lock().remove(&attempt);
         self.shared
             .invented
             .lock()
             .retain(|(other, _)| *other != attempt);
-        self.inner.abandon(attempt);
+        self.inner.abandon(attempt)
     }
 
     fn answer(&self, ticket: Ticket, answer: Answer) {
@@ -232,6 +232,10 @@ impl Sink for Filter {
 
     fn also_at(&self, location: &Location) -> Vec<Location> {
         self.sink.also_at(location)
+    }
+
+    fn relocated(&self, locations: Vec<Location>) {
+        self.sink.relocated(locations);
     }
 
     fn introduced(&self, peer: &Introduction) {

@@ -4,6 +4,7 @@
 //! * [`Sink`] is who listens: the delivery core of `fipa-mts`.
 //! * [`Outcome`] is what a sender is told in the end, one per receiver.
 //! * [`wire`] is the fixed layout of a parcel, shared by the mailbox and the network frame.
+//! * [`OwnerProcess`] tells a process from a forked child.
 //! * [`Allowance`] is how much a peer or a sender may still do.
 //! * `conformance` (feature of that name) is the suite that every implementation passes;
 //!   [`Faulty`] wraps a transport and makes it fail on purpose.
@@ -18,6 +19,7 @@ mod faulty;
 mod incarnation;
 mod location;
 mod outcome;
+mod owner;
 mod parcel;
 mod transport;
 pub mod wire;
@@ -27,8 +29,9 @@ pub use faulty::{Fault, Faulty};
 pub use incarnation::Incarnation;
 pub use location::{Kind, Location, LocationError, Signature};
 pub use outcome::{Attempt, FailureReason, Outcome};
+pub use owner::{Forked, OwnerProcess};
 pub use parcel::{Body, Parcel, Report, Stream};
 pub use transport::{
-    Answer, Arrival, Arriving, AttemptId, Conclusion, Hop, Introduction, ListenError,
+    Abandoned, Answer, Arrival, Arriving, AttemptId, Conclusion, Hop, Introduction, ListenError,
     LoanedContent, Sink, Ticket, Transport, Verdict, WayError, WayFault,
 };

@@ -130,11 +130,13 @@ pub enum FailureReason {
     Unconfirmed,
     /// The letter came back to a service that had already stamped it.
     Loop,
+    /// The sender's own service is closed.
+    Closed,
 }
 
 impl FailureReason {
     /// Every reason, for encoding: the position is the code on the wire, so new ones go last.
-    pub(crate) const CODES: [Self; 8] = [
+    pub(crate) const CODES: [Self; 9] = [
         Self::NoSuchAgent,
         Self::QueueFull,
         Self::Unreachable,
@@ -143,6 +145,7 @@ impl FailureReason {
         Self::TimedOut,
         Self::Unconfirmed,
         Self::Loop,
+        Self::Closed,
     ];
 }
 
@@ -157,6 +160,7 @@ impl fmt::Display for FailureReason {
             Self::TimedOut => "timed out",
             Self::Unconfirmed => "unconfirmed",
             Self::Loop => "loop",
+            Self::Closed => "closed",
         })
     }
 }

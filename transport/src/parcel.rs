@@ -25,35 +25,33 @@ pub struct Stream {
 /// the letter's memory.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parcel {
-    /// The name of the receiving agent, 1 to [`Parcel::MAX_NAME`] bytes of UTF-8. For a report or
-    /// a credit: the receiver of the letters it is about.
+    /// The name of the receiving agent, 1 to [`Parcel::MAX_NAME`] bytes of UTF-8. For a note
+    /// ([`Body::Report`], [`Body::Credit`], [`Body::Predecessor`]): the receiver of the letters it
+    /// is about.
     pub receiver: Arc<str>,
-    /// Whose order this letter belongs to.
+    /// The stream that the letter belongs to.
     pub stream: Stream,
-    /// Position among everything this life of the sender sends, from 1: later letters of a
-    /// stream have higher numbers, not necessarily the next one.
+    /// Position among everything that this registration of the sender sends, from 1. Later letters
+    /// of a stream have higher numbers, not necessarily the next one.
     pub sequence: u64,
-    /// The letter of the stream that must have been taken before this one, or 0 when there is
-    /// none: the nearest earlier one that has no outcome yet. A letter that expired is thus left
-    /// out of the chain and not waited for.
+    /// The letter of the stream that the receiver must have taken before this one, or 0: the
+    /// highest lower sequence that was open (without an outcome) in the sender's process when it
+    /// dispatched this copy.
     pub after: u64,
-    /// What is left of the letter's deadline. Time spent on the way is not subtracted: hosts need
-    /// not agree on the clock.
+    /// The hand-over: a number that the service which hands the letter over uses for no other
+    /// hand-over, and that rises from each to the next. A report repeats the number of the latest
+    /// hand-over of its letter by the service that it goes to. 0 in credits.
+    pub transfer: u64,
+    /// Rest of the letter's deadline. Time in transit is not subtracted, because hosts need not
+    /// agree on the clock.
     pub remaining: Duration,
-    /// How many times the letter went from host to host so far; at least
-    /// [`LAST_HOPS`](Self::LAST_HOPS) when it must not follow a receiver that has moved.
-    pub hops: u8,
-    /// What it is about.
+    /// The letter, or the note about letters.
     pub body: Body,
 }
 
 impl Parcel {
     /// Longest name of a receiver, in bytes.
     pub const MAX_NAME: usize = 4096;
-
-    /// With this many [`hops`](Self::hops) a letter is for this life of its receiver only: it has
-    /// followed its receiver once, or an attempt that nothing was heard of may have delivered it.
-    pub const LAST_HOPS: u8 = 2;
 }
 
 /// The kinds of parcels.
@@ -61,16 +59,30 @@ impl Parcel {
 pub enum Body {
     /// A letter to be delivered.
     Letter(Letter),
-    /// What became of a letter that had been taken into custody. Goes back to whoever handed the
-    /// letter over; stream and sequence say which letter.
+    /// The end of a custody. It goes back to the service that handed the letter over; stream,
+    /// sequence and transfer name the letter and the hand-over.
     Report(Report),
     /// There is room again for letters of this stream, after [`crate::Answer::Busy`].
     Credit,
+    /// The letter named by stream and sequence has a lower predecessor now: the `after` of this
+    /// parcel. It goes to the service that the letter was handed to.
+    Predecessor,
 }
 
-/// The outcome of a letter that was in custody.
+/// How the custody of a letter ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Report {
-    /// The outcome as the sender is to be told, with the attempts made since custody.
-    pub outcome: Outcome,
+#[non_exhaustive]
+pub enum Report {
+    /// The letter has an outcome, as its sender is to be told, with the attempts made since
+    /// custody.
+    Settled(Outcome),
+    /// The letter is handed back, because its predecessor is not here. The service forgets it, and
+    /// its sender dispatches it again.
+    Returned {
+        /// Whether an attempt by this service, or by one behind it, may have delivered the letter.
+        uncertain: bool,
+    },
+    /// The letter is handed back, because its receiver's registration has left this host. Not
+    /// taken, neither here nor behind this service.
+    Moved,
 }

@@ -14,11 +14,12 @@ use crate::{FailureReason, Kind, Location, Parcel, Stream};
 ///
 /// A transport tries once and reports. It keeps these rules, which [`crate::conformance`] checks:
 ///
-/// 1. **One conclusion.** Every [`dispatch`](Self::dispatch) that returned `Ok` is followed by
-///    exactly one [`Sink::concluded`] with its attempt, unless the attempt was
-///    [abandoned](Self::abandon) before.
-/// 2. **Honest conclusions.** [`Conclusion::NotSent`] only when the other side cannot have got
-///    the letter, and never will. If in doubt, [`Conclusion::Unconfirmed`].
+/// 1. **One conclusion.** Every [`dispatch`](Self::dispatch) that returned `Ok` has exactly one
+///    conclusion: by [`Sink::concluded`], or at once by [`abandon`](Self::abandon).
+/// 2. **Honest conclusions.** [`Conclusion::NotSent`] and [`Abandoned::NotSent`] only when no byte
+///    of the parcel has reached the other side, and none ever will. If in doubt,
+///    [`Conclusion::Unconfirmed`] and [`Abandoned::Unconfirmed`]. The parcel of one attempt goes
+///    over at most one connection, and never after the attempt was concluded as not sent.
 /// 3. **An answer is the other sink's answer.** `Accepted` is reported only after the receiving
 ///    sink said so; nothing is acknowledged on its behalf. It gets the parcel of an attempt once; of
 ///    a copy that reached it nevertheless, what it says is no answer to the attempt.
@@ -46,7 +47,8 @@ pub trait Transport: Send + Sync + 'static {
     fn answers_at_once(&self) -> bool;
 
     /// Begins to listen and hands everything that arrives to `sink`. Called once, before anything
-    /// else. Returns the locations at which this endpoint can be reached, best first.
+    /// else. Returns the locations at which this endpoint can be reached, best first; a change of
+    /// them is reported by [`Sink::relocated`].
     ///
     /// # Errors
     /// When the endpoint cannot be opened; nothing is left open then.
@@ -58,9 +60,9 @@ pub trait Transport: Send + Sync + 'static {
     /// When it is known at once that the parcel does not go; no conclusion follows then.
     fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError>;
 
-    /// The caller is no longer interested in this attempt: its resources are freed, its
-    /// conclusion is not reported. Unknown attempts are ignored.
-    fn abandon(&self, attempt: AttemptId);
+    /// Ends an attempt and concludes it at once: its resources are freed, and
+    /// [`Sink::concluded`] is not called for it. An unknown attempt is [`Abandoned::Unconfirmed`].
+    fn abandon(&self, attempt: AttemptId) -> Abandoned;
 
     /// Answers an arrival for which the sink had said [`Verdict::Later`]. Unknown tickets are
     /// ignored: the peer may be gone.
@@ -151,6 +153,13 @@ pub trait Sink: Send + Sync {
         Vec::new()
     }
 
+    /// The endpoint is reached at these locations from now on, best first, instead of those that
+    /// [`listen`](Transport::listen) or an earlier call gave: the addresses of this host have
+    /// changed. There may be none.
+    fn relocated(&self, locations: Vec<Location>) {
+        let _ = locations;
+    }
+
     /// A service has introduced itself on a connection that was opened: parcels can go both ways
     /// from now on. Transports without connections say nothing; nor need a sink listen.
     fn introduced(&self, peer: &Introduction) {
@@ -237,6 +246,14 @@ pub enum Answer {
         /// The last letter of the stream that was taken.
         last: u64,
     },
+    /// Handed back: the letter's predecessor is not here, so that its sender has to dispatch the
+    /// letter again. Not a failure of the way.
+    Returned {
+        /// Whether an attempt by this service, or by one behind it, may have delivered the letter.
+        uncertain: bool,
+    },
+    /// The receiver's registration that this letter is for was here until a moment ago. Not taken.
+    Moved,
     /// Not accepted, finally.
     Failed {
         /// Why.
@@ -255,6 +272,26 @@ impl Answer {
         Self::Failed {
             reason,
             detail: detail.into(),
+        }
+    }
+}
+
+/// How an attempt ended that its caller [abandoned](Transport::abandon).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Abandoned {
+    /// No byte of the parcel has reached the other side, and none ever will.
+    NotSent,
+    /// The other side may have the parcel.
+    Unconfirmed,
+}
+
+impl Abandoned {
+    /// The conclusion of the attempt, with this error.
+    #[must_use]
+    pub fn conclusion(self, error: WayError) -> Conclusion {
+        match self {
+            Self::NotSent => Conclusion::NotSent(error),
+            Self::Unconfirmed => Conclusion::Unconfirmed(error),
         }
     }
 }

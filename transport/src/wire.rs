@@ -2,8 +2,8 @@
 //!
 //! A parcel is a [`ParcelHeader`] followed by a body: the receiver's name, then what
 //! [`Body`] it is. All integers are little-endian. A letter's body is its envelope, then the
-//! message in its three pieces ([`Payload`]); a report's body is written by this module; a credit
-//! has none.
+//! message in its three pieces ([`Payload`]); a report's body is written by this module; credits
+//! and predecessors have none.
 //!
 //! Everything here may come from a hostile peer: lengths are checked against what is there before
 //! they are used, and nothing is allocated by them.
@@ -28,7 +28,7 @@ use crate::{
 #[repr(C)]
 pub struct ParcelHeader {
     kind: u8,
-    hops: u8,
+    reserved: u8,
     name_len: U16,
     envelope_len: U32,
     head_len: U32,
@@ -38,6 +38,7 @@ pub struct ParcelHeader {
     receiver: U64,
     sequence: U64,
     after: U64,
+    transfer: U64,
     remaining_us: U64,
 }
 
@@ -47,6 +48,7 @@ pub const HEADER_LEN: usize = size_of::<ParcelHeader>();
 const LETTER: u8 = 1;
 const REPORT: u8 = 2;
 const CREDIT: u8 = 3;
+const PREDECESSOR: u8 = 4;
 
 /// Longest deadline that travels: one hour. What a peer writes beyond is cut to it.
 pub const MAX_REMAINING: Duration = Duration::from_secs(60 * 60);
@@ -122,7 +124,7 @@ impl ParcelHeader {
         let u32_of = |len: usize| u32::try_from(len).map(U32::new).map_err(|_| too_long(len));
         let mut header = Self {
             kind: CREDIT,
-            hops: parcel.hops,
+            reserved: 0,
             name_len: U16::new(parcel.receiver.len() as u16),
             envelope_len: U32::ZERO,
             head_len: U32::ZERO,
@@ -132,6 +134,7 @@ impl ParcelHeader {
             receiver: U64::new(parcel.stream.receiver.as_u64()),
             sequence: U64::new(parcel.sequence),
             after: U64::new(parcel.after),
+            transfer: U64::new(parcel.transfer),
             remaining_us: U64::new(parcel.remaining.min(MAX_REMAINING).as_micros() as u64),
         };
         let mut pieces = Pieces {
@@ -149,12 +152,13 @@ impl ParcelHeader {
                 pieces.letter = Some(letter);
             }
             Body::Report(report) => {
-                let body = write_outcome(&report.outcome);
+                let body = write_report(report);
                 header.kind = REPORT;
                 header.head_len = u32_of(body.len())?;
                 pieces.report = Some(body);
             }
             Body::Credit => {}
+            Body::Predecessor => header.kind = PREDECESSOR,
         }
         Ok((header, pieces))
     }
@@ -272,10 +276,9 @@ impl ParcelHeader {
                     },
                 ))
             }
-            REPORT => Body::Report(Report {
-                outcome: read_outcome(&front).ok_or(WireError::Report)?,
-            }),
+            REPORT => Body::Report(read_report(&front).ok_or(WireError::Report)?),
             CREDIT => Body::Credit,
+            PREDECESSOR => Body::Predecessor,
             other => return Err(WireError::UnknownKind(other)),
         };
         Ok(Parcel {
@@ -283,8 +286,8 @@ impl ParcelHeader {
             stream: self.stream(),
             sequence: self.sequence.get(),
             after: self.after.get(),
+            transfer: self.transfer.get(),
             remaining: Duration::from_micros(self.remaining_us.get()).min(MAX_REMAINING),
-            hops: self.hops,
             body,
         })
     }
@@ -311,12 +314,42 @@ fn position<T: PartialEq>(all: &[T], one: &T) -> u8 {
         .map_or(u8::MAX, |place| place as u8)
 }
 
-/// An outcome as it stands in a report.
+/// The tags of letters that are handed back; outcomes have lower ones.
+const RETURNED: u8 = 3;
+const MOVED: u8 = 4;
+
+/// Writes the body of a report.
 ///
 /// ```text
-/// outcome := tag(0 delivered, 1 sent, 2 failed) code(kind or reason) n(attempts) attempt*
-/// attempt := kind fault location(u16 length, text) detail(u16 length, text)
+/// report   := outcome | returned | moved
+/// outcome  := tag(0 delivered, 1 sent, 2 failed) code(kind or reason) n(attempts) attempt*
+/// attempt  := kind fault location(u16 length, text) detail(u16 length, text)
+/// returned := tag(3) uncertain(0 or 1)
+/// moved    := tag(4) 0
 /// ```
+#[must_use]
+pub fn write_report(report: &Report) -> Bytes {
+    match report {
+        Report::Settled(outcome) => write_outcome(outcome),
+        Report::Returned { uncertain } => Bytes::copy_from_slice(&[RETURNED, u8::from(*uncertain)]),
+        Report::Moved => Bytes::from_static(&[MOVED, 0]),
+    }
+}
+
+/// Reads the body of a report. Returns none when the bytes are something else.
+#[must_use]
+pub fn read_report(bytes: &[u8]) -> Option<Report> {
+    match bytes {
+        [RETURNED, uncertain @ (0 | 1)] => Some(Report::Returned {
+            uncertain: *uncertain == 1,
+        }),
+        [MOVED, 0] => Some(Report::Moved),
+        [RETURNED | MOVED, ..] => None,
+        outcome => read_outcome(outcome).map(Report::Settled),
+    }
+}
+
+/// Writes an outcome as it stands in a report; see [`write_report`].
 #[must_use]
 pub fn write_outcome(outcome: &Outcome) -> Bytes {
     let mut out = BytesMut::new();
@@ -426,8 +459,8 @@ mod tests {
             },
             sequence: 3,
             after: 2,
+            transfer: 5,
             remaining: Duration::from_millis(1500),
-            hops: 1,
             body,
         }
     }
@@ -444,17 +477,15 @@ mod tests {
         .stamped(Bytes::from_static(b"stamp"))
     }
 
-    fn failed() -> Report {
+    fn failed() -> Outcome {
         let attempts = vec![Attempt {
             via: Kind::Shm,
             location: "shm://1#0000000000000001".parse().unwrap(),
             error: WayError::new(WayFault::Broken, "gone"),
         }];
-        Report {
-            outcome: Outcome::Failed {
-                reason: FailureReason::Loop,
-                attempts,
-            },
+        Outcome::Failed {
+            reason: FailureReason::Loop,
+            attempts,
         }
     }
 
@@ -465,15 +496,19 @@ mod tests {
 
     #[test]
     fn the_header_has_no_hidden_padding() {
-        assert_eq!(HEADER_LEN, 64);
+        assert_eq!(HEADER_LEN, 72);
     }
 
     #[test]
     fn every_kind_survives() {
         for body in [
             Body::Letter(split_letter()),
-            Body::Report(failed()),
+            Body::Report(Report::Settled(failed())),
+            Body::Report(Report::Returned { uncertain: false }),
+            Body::Report(Report::Returned { uncertain: true }),
+            Body::Report(Report::Moved),
             Body::Credit,
+            Body::Predecessor,
         ] {
             let parcel = parcel(body);
             let (header, body) = written(&parcel);
@@ -525,10 +560,18 @@ mod tests {
 
     #[test]
     fn every_truncation_of_a_report_is_refused() {
-        let whole = write_outcome(&failed().outcome);
-        for len in 0..whole.len() {
-            assert_eq!(read_outcome(&whole[..len]), None, "{len}");
+        for report in [
+            Report::Settled(failed()),
+            Report::Returned { uncertain: true },
+            Report::Moved,
+        ] {
+            let whole = write_report(&report);
+            for len in 0..whole.len() {
+                assert_eq!(read_report(&whole[..len]), None, "{len}");
+            }
+            assert_eq!(read_report(&whole), Some(report));
         }
-        assert_eq!(read_outcome(&whole), Some(failed().outcome));
+        assert_eq!(read_report(&[RETURNED, 2]), None);
+        assert_eq!(read_report(&[RETURNED, 0, 0]), None);
     }
 }

@@ -8,8 +8,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use fipa_transport::conformance::Fixture;
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Conclusion, Faulty, Hop, Incarnation, Kind, ListenError, Location,
-    Parcel, Sink, Ticket, Transport, Verdict, WayError, WayFault, wire,
+    Abandoned, Answer, Arrival, AttemptId, Conclusion, Faulty, Hop, Incarnation, Kind, ListenError,
+    Location, Parcel, Sink, Ticket, Transport, Verdict, WayError, WayFault, wire,
 };
 use parking_lot::Mutex;
 
@@ -101,10 +101,12 @@ impl Transport for Local {
         Ok(())
     }
 
-    fn abandon(&self, attempt: AttemptId) {
+    fn abandon(&self, attempt: AttemptId) -> Abandoned {
         let mut state = self.0.state.lock();
         state.open.remove(&attempt);
         state.conclusions.retain(|(other, _)| *other != attempt);
+        // It is in the other side's inbox, or was.
+        Abandoned::Unconfirmed
     }
 
     fn answer(&self, ticket: Ticket, answer: Answer) {
@@ -251,7 +253,7 @@ mod faults {
             sequence: 1,
             after: 0,
             remaining: std::time::Duration::ZERO,
-            hops: 0,
+            transfer: 0,
             body: Body::Credit,
         }
     }

@@ -79,6 +79,12 @@ pub(crate) trait Out {
     fn byte(&mut self, byte: u8);
     fn slice(&mut self, bytes: &[u8]);
 
+    /// Appends bytes whose copy satisfies a condition. Returns whether they were appended; what cannot
+    /// check its own copy appends none.
+    fn slice_if(&mut self, _bytes: &[u8], _is_wanted: &dyn Fn(&[u8]) -> bool) -> bool {
+        false
+    }
+
     /// The same as three slices.
     #[inline]
     fn framed<const N: usize, const M: usize>(
@@ -208,6 +214,16 @@ impl Out for Vec<u8> {
 
     fn slice(&mut self, bytes: &[u8]) {
         self.extend_from_slice(bytes);
+    }
+
+    fn slice_if(&mut self, bytes: &[u8], is_wanted: &dyn Fn(&[u8]) -> bool) -> bool {
+        let before = self.len();
+        self.extend_from_slice(bytes);
+        let wanted = self.get(before..).is_some_and(is_wanted);
+        if !wanted {
+            self.truncate(before);
+        }
+        wanted
     }
 }
 

@@ -141,6 +141,12 @@ impl Writer<'_> {
             }
             self.push(")");
         }
+        if self.dialect == Dialect::FipaServices && !agent.user_defined().is_empty() {
+            return Err(EncodeError::Unrepresentable {
+                what: "user-defined parameter of an agent",
+                why: "fipa_services does not read one in a string message",
+            });
+        }
         self.user_defined(agent.user_defined())?;
         self.push(")");
         Ok(())

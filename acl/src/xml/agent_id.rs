@@ -278,11 +278,11 @@ pub(super) fn write(
         out.close("resolvers");
     }
     for (name, value) in agent.user_defined() {
-        if dialect == Dialect::Standard {
-            out.user_defined(name, value, false)?;
-        } else {
-            // fipa_services writes user-defined elements, but reads only this.
-            out.user_element(name, value)?;
+        match dialect {
+            Dialect::Standard => out.user_defined(name, value, false)?,
+            // It reads no `<X-name>`, and `user-defined` with a type only.
+            Dialect::FipaServices => out.user_defined(name, value, true)?,
+            Dialect::Jade => out.user_element(name, value)?,
         }
     }
     out.close("agent-identifier");

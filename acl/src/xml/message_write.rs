@@ -114,17 +114,19 @@ fn write_content(
     let Some(content) = message.content() else {
         return Ok(());
     };
-    // Copied before it is looked at: nobody vouches that shared memory stays as it is.
-    let content = content.to_vec();
-    let text = std::str::from_utf8(&content).map_err(|_| EncodeError::Unrepresentable {
-        what: "content",
-        why: "it is not UTF-8 text",
-    })?;
-    if dialect == Dialect::Jade {
-        readable_by_jade("content", text)?;
-    }
     out.open("content");
-    out.content(text)?;
+    if dialect == Dialect::Jade {
+        // Copied before it is checked: shared memory may change meanwhile.
+        let content = content.to_vec();
+        let text = std::str::from_utf8(&content).map_err(|_| EncodeError::Unrepresentable {
+            what: "content",
+            why: "it is not UTF-8 text",
+        })?;
+        readable_by_jade("content", text)?;
+        out.content(&content)?;
+    } else {
+        out.content(content)?;
+    }
     out.close("content");
     Ok(())
 }

@@ -15,6 +15,7 @@ mod envelope_write;
 mod message_read;
 mod message_write;
 mod out;
+mod plain;
 mod reader;
 mod tag;
 mod value;

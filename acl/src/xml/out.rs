@@ -4,6 +4,7 @@ use crate::Dialect;
 use crate::error::EncodeError;
 use crate::scan::{self, TOPS};
 use crate::word::is_token;
+use crate::xml::plain::{Around, is_plain};
 
 /// A document in the making.
 pub(super) struct Out<'a> {
@@ -79,13 +80,67 @@ impl<'a> Out<'a> {
         Ok(())
     }
 
-    /// Text that keeps its line breaks and tabulators as they are where the reader lets it.
-    pub(super) fn content(&mut self, text: &str) -> Result<(), EncodeError> {
-        self.escaped("content", text, self.guards_space)
+    /// Text that keeps its line breaks and tabulators as they are where the reader lets it. It is
+    /// copied before it is checked, because shared memory may change meanwhile.
+    pub(super) fn content(&mut self, content: &[u8]) -> Result<(), EncodeError> {
+        let guards_space = self.guards_space;
+        let mut around = Around::NOTHING;
+        let mut rest = content;
+        while !rest.is_empty() {
+            let (step, later) = rest.split_at(rest.len().min(STEP));
+            around.is_last = later.is_empty();
+            let plain = |bytes: &[u8]| is_plain(bytes, guards_space, around);
+            if self.out.slice_if(step, &plain) {
+                around.before = step.last().copied();
+                rest = later;
+                continue;
+            }
+            while rest.len() > later.len() {
+                let whole = self.piece(rest, around.before)?;
+                let (written, unwritten) = rest.split_at(whole);
+                around.before = written.last().copied();
+                rest = unwritten;
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes the first characters of content. Returns how many bytes they have.
+    fn piece(&mut self, content: &[u8], before: Option<u8>) -> Result<usize, EncodeError> {
+        let mut copy = [0; PIECE];
+        let len = content.len().min(PIECE);
+        let (copy, _) = copy.split_at_mut(len);
+        copy.copy_from_slice(content.split_at(len).0);
+        let is_last = len == content.len();
+        let around = Around { before, is_last };
+        if is_plain(copy, self.guards_space, around) {
+            self.out.slice(copy);
+            return Ok(len);
+        }
+        let text = match std::str::from_utf8(copy) {
+            Ok(text) => text,
+            // The last character continues in the next piece.
+            Err(error) if error.error_len().is_none() && !is_last => {
+                let (whole, _) = copy.split_at(error.valid_up_to());
+                std::str::from_utf8(whole).unwrap_or_default()
+            }
+            Err(_) => {
+                return Err(EncodeError::Unrepresentable {
+                    what: "content",
+                    why: "it is not UTF-8 text",
+                });
+            }
+        };
+        let around = Around {
+            is_last: text.len() == content.len(),
+            ..around
+        };
+        self.escaped("content", text, self.guards_space, around)?;
+        Ok(text.len())
     }
 
     pub(super) fn text(&mut self, what: &'static str, text: &str) -> Result<(), EncodeError> {
-        self.escaped(what, text, true)
+        self.escaped(what, text, true, Around::NOTHING)
     }
 
     /// Text whose reader takes white space around it away: there it is escaped.
@@ -98,7 +153,7 @@ impl<'a> Out<'a> {
         let before = text.len() - inner.len();
         let core = inner.trim_end_matches(' ');
         self.spaces(before);
-        self.escaped(what, core, true)?;
+        self.escaped(what, core, true, Around::NOTHING)?;
         self.spaces(inner.len() - core.len());
         Ok(())
     }
@@ -120,8 +175,12 @@ impl<'a> Out<'a> {
             let shown = name.chars().take(60).collect();
             return Err(EncodeError::UserDefinedName(shown));
         }
-        self.raw("<user-defined");
         let what = "user-defined parameter";
+        if self.guards_space && value.is_empty() {
+            let why = "fipa_services does not read an empty one in XML";
+            return Err(EncodeError::Unrepresentable { what, why });
+        }
+        self.raw("<user-defined");
         self.attribute("href", what, &format!("X-{name}"))?;
         self.raw(if typed { " type=\"string\">" } else { ">" });
         self.text(what, value)?;
@@ -141,7 +200,13 @@ impl<'a> Out<'a> {
         self.element(&format!("X-{name}"), "user-defined parameter", value)
     }
 
-    fn escaped(&mut self, what: &'static str, text: &str, layout: bool) -> Result<(), EncodeError> {
+    fn escaped(
+        &mut self,
+        what: &'static str,
+        text: &str,
+        layout: bool,
+        around: Around,
+    ) -> Result<(), EncodeError> {
         let looked_for = if self.guards_space {
             MARK | SPACE
         } else {
@@ -155,8 +220,11 @@ impl<'a> Out<'a> {
             from = at + 1;
             // In front of the text there might as well be a space.
             let condensed = || {
-                let before = at.checked_sub(1).and_then(|before| bytes.get(before));
-                before.is_none_or(|byte| *byte == b' ') || from == bytes.len()
+                let before = match at.checked_sub(1) {
+                    Some(before) => bytes.get(before).copied(),
+                    None => around.before,
+                };
+                before.is_none_or(|byte| byte == b' ') || around.is_last && from == bytes.len()
             };
             let escape = match bytes.get(at..).unwrap_or_default() {
                 [b' ', ..] if condensed() => "&#x20;",
@@ -185,6 +253,13 @@ impl<'a> Out<'a> {
         Ok(())
     }
 }
+
+/// Bytes of content that are copied and checked at a time. A copy stays in the processor's cache until
+/// it has been checked.
+const STEP: usize = 16 << 10;
+
+/// Bytes of content that are escaped at a time.
+const PIECE: usize = 4096;
 
 /// Where the first byte is that is looked for.
 fn marked(bytes: &[u8], looked_for: u8) -> Option<usize> {

@@ -2,6 +2,8 @@
 
 use std::borrow::Cow;
 
+use memchr::memmem;
+
 use crate::error::{DecodeError, Problem};
 use crate::scan::{self, find_byte};
 use crate::xml::reader::{Elements, Event};
@@ -62,6 +64,18 @@ impl<'a> Piece<'a> {
             let offset = self.offset + (self.raw.len() - rest);
             DecodeError::new(offset, clause, Problem::Xml("no such entity or character"))
         })
+    }
+
+    /// Refuses what XML allows in CDATA sections only (XML 1.0 clause 2.4). fipa_services writes
+    /// content with `]]>` into one section, unescaped: without its `]]>` it would be another text.
+    fn check_end_of_section(&self, clause: &'static str) -> Result<(), DecodeError> {
+        match memmem::find(self.raw, b"]]>") {
+            Some(at) if !self.literal => {
+                let problem = Problem::Xml("']]>' outside of a CDATA section");
+                Err(DecodeError::new(self.offset + at, clause, problem))
+            }
+            _ => Ok(()),
+        }
     }
 
     fn unescape(&self, out: &mut Vec<u8>) {
@@ -178,11 +192,14 @@ impl<'a> Value<'a> {
         let mut elements = Elements::inside(self.all);
         while let Some(event) = elements.next()? {
             match event {
-                Event::Text(piece) => Piece {
-                    offset: self.offset + piece.offset,
-                    ..piece
+                Event::Text(piece) => {
+                    let piece = Piece {
+                        offset: self.offset + piece.offset,
+                        ..piece
+                    };
+                    piece.check(self.clause)?;
+                    piece.check_end_of_section(self.clause)?;
                 }
-                .check(self.clause)?,
                 Event::Start(_) => elements.skip()?,
                 Event::End => break,
             }

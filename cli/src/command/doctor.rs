@@ -60,9 +60,6 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 }
 
 fn table(checks: &[Check]) -> String {
-    if checks.is_empty() {
-        return "nothing that is configured needs anything of this machine\n".to_owned();
-    }
     let mut table = Table::new();
     table
         .load_style(presets::NOTHING)

@@ -149,7 +149,9 @@ fn told(process: &Report, gateway: Option<&Report>) -> String {
 }
 
 fn gateway_told(gateway: &Report) -> String {
+    let locations: Vec<String> = gateway.locations.iter().map(ToString::to_string).collect();
     let mut text = format!("\nThe gateway {}:\n", gateway.mts);
+    text.push_str(&format!("takes letters at {}\n", locations.join(", ")));
     let mut ways = table(&[
         "WAY",
         "STANDING",

@@ -130,7 +130,8 @@ fn ready(config: &Config, gateway: &Gateway, problem: Option<&str>) -> String {
 }
 
 fn ready_json(config: &Config, gateway: &Gateway, problem: Option<&str>) -> Value {
-    let locations = gateway.locations().iter().map(ToString::to_string);
+    let locations = gateway.locations();
+    let locations = locations.iter().map(ToString::to_string);
     let mut discovery = json!({ "mdns": config.discovery.mdns });
     if let Some(problem) = problem {
         discovery["problem"] = problem.into();

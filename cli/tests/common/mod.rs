@@ -169,8 +169,9 @@ pub(crate) struct Running {
 }
 
 impl Running {
+    /// Starts a command and waits for the first line of its output.
     #[track_caller]
-    fn new(mut command: Command) -> Self {
+    pub(crate) fn new(mut command: Command) -> Self {
         let mut child = command
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())

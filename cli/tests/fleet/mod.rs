@@ -9,20 +9,20 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::pin::Pin;
-use std::process::Stdio;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::task::Poll;
 use std::time::{Duration, Instant};
 
 use fipa::config::Sources;
-use fipa::keys::{Keys, VALID};
 use fipa::{
     Agent, AgentId, Config, Deliveries, Domain, FailureReason, Kind, Outcome, Performative,
 };
 use fipa_testbed::{Host, Network, Running};
 use parking_lot::Mutex;
 use tokio::runtime::Runtime;
+
+use crate::hosts::{self, PORT, filter, keys, make_keys, nft};
 
 /// Ends what hangs. Nothing is expected to take this long.
 const WATCHDOG: Duration = Duration::from_secs(90);
@@ -32,8 +32,6 @@ const AT_ONCE: usize = 8;
 const PAUSE: Duration = Duration::from_millis(8);
 /// Letters delivered in a row that count as traffic that goes on.
 const IN_A_ROW: u64 = 40;
-/// The port of every gateway.
-const PORT: u16 = 7788;
 
 /// What all parties have in common.
 #[derive(Debug, Clone)]
@@ -82,22 +80,6 @@ impl Plan {
     }
 }
 
-/// The keys of a host, in the `/tmp` of this test alone.
-fn keys(at: usize) -> Keys {
-    Keys::at(format!("/tmp/keys{at}"))
-}
-
-/// Everybody trusts everybody.
-fn make_keys() {
-    for at in 0..3 {
-        keys(at).init(&format!("gateway{at}"), &[], VALID).unwrap();
-    }
-    for (at, other) in pairs() {
-        let pem = std::fs::read(keys(other).own_file()).unwrap();
-        keys(at).trust(&pem).unwrap();
-    }
-}
-
 /// The hosts and who is on them.
 pub(crate) struct Fleet {
     pub(crate) network: Network,
@@ -135,10 +117,9 @@ impl Fleet {
     /// Three hosts whose gateways know each other by address, and whose agents know each other.
     pub(crate) fn new(plan: &Plan) -> Self {
         // What killed processes leave behind goes with the test.
-        fipa_testbed::run("mount -t tmpfs tmpfs /tmp");
         fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
         if plan.has_keys() {
-            make_keys();
+            make_keys(3);
         }
         let network = Network::new(3);
         let accounts = Arc::new(Accounts::default());
@@ -465,34 +446,9 @@ impl Party {
 }
 
 fn start_gateway(host: &Host, settings: &[String]) -> Running {
-    let mut command = host.command(env!("CARGO_BIN_EXE_fipa"));
-    command.args(["up", "--json"]);
-    for setting in settings {
-        command.args(["--set", setting]);
-    }
-    if std::env::var_os("FIPA_TEST_LOG").is_some() {
-        command.arg("-v");
-    }
-    command.stdin(Stdio::null()).stdout(Stdio::piped());
-    let mut gateway = Running::start(&mut command);
-    let mut ready = String::new();
-    let stdout = gateway.child().stdout.take().unwrap();
-    std::io::BufRead::read_line(&mut std::io::BufReader::new(stdout), &mut ready).unwrap();
+    let (gateway, ready) = Running::until_ready(&mut hosts::gateway(host, settings));
     assert!(ready.starts_with('{'), "the gateway is not ready: {ready}");
     gateway
-}
-
-/// Adds a rule for what comes in.
-fn filter(host: &Host, rule: &str) {
-    nft(host, "add table inet weather");
-    let hook = "{ type filter hook input priority 0; }";
-    nft(host, &format!("add chain inet weather in {hook}"));
-    nft(host, &format!("add rule inet weather in {rule}"));
-}
-
-fn nft(host: &Host, command: &str) {
-    let done = host.command("nft").arg(command).status().unwrap();
-    assert!(done.success(), "nft {command}");
 }
 
 async fn send(agent: &Agent, to: usize, number: u64) -> Deliveries {

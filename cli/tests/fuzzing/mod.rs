@@ -166,12 +166,14 @@ impl Writer<'_> {
         let receiver = &self.receivers[self.random.usize(..self.receivers.len())];
         let body = match self.random.u8(..12) {
             0 => Body::Credit,
-            1 => Body::Report(Report {
-                outcome: Outcome::Failed {
-                    reason: FailureReason::Unreachable,
-                    attempts: Vec::new(),
-                },
+            1 => Body::Report(Report::Settled(Outcome::Failed {
+                reason: FailureReason::Unreachable,
+                attempts: Vec::new(),
+            })),
+            2 => Body::Report(Report::Returned {
+                uncertain: self.random.bool(),
             }),
+            3 => Body::Predecessor,
             _ => Body::Letter(letter(self.random, receiver)),
         };
         let parcel = Parcel {
@@ -182,8 +184,8 @@ impl Writer<'_> {
             },
             sequence: self.random.u64(..5),
             after: self.random.u64(..3),
+            transfer: self.random.u64(..5),
             remaining: Duration::from_millis(self.random.u64(..5000)),
-            hops: self.random.u8(..3),
             body,
         };
         written(&parcel)
@@ -201,7 +203,7 @@ impl Writer<'_> {
             sequence: 1,
             after: 0,
             remaining: Duration::from_secs(5),
-            hops: 0,
+            transfer: 0,
             body: Body::Letter(letter),
         })
     }

@@ -111,7 +111,7 @@ impl Crowd {
             sequence: self.arrived,
             after: 0,
             remaining: Duration::from_secs(5),
-            hops: 0,
+            transfer: 0,
             body: Body::Letter(self.letter.clone()),
         };
         let from = Hop {

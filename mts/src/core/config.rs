@@ -25,11 +25,16 @@ pub struct CoreConfig {
     pub routes: Vec<(Pattern, Vec<Kind>)>,
     /// Letters that wait in an agent's queue before its senders are held back.
     pub queue: usize,
+    /// Bytes of the letters in an agent's queue before its senders are held back. One letter is
+    /// always taken.
+    pub queue_bytes: usize,
     /// Letters on their way from one sender to one receiver at a time.
     pub window: usize,
     /// Letters that wait for one receiver from one sender, on their way or not, before more are
     /// held back.
     pub lane: usize,
+    /// Bytes of the same. One letter is always taken.
+    pub lane_bytes: usize,
     /// Bytes of letters of others that a gateway has in custody before more are held back. One
     /// letter is always taken.
     pub custody_bytes: usize,
@@ -48,8 +53,10 @@ impl CoreConfig {
             order,
             routes: Vec::new(),
             queue: 256,
+            queue_bytes: 64 << 20,
             window: 16,
             lane: 1024,
+            lane_bytes: 64 << 20,
             custody_bytes: 256 << 20,
             attempt_timeout: Duration::from_secs(1),
         }

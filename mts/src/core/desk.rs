@@ -10,9 +10,12 @@ use fipa_acl::Letter;
 use fipa_sds::{Directory, Entry};
 use fipa_transport::{
     Answer, AttemptId, Body, FailureReason, Incarnation, Kind, Location, Outcome, Parcel, Report,
-    Stream, Ticket,
+    Stream, Ticket, WayError, WayFault,
 };
+use smallvec::SmallVec;
 
+use super::departed::Departed;
+use super::lane::{Delivery, LaneId};
 use super::routes::Tallies;
 use super::{CoreConfig, News, Notice, SendId};
 use crate::Map;
@@ -30,12 +33,15 @@ pub enum Action {
         /// What.
         parcel: Parcel,
     },
-    /// Tell the transport that nobody waits for this attempt any more.
+    /// Have the transport [abandon](fipa_transport::Transport::abandon) this attempt. The core is
+    /// told at once how it ended, by [`Core::handle_conclusion`](super::Core::handle_conclusion).
     Abandon {
-        /// Which transport.
+        /// The transport.
         kind: Kind,
-        /// Which attempt.
+        /// The attempt.
         attempt: AttemptId,
+        /// The error of the conclusion.
+        error: WayError,
     },
     /// Give the transport the answer to an arrival that was put off.
     Answer {
@@ -85,18 +91,34 @@ pub enum Action {
 pub(crate) enum Origin {
     /// An agent of this process.
     Local { send: SendId },
-    /// Another message transport service, which is told by a late answer or by a report.
-    Forwarded {
-        back: Location,
-        /// The stream it came with. It left with another one when its receiver had moved.
-        stream: Stream,
-        /// The arrival that still has no answer.
-        unanswered: Option<(Kind, Ticket)>,
-    },
+    /// Other message transport services, which are told by a late answer or by a report.
+    Forwarded { upstreams: SmallVec<[Upstream; 1]> },
     /// An old peer, which has sent it from this address, and is told by a failure message.
     OldPeer { from: IpAddr },
     /// Nobody is told: it is a failure message.
     Nobody,
+}
+
+/// A service that handed a copy of a letter over.
+#[derive(Debug)]
+pub(crate) struct Upstream {
+    /// Where reports to it go.
+    pub(crate) back: Location,
+    /// Its latest hand-over of the letter, which a report names.
+    pub(crate) transfer: u64,
+    /// The arrival that still has no answer.
+    pub(crate) unanswered: Option<(Kind, Ticket)>,
+}
+
+/// How a letter leaves a lane.
+#[derive(Debug)]
+pub(crate) enum Settlement {
+    /// It has an outcome.
+    Outcome(Outcome),
+    /// A custodian hands it back, because its predecessor did not come.
+    Returned { uncertain: bool },
+    /// A custodian hands it back, because its receiver's registration has left this host.
+    Moved,
 }
 
 /// Who is told of a failure by a message.
@@ -122,23 +144,22 @@ pub(crate) struct Undelivered {
 #[derive(Debug)]
 pub(crate) enum Purpose {
     /// A letter of a lane.
-    Letter { stream: Stream, sequence: u64 },
-    /// A report or a credit.
+    Letter { lane: LaneId, sequence: u64 },
+    /// A report, a credit or a predecessor.
     Note(Box<Note>),
     /// Whether a static peer is there.
     Touch { peer: u64 },
 }
 
-/// A report or a credit on its way.
+/// A note about letters on its way: a report, a credit or a predecessor.
 #[derive(Debug)]
 pub(crate) struct Note {
     pub(crate) location: Location,
     pub(crate) parcel: Parcel,
     pub(crate) tries: u32,
+    /// Until when it is repeated without an acknowledgment.
+    pub(crate) until: Option<Instant>,
 }
-
-/// How often a report is tried. Whoever waits for it has a deadline of its own.
-pub(crate) const NOTE_TRIES: u32 = 5;
 
 /// What all lanes share.
 pub(crate) struct Desk {
@@ -147,6 +168,9 @@ pub(crate) struct Desk {
     pub(crate) actions: VecDeque<Action>,
     pub(crate) attempts: Map<AttemptId, Purpose>,
     pub(crate) undelivered: VecDeque<Undelivered>,
+    /// Notes that have been sent and are repeated if they are not acknowledged.
+    pub(crate) repeated: VecDeque<AttemptId>,
+    pub(crate) departed: Departed,
     /// Bytes of all letters in lanes.
     pub(crate) held: usize,
     pub(super) tallies: Tallies,
@@ -154,7 +178,7 @@ pub(crate) struct Desk {
     pub(crate) watched: bool,
     health: Map<Location, Health>,
     /// Lanes that found no room on the way to a location, in order.
-    waiting_for_room: Map<Location, VecDeque<Stream>>,
+    waiting_for_room: Map<Location, VecDeque<LaneId>>,
     next_attempt: u64,
 }
 
@@ -178,6 +202,8 @@ impl Desk {
             actions: VecDeque::new(),
             attempts: Map::default(),
             undelivered: VecDeque::new(),
+            repeated: VecDeque::new(),
+            departed: Departed::default(),
             held: 0,
             tallies: Tallies::default(),
             watched: false,
@@ -187,34 +213,75 @@ impl Desk {
         }
     }
 
+    /// The number of the next attempt, which is also the number of its hand-over.
+    pub(crate) fn next_attempt(&mut self) -> AttemptId {
+        let attempt = AttemptId(self.next_attempt);
+        self.next_attempt += 1;
+        attempt
+    }
+
     pub(crate) fn dispatch(
         &mut self,
+        attempt: AttemptId,
         purpose: Purpose,
         location: Location,
         parcel: Parcel,
-    ) -> AttemptId {
-        let attempt = AttemptId(self.next_attempt);
-        self.next_attempt += 1;
+    ) {
         self.attempts.insert(attempt, purpose);
         self.actions.push_back(Action::Dispatch {
             attempt,
             location,
             parcel,
         });
-        attempt
     }
 
-    pub(crate) fn abandon(&mut self, kind: Kind, attempt: AttemptId) {
+    /// Has the transport end an attempt, whose conclusion follows at once.
+    pub(crate) fn abandon(&mut self, kind: Kind, attempt: AttemptId, error: WayError) {
+        self.actions.push_back(Action::Abandon {
+            kind,
+            attempt,
+            error,
+        });
+    }
+
+    /// Has the transport end an attempt whose conclusion does not matter any more.
+    pub(crate) fn drop_attempt(&mut self, kind: Kind, attempt: AttemptId) {
         if self.attempts.remove(&attempt).is_some() {
-            self.actions.push_back(Action::Abandon { kind, attempt });
+            let error = WayError::new(WayFault::TimedOut, "");
+            self.abandon(kind, attempt, error);
         }
     }
 
-    /// Sends a report or a credit back to where parcels of a stream came from.
+    /// Sends a note. It is repeated when it says so, each time to another of the locations at which
+    /// the service is reached at present.
     pub(crate) fn note(&mut self, mut note: Note) {
+        if note.tries > 0 {
+            note.location = self.present_location(&note);
+        }
         note.tries += 1;
         let (location, parcel) = (note.location.clone(), note.parcel.clone());
-        self.dispatch(Purpose::Note(Box::new(note)), location, parcel);
+        let attempt = self.next_attempt();
+        if note.until.is_some() {
+            self.repeated.push_back(attempt);
+        }
+        self.dispatch(attempt, Purpose::Note(Box::new(note)), location, parcel);
+    }
+
+    /// Where the service that a note goes to is reached: it may have another address by now. The
+    /// directory has the locations of the letters' sender, which is behind that service.
+    fn present_location(&self, note: &Note) -> Location {
+        let service = note.location.incarnation();
+        let sender = self.directory.known_incarnation(note.parcel.stream.sender);
+        let mut present: Vec<&Location> = Vec::new();
+        if let Some(entry) = &sender {
+            let locations = entry.locations.iter();
+            present.extend(locations.filter(|it| it.incarnation() == service));
+        }
+        let next = (note.tries as usize).checked_rem(present.len());
+        match next.and_then(|next| present.get(next)) {
+            Some(location) if service.is_known() => (*location).clone(),
+            _ => note.location.clone(),
+        }
     }
 
     pub(crate) fn credit(&mut self, stream: Stream, receiver: Arc<str>, back: Location) {
@@ -223,6 +290,28 @@ impl Desk {
             location: back,
             parcel,
             tries: 0,
+            until: None,
+        });
+    }
+
+    /// Tells a service that a letter handed to it has a lower predecessor now. A lost note costs
+    /// time only, because the service hands the letter back when it waits too long.
+    pub(crate) fn predecessor(
+        &mut self,
+        stream: Stream,
+        receiver: Arc<str>,
+        (sequence, after): (u64, u64),
+        location: Location,
+    ) {
+        let parcel = Parcel {
+            after,
+            ..note_parcel(stream, receiver, sequence, Body::Predecessor)
+        };
+        self.note(Note {
+            location,
+            parcel,
+            tries: 0,
+            until: None,
         });
     }
 
@@ -244,70 +333,81 @@ impl Desk {
         }
     }
 
-    /// Tells whoever has to know what became of a delivery.
+    /// Tells the letter's sender, or the services that handed it over, how it left its lane.
     pub(crate) fn settle(
         &mut self,
-        origin: Origin,
+        delivery: Delivery,
         stream: Stream,
-        sequence: u64,
         receiver: Arc<str>,
-        outcome: Outcome,
+        settlement: Settlement,
     ) {
-        self.notice(stream, sequence, &receiver, || News::Settled {
-            outcome: outcome.clone(),
-            sender: !matches!(origin, Origin::Forwarded { .. }),
-        });
-        match origin {
-            Origin::Local { send } => {
+        let Delivery {
+            origin,
+            sequence,
+            deadline,
+            ..
+        } = delivery;
+        if let Settlement::Outcome(outcome) = &settlement {
+            self.notice(stream, sequence, &receiver, || News::Settled {
+                outcome: outcome.clone(),
+                sender: !matches!(origin, Origin::Forwarded { .. }),
+            });
+        }
+        match (origin, settlement) {
+            (Origin::Local { send }, Settlement::Outcome(outcome)) => {
                 self.actions.push_back(Action::Outcome {
                     send,
                     receiver,
                     outcome,
                 });
             }
-            Origin::Forwarded {
-                back,
-                stream,
-                unanswered,
-            } => {
-                let brief = match &outcome {
-                    Outcome::Delivered { attempts, .. } if attempts.is_empty() => {
-                        Some(Answer::Accepted)
-                    }
-                    Outcome::Failed { reason, attempts } if attempts.is_empty() => {
-                        Some(Answer::failed(*reason, ""))
-                    }
-                    _ => None,
-                };
-                match (unanswered, brief) {
-                    (Some((kind, ticket)), Some(answer)) => {
-                        self.actions.push_back(Action::Answer {
-                            kind,
-                            ticket,
-                            answer,
-                        });
-                    }
-                    (unanswered, _) => {
-                        if let Some((kind, ticket)) = unanswered {
-                            let answer = Answer::Custody;
-                            self.actions.push_back(Action::Answer {
-                                kind,
-                                ticket,
-                                answer,
-                            });
-                        }
-                        let body = Body::Report(Report { outcome });
-                        let parcel = note_parcel(stream, receiver, sequence, body);
-                        self.note(Note {
-                            location: back,
-                            parcel,
-                            tries: 0,
-                        });
-                    }
+            (Origin::Forwarded { upstreams }, settlement) => {
+                let (brief, report) = tidings(settlement);
+                for upstream in upstreams {
+                    let letter = (stream, sequence);
+                    self.tell(upstream, letter, &receiver, (&brief, &report), deadline);
                 }
             }
-            Origin::OldPeer { .. } | Origin::Nobody => {}
+            // Only custodians hand letters back; failure messages have no sender to be told.
+            (Origin::Local { .. } | Origin::OldPeer { .. } | Origin::Nobody, _) => {}
         }
+    }
+
+    fn tell(
+        &mut self,
+        upstream: Upstream,
+        (stream, sequence): (Stream, u64),
+        receiver: &Arc<str>,
+        (brief, report): (&Option<Answer>, &Report),
+        deadline: Instant,
+    ) {
+        let Upstream {
+            back,
+            transfer,
+            unanswered,
+        } = upstream;
+        if let Some((kind, ticket)) = unanswered {
+            let answer = brief.clone().unwrap_or(Answer::Custody);
+            self.actions.push_back(Action::Answer {
+                kind,
+                ticket,
+                answer,
+            });
+            if brief.is_some() {
+                return;
+            }
+        }
+        let body = Body::Report(report.clone());
+        let parcel = Parcel {
+            transfer,
+            ..note_parcel(stream, Arc::clone(receiver), sequence, body)
+        };
+        self.note(Note {
+            location: back,
+            parcel,
+            tries: 0,
+            until: Some(deadline),
+        });
     }
 
     /// Who is meant by this stream and this name, if the directory still has such an agent.
@@ -350,24 +450,24 @@ impl Desk {
         fallback.map(|(location, _)| location.clone())
     }
 
-    pub(crate) fn wait_for_room(&mut self, location: &Location, stream: Stream) {
+    pub(crate) fn wait_for_room(&mut self, location: &Location, lane: LaneId) {
         let waiting = self.waiting_for_room.entry(location.clone()).or_default();
-        if !waiting.contains(&stream) {
-            waiting.push_back(stream);
+        if !waiting.contains(&lane) {
+            waiting.push_back(lane);
         }
     }
 
     /// The lane that may try this location now that something under way there has ended.
-    pub(crate) fn room_for(&mut self, location: &Location) -> Option<Stream> {
+    pub(crate) fn room_for(&mut self, location: &Location) -> Option<LaneId> {
         if self.waiting_for_room.is_empty() {
             return None;
         }
         let waiting = self.waiting_for_room.get_mut(location)?;
-        let stream = waiting.pop_front();
+        let lane = waiting.pop_front();
         if waiting.is_empty() {
             self.waiting_for_room.remove(location);
         }
-        stream
+        lane
     }
 
     /// How often in a row this way has failed and until when it is put back, if it is.
@@ -380,6 +480,11 @@ impl Desk {
         if !self.health.is_empty() {
             self.health.remove(location);
         }
+    }
+
+    /// Forgets the failures of these ways.
+    pub(super) fn forget_failures(&mut self, which: impl Fn(&Location) -> bool) {
+        self.health.retain(|location, _| !which(location));
     }
 
     pub(crate) fn way_failed(&mut self, now: Instant, location: &Location) {
@@ -426,8 +531,32 @@ pub(super) fn note_parcel(stream: Stream, receiver: Arc<str>, sequence: u64, bod
         stream,
         sequence,
         after: 0,
+        transfer: 0,
         remaining: Duration::ZERO,
-        hops: 0,
         body,
+    }
+}
+
+/// How services that handed a letter over are told: by this answer when it says everything, else
+/// by this report.
+fn tidings(settlement: Settlement) -> (Option<Answer>, Report) {
+    match settlement {
+        Settlement::Outcome(outcome) => {
+            let brief = match &outcome {
+                Outcome::Delivered { attempts, .. } if attempts.is_empty() => {
+                    Some(Answer::Accepted)
+                }
+                Outcome::Failed { reason, attempts } if attempts.is_empty() => {
+                    Some(Answer::failed(*reason, ""))
+                }
+                _ => None,
+            };
+            (brief, Report::Settled(outcome))
+        }
+        Settlement::Returned { uncertain } => (
+            Some(Answer::Returned { uncertain }),
+            Report::Returned { uncertain },
+        ),
+        Settlement::Moved => (Some(Answer::Moved), Report::Moved),
     }
 }

@@ -11,9 +11,11 @@ use fipa_transport::{
     Stream, Ticket, Verdict,
 };
 
-use super::desk::{Action, Author, Origin, Undelivered, life_of};
-use super::lane::{Delivery, Lane};
-use super::{Core, MAX_DEADLINE, News, Now};
+use super::desk::{Action, Author, Origin, Undelivered, Upstream, life_of};
+use super::lane::{Delivery, LaneId, LaneKey};
+use super::{Core, MAX_DEADLINE, News, Now, own_lane};
+use smallvec::smallvec;
+
 use crate::failure::Failure;
 use crate::stamp;
 
@@ -41,35 +43,37 @@ impl Core {
             Ok(admitted) => admitted,
             Err(refusal) => return Verdict::Now(refusal),
         };
-        let stream = Stream {
-            receiver: life_of(&entry),
-            ..parcel.stream
-        };
-        let moved = stream != parcel.stream;
-        let (bound, ending) = (self.desk.config.lane, self.ending);
-        let bytes = self.desk.held.saturating_add(stamped.len());
-        let too_many_bytes = self.desk.held > 0 && bytes > self.desk.config.custody_bytes;
+        let stream = parcel.stream;
+        let key = LaneKey::Custody(stream);
         let taken = match unanswered {
             Some(_) => Verdict::Later,
             None => Verdict::Now(Answer::Custody),
         };
-        let mut origin = Origin::Forwarded {
+        let mut upstream = Upstream {
             back: from.location.clone(),
-            stream: parcel.stream,
+            transfer: parcel.transfer,
             unanswered,
         };
-        if let Some(lane) = self.lanes.get_mut(&stream) {
-            origin = match lane.adopt(parcel.sequence, origin, &mut self.desk) {
-                Some(origin) => origin,
+        if let Some(id) = self.lane_ids.get(&key).copied() {
+            let mut kept = Some(upstream);
+            self.with_lane(now, id, |lane, desk| {
+                let letter = (parcel.sequence, parcel.after);
+                kept = kept
+                    .take()
+                    .and_then(|it| lane.adopt(now.instant, letter, it, desk).err());
+            });
+            upstream = match kept {
+                Some(upstream) => upstream,
                 None => return taken,
             };
         }
-        if ending {
+        if self.ending {
             return Verdict::Now(Answer::Busy);
         }
-        if too_many_bytes || self.lanes.get(&stream).map_or(0, Lane::len) >= bound {
-            let new_lane = || Lane::new(now.instant, stream, Arc::clone(&entry.name));
-            let lane = self.lanes.entry(stream).or_insert_with(new_lane);
+        let id = self.lane(now, key, &entry.name);
+        if let Some(lane) = self.lanes.get_mut(&id)
+            && !lane.admits(parcel.sequence, stamped.len(), &self.desk)
+        {
             lane.wait_for_credit(from.location);
             return Verdict::Now(Answer::Busy);
         }
@@ -77,7 +81,7 @@ impl Core {
             return Verdict::Now(Answer::failed(FailureReason::Refused, why));
         }
         if from.remote {
-            self.hear(parcel.stream.sender, &stamped, &from);
+            self.hear(stream.sender, &stamped, &from);
         }
         self.desk
             .notice(stream, parcel.sequence, &entry.name, || News::Passed {
@@ -85,14 +89,15 @@ impl Core {
                 remote: from.remote,
                 letter: stamped.clone(),
             });
-        let onwards = entry.reach != Reach::Local;
         let deadline = now.instant + parcel.remaining.min(MAX_DEADLINE);
-        let mut delivery = Delivery::new(origin, stamped, parcel.sequence, deadline);
-        // The one before it was for the earlier life.
-        delivery.after = if moved { 0 } else { parcel.after };
-        delivery.hops = parcel.hops.saturating_add(u8::from(onwards));
+        let origin = Origin::Forwarded {
+            upstreams: smallvec![upstream],
+        };
+        let letter_of = (stream.receiver, parcel.sequence);
+        let mut delivery = Delivery::new(now.instant, origin, stamped, letter_of, deadline);
+        delivery.after = parcel.after;
         delivery.custody_due = unanswered.map(|_| now.instant + CUSTODY_AFTER);
-        self.put(now, stream, Arc::clone(&entry.name), delivery);
+        self.put(now, id, delivery);
         taken
     }
 
@@ -118,30 +123,23 @@ impl Core {
         if !config.forwards {
             return Err(unknown("the agent is not in this process any more"));
         }
-        let life = parcel.stream.receiver;
-        let here = self.desk.receiver(life, &parcel.receiver);
-        let moved = here.is_none() && from.remote && parcel.hops < Parcel::LAST_HOPS;
-        let entry = match here {
-            None if moved => self.departed.successor(life, &*self.desk.directory),
-            here => here,
+        let registration = parcel.stream.receiver;
+        let Some(entry) = self.desk.receiver(registration, &parcel.receiver) else {
+            return Err(
+                match self.desk.departed.contains(now.instant, registration) {
+                    true => Answer::Moved,
+                    false => unknown("the agent is not known to the gateway"),
+                },
+            );
         };
-        let entry = entry.ok_or_else(|| unknown("the agent is not known to the gateway"))?;
         if entry.role != Role::Agent {
             return Err(refused(
                 "letters for another gateway are not passed on".to_owned(),
             ));
         }
-        // Never between strangers: what comes from the network is for this host, or for who has
-        // just left it.
-        if from.remote && !moved && entry.reach != Reach::Local {
+        // Letters from the network are for this host: a gateway never relays between others.
+        if from.remote && entry.reach != Reach::Local {
             return Err(unknown("the agent is not on the gateway's host"));
-        }
-        // Where the letter has been before, its sender can do better.
-        if moved
-            && let Reach::Remote { gateway } = entry.reach
-            && stamp::passed(&letter, gateway).map_err(|error| refused(error.to_string()))?
-        {
-            return Err(unknown("the agent has moved"));
         }
         match stamp::carries(&letter, &config.name, config.incarnation) {
             Ok(true) => return Err(Answer::failed(FailureReason::Loop, &*config.name)),
@@ -175,11 +173,16 @@ impl Core {
         }
     }
 
-    /// Whether a letter that has nobody who could be held back finds room.
-    fn has_room(&self, stream: Stream, len: usize) -> bool {
-        let lane = self.lanes.get(&stream).map_or(0, Lane::len);
+    /// Whether there is room for another letter in this lane.
+    pub(super) fn has_room(&self, lane: LaneId, len: usize) -> bool {
+        let lane = self.lanes.get(&lane);
+        lane.is_some_and(|lane| lane.has_room(len, &self.desk))
+    }
+
+    /// Whether there is room for a letter whose sender cannot be held back.
+    fn has_room_for_stranger(&self, lane: LaneId, len: usize) -> bool {
         let bytes = self.desk.held.saturating_add(len);
-        lane < self.desk.config.lane && bytes <= self.desk.config.custody_bytes
+        bytes <= self.desk.config.custody_bytes && self.has_room(lane, len)
     }
 
     /// An old peer's letter arrived from this address, for the agents of this host that its
@@ -203,7 +206,8 @@ impl Core {
         let sender = stamp::sender(&letter).unwrap_or_default();
         let stream_sender = self.desk.config.incarnation;
         for receiver in receivers {
-            let (entries, missing) = match fipa_sds::resolve(&*directory, &receiver, &sender) {
+            let (entries, missing) = match fipa_sds::resolve_legacy(&*directory, &receiver, &sender)
+            {
                 Ok(Resolution::Exact(entry)) => (vec![entry], Vec::new()),
                 Ok(Resolution::Multicast(entries)) => (entries, Vec::new()),
                 Ok(Resolution::Coalition {
@@ -256,7 +260,8 @@ impl Core {
                         remote: true,
                         letter: letter.clone(),
                     });
-                if !self.has_room(stream, letter.len()) {
+                let lane = self.lane(now, own_lane(stream_sender, entry), &entry.name);
+                if !self.has_room_for_stranger(lane, letter.len()) {
                     self.desk.undelivered.push_back(Undelivered {
                         sender: Author::OldPeer { from },
                         receiver: Arc::clone(&entry.name),
@@ -273,9 +278,10 @@ impl Core {
                 }
                 let until = now.instant + deadline.min(MAX_DEADLINE);
                 let origin = Origin::OldPeer { from };
-                let mut delivery = Delivery::new(origin, letter.clone(), sequence, until);
-                delivery.hops = 1;
-                self.put(now, stream, Arc::clone(&entry.name), delivery);
+                let letter_of = (stream.receiver, sequence);
+                let letter = letter.clone();
+                let delivery = Delivery::new(now.instant, origin, letter, letter_of, until);
+                self.put(now, lane, delivery);
             }
         }
         self.tell_failures(now);
@@ -343,9 +349,10 @@ impl Core {
                 Author::OldPeer { from } => Some(from),
                 Author::Ours(_) => None,
             };
-            if let Author::Ours(agent) = sender
-                && let Some(inbox) = self.agents.get_mut(&agent)
-            {
+            if let Author::Ours(agent) = sender {
+                let Some(inbox) = self.agents.get_mut(&agent) else {
+                    continue;
+                };
                 let letter = match report.written_for(name, Dialect::Standard, now.utc) {
                     Ok(letter) => letter,
                     Err(error) => {
@@ -391,26 +398,26 @@ impl Core {
                 sender: self.desk.config.incarnation,
                 receiver: life_of(&entry),
             };
-            if !self.has_room(stream, letter.len()) {
+            let id = self.lane(now, own_lane(stream.sender, &entry), &entry.name);
+            if !self.has_room_for_stranger(id, letter.len()) {
                 tracing::info!(to = %report.sender, %reason, "no room for a failure message");
                 continue;
             }
             let deadline = now.instant + FAILURE_DEADLINE;
-            let mut delivery = Delivery::new(Origin::Nobody, letter, sequence, deadline);
-            delivery.hops = u8::from(entry.reach != Reach::Local);
+            let letter_of = (stream.receiver, sequence);
+            let origin = Origin::Nobody;
+            let delivery = Delivery::new(now.instant, origin, letter, letter_of, deadline);
             self.desk
                 .notice(stream, sequence, &entry.name, || News::Sent {
                     send: None,
                     letter: delivery.letter.clone(),
                 });
-            if said.is_some() {
-                let new = || Lane::new(now.instant, stream, Arc::clone(&entry.name));
-                self.lanes
-                    .entry(stream)
-                    .or_insert_with(new)
-                    .said(Arc::clone(&entry));
+            if said.is_some()
+                && let Some(lane) = self.lanes.get_mut(&id)
+            {
+                lane.said(Arc::clone(&entry));
             }
-            self.put(now, stream, Arc::clone(&entry.name), delivery);
+            self.put(now, id, delivery);
         }
     }
 }

@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 use fipa_acl::Letter;
 use fipa_transport::{Answer, FailureReason, Incarnation, Kind, Location, Parcel, Stream};
 
-use super::MAX_DEADLINE;
+use super::rules::{self, Offer};
+use super::{CoreConfig, MAX_DEADLINE};
 use crate::Gate;
 
 /// A letter taken from an agent's queue.
@@ -29,6 +30,11 @@ pub(crate) struct Inbox {
     pub(crate) name: Arc<str>,
     queue: VecDeque<Received>,
     bound: usize,
+    /// Bytes of the letters in the queue, without failure messages.
+    bytes: usize,
+    bytes_bound: usize,
+    /// Letters of one sender that are remembered: as many as it can have open.
+    recent: usize,
     /// By a keyed hash: strangers choose these, tens of thousands of them.
     senders: HashMap<Incarnation, Taken>,
     /// Who was told that the queue is full and waits for a credit, in order.
@@ -48,9 +54,6 @@ struct Taken {
     seen: Instant,
 }
 
-/// How many taken letters of a sender are remembered one by one. More than any window of letters
-/// under way: only what is under way can be tried again.
-const RECENT: usize = 128;
 /// Senders remembered by one agent. They are not forgotten before every letter of theirs has
 /// passed its deadline, so the bound is on how many different lives may write within an hour.
 const MAX_SENDERS: usize = 65_536;
@@ -60,11 +63,14 @@ const MAX_WAITING: usize = 4096;
 const MAX_FAILURES: usize = 256;
 
 impl Inbox {
-    pub(crate) fn new(name: Arc<str>, bound: usize) -> Self {
+    pub(crate) fn new(name: Arc<str>, config: &CoreConfig) -> Self {
         Self {
             name,
             queue: VecDeque::new(),
-            bound,
+            bound: config.queue,
+            bytes: 0,
+            bytes_bound: config.queue_bytes,
+            recent: config.lane,
             senders: HashMap::new(),
             waiting: VecDeque::new(),
             failures: 0,
@@ -83,18 +89,22 @@ impl Inbox {
         gate: Option<&dyn Gate>,
     ) -> Answer {
         let (stream, sequence) = (parcel.stream, parcel.sequence);
-        if let Some(taken) = self.senders.get_mut(&stream.sender) {
-            taken.seen = now;
-            if sequence <= taken.last {
-                return taken.answer_again(sequence);
+        if stream.sender.is_known() {
+            let taken = self.senders.get_mut(&stream.sender);
+            let last = taken.as_ref().map_or(0, |taken| taken.last);
+            let offer = rules::offer(last, sequence, parcel.after);
+            if let Some(taken) = taken {
+                taken.seen = now;
+                if offer == Offer::Earlier {
+                    return taken.answer_again(sequence, self.recent);
+                }
             }
-            if parcel.after > taken.last {
-                return Answer::OutOfOrder { last: taken.last };
+            if offer == Offer::OutOfOrder {
+                return Answer::OutOfOrder { last };
             }
-        } else if stream.sender.is_known() && parcel.after > 0 {
-            return Answer::OutOfOrder { last: 0 };
         }
-        if self.queue.len() - self.failures >= self.bound {
+        let len = letter.len();
+        if !self.has_room(len) {
             self.wait(stream, back);
             return Answer::Busy;
         }
@@ -108,6 +118,7 @@ impl Inbox {
         {
             return refusal;
         }
+        self.bytes += len;
         self.queue.push_back(Received {
             letter,
             sender: stream.sender,
@@ -116,11 +127,19 @@ impl Inbox {
         Answer::Accepted
     }
 
+    /// Whether there is room for a letter of this many bytes. One letter is always taken.
+    fn has_room(&self, len: usize) -> bool {
+        let letters = self.queue.len() - self.failures;
+        let fits = self.bytes.saturating_add(len) <= self.bytes_bound;
+        letters < self.bound && (fits || letters == 0)
+    }
+
     /// Whether there is room for a letter without a stream; for what has no way to wait.
     pub(crate) fn push_unframed(&mut self, letter: Letter, via: Kind) -> bool {
-        if self.queue.len() - self.failures >= self.bound {
+        if !self.has_room(letter.len()) {
             return false;
         }
+        self.bytes += letter.len();
         self.queue.push_back(Received {
             letter,
             sender: Incarnation::UNKNOWN,
@@ -146,8 +165,9 @@ impl Inbox {
 
     pub(crate) fn take(&mut self) -> Option<Received> {
         let received = self.queue.pop_front()?;
-        if received.via.is_none() {
-            self.failures -= 1;
+        match received.via {
+            None => self.failures -= 1,
+            Some(_) => self.bytes -= received.letter.len(),
         }
         Some(received)
     }
@@ -160,7 +180,7 @@ impl Inbox {
     /// a full queue does not cost a credit per letter.
     pub(crate) fn credits(&mut self) -> impl Iterator<Item = (Stream, Location)> {
         let used = self.queue.len() - self.failures;
-        let room = if used * 2 <= self.bound {
+        let room = if used * 2 <= self.bound && self.bytes <= self.bytes_bound / 2 {
             self.bound - used
         } else {
             0
@@ -196,7 +216,7 @@ impl Inbox {
             seen: now,
         });
         taken.last = sequence;
-        if taken.recent.len() >= RECENT {
+        if taken.recent.len() >= self.recent {
             taken.recent.pop_front();
         }
         taken.recent.push_back(sequence);
@@ -217,11 +237,13 @@ impl Inbox {
 }
 
 impl Taken {
-    fn answer_again(&self, sequence: u64) -> Answer {
-        if self.recent.contains(&sequence) {
+    /// Answers a copy of a letter that was taken or left out before. The last `bound` letters are
+    /// remembered.
+    fn answer_again(&self, sequence: u64, bound: usize) -> Answer {
+        if self.recent.binary_search(&sequence).is_ok() {
             return Answer::Accepted;
         }
-        let forgotten = self.recent.len() >= RECENT && self.recent.front() > Some(&sequence);
+        let forgotten = self.recent.len() >= bound && self.recent.front() > Some(&sequence);
         if forgotten {
             Answer::failed(FailureReason::Unconfirmed, "too long ago to tell")
         } else {
@@ -247,10 +269,18 @@ mod tests {
             },
             sequence,
             after,
+            transfer: 0,
             remaining: Duration::from_secs(1),
-            hops: 0,
             body: Body::Letter(Letter::default()),
         }
+    }
+
+    fn inbox(bound: usize) -> Inbox {
+        let config = CoreConfig {
+            queue: bound,
+            ..CoreConfig::new("mts", Incarnation::from_u64(9), Vec::new())
+        };
+        Inbox::new("b".into(), &config)
     }
 
     fn back() -> Location {
@@ -270,7 +300,7 @@ mod tests {
 
     #[test]
     fn order_holds_and_copies_are_taken_once() {
-        let mut inbox = Inbox::new("b".into(), 10);
+        let mut inbox = inbox(10);
         assert_eq!(offer(&mut inbox, 5, 3), Answer::OutOfOrder { last: 0 });
         assert_eq!(offer(&mut inbox, 3, 0), Answer::Accepted);
         assert_eq!(offer(&mut inbox, 9, 5), Answer::OutOfOrder { last: 3 });
@@ -282,7 +312,7 @@ mod tests {
 
     #[test]
     fn what_was_left_out_is_not_taken_later_nor_called_delivered() {
-        let mut inbox = Inbox::new("b".into(), 10);
+        let mut inbox = inbox(10);
         assert_eq!(offer(&mut inbox, 7, 0), Answer::Accepted);
         let late = offer(&mut inbox, 6, 0);
         assert!(
@@ -300,8 +330,9 @@ mod tests {
 
     #[test]
     fn what_is_too_old_to_remember_is_not_called_delivered() {
-        let mut inbox = Inbox::new("b".into(), 1000);
-        for sequence in 1..=RECENT as u64 + 1 {
+        let mut inbox = inbox(2000);
+        let recent = inbox.recent as u64;
+        for sequence in 1..=recent + 1 {
             assert_eq!(offer(&mut inbox, sequence, sequence - 1), Answer::Accepted);
         }
         let old = offer(&mut inbox, 1, 0);
@@ -319,7 +350,7 @@ mod tests {
 
     #[test]
     fn a_full_queue_holds_back_and_gives_credit_when_half_empty() {
-        let mut inbox = Inbox::new("b".into(), 4);
+        let mut inbox = inbox(4);
         for sequence in 1..=4 {
             assert_eq!(offer(&mut inbox, sequence, 0), Answer::Accepted);
         }
@@ -343,7 +374,7 @@ mod tests {
 
     #[test]
     fn failure_messages_are_bounded_too() {
-        let mut inbox = Inbox::new("b".into(), 1);
+        let mut inbox = inbox(1);
         let taken = (0..1000)
             .filter(|_| inbox.push_failure(Letter::default()))
             .count();

@@ -5,17 +5,18 @@
 //! [`Action`]s. The same core serves a robot process and, with leave to forward, the gateway; and
 //! the same core runs in simulations on virtual time.
 //!
+//! * `rules`: what keeps a stream in order and alive, as pure functions.
 //! * `lane`: letters of one stream on their way, in order, one way at a time.
 //! * `inbox`: the receiving end, where letters are taken once and in order.
-//! * `forward`: letters for somebody else.
-//! * `departed`: agents of this host that have moved, which letters follow once.
+//! * `forward`: letters for agents of other processes.
+//! * `departed`: registrations that have left this host a moment ago.
 //! * `peers`: services that the configuration names, and how it stands with them.
 //! * `routes`: which way letters would go and what happened on each way, for people.
 //! * `desk`: what lanes share: attempts, health of ways, things to be done.
 //! * `notice`: what somebody who watches is told.
 //!
-//! A letter's order and identity are its *stream* (one life of the sender, one life of the
-//! receiver) and its sequence. Every letter names the one that must be taken before it, so that
+//! A letter's order and identity are its *stream* (one registration of the sender, one of the
+//! receiver) and its sequence. Every copy names the letter that must be taken before it, so that
 //! letters that failed leave no hole that would be waited for.
 
 mod config;
@@ -27,6 +28,8 @@ mod lane;
 mod notice;
 mod peers;
 mod routes;
+#[doc(hidden)]
+pub mod rules;
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -34,19 +37,18 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::Letter;
-use fipa_sds::{Directory, Entry, Pattern, Resolution};
+use fipa_sds::{Directory, Entry, Pattern, Resolution, Role};
 use fipa_transport::{
-    Allowance, Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind,
-    Location, Outcome, Parcel, Report, Stream, Verdict, WayFault,
+    Allowance, Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind,
+    Location, Outcome, Parcel, Report, Stream, Verdict, WayError, WayFault,
 };
 
 pub use config::{CoreConfig, MAX_DEADLINE};
-use departed::Departed;
 pub use desk::Action;
-use desk::{Author, Desk, NOTE_TRIES, Note, Origin, Purpose, Undelivered};
+use desk::{Author, Desk, Note, Origin, Purpose, Undelivered};
 use inbox::Inbox;
 pub use inbox::Received;
-use lane::{Delivery, Lane, Moved};
+use lane::{Delivery, Lane, LaneId, LaneKey};
 pub use notice::{News, Notice};
 
 use crate::{Gate, Map};
@@ -99,25 +101,41 @@ const IDLE_TIME: Duration = Duration::from_secs(60);
 /// The delivery core. See the module's documentation.
 pub struct Core {
     desk: Desk,
-    lanes: Map<Stream, Lane>,
+    lanes: Map<LaneId, Lane>,
+    lane_ids: Map<LaneKey, LaneId>,
     agents: Map<Incarnation, Inbox>,
-    timers: BinaryHeap<Reverse<(Instant, Stream)>>,
+    timers: BinaryHeap<Reverse<(Instant, LaneId)>>,
     notes: BinaryHeap<Reverse<LateNote>>,
     peers: Peers,
-    departed: Departed,
     gate: Option<Arc<dyn Gate>>,
     /// How many old peers' letters that were refused may still be told of.
     refusals: Option<Allowance>,
     /// No more letters of others are taken.
     ending: bool,
+    /// The service has ended: nothing is sent any more.
+    closed: bool,
+    next_lane: u64,
     next_send: u64,
     /// Sequence of the letters that this service sends in its own name, where it is no agent.
     next_sequence: u64,
     next_forget: Option<Instant>,
 }
 
-/// A report that is tried again later.
-struct LateNote(Instant, Note);
+/// What is to be done about a note at a later time.
+struct LateNote(Instant, Late);
+
+enum Late {
+    /// Send it again.
+    Again(Box<Note>),
+    /// See whether it was acknowledged.
+    Check(AttemptId),
+}
+
+/// Notes that are repeated until they are acknowledged, at most. Beyond that a note is sent once.
+const MAX_LATE_NOTES: usize = 65_536;
+/// Pauses before a note that was not acknowledged is sent again.
+const FIRST_NOTE_PAUSE: Duration = Duration::from_millis(20);
+const LONGEST_NOTE_PAUSE: Duration = Duration::from_secs(1);
 
 impl Ord for LateNote {
     fn cmp(&self, other: &Self) -> std::cmp::Ordering {
@@ -146,14 +164,16 @@ impl Core {
         Self {
             desk: Desk::new(config, directory),
             lanes: Map::default(),
+            lane_ids: Map::default(),
             agents: Map::default(),
             timers: BinaryHeap::new(),
             notes: BinaryHeap::new(),
             peers: Peers::default(),
-            departed: Departed::default(),
             gate: None,
             refusals: None,
             ending: false,
+            closed: false,
+            next_lane: 1,
             next_send: 1,
             next_sequence: 1,
             next_forget: None,
@@ -177,27 +197,28 @@ impl Core {
 
     /// An agent of this process has been registered: letters for it are taken from now on.
     pub fn register(&mut self, name: Arc<str>, incarnation: Incarnation) {
-        let bound = self.desk.config.queue;
-        self.agents.insert(incarnation, Inbox::new(name, bound));
+        let inbox = Inbox::new(name, &self.desk.config);
+        self.agents.insert(incarnation, inbox);
     }
 
     /// An agent of this process goes away: its unread letters are dropped, its letters under way
     /// end as failed or unconfirmed.
-    pub fn deregister(&mut self, incarnation: Incarnation) {
+    pub fn deregister(&mut self, now: Now, incarnation: Incarnation) {
         if let Some(mut inbox) = self.agents.remove(&incarnation) {
             let receiver = Arc::clone(&inbox.name);
             for (stream, back) in inbox.all_waiting() {
                 self.desk.credit(stream, Arc::clone(&receiver), back);
             }
         }
-        for lane in self.lanes.values_mut() {
-            if lane.sender() == incarnation {
-                lane.give_up(&mut self.desk);
+        for id in self.lanes_in_order() {
+            if let Some(lane) = self.lanes.get_mut(&id)
+                && lane.sender() == incarnation
+            {
+                lane.give_up(now.instant, &mut self.desk);
             }
         }
         self.desk.undelivered.clear();
-        self.lanes
-            .retain(|_, lane| !lane.is_idle() || lane.sender() != incarnation);
+        self.forget_lanes(|lane| lane.is_idle() && lane.sender() == incarnation);
     }
 
     /// Sends a letter. Returns how many outcomes will follow under this number; outcomes that are
@@ -211,6 +232,15 @@ impl Core {
         } = submission;
         let send = SendId(self.next_send);
         self.next_send += 1;
+        if self.closed {
+            for receiver in &receivers {
+                let receiver = Arc::clone(receiver);
+                let reason = FailureReason::Closed;
+                self.undeliverable(send, sender, receiver, letter.clone(), reason);
+            }
+            self.desk.undelivered.clear();
+            return (send, receivers.len());
+        }
         let deadline = now.instant + deadline.min(MAX_DEADLINE);
         let directory = Arc::clone(&self.desk.directory);
         let sender_name = self
@@ -288,8 +318,11 @@ impl Core {
             receiver: desk::life_of(entry),
         };
         let name = Arc::clone(&entry.name);
-        let waiting = self.lanes.get(&stream).map_or(0, Lane::len);
-        if waiting >= self.desk.config.lane {
+        if self.closed {
+            return self.undeliverable(send, sender, name, letter, FailureReason::Closed);
+        }
+        let lane = self.lane(now, own_lane(sender, entry), &name);
+        if !self.has_room(lane, letter.len()) {
             return self.undeliverable(send, sender, name, letter, FailureReason::QueueFull);
         }
         let sequence = self.sequence_of(sender);
@@ -298,8 +331,9 @@ impl Core {
             letter: letter.clone(),
         });
         let origin = Origin::Local { send };
-        let delivery = Delivery::new(origin, letter, sequence, deadline);
-        self.put(now, stream, name, delivery);
+        let letter_of = (stream.receiver, sequence);
+        let delivery = Delivery::new(now.instant, origin, letter, letter_of, deadline);
+        self.put(now, lane, delivery);
     }
 
     fn sequence_of(&mut self, sender: Incarnation) -> u64 {
@@ -353,41 +387,61 @@ impl Core {
     }
 
     /// Puts a letter into its lane and gets it moving.
-    fn put(&mut self, now: Now, stream: Stream, receiver: Arc<str>, delivery: Delivery) {
-        let lane = self
-            .lanes
-            .entry(stream)
-            .or_insert_with(|| Lane::new(now.instant, stream, receiver));
-        lane.push(delivery, &mut self.desk);
-        self.with_lane(now, stream, |lane, desk, moved| {
-            lane.pump(now.instant, desk, moved)
+    fn put(&mut self, now: Now, lane: LaneId, delivery: Delivery) {
+        self.with_lane(now, lane, |lane, desk| {
+            lane.push(delivery, desk);
+            lane.pump(now.instant, desk);
         });
     }
 
-    /// Works on a lane, then takes care of what it could not decide alone and of its timer.
-    fn with_lane(
-        &mut self,
-        now: Now,
-        stream: Stream,
-        work: impl FnOnce(&mut Lane, &mut Desk, &mut Vec<Moved>),
-    ) {
-        let mut moved = Vec::new();
-        let Some(lane) = self.lanes.get_mut(&stream) else {
+    /// The lane with this key, which is made if there is none.
+    fn lane(&mut self, now: Now, key: LaneKey, receiver: &Arc<str>) -> LaneId {
+        if let Some(id) = self.lane_ids.get(&key) {
+            return *id;
+        }
+        let id = LaneId(self.next_lane);
+        self.next_lane += 1;
+        self.lane_ids.insert(key.clone(), id);
+        let lane = Lane::new(now.instant, id, key, Arc::clone(receiver));
+        self.lanes.insert(id, lane);
+        id
+    }
+
+    /// All lanes, in the order in which they were made: runs with one seed are the same.
+    fn lanes_in_order(&self) -> Vec<LaneId> {
+        let mut lanes: Vec<LaneId> = self.lanes.keys().copied().collect();
+        lanes.sort_unstable();
+        lanes
+    }
+
+    /// The lane that holds letters of this stream for the receiver of this name.
+    fn lane_of(&self, stream: Stream, receiver: &Arc<str>) -> Option<LaneId> {
+        let keys = [
+            LaneKey::Custody(stream),
+            LaneKey::Name(stream.sender, Arc::clone(receiver)),
+            LaneKey::Service(stream),
+        ];
+        keys.iter().find_map(|key| self.lane_ids.get(key).copied())
+    }
+
+    /// Works on a lane, then takes care of its timer.
+    fn with_lane(&mut self, now: Now, id: LaneId, work: impl FnOnce(&mut Lane, &mut Desk)) {
+        let Some(lane) = self.lanes.get_mut(&id) else {
             return;
         };
-        work(lane, &mut self.desk, &mut moved);
+        work(lane, &mut self.desk);
         if let Some(due) = lane.due()
             && lane.scheduled.is_none_or(|scheduled| due < scheduled)
         {
             lane.scheduled = Some(due);
-            self.timers.push(Reverse((due, stream)));
+            self.timers.push(Reverse((due, id)));
         }
-        for Moved { to, delivery } in moved {
-            let stream = Stream {
-                sender: stream.sender,
-                receiver: desk::life_of(&to),
-            };
-            self.put(now, stream, Arc::clone(&to.name), delivery);
+        while let Some(attempt) = self.desk.repeated.pop_front() {
+            if self.notes.len() < MAX_LATE_NOTES {
+                let due = now.instant + self.desk.config.attempt_timeout;
+                self.notes
+                    .push(Reverse(LateNote(due, Late::Check(attempt))));
+            }
         }
     }
 
@@ -435,9 +489,8 @@ impl Core {
         } = arrival;
         match std::mem::replace(&mut parcel.body, Body::Credit) {
             Body::Letter(letter) => {
-                if parcel.after > 0 && parcel.after >= parcel.sequence {
-                    // Followed from letter to letter, this would lead nowhere, or in a circle.
-                    let detail = "the letter comes after itself or a later one";
+                if parcel.sequence == 0 || parcel.after >= parcel.sequence {
+                    let detail = "the letter's sequence is not above its predecessor's";
                     return Verdict::Now(Answer::failed(FailureReason::Refused, detail));
                 }
                 let watched = self.desk.watched;
@@ -469,30 +522,51 @@ impl Core {
                 verdict
             }
             Body::Report(report) => {
-                self.handle_report(now, &parcel, report);
+                self.handle_report(now, &parcel, &from, report);
                 Verdict::Now(Answer::Accepted)
             }
             Body::Credit => {
-                self.with_lane(now, parcel.stream, |lane, desk, moved| {
-                    lane.resume(now.instant, desk, moved)
-                });
+                if let Some(lane) = self.lane_of(parcel.stream, &parcel.receiver) {
+                    self.with_lane(now, lane, |lane, desk| lane.resume(now.instant, desk));
+                }
+                self.tell_failures(now);
+                Verdict::Now(Answer::Accepted)
+            }
+            Body::Predecessor => {
+                if let Some(lane) = self.lane_ids.get(&LaneKey::Custody(parcel.stream)) {
+                    let letter = (parcel.sequence, parcel.after);
+                    let from = from.location.incarnation();
+                    self.with_lane(now, *lane, |lane, desk| {
+                        lane.predecessor_told(now.instant, from, letter, desk);
+                    });
+                }
                 self.tell_failures(now);
                 Verdict::Now(Answer::Accepted)
             }
         }
     }
 
-    fn handle_report(&mut self, now: Now, parcel: &Parcel, report: Report) {
-        self.with_lane(now, parcel.stream, |lane, desk, moved| {
-            lane.reported(now.instant, parcel.sequence, report, desk, moved);
-        });
+    fn handle_report(&mut self, now: Now, parcel: &Parcel, from: &Hop, report: Report) {
+        if let Some(lane) = self.lane_of(parcel.stream, &parcel.receiver) {
+            let Parcel {
+                stream,
+                sequence,
+                transfer,
+                ..
+            } = *parcel;
+            let letter = (stream.receiver, sequence, transfer);
+            let from = from.location.incarnation();
+            self.with_lane(now, lane, |lane, desk| {
+                lane.reported(now.instant, from, letter, report, desk);
+            });
+        }
         self.tell_failures(now);
     }
 
     /// An attempt has ended, or was refused by its transport at once.
     pub fn handle_conclusion(&mut self, now: Now, attempt: AttemptId, conclusion: Conclusion) {
         match self.desk.attempts.remove(&attempt) {
-            Some(Purpose::Letter { stream, sequence }) => {
+            Some(Purpose::Letter { lane: id, sequence }) => {
                 let mut way = None;
                 // What found no room has made none: told that it had, it would try again at once,
                 // and in vain, until the way counts as broken.
@@ -500,15 +574,13 @@ impl Core {
                     &conclusion,
                     Conclusion::NotSent(error) if error.fault == WayFault::Congested
                 );
-                self.with_lane(now, stream, |lane, desk, moved| {
+                self.with_lane(now, id, |lane, desk| {
                     way = lane.way_of(sequence).filter(|_| made_room).cloned();
-                    lane.concluded(now.instant, sequence, attempt, conclusion, desk, moved);
+                    lane.concluded(now.instant, sequence, attempt, conclusion, desk);
                 });
                 // Whatever has ended has made room.
-                if let Some(stream) = way.and_then(|way| self.desk.room_for(&way)) {
-                    self.with_lane(now, stream, |lane, desk, moved| {
-                        lane.resume(now.instant, desk, moved)
-                    });
+                if let Some(id) = way.and_then(|way| self.desk.room_for(&way)) {
+                    self.with_lane(now, id, |lane, desk| lane.resume(now.instant, desk));
                 }
             }
             Some(Purpose::Note(note)) => self.note_concluded(now, *note, conclusion),
@@ -524,22 +596,36 @@ impl Core {
 
     fn note_concluded(&mut self, now: Now, note: Note, conclusion: Conclusion) {
         let arrived = matches!(conclusion, Conclusion::Answered(_) | Conclusion::Handed);
-        // A credit that is lost is made up for by the sender's own pause.
-        let again = matches!(note.parcel.body, Body::Report(_)) && note.tries < NOTE_TRIES;
-        if !arrived && again {
-            let pause = Duration::from_millis(20) * (1 << note.tries);
+        // Other notes that are lost are made up for by the pauses of those they are for.
+        let again = note.until.is_some_and(|until| now.instant < until);
+        if !arrived && again && self.notes.len() < MAX_LATE_NOTES {
+            let pause = FIRST_NOTE_PAUSE.saturating_mul(1 << note.tries.min(10));
+            let due = now.instant + pause.min(LONGEST_NOTE_PAUSE);
             self.notes
-                .push(Reverse(LateNote(now.instant + pause, note)));
+                .push(Reverse(LateNote(due, Late::Again(Box::new(note)))));
+        }
+    }
+
+    fn handle_late_note(&mut self, now: Now, late: Late) {
+        match late {
+            Late::Again(note) => self.desk.note(*note),
+            Late::Check(attempt) => {
+                if let Some(Purpose::Note(note)) = self.desk.attempts.remove(&attempt) {
+                    let kind = note.location.kind();
+                    let error = WayError::new(WayFault::TimedOut, "");
+                    self.desk.abandon(kind, attempt, error.clone());
+                    self.note_concluded(now, *note, Conclusion::Unconfirmed(error));
+                }
+            }
         }
     }
 
     /// Something in the directory has changed.
     pub fn handle_directory_change(&mut self, now: Now) {
-        let streams: Vec<Stream> = self.lanes.keys().copied().collect();
-        for stream in streams {
-            self.with_lane(now, stream, |lane, desk, moved| {
+        for lane in self.lanes_in_order() {
+            self.with_lane(now, lane, |lane, desk| {
                 if !lane.is_empty() {
-                    lane.directory_changed(now.instant, desk, moved);
+                    lane.directory_changed(now.instant, desk);
                 }
             });
         }
@@ -547,38 +633,43 @@ impl Core {
     }
 
     /// This entry has left the directory, or its name has another one now. Comes before
-    /// [`handle_directory_change`](Self::handle_directory_change). A gateway passes letters for an
-    /// agent that has left its host on to where the name is registered next, for half a minute.
+    /// [`handle_directory_change`](Self::handle_directory_change). For half a minute a gateway
+    /// answers letters for an agent that has left its host with [`Answer::Moved`].
     pub fn handle_departure(&mut self, now: Now, entry: &Entry) {
         if self.desk.config.forwards {
-            self.departed.left(now.instant, entry);
+            self.desk.departed.left(now.instant, entry);
         }
     }
 
     /// Time has passed: call this when [`poll_timeout`](Self::poll_timeout) says so.
     pub fn handle_timeout(&mut self, now: Now) {
-        while let Some(Reverse((due, stream))) = self.timers.peek().copied() {
+        // Taken first: work on a lane may set its timer again, and never for this call.
+        let mut lanes = Vec::new();
+        while let Some(Reverse((due, id))) = self.timers.peek().copied() {
             if due > now.instant {
                 break;
             }
             self.timers.pop();
-            if let Some(lane) = self.lanes.get_mut(&stream)
+            if let Some(lane) = self.lanes.get_mut(&id)
                 && lane.scheduled == Some(due)
             {
                 lane.scheduled = None;
+                lanes.push(id);
             }
-            self.with_lane(now, stream, |lane, desk, moved| {
-                lane.pump(now.instant, desk, moved)
-            });
         }
+        for id in lanes {
+            self.with_lane(now, id, |lane, desk| lane.pump(now.instant, desk));
+        }
+        let mut notes = Vec::new();
         while self
             .notes
             .peek()
             .is_some_and(|Reverse(late)| late.0 <= now.instant)
         {
-            if let Some(Reverse(LateNote(_, note))) = self.notes.pop() {
-                self.desk.note(note);
-            }
+            notes.extend(self.notes.pop());
+        }
+        for Reverse(LateNote(_, late)) in notes {
+            self.handle_late_note(now, late);
         }
         self.peers.handle_timeout(now.instant, &mut self.desk);
         self.tell_failures(now);
@@ -616,14 +707,61 @@ impl Core {
         self.peers.parted(now.instant, location);
     }
 
+    /// The network of this host has changed, or this service has opened a connection: what failed
+    /// before may work now. Failures of routes to the service, or of all routes without one, are
+    /// forgotten, and what waits because of them is sent at once.
+    pub fn handle_reachable(&mut self, now: Now, service: Option<Incarnation>) {
+        let is_meant = |location: &Location| service.is_none_or(|it| it == location.incarnation());
+        self.desk.forget_failures(is_meant);
+        if service.is_none() {
+            self.peers.ask_again(now.instant, &mut self.desk);
+        }
+        for lane in self.lanes_in_order() {
+            self.with_lane(now, lane, |lane, desk| {
+                if lane.is_paused_towards(desk, is_meant) {
+                    lane.resume(now.instant, desk);
+                }
+            });
+        }
+        self.tell_failures(now);
+    }
+
+    /// Opens connections to these locations, for peers that are to be told where this service is
+    /// now: dispatches a credit that no lane waits for to each. Nothing is repeated.
+    pub fn greet(&mut self, services: Vec<(Arc<str>, Location)>) {
+        for (name, location) in services {
+            let nobodys = Stream {
+                sender: Incarnation::UNKNOWN,
+                receiver: Incarnation::UNKNOWN,
+            };
+            self.desk.note(Note {
+                location,
+                parcel: desk::note_parcel(nobodys, name, 0, Body::Credit),
+                tries: 0,
+                until: None,
+            });
+        }
+    }
+
     fn forget_idle_lanes(&mut self, now: Now) {
         if self.lanes.len() <= IDLE_LANES || self.next_forget.is_some_and(|due| due > now.instant) {
             return;
         }
         self.next_forget = Some(now.instant + IDLE_TIME / 4);
-        self.lanes.retain(|_, lane| {
+        self.forget_lanes(|lane| {
             let quiet = now.instant.saturating_duration_since(lane.active) > IDLE_TIME;
-            !lane.is_idle() || (lane.remembers() && !quiet)
+            lane.is_idle() && (quiet || !lane.remembers())
+        });
+    }
+
+    fn forget_lanes(&mut self, forget: impl Fn(&Lane) -> bool) {
+        let ids = &mut self.lane_ids;
+        self.lanes.retain(|_, lane| {
+            let goes = forget(lane);
+            if goes {
+                ids.remove(lane.key());
+            }
+            !goes
         });
     }
 
@@ -646,11 +784,28 @@ impl Core {
         self.lanes.values().any(|lane| !lane.is_empty())
     }
 
-    /// Gives up everything that is under way: the service ends. Outcomes are among the actions.
-    pub fn give_up(&mut self) {
-        for lane in self.lanes.values_mut() {
-            lane.give_up(&mut self.desk);
+    /// Gives up everything that is under way: the service ends, and whatever is sent from now on
+    /// fails as closed. Outcomes are among the actions, and follow from the conclusions of the
+    /// attempts that are abandoned.
+    pub fn give_up(&mut self, now: Now) {
+        self.closed = true;
+        for id in self.lanes_in_order() {
+            if let Some(lane) = self.lanes.get_mut(&id) {
+                lane.give_up(now.instant, &mut self.desk);
+            }
         }
         self.desk.undelivered.clear();
+    }
+}
+
+/// The lane for letters that this process sends to a receiver.
+fn own_lane(sender: Incarnation, entry: &Entry) -> LaneKey {
+    match entry.role {
+        Role::Agent => LaneKey::Name(sender, Arc::clone(&entry.name)),
+        // Services may share a name.
+        _ => LaneKey::Service(Stream {
+            sender,
+            receiver: desk::life_of(entry),
+        }),
     }
 }

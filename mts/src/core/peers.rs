@@ -128,6 +128,17 @@ impl Peers {
         self.look_ahead();
     }
 
+    /// The network of this host has changed: peers that did not answer are asked at once.
+    pub(super) fn ask_again(&mut self, now: Instant, desk: &mut Desk) {
+        for watched in &mut self.all {
+            watched.rounds = 0;
+            if let State::AskAt(at) = watched.state {
+                watched.state = State::AskAt(at.min(now));
+            }
+        }
+        self.ask_who_is_due(now, desk);
+    }
+
     /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
     pub(super) fn due(&self) -> Option<Instant> {
         self.due
@@ -142,7 +153,7 @@ impl Peers {
                 && until <= now
             {
                 if let Some(way) = watched.ways.get(watched.current) {
-                    desk.abandon(way.kind(), attempt);
+                    desk.drop_attempt(way.kind(), attempt);
                 }
                 watched.failed(now, WayError::new(WayFault::TimedOut, ""));
             }
@@ -225,7 +236,7 @@ impl Watched {
     fn give_up(self, desk: &mut Desk) {
         if let (State::Asked { attempt, .. }, Some(way)) = (self.state, self.ways.get(self.current))
         {
-            desk.abandon(way.kind(), attempt);
+            desk.drop_attempt(way.kind(), attempt);
         }
     }
 
@@ -241,7 +252,9 @@ impl Watched {
             receiver: Incarnation::UNKNOWN,
         };
         let parcel = note_parcel(nobodys, Arc::clone(&self.peer.name), 0, Body::Credit);
-        let attempt = desk.dispatch(Purpose::Touch { peer: self.id }, way.clone(), parcel);
+        let attempt = desk.next_attempt();
+        let purpose = Purpose::Touch { peer: self.id };
+        desk.dispatch(attempt, purpose, way.clone(), parcel);
         self.last_asked = Some(now);
         self.state = State::Asked {
             attempt,

@@ -83,11 +83,28 @@ impl Sink for Receiving {
         others.cloned().collect()
     }
 
+    fn relocated(&self, locations: Vec<Location>) {
+        let Some(shared) = self.shared.upgrade() else {
+            return;
+        };
+        shared.locate(self.kind, locations, true);
+        let mut state = shared.state.lock();
+        state.core.handle_reachable(Now::read(), None);
+        shared.carry_out(state);
+    }
+
     fn introduced(&self, peer: &Introduction) {
-        if let Some(shared) = self.shared.upgrade()
-            && let Some(contacts) = &shared.config.contacts
-        {
+        let Some(shared) = self.shared.upgrade() else {
+            return;
+        };
+        if let Some(contacts) = &shared.config.contacts {
             contacts.introduced(peer);
+        }
+        let service = peer.hop.location.incarnation();
+        if service.is_known() {
+            let mut state = shared.state.lock();
+            state.core.handle_reachable(Now::read(), Some(service));
+            shared.carry_out(state);
         }
     }
 

@@ -1,65 +1,223 @@
 //! The promises, as invariants.
 
-use fipa_transport::{FailureReason, Outcome};
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
 
-use super::{Breach, World};
+use fipa_transport::{FailureReason, Incarnation, Outcome};
+
+use super::links::transfer_time;
+use super::{ATTEMPT_TIMEOUT, World};
+
+/// Longest time that a failed route is left alone.
+const LONGEST_PENALTY: Duration = Duration::from_secs(5);
+/// How long a busy receiver is left alone when no credit comes.
+const BUSY_PAUSE: Duration = Duration::from_millis(100);
+
+/// What must hold in every run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Invariant {
+    /// The world itself, and that what is watched is what happens.
+    World,
+    /// One outcome for each receiver of a letter, within its deadline.
+    OneOutcome,
+    /// A registration takes the letters of one sender in the order of sending.
+    Order,
+    /// Of all registrations of a name, one takes a letter, once.
+    AtMostOnce,
+    /// A letter that is *delivered* was taken.
+    NoFalseDelivered,
+    /// A letter that was taken does not fail for certain.
+    NoFalseFailure,
+    /// A letter is not taken while an earlier one of the same sender to the same name, not taken
+    /// yet, is open at its sender; so no letter fails because later ones were taken.
+    NotPassedOver,
+    /// A letter sent after all faults is delivered within a bound.
+    Liveness,
+    /// Without any fault no letter fails, and each failure is told.
+    Calm,
+}
+
+impl fmt::Display for Invariant {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Debug::fmt(self, f)
+    }
+}
+
+/// The first breach of each invariant.
+pub(crate) type Breaches = BTreeMap<Invariant, String>;
 
 impl World {
-    pub(super) fn check_deadline(&mut self, number: u64) -> Result<(), Breach> {
+    pub(super) fn breach(&mut self, invariant: Invariant, text: impl FnOnce() -> String) {
+        self.breaches.entry(invariant).or_insert_with(text);
+    }
+
+    /// How long the delivery of a letter of this size that is sent now may take when nothing goes
+    /// wrong any more: two round trips, one back-off of the route, one attempt without an answer,
+    /// and the transfer of what is queued.
+    pub(super) fn bound(&self, size: usize) -> Duration {
+        let w = self.weather;
+        let hops = Duration::from_millis(3 * 5 + 2 * w.local_ms);
+        let answers = Duration::from_millis(3 * (w.answering_ms + 5));
+        let transfer = transfer_time(self.open_bytes + size);
+        // What is ahead in a slow agent's queue is queued, too.
+        let open: usize = self.open.values().map(|open| open.len()).sum();
+        let reading = match w.reading_pause_ms > 1 {
+            true => (Duration::from_millis(w.reading_pause_ms + 2) + BUSY_PAUSE) * open as u32,
+            false => Duration::ZERO,
+        };
+        (hops + answers) * 2 + LONGEST_PENALTY + ATTEMPT_TIMEOUT + transfer + reading
+    }
+
+    pub(super) fn check_deadline(&mut self, number: u64) {
         let sent = &self.sent[&number];
         let (known, expected) = (sent.outcomes.len(), sent.expected);
         if known < expected && self.processes[sent.process].alive {
-            return Err(format!(
-                "letter {number} has {known} of {expected} outcomes after its deadline"
-            ));
+            self.breach(Invariant::OneOutcome, || {
+                format!("letter {number} has {known} of {expected} outcomes after its deadline")
+            });
         }
-        Ok(())
     }
 
-    pub(super) fn check_end(&mut self) -> Result<(), Breach> {
+    pub(super) fn check_liveness(&mut self, number: u64) {
+        let sent = &self.sent[&number];
+        let (Some(bound), [receiver]) = (sent.bound, &*sent.receivers) else {
+            return;
+        };
+        let outcome = sent.outcomes.get(receiver);
+        let was_refused = || {
+            let key = (number, Arc::clone(receiver));
+            self.refused.lock().contains(&key)
+        };
+        let why = match outcome {
+            Some(Outcome::Delivered { .. }) => return,
+            // Unconfirmed, if another attempt had no answer before.
+            Some(Outcome::Failed {
+                reason: FailureReason::Refused | FailureReason::Unconfirmed,
+                ..
+            }) if was_refused() => return,
+            // Its sender may try again, and will succeed.
+            Some(Outcome::Failed {
+                reason: FailureReason::QueueFull,
+                attempts,
+            }) if attempts.is_empty() && self.weather.lane < 1024 => return,
+            Some(outcome) => outcome.to_string(),
+            None => "no outcome".to_owned(),
+        };
+        let quiet = sent.at - self.quiet;
+        let text = format!(
+            "letter {number} to {receiver}, sent {quiet:?} after the last fault with a deadline \
+             of {:?}, was not delivered within {bound:?}: {why}",
+            sent.deadline
+        );
+        self.breach(Invariant::Liveness, || text);
+    }
+
+    /// A registration has accepted a letter into its queue.
+    pub(super) fn accepted(&mut self, agent: Incarnation, number: u64) {
+        self.accepted.insert((agent, number));
+        let sent = &self.sent[&number];
+        let name = Arc::clone(&self.names[&agent]);
+        let sender = &self.processes[sent.process];
+        let registered = |(_, agent): &(Arc<str>, Incarnation)| *agent == sent.sender;
+        if !sender.alive || !sender.agents.iter().any(registered) {
+            return;
+        }
+        let Some(open) = self.open.get(&(sent.sender, Arc::clone(&name))) else {
+            return;
+        };
+        let mut earlier = open.range(..number);
+        if let Some(earlier) = earlier.find(|earlier| !self.accepted.contains(&(agent, **earlier)))
+        {
+            let text = format!("letter {number} was taken by {name} before {earlier}, still open");
+            self.breach(Invariant::NotPassedOver, || text);
+        }
+    }
+
+    /// An agent has taken a letter out of its queue.
+    pub(super) fn check_take(&mut self, agent: Incarnation, number: u64) {
+        let sent = &self.sent[&number];
+        let name = Arc::clone(&self.names[&agent]);
+        if sent.known.is_some_and(|known| known != agent) {
+            self.followed += 1;
+        }
+        let last = self.last_taken.insert((agent, sent.sender), number);
+        if let Some(last) = last.filter(|last| *last >= number) {
+            self.breach(Invariant::Order, || {
+                format!("letter {number} was taken by {name} after {last} of the same sender")
+            });
+        }
+        let before = self.taken.insert((Arc::clone(&name), number), agent);
+        if let Some(before) = before {
+            let which = match before == agent {
+                true => "twice by the same registration",
+                false => "by two registrations",
+            };
+            let outcome = self.sent[&number].outcomes.get(&name);
+            let outcome = outcome.map_or("no outcome yet".into(), ToString::to_string);
+            self.breach(Invariant::AtMostOnce, || {
+                format!("letter {number} was taken {which} of {name}; {outcome}")
+            });
+        }
+    }
+
+    pub(super) fn check_end(&mut self) {
         let mut failed = 0;
+        let mut breaches = Vec::new();
         for (number, sent) in &self.sent {
             for (receiver, outcome) in &sent.outcomes {
-                let was_taken = self
-                    .taken
-                    .iter()
-                    .any(|(life, all)| self.names[life] == *receiver && all.contains(number));
+                let key = (Arc::clone(receiver), *number);
+                let was_taken = self.taken.contains_key(&key);
+                let was_refused = || {
+                    let key = (*number, Arc::clone(receiver));
+                    self.refused.lock().contains(&key)
+                };
                 match outcome {
-                    Outcome::Delivered { .. } if !was_taken => {
-                        return Err(format!("letter {number} to {receiver} is lost: {outcome}"));
-                    }
+                    Outcome::Delivered { .. } if !was_taken => breaches.push((
+                        Invariant::NoFalseDelivered,
+                        format!("letter {number} to {receiver} is lost: {outcome}"),
+                    )),
                     Outcome::Failed { reason, .. }
                         if was_taken && *reason != FailureReason::Unconfirmed =>
                     {
-                        return Err(format!("letter {number} was delivered, but {outcome}"));
+                        breaches.push((
+                            Invariant::NoFalseFailure,
+                            format!("letter {number} was taken by {receiver}, but {outcome}"),
+                        ));
                     }
-                    // Nobody refuses anything in this world: it was overtaken. Only when a gateway
-                    // dies together with its report of a failure, others go on without that letter; and
-                    // one that follows its receiver is overtaken by one sent to its new life.
                     Outcome::Failed {
                         reason: FailureReason::Refused,
                         ..
-                    } if self.weather.deaths + self.weather.moves == 0 => {
-                        return Err(format!("letter {number} was left out: {outcome}"));
-                    }
+                    } if !was_refused() => breaches.push((
+                        Invariant::NotPassedOver,
+                        format!("letter {number} to {receiver}, which no gate refused: {outcome}"),
+                    )),
                     Outcome::Failed { reason, .. } => {
                         failed += 1;
-                        if self.weather.is_calm() && *reason != FailureReason::NoSuchAgent {
-                            return Err(format!("letter {number} in calm weather: {outcome}"));
+                        if self.forecast.is_calm() && *reason != FailureReason::NoSuchAgent {
+                            let text = format!("letter {number} in calm weather: {outcome}");
+                            breaches.push((Invariant::Calm, text));
                         }
                     }
                     _ => {}
                 }
             }
         }
-        if self.weather.is_calm() && failed != self.failures_told {
-            return Err(format!("{failed} failures, {} told", self.failures_told));
+        for (invariant, text) in breaches {
+            self.breach(invariant, || text);
         }
-        for process in self.processes.iter().filter(|process| process.alive) {
-            if process.core.has_open_letters() {
-                return Err("letters are still open at the end".into());
-            }
+        let told = self.failures_told;
+        if self.forecast.is_calm() && failed != told {
+            self.breach(Invariant::Calm, || {
+                format!("{failed} failures, {told} told")
+            });
         }
-        Ok(())
+        let mut living = self.processes.iter().filter(|process| process.alive);
+        if living.any(|process| process.core.has_open_letters()) {
+            self.breach(Invariant::OneOutcome, || {
+                "letters are still open at the end".into()
+            });
+        }
     }
 }

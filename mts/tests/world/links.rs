@@ -1,46 +1,110 @@
 //! What lies between processes: links that lose, delay and refuse, and never reorder.
+//!
+//! The world's part of the interface between core and transports stands here: dispatch, abandon,
+//! answer and arrival.
 
-use std::time::Duration;
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
 
 use fipa_transport::{
-    Arrival, AttemptId, Body, Conclusion, Hop, Kind, Location, Parcel, Ticket, Verdict, WayError,
-    WayFault,
+    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Kind, Location, Parcel, Ticket, Verdict,
+    WayError, WayFault,
 };
 
-use super::view::way;
-use super::weather::LATE_MS;
+use super::gates::number_of;
+use super::view::{address_of, way};
 use super::{Breach, Event, World};
+
+/// Bytes a second between two hosts, by each transport. A full window of the largest letters takes
+/// less time than an attempt may.
+pub(super) const BYTES_PER_SECOND: u64 = 4_000_000;
+/// Bytes that a connection takes before parcels wait in the sender's outbox.
+const SOCKET: usize = 16 << 10;
+/// Largest letter in a datagram.
+pub(super) const MAX_DATAGRAM: usize = 8 << 10;
+
+/// One direction between two processes.
+pub(super) struct Link {
+    /// When the last parcel arrives: links keep their order.
+    arrives: Instant,
+    /// Parcels that have not been transmitted, by when they will be.
+    queue: VecDeque<(Instant, usize)>,
+}
+
+/// An attempt without a conclusion.
+pub(super) struct Flight {
+    /// The process that it goes to; `usize::MAX` for none.
+    to: usize,
+    /// When its first byte leaves; none if no byte ever does.
+    leaves: Option<Instant>,
+    /// Its arrival.
+    event: Option<u64>,
+    /// The link that it waits for, and when it will be transmitted.
+    queued: Option<((usize, usize, Kind), Instant)>,
+}
+
+/// A parcel that is about to arrive.
+pub(super) struct Flown {
+    from: usize,
+    to: usize,
+    kind: Kind,
+    attempt: AttemptId,
+    parcel: Parcel,
+    /// Its answer is lost.
+    mute: bool,
+    /// Not the parcel itself, but a second one.
+    copy: bool,
+}
+
+fn error(fault: WayFault) -> WayError {
+    WayError::new(fault, "simulated")
+}
 
 impl World {
     pub(super) fn dispatch(
         &mut self,
         at: usize,
         attempt: AttemptId,
-        to: &Location,
+        location: &Location,
         parcel: Parcel,
     ) {
-        let kind = to.kind();
+        let kind = location.kind();
         let host = self.processes[at].host;
-        let living = (0..self.processes.len()).find(|&p| {
-            self.processes[p].incarnation == to.incarnation() && self.processes[p].alive
+        self.trace(|| {
+            format!(
+                "{at} dispatches {} to {location}",
+                text_of(attempt, &parcel)
+            )
         });
-        let error = |fault| WayError::new(fault, "simulated");
-        let down = self.down.contains(&(host, kind))
-            || living.is_some_and(|p| self.down.contains(&(self.processes[p].host, kind)));
-        self.processes[at]
-            .open
-            .insert(attempt, living.unwrap_or(usize::MAX));
-        let Some(receiver) = living.filter(|_| !down) else {
-            let conclusion = Conclusion::NotSent(error(WayFault::Unreachable));
-            return self.after_ms(
-                3,
-                Event::Conclude {
-                    at,
-                    attempt,
-                    conclusion,
-                },
-            );
+        let target = self.by_incarnation.get(&location.incarnation()).copied();
+        let target = target.filter(|target| self.processes[*target].alive);
+        let flight = Flight {
+            to: target.unwrap_or(usize::MAX),
+            leaves: None,
+            event: None,
+            queued: None,
         };
+        self.processes[at].open.insert(attempt, flight);
+        let remote = target.is_some_and(|p| self.processes[p].host != host);
+        let size = size_of(&parcel);
+        if kind == Kind::Udp && size > MAX_DATAGRAM {
+            let conclusion = Conclusion::NotSent(error(WayFault::TooLarge));
+            self.conclude_within(0, at, attempt, conclusion);
+            return;
+        }
+        let down = self.down.contains(&(host, kind))
+            || target.is_some_and(|p| self.down.contains(&(self.processes[p].host, kind)));
+        let unreachable = || Conclusion::NotSent(error(WayFault::Unreachable));
+        let Some(to) = target.filter(|_| !down) else {
+            return self.conclude_within(3, at, attempt, unreachable());
+        };
+        if remote && !self.is_present(to, location) {
+            // Some networks report an address without a host, others drop the packets.
+            if self.random.bool() {
+                self.conclude_within(3, at, attempt, unreachable());
+            }
+            return;
+        }
         let mut luck = self.random.f64();
         let mut happens = |rate: f64| {
             luck -= rate;
@@ -48,100 +112,230 @@ impl World {
         };
         let w = self.weather;
         if happens(w.refusal) {
-            let conclusion = Conclusion::NotSent(error(WayFault::Unreachable));
-            return self.after_ms(
-                3,
-                Event::Conclude {
-                    at,
-                    attempt,
-                    conclusion,
-                },
-            );
+            return self.conclude_within(3, at, attempt, unreachable());
         }
-        if happens(w.loss) {
-            let conclusion = Conclusion::Unconfirmed(error(WayFault::Broken));
-            return self.after_ms(
-                50,
-                Event::Conclude {
-                    at,
-                    attempt,
-                    conclusion,
-                },
-            );
-        }
-        if happens(w.silence) || self.is_cut(at, receiver) {
+        let (lost, silent) = (happens(w.loss), happens(w.silence));
+        if lost || silent || self.is_cut(at, to) {
+            self.fly(at, attempt, Some(self.now), None);
+            if lost {
+                let conclusion = Conclusion::Unconfirmed(error(WayFault::Broken));
+                self.conclude_within(50, at, attempt, conclusion);
+            }
             return;
         }
         let mute = happens(w.answer_loss);
-        let between_hosts = self.processes[at].host != self.processes[receiver].host;
-        let mut strays = |rate: f64| between_hosts && rate > 0.0 && self.random.f64() < rate;
+        let mut strays = |rate: f64| remote && rate > 0.0 && self.random.f64() < rate;
         let (copied, late) = (strays(w.copies), strays(w.overtaken));
-        let arrive = |parcel, copy| Event::Arrive {
-            from: at,
-            to: receiver,
+        let arrive = |parcel, copy| {
+            Event::Arrive(Box::new(Flown {
+                from: at,
+                to,
+                kind,
+                attempt,
+                parcel,
+                mute,
+                copy,
+            }))
+        };
+        if copied {
+            let arrives = self.after_ms(w.late_ms, arrive(parcel.clone(), true));
+            self.fault_until(arrives);
+        }
+        if late {
+            let delay = Duration::from_micros(self.random.u64(..=w.late_ms * 1000));
+            let arrives = self.now + delay;
+            let event = self.at(arrives, arrive(parcel, false));
+            self.fly(at, attempt, Some(self.now), Some(event));
+            return self.fault_until(arrives);
+        }
+        let (leaves, done, arrives) = self.transmit((at, to), kind, remote, size);
+        let event = self.at(arrives, arrive(parcel, false));
+        self.fly(at, attempt, Some(leaves), Some(event));
+        if let Some(flight) = self.processes[at].open.get_mut(&attempt) {
+            flight.queued = Some(((at, to, kind), done));
+        }
+    }
+
+    /// When a parcel leaves its process, when it is transmitted, and when it arrives.
+    fn transmit(
+        &mut self,
+        (at, to): (usize, usize),
+        kind: Kind,
+        remote: bool,
+        size: usize,
+    ) -> (Instant, Instant, Instant) {
+        let now = self.now;
+        let mut delay = Duration::from_micros(self.random.u64(20..5000));
+        if !remote {
+            let more = self.random.u64(..=self.weather.local_ms * 1000);
+            delay += Duration::from_micros(more);
+        }
+        let hosts = [self.processes[at].host, self.processes[to].host];
+        let stalled = hosts.iter().filter_map(|host| self.stalled.get(host));
+        let stalled = stalled
+            .max()
+            .copied()
+            .filter(|_| remote && kind == Kind::Tcp);
+        let link = self.links.entry((at, to, kind)).or_insert_with(|| Link {
+            arrives: now,
+            queue: VecDeque::new(),
+        });
+        while link.queue.front().is_some_and(|(done, _)| *done <= now) {
+            link.queue.pop_front();
+        }
+        let mut leaves = now;
+        let mut ahead: usize = link.queue.iter().map(|(_, size)| size).sum();
+        for (done, size) in &link.queue {
+            if kind != Kind::Tcp || ahead < SOCKET {
+                break;
+            }
+            (leaves, ahead) = (*done, ahead - size);
+        }
+        let free = link.queue.back().map_or(now, |(done, _)| *done);
+        let begins = free.max(stalled.unwrap_or(now)).max(now);
+        let done = match remote {
+            true => begins + transfer_time(size),
+            false => now,
+        };
+        if done > now {
+            link.queue.push_back((done, size));
+        }
+        link.arrives = link.arrives.max(done + delay);
+        (leaves, done, link.arrives)
+    }
+
+    fn fly(&mut self, at: usize, attempt: AttemptId, leaves: Option<Instant>, event: Option<u64>) {
+        if let Some(flight) = self.processes[at].open.get_mut(&attempt) {
+            (flight.leaves, flight.event) = (leaves, event);
+        }
+    }
+
+    fn conclude_within(&mut self, ms: u64, at: usize, attempt: AttemptId, conclusion: Conclusion) {
+        let conclude = Event::Conclude {
+            at,
+            attempt,
+            conclusion,
+        };
+        self.after_ms(ms, conclude);
+    }
+
+    /// A core is not interested in an attempt any more, and is told at once how it ended.
+    pub(super) fn abandon(&mut self, at: usize, attempt: AttemptId, error: WayError) {
+        let conclusion = match self.take_back(at, attempt) {
+            true => Conclusion::NotSent(error),
+            false => Conclusion::Unconfirmed(error),
+        };
+        self.trace(|| format!("{at} abandons {attempt:?}: {conclusion:?}"));
+        self.note_end(at, attempt, &conclusion);
+        let now = self.clocks();
+        let core = &mut self.processes[at].core;
+        core.handle_conclusion(now, attempt, conclusion);
+    }
+
+    /// An attempt has this end.
+    pub(super) fn note_end(&mut self, at: usize, attempt: AttemptId, conclusion: &Conclusion) {
+        if let Conclusion::Answered(Answer::Accepted) | Conclusion::Unconfirmed(_) = conclusion {
+            self.may_repeat.insert((at, attempt));
+        }
+    }
+
+    /// Ends an attempt. Returns whether no byte of its parcel has left and none ever will.
+    fn take_back(&mut self, at: usize, attempt: AttemptId) -> bool {
+        let Some(flight) = self.processes[at].open.remove(&attempt) else {
+            return false;
+        };
+        let never = flight.leaves.is_none_or(|leaves| leaves > self.now);
+        if never {
+            flight.event.and_then(|event| self.due.remove(&event));
+            if let Some((link, done)) = flight.queued
+                && let Some(link) = self.links.get_mut(&link)
+            {
+                link.queue.retain(|(other, _)| *other != done);
+            }
+        }
+        never
+    }
+
+    /// This process is gone: what had not left it goes with it, what was under way to it breaks
+    /// off.
+    pub(super) fn break_off(&mut self, dead: usize) {
+        let own: Vec<AttemptId> = self.processes[dead].open.keys().copied().collect();
+        for attempt in own {
+            self.take_back(dead, attempt);
+        }
+        for at in 0..self.processes.len() {
+            let flights = self.processes[at].open.iter();
+            let broken_off: Vec<AttemptId> = flights
+                .filter(|(_, flight)| flight.to == dead)
+                .map(|(attempt, _)| *attempt)
+                .collect();
+            for attempt in broken_off {
+                let error = WayError::new(WayFault::Broken, "the process died");
+                self.conclude_within(20, at, attempt, Conclusion::Unconfirmed(error));
+            }
+        }
+    }
+
+    /// Whether this location is where its service can be reached now.
+    fn is_present(&self, to: usize, location: &Location) -> bool {
+        let registry = self.registry.lock();
+        let present = registry.present_address(self.processes[to].host, location.kind());
+        address_of(location) == Some(present)
+    }
+
+    /// Whether nothing passes from one of these processes to the other.
+    fn is_cut(&self, one: usize, other: usize) -> bool {
+        let (one, other) = (self.processes[one].host, self.processes[other].host);
+        one != other && (self.cut_off.contains(&one) || self.cut_off.contains(&other))
+    }
+
+    /// The answer to an arrival that was put off.
+    pub(super) fn answer(&mut self, at: usize, ticket: Ticket, answer: Answer) {
+        if let Some((sender, attempt)) = self.processes[at].tickets.remove(&ticket)
+            && !self.is_cut(at, sender)
+        {
+            self.conclude_within(2, sender, attempt, Conclusion::Answered(answer));
+        }
+    }
+
+    pub(super) fn arrive(&mut self, flown: Flown) -> Result<(), Breach> {
+        let Flown {
+            from,
+            to,
             kind,
             attempt,
             parcel,
             mute,
             copy,
-        };
-        if copied {
-            self.after_ms(LATE_MS, arrive(parcel.clone(), true));
+        } = flown;
+        let broken = || Conclusion::Unconfirmed(error(WayFault::Broken));
+        let is_letter = matches!(parcel.body, Body::Letter(_));
+        // An attempt that ended with a certain *not taken* must not deliver its letter later.
+        if copy && is_letter && !self.may_repeat.contains(&(from, attempt)) {
+            return Ok(());
         }
-        if late {
-            return self.after_ms(LATE_MS, arrive(parcel, false));
-        }
-        let delay = Duration::from_micros(self.random.u64(20..5000));
-        let link = self.links.entry((at, receiver, kind)).or_insert(self.now);
-        *link = (*link).max(self.now + delay);
-        let arrives = *link;
-        self.at(arrives, arrive(parcel, false));
-    }
-
-    /// Whether nothing passes from one of these processes to the other.
-    pub(super) fn is_cut(&self, one: usize, other: usize) -> bool {
-        let (one, other) = (self.processes[one].host, self.processes[other].host);
-        one != other && (self.cut_off.contains(&one) || self.cut_off.contains(&other))
-    }
-
-    /// A host is cut off from all others, for long enough that attempts are given up.
-    pub(super) fn cut_off(&mut self) {
-        let host = self.random.usize(..self.weather.hosts);
-        self.cut_off.insert(host);
-        self.after_ms(1500, Event::JoinedAgain { host });
-    }
-
-    pub(super) fn arrive(
-        &mut self,
-        (from, to): (usize, usize),
-        kind: Kind,
-        attempt: AttemptId,
-        parcel: Parcel,
-        mute: bool,
-        copy: bool,
-    ) -> Result<(), Breach> {
-        let broken = || Conclusion::Unconfirmed(WayError::new(WayFault::Broken, "simulated"));
         if !self.processes[to].alive {
-            if copy {
-                return Ok(());
+            if !copy {
+                self.conclude_within(5, from, attempt, broken());
             }
-            self.after_ms(
-                5,
-                Event::Conclude {
-                    at: from,
-                    attempt,
-                    conclusion: broken(),
-                },
-            );
             return Ok(());
         }
         let now = self.clocks();
-        let location = way(kind, self.processes[from].incarnation);
-        let remote = self.processes[from].host != self.processes[to].host;
-        let is_letter = matches!(parcel.body, Body::Letter(_));
-        if is_letter && remote && parcel.hops >= Parcel::LAST_HOPS {
-            self.followed += 1;
-        }
+        let (host, remote) = {
+            let (one, other) = (&self.processes[from], &self.processes[to]);
+            (one.host, one.host != other.host)
+        };
+        let address = match remote {
+            true => self.registry.lock().present_address(host, kind),
+            false => 0,
+        };
+        let location = way(kind, self.processes[from].incarnation, address);
+        let letter = match &parcel.body {
+            Body::Letter(letter) => number_of(letter),
+            _ => None,
+        };
+        let stream = parcel.stream;
+        let text = self.traced.then(|| text_of(attempt, &parcel));
         let cut = self.is_cut(to, from);
         let process = &mut self.processes[to];
         process.next_ticket += 1;
@@ -152,42 +346,60 @@ impl World {
             ticket,
         };
         let at_once = kind == Kind::Shm;
+        let waiting = process.core.waiting(stream.receiver);
         let verdict = process.core.handle_arrival(now, kind, at_once, arrival);
+        let is_taken = process.core.waiting(stream.receiver) > waiting;
+        if let Some(text) = text {
+            let copy = if copy { " (a copy)" } else { "" };
+            self.trace(|| format!("{to} says {verdict:?} to {text} from {from}{copy}"));
+        }
+        let process = &mut self.processes[to];
         match verdict {
             // What is said of a copy is no answer to the attempt (rule 3 of transports).
             _ if copy => {}
             // The way back is cut.
             Verdict::Now(_) if cut => {}
             Verdict::Now(answer) => {
-                let conclusion = if mute {
-                    broken()
-                } else {
-                    Conclusion::Answered(answer)
+                let conclusion = match mute {
+                    true => broken(),
+                    false => Conclusion::Answered(answer),
                 };
-                self.after_ms(
-                    self.weather.answering_ms,
-                    Event::Conclude {
-                        at: from,
-                        attempt,
-                        conclusion,
-                    },
-                );
+                self.conclude_within(self.weather.answering_ms, from, attempt, conclusion);
             }
             Verdict::Later if at_once => return Err("a late answer over shared memory".into()),
-            Verdict::Later if mute => {
-                self.after_ms(
-                    60,
-                    Event::Conclude {
-                        at: from,
-                        attempt,
-                        conclusion: broken(),
-                    },
-                );
-            }
+            Verdict::Later if mute => self.conclude_within(60, from, attempt, broken()),
             Verdict::Later => {
                 process.tickets.insert(ticket, (from, attempt));
             }
         }
+        if let Some(number) = letter
+            && is_taken
+        {
+            self.accepted(stream.receiver, number);
+        }
         self.carry_out(to)
     }
+}
+
+fn text_of(attempt: AttemptId, parcel: &Parcel) -> String {
+    let what = match &parcel.body {
+        Body::Letter(letter) => format!("letter {:?}", number_of(letter)),
+        other => format!("{other:?}"),
+    };
+    let (stream, after) = (parcel.stream, parcel.after);
+    format!(
+        "{what} ({attempt:?}, {} of {} for {}, after {after})",
+        parcel.sequence, stream.sender, stream.receiver
+    )
+}
+
+fn size_of(parcel: &Parcel) -> usize {
+    match &parcel.body {
+        Body::Letter(letter) => letter.len(),
+        _ => 0,
+    }
+}
+
+pub(super) fn transfer_time(bytes: usize) -> Duration {
+    Duration::from_micros(bytes as u64 * 1_000_000 / BYTES_PER_SECOND)
 }

@@ -1,39 +1,45 @@
 //! A simulated world: hosts, processes, links, time.
 
-use std::cmp::Reverse;
 mod checks;
+mod faults;
+mod gates;
 mod links;
 mod moves;
+mod traffic;
 mod view;
 mod watching;
 mod weather;
 
-use std::collections::{BTreeMap, BinaryHeap, HashMap, HashSet};
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet, BinaryHeap, HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, Message, Performative};
-use fipa_mts::core::{Action, Core, CoreConfig, Now, SendId, Submission};
-use fipa_mts::letter_for;
+use fipa_mts::core::{Action, Core, CoreConfig, Now, SendId};
 use fipa_sds::{Entry, Role};
-use fipa_transport::{
-    AttemptId, Conclusion, Incarnation, Kind, Outcome, Parcel, Ticket, WayError, WayFault,
-};
+use fipa_transport::{AttemptId, Conclusion, Incarnation, Kind, Ticket};
 use parking_lot::Mutex;
 
+use self::checks::{Breaches, Invariant};
+use self::gates::{Denied, Refused, Rules};
+use self::links::{Flight, Flown, Link};
+use self::traffic::Sent;
 use self::view::{Registered, Registry, View};
 use self::watching::Watching;
 pub(crate) use self::weather::Weather;
 
 const PROCESSES: usize = 3;
 const AGENTS: usize = 2;
-const LETTERS: u64 = 120;
-/// Letters are sent within this time; then the world may come to rest.
+/// Letters are sent within this time at least, and a while after the world has healed.
 const ACTIVE_MS: u64 = 3000;
-const DEADLINE: Duration = Duration::from_millis(2500);
-/// Outcomes may come this much after the deadline: one turn of the core's timer.
-const SLACK: Duration = Duration::from_millis(5);
+/// How long an attempt may go without an answer.
+const ATTEMPT_TIMEOUT: Duration = Duration::from_millis(300);
 
+/// Maps with the same order in every run.
+type Map<K, V> = HashMap<K, V, foldhash::fast::FixedState>;
+type Set<T> = HashSet<T, foldhash::fast::FixedState>;
+
+/// What makes a run worthless: the world or its watchers cannot go on.
 type Breach = String;
 
 /// A process: robot process or gateway.
@@ -44,9 +50,9 @@ struct Process {
     core: Core,
     agents: Vec<(Arc<str>, Incarnation)>,
     /// Attempts that have not been concluded: dead receivers break them off.
-    open: BTreeMap<AttemptId, usize>,
-    /// Arrivals answered later: who waits for the answer, and since which of its lives.
-    tickets: HashMap<Ticket, (usize, AttemptId)>,
+    open: BTreeMap<AttemptId, Flight>,
+    /// Arrivals answered later: the process that waits for the answer, and its attempt.
+    tickets: Map<Ticket, (usize, AttemptId)>,
     next_ticket: u64,
     alive: bool,
     wake: Option<Instant>,
@@ -54,15 +60,11 @@ struct Process {
 
 enum Event {
     Send,
-    Arrive {
-        from: usize,
-        to: usize,
-        kind: Kind,
-        attempt: AttemptId,
-        parcel: Parcel,
-        mute: bool,
-        copy: bool,
+    /// The next letter of a pair that sends without a pause.
+    Stream {
+        pair: usize,
     },
+    Arrive(Box<Flown>),
     Conclude {
         at: usize,
         attempt: AttemptId,
@@ -78,9 +80,15 @@ enum Event {
     Deadline {
         number: u64,
     },
+    /// By now this letter has to be delivered.
+    Liveness {
+        number: u64,
+    },
     Die,
+    Restart,
     Forgotten {
         process: usize,
+        returns: bool,
     },
     Reborn {
         process: usize,
@@ -96,53 +104,76 @@ enum Event {
         host: usize,
         departed: Vec<(usize, Arc<Entry>)>,
     },
+    Readdress,
     CutOff,
     JoinedAgain {
         host: usize,
     },
-    Outage {
-        host: usize,
-        kind: Kind,
-    },
+    Stall,
+    Outage,
     OutageEnds {
         host: usize,
         kind: Kind,
     },
 }
 
-/// What is remembered of a sent letter, by its number.
-struct Sent {
-    process: usize,
-    sender: Incarnation,
-    expected: usize,
-    outcomes: BTreeMap<Arc<str>, Outcome>,
-}
-
 pub(crate) struct World {
+    seed: u64,
+    /// What goes wrong until the world heals.
+    forecast: Weather,
+    /// What goes wrong now.
     weather: Weather,
     random: fastrand::Rng,
     start: Instant,
     now: Instant,
+    /// When no new fault begins any more.
+    heals: Instant,
+    /// When the last fault is over, as far as faults have begun.
+    quiet: Instant,
     events: BinaryHeap<Reverse<(Instant, u64)>>,
-    due: HashMap<u64, Event>,
+    due: Map<u64, Event>,
     next_event: u64,
     registry: Arc<Mutex<Registry>>,
     processes: Vec<Process>,
-    /// When the last parcel on a link arrives: links keep their order.
-    links: HashMap<(usize, usize, Kind), Instant>,
-    down: HashSet<(usize, Kind)>,
+    by_incarnation: Map<Incarnation, usize>,
+    links: Map<(usize, usize, Kind), Link>,
+    /// Attempts whose letter may arrive another time: it was accepted, or may have been.
+    may_repeat: Set<(usize, AttemptId)>,
+    down: Set<(usize, Kind)>,
     /// Hosts that nothing gets to or from.
-    cut_off: HashSet<usize>,
-    sends: HashMap<(usize, SendId), u64>,
+    cut_off: Set<usize>,
+    /// Until when TCP to and from a host stands still.
+    stalled: Map<usize, Instant>,
+    denied: Vec<(usize, Denied)>,
+    refused: Refused,
+    /// Names of agents that send without a pause, and of their receivers.
+    pairs: Vec<(Arc<str>, Arc<str>)>,
+    sends: Map<(usize, SendId), u64>,
     sent: BTreeMap<u64, Sent>,
-    /// Which letters each life of each agent took, in order.
-    taken: HashMap<Incarnation, Vec<u64>>,
-    names: HashMap<Incarnation, Arc<str>>,
+    /// Letters without an outcome, by the sender's registration and the receiver's name.
+    open: Map<(Incarnation, Arc<str>), BTreeSet<u64>>,
+    /// Bytes of letters without an outcome.
+    open_bytes: usize,
+    /// Letters that a registration has accepted into its queue.
+    accepted: Set<(Incarnation, u64)>,
+    /// Which registration of a name has taken a letter.
+    taken: Map<(Arc<str>, u64), Incarnation>,
+    /// The last letter of each sender that a registration has taken.
+    last_taken: Map<(Incarnation, Incarnation), u64>,
+    names: Map<Incarnation, Arc<str>>,
     /// Agents that are about to read.
-    reading: HashSet<Incarnation>,
+    reading: Set<Incarnation>,
     failures_told: u64,
-    /// Letters that came to the host to which their receiver had moved.
+    /// Letters that another registration of their receiver took than the one that was known when
+    /// they were sent.
     followed: u64,
+    /// The longest time that a letter sent after the faults took.
+    slowest: Duration,
+    /// Letters that had to be delivered within the bound.
+    bounded: u64,
+    breaches: Breaches,
+    /// Whether everything that happens is printed.
+    traced: bool,
     /// Whether anybody watches: in some worlds, so that the others show that it makes no
     /// difference.
     watched: bool,
@@ -153,63 +184,63 @@ pub(crate) struct World {
 impl World {
     pub(crate) fn new(seed: u64, weather: Weather) -> Self {
         let start = Instant::now();
+        let mut random = fastrand::Rng::with_seed(seed);
+        let heals = start + Duration::from_millis(random.u64(ACTIVE_MS / 2..=ACTIVE_MS));
         let mut world = Self {
+            seed,
+            forecast: weather,
             weather,
-            random: fastrand::Rng::with_seed(seed),
+            random,
             start,
             now: start,
+            heals,
+            quiet: heals,
             events: BinaryHeap::new(),
-            due: HashMap::new(),
+            due: Map::default(),
             next_event: 0,
             registry: Arc::default(),
             processes: Vec::new(),
-            links: HashMap::new(),
-            down: HashSet::new(),
-            cut_off: HashSet::new(),
-            sends: HashMap::new(),
+            by_incarnation: Map::default(),
+            links: Map::default(),
+            may_repeat: Set::default(),
+            down: Set::default(),
+            cut_off: Set::default(),
+            stalled: Map::default(),
+            denied: Vec::new(),
+            refused: Arc::default(),
+            pairs: Vec::new(),
+            sends: Map::default(),
             sent: BTreeMap::new(),
-            taken: HashMap::new(),
-            names: HashMap::new(),
-            reading: HashSet::new(),
+            open: Map::default(),
+            open_bytes: 0,
+            accepted: Set::default(),
+            taken: Map::default(),
+            last_taken: Map::default(),
+            names: Map::default(),
+            reading: Set::default(),
             failures_told: 0,
             followed: 0,
+            slowest: Duration::ZERO,
+            bounded: 0,
+            breaches: Breaches::new(),
+            traced: std::env::var_os("FIPA_SIM_TRACE").is_some(),
             watched: seed.is_multiple_of(4),
             watching: (0..weather.hosts).map(|_| Watching::default()).collect(),
         };
+        world.draw_denials();
+        world.registry.lock().now = Some(start);
         for host in 0..weather.hosts {
-            world.birth(host, true, &[format!("gateway{host}")]);
+            let known = vec![start; weather.hosts];
+            world.birth(host, true, &[format!("gateway{host}")], &known);
             for process in 0..PROCESSES {
                 let names: Vec<String> = (0..AGENTS)
                     .map(|agent| format!("h{host}_p{process}_{agent}"))
                     .collect();
-                world.birth(host, false, &names);
+                world.birth(host, false, &names, &known);
             }
         }
-        for _ in 0..LETTERS {
-            let at = world.some_time();
-            world.at(at, Event::Send);
-        }
-        for _ in 0..weather.deaths {
-            let at = world.some_time();
-            world.at(at, Event::Die);
-        }
-        for _ in 0..weather.moves {
-            let at = world.some_time();
-            world.at(at, Event::Move);
-        }
-        for _ in 0..weather.partitions {
-            let at = world.some_time();
-            world.at(at, Event::CutOff);
-        }
-        for _ in 0..weather.outages {
-            let at = world.some_time();
-            let host = world.random.usize(..weather.hosts);
-            let kind = *world
-                .random
-                .choice(&[Kind::Shm, Kind::Tcp, Kind::Udp])
-                .expect("a kind");
-            world.at(at, Event::Outage { host, kind });
-        }
+        world.plan_traffic();
+        world.plan_faults();
         world
     }
 
@@ -221,23 +252,39 @@ impl World {
         self.followed
     }
 
+    /// How many letters the bound of liveness was checked for, and the longest time one of them
+    /// took.
+    pub(crate) fn liveness(&self) -> (u64, Duration) {
+        (self.bounded, self.slowest)
+    }
+
     fn incarnation(&mut self) -> Incarnation {
         Incarnation::from_u64(self.random.u64(1..))
     }
 
-    fn some_time(&mut self) -> Instant {
-        self.start + Duration::from_micros(self.random.u64(..ACTIVE_MS * 1000))
-    }
-
-    fn at(&mut self, at: Instant, event: Event) {
+    fn at(&mut self, at: Instant, event: Event) -> u64 {
         self.next_event += 1;
         self.due.insert(self.next_event, event);
         self.events.push(Reverse((at, self.next_event)));
+        self.next_event
     }
 
-    fn after_ms(&mut self, most: u64, event: Event) {
-        let delay = Duration::from_micros(self.random.u64(..=most * 1000));
-        self.at(self.now + delay, event);
+    fn after_ms(&mut self, most: u64, event: Event) -> Instant {
+        let at = self.now + Duration::from_micros(self.random.u64(..=most * 1000));
+        self.at(at, event);
+        at
+    }
+
+    /// A fault lasts until then.
+    fn fault_until(&mut self, end: Instant) {
+        self.quiet = self.quiet.max(end);
+    }
+
+    /// Prints what happens, for a look at one seed.
+    fn trace(&self, text: impl FnOnce() -> String) {
+        if self.traced {
+            println!("{:?} {}", self.now - self.start, text());
+        }
     }
 
     fn clocks(&self) -> Now {
@@ -247,10 +294,8 @@ impl World {
         }
     }
 
-    fn birth(&mut self, host: usize, gateway: bool, names: &[String]) -> usize {
+    fn birth(&mut self, host: usize, gateway: bool, names: &[String], known: &[Instant]) {
         let incarnation = self.incarnation();
-        let registry = Arc::clone(&self.registry);
-        let order = vec![Kind::Shm, Kind::Udp, Kind::Tcp];
         let name = if gateway {
             names[0].clone()
         } else {
@@ -260,12 +305,12 @@ impl World {
             forwards: gateway,
             queue: self.weather.queue,
             window: 8,
-            lane: 32,
-            attempt_timeout: Duration::from_millis(300),
-            ..CoreConfig::new(name, incarnation, order)
+            lane: self.weather.lane,
+            attempt_timeout: ATTEMPT_TIMEOUT,
+            ..CoreConfig::new(name, incarnation, self.weather.order.to_vec())
         };
         let view = View {
-            registry,
+            registry: Arc::clone(&self.registry),
             host,
             gateway,
         };
@@ -273,10 +318,10 @@ impl World {
             host,
             gateway,
             incarnation,
-            core: Core::new(config, Arc::new(view)),
+            core: Core::new(config, Arc::new(view)).gated(Arc::new(self.rules(host, gateway))),
             agents: Vec::new(),
             open: BTreeMap::new(),
-            tickets: HashMap::new(),
+            tickets: Map::default(),
             next_ticket: 0,
             alive: true,
             wake: None,
@@ -295,51 +340,78 @@ impl World {
             }
             let role = if gateway { Role::Gateway } else { Role::Agent };
             self.names.insert(agent, Arc::clone(&name));
-            let registered = Registered {
+            self.registry.lock().register(Registered {
                 name,
                 incarnation: agent,
                 host,
                 mts: incarnation,
                 role,
-                known: Vec::new(),
+                known: known.to_vec(),
                 left: Vec::new(),
-            };
-            self.registry.lock().entries.push(registered);
+            });
         }
+        self.by_incarnation
+            .insert(incarnation, self.processes.len());
         self.processes.push(process);
-        self.processes.len() - 1
     }
 
-    pub(crate) fn run(&mut self) -> Result<(), Breach> {
-        let end =
-            self.start + Duration::from_millis(ACTIVE_MS) + DEADLINE + Duration::from_secs(20);
+    /// The rules of access of a process on this host.
+    fn rules(&self, host: usize, gateway: bool) -> Rules {
+        let w = self.weather;
+        let (share, place) = match gateway {
+            true => (w.refused_by_gateways, host as u64),
+            false => (w.refused_by_receivers, 1000),
+        };
+        let here = self.denied.iter().filter(|(at, _)| gateway && *at == host);
+        Rules {
+            seed: self.seed.wrapping_mul(4099).wrapping_add(place),
+            share,
+            denied: here.map(|(_, denied)| denied.clone()).collect(),
+            rate: (gateway && w.rate > 0.0).then_some((w.rate, self.heals)),
+            taken: Mutex::default(),
+            refused: Arc::clone(&self.refused),
+        }
+    }
+
+    /// Runs until nothing happens any more.
+    ///
+    /// # Errors
+    /// The first breach of each invariant.
+    pub(crate) fn run(&mut self) -> Result<(), Breaches> {
+        if let Err(breach) = self.play() {
+            self.breach(Invariant::World, || breach);
+        }
+        match self.breaches.is_empty() {
+            true => Ok(()),
+            false => Err(std::mem::take(&mut self.breaches)),
+        }
+    }
+
+    fn play(&mut self) -> Result<(), Breach> {
+        let end = self.start + fipa_mts::core::MAX_DEADLINE + Duration::from_secs(60);
         while let Some(Reverse((at, number))) = self.events.pop() {
             if at > end {
                 break;
             }
-            self.now = at;
-            self.registry.lock().now = Some(at);
             let Some(event) = self.due.remove(&number) else {
                 continue;
             };
+            if self.now < self.heals && at >= self.heals {
+                self.weather = self.weather.healed();
+            }
+            self.now = at;
+            self.registry.lock().now = Some(at);
             self.happen(event)?;
         }
-        self.check_end()?;
+        self.check_end();
         self.check_watched()
     }
 
     fn happen(&mut self, event: Event) -> Result<(), Breach> {
         match event {
-            Event::Send => self.send(),
-            Event::Arrive {
-                from,
-                to,
-                kind,
-                attempt,
-                parcel,
-                mute,
-                copy,
-            } => self.arrive((from, to), kind, attempt, parcel, mute, copy),
+            Event::Send => self.send_burst(),
+            Event::Stream { pair } => self.send_on(pair),
+            Event::Arrive(flown) => self.arrive(*flown),
             Event::Conclude {
                 at,
                 attempt,
@@ -348,6 +420,9 @@ impl World {
                 let now = self.clocks();
                 let process = &mut self.processes[at];
                 if process.alive && process.open.remove(&attempt).is_some() {
+                    self.trace(|| format!("{at} has {conclusion:?} of {attempt:?}"));
+                    self.note_end(at, attempt, &conclusion);
+                    let process = &mut self.processes[at];
                     process.core.handle_conclusion(now, attempt, conclusion);
                     self.carry_out(at)?;
                 }
@@ -355,44 +430,31 @@ impl World {
             }
             Event::Timer { at } => {
                 let now = self.clocks();
-                if self.processes[at].alive {
-                    self.processes[at].wake = None;
-                    self.processes[at].core.handle_timeout(now);
+                let process = &mut self.processes[at];
+                if process.alive && process.wake.is_some_and(|wake| wake <= now.instant) {
+                    process.wake = None;
+                    process.core.handle_timeout(now);
                     self.carry_out(at)?;
                 }
                 Ok(())
             }
             Event::Read { at, agent } => self.read(at, agent),
-            Event::Deadline { number } => self.check_deadline(number),
+            Event::Deadline { number } => {
+                self.check_deadline(number);
+                Ok(())
+            }
+            Event::Liveness { number } => {
+                self.check_liveness(number);
+                Ok(())
+            }
             Event::Die => self.die(),
-            Event::Forgotten { process } => {
-                let mts = self.processes[process].incarnation;
-                self.registry
-                    .lock()
-                    .entries
-                    .retain(|entry| entry.mts != mts);
-                self.directory_changed()
-            }
-            Event::Reborn { process } => {
-                let (host, gateway) = (
-                    self.processes[process].host,
-                    self.processes[process].gateway,
-                );
-                let names: Vec<String> = if gateway {
-                    vec![format!("gateway{host}")]
-                } else {
-                    self.processes[process]
-                        .agents
-                        .iter()
-                        .map(|(n, _)| n.to_string())
-                        .collect()
-                };
-                self.birth(host, gateway, &names);
-                self.directory_changed()
-            }
+            Event::Restart => self.restart(),
+            Event::Forgotten { process, returns } => self.forgotten(process, returns),
+            Event::Reborn { process } => self.reborn(process),
             Event::Move => self.leave(),
             Event::Settle { name } => self.settle(name),
             Event::News { host, departed } => self.news(host, &departed),
+            Event::Readdress => self.readdress(),
             Event::CutOff => {
                 self.cut_off();
                 Ok(())
@@ -401,9 +463,12 @@ impl World {
                 self.cut_off.remove(&host);
                 Ok(())
             }
-            Event::Outage { host, kind } => {
-                self.down.insert((host, kind));
-                self.after_ms(800, Event::OutageEnds { host, kind });
+            Event::Stall => {
+                self.stall();
+                Ok(())
+            }
+            Event::Outage => {
+                self.outage();
                 Ok(())
             }
             Event::OutageEnds { host, kind } => {
@@ -411,70 +476,6 @@ impl World {
                 Ok(())
             }
         }
-    }
-
-    fn directory_changed(&mut self) -> Result<(), Breach> {
-        let now = self.clocks();
-        for at in 0..self.processes.len() {
-            if self.processes[at].alive {
-                self.processes[at].core.handle_directory_change(now);
-                self.carry_out(at)?;
-            }
-        }
-        Ok(())
-    }
-
-    fn send(&mut self) -> Result<(), Breach> {
-        let living: Vec<usize> = (0..self.processes.len())
-            .filter(|&at| self.processes[at].alive && !self.processes[at].gateway)
-            .collect();
-        let Some(&at) = self.random.choice(&living) else {
-            return Ok(());
-        };
-        let agents = self.processes[at].agents.iter();
-        let Some((name, sender)) = self.random.choice(agents).cloned() else {
-            return Ok(());
-        };
-        let host = self.random.usize(..self.weather.hosts);
-        // Few pairs and bursts: order is worth nothing if nobody sends twice.
-        // Few patterns: to compile them takes longer than all the rest.
-        let receiver = match self.random.u32(..30) {
-            0 => format!("h{host}_.*"),
-            1..=3 => "nobody".to_owned(),
-            _ => format!("h{host}_p{}_{}", self.random.usize(..PROCESSES), 0),
-        };
-        for _ in 0..self.random.u32(1..6) {
-            let number = self.sent.len() as u64 + 1;
-            let message = Message::builder(Performative::Inform)
-                .sender(AgentId::new(&*name).expect("a name"))
-                .receiver(AgentId::new(&receiver).expect("a name"))
-                .content(number.to_string())
-                .build()
-                .expect("a message");
-            let letter = letter_for(&message, self.clocks().utc).expect("a letter");
-            let submission = Submission {
-                sender,
-                letter,
-                receivers: vec![receiver.as_str().into()],
-                deadline: DEADLINE,
-            };
-            let now = self.clocks();
-            let (send, expected) = self.processes[at].core.send(now, submission);
-            self.sends.insert((at, send), number);
-            let outcomes = BTreeMap::new();
-            self.sent.insert(
-                number,
-                Sent {
-                    process: at,
-                    sender,
-                    expected,
-                    outcomes,
-                },
-            );
-            self.at(self.now + DEADLINE + SLACK, Event::Deadline { number });
-            self.carry_out(at)?;
-        }
-        Ok(())
     }
 
     /// Does what a core wants done.
@@ -485,41 +486,15 @@ impl World {
                     attempt,
                     location,
                     parcel,
-                } => {
-                    self.dispatch(at, attempt, &location, parcel);
-                }
-                Action::Abandon { attempt, .. } => {
-                    self.processes[at].open.remove(&attempt);
-                }
-                Action::Answer { ticket, answer, .. } => {
-                    if let Some((sender, attempt)) = self.processes[at].tickets.remove(&ticket)
-                        && !self.is_cut(at, sender)
-                    {
-                        let conclusion = Conclusion::Answered(answer);
-                        self.after_ms(
-                            2,
-                            Event::Conclude {
-                                at: sender,
-                                attempt,
-                                conclusion,
-                            },
-                        );
-                    }
-                }
+                } => self.dispatch(at, attempt, &location, parcel),
+                Action::Abandon { attempt, error, .. } => self.abandon(at, attempt, error),
+                Action::Answer { ticket, answer, .. } => self.answer(at, ticket, answer),
                 Action::Outcome {
                     send,
                     receiver,
                     outcome,
-                } => {
-                    let Some(number) = self.sends.get(&(at, send)) else {
-                        return Err(format!("an outcome of a letter nobody sent: {outcome}"));
-                    };
-                    let sent = self.sent.get_mut(number).expect("it was sent");
-                    if let Some(first) = sent.outcomes.insert(receiver, outcome.clone()) {
-                        return Err(format!("letter {number}: {first}, then {outcome}"));
-                    }
-                }
-                // Everybody knows everybody here.
+                } => self.outcome((at, send), receiver, outcome)?,
+                // Every process knows all others here.
                 Action::Heard { .. } | Action::Doubtful { .. } => {}
                 Action::Notice(notice) => {
                     let Now { instant, utc } = self.clocks();
@@ -543,108 +518,16 @@ impl World {
         Ok(())
     }
 
-    fn read(&mut self, at: usize, agent: Incarnation) -> Result<(), Breach> {
-        if !self.processes[at].alive {
-            return Ok(());
-        }
-        // All at once when there is no pause to keep, so that queues do not fill in calm weather.
-        let most = if self.weather.reading_pause_ms > 1 {
-            1
-        } else {
-            usize::MAX
-        };
-        let mut read = 0;
-        while read < most && self.take(at, agent)? {
-            read += 1;
-        }
-        self.reading.remove(&agent);
-        if self.processes[at].core.waiting(agent) > 0 {
-            self.reading.insert(agent);
-            self.after_ms(1 + self.weather.reading_pause_ms, Event::Read { at, agent });
-        }
-        self.carry_out(at)
+    fn robots(&self) -> impl Iterator<Item = usize> {
+        let robot = |at: &usize| self.processes[*at].alive && !self.processes[*at].gateway;
+        (0..self.processes.len()).filter(robot)
     }
 
-    fn take(&mut self, at: usize, agent: Incarnation) -> Result<bool, Breach> {
-        let Some(received) = self.processes[at].core.take(agent) else {
-            return Ok(false);
-        };
-        let message = Message::decode(received.letter.payload()).expect("a message");
-        if *message.performative() == Performative::Failure {
-            self.failures_told += 1;
-            return Ok(true);
+    fn view(&self, at: usize) -> View {
+        View {
+            registry: Arc::clone(&self.registry),
+            host: self.processes[at].host,
+            gateway: self.processes[at].gateway,
         }
-        let content = message.content().expect("content");
-        let number: u64 = std::str::from_utf8(content)
-            .expect("text")
-            .parse()
-            .expect("a number");
-        let taken = self.taken.entry(agent).or_default();
-        let sender = self.sent[&number].sender;
-        let earlier = taken
-            .iter()
-            .rev()
-            .find(|other| self.sent[other].sender == sender);
-        if earlier.is_some_and(|earlier| *earlier >= number) {
-            return Err(format!(
-                "letter {number} was taken after {earlier:?} of the same sender"
-            ));
-        }
-        taken.push(number);
-        let name = &self.names[&agent];
-        let copies: usize = self
-            .taken
-            .iter()
-            .filter(|(life, _)| self.names[life] == *name)
-            .map(|(_, taken)| taken.iter().filter(|other| **other == number).count())
-            .sum();
-        if copies > 1 {
-            return Err(format!(
-                "letter {number} was taken {copies} times by {name}"
-            ));
-        }
-        Ok(true)
-    }
-
-    /// A process dies: what it had is gone, what was under way to it breaks off, and after a
-    /// moment the directory has noticed.
-    fn die(&mut self) -> Result<(), Breach> {
-        let living: Vec<usize> = (0..self.processes.len())
-            .filter(|&at| self.processes[at].alive)
-            .collect();
-        let Some(&dead) = self.random.choice(&living) else {
-            return Ok(());
-        };
-        // What lay in its queues had been delivered: that is where the promise ends.
-        for (_, agent) in self.processes[dead].agents.clone() {
-            while self.take(dead, agent)? {}
-        }
-        self.processes[dead].alive = false;
-        for at in 0..self.processes.len() {
-            let broken_off: Vec<AttemptId> = self.processes[at]
-                .open
-                .iter()
-                .filter(|(_, to)| **to == dead)
-                .map(|(attempt, _)| *attempt)
-                .collect();
-            for attempt in broken_off {
-                let error = WayError::new(WayFault::Broken, "the process died");
-                let conclusion = Conclusion::Unconfirmed(error);
-                self.after_ms(
-                    20,
-                    Event::Conclude {
-                        at,
-                        attempt,
-                        conclusion,
-                    },
-                );
-            }
-        }
-        self.after_ms(200, Event::Forgotten { process: dead });
-        if self.random.f64() < 0.8 {
-            let delay = Duration::from_millis(self.random.u64(210..600));
-            self.at(self.now + delay, Event::Reborn { process: dead });
-        }
-        Ok(())
     }
 }

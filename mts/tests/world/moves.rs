@@ -1,11 +1,12 @@
 //! Agents that move from process to process, and mostly from host to host.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use fipa_sds::{Directory, Entry, Role};
+use fipa_transport::Incarnation;
 
-use super::view::{Registered, View};
+use super::view::Registered;
 use super::{Breach, Event, World};
 
 impl World {
@@ -19,27 +20,35 @@ impl World {
             return Ok(());
         };
         let (name, life) = self.processes[at].agents.remove(agent);
+        while self.take(at, life) {}
+        self.end_registrations(self.processes[at].host, &[life]);
+        let now = self.clocks();
+        self.processes[at].core.deregister(now, life);
+        self.carry_out(at)?;
+        let settles = self.after_ms(3, Event::Settle { name });
+        self.fault_until(settles);
+        Ok(())
+    }
+
+    /// These registrations, which were on this host, have ended.
+    pub(super) fn end_registrations(&mut self, host: usize, lives: &[Incarnation]) {
         let mut seen: Vec<Vec<(usize, Arc<Entry>)>> = vec![Vec::new(); self.weather.hosts];
         for process in 0..self.processes.len() {
-            let entry = self.view(process).known_incarnation(life);
+            if !self.processes[process].alive {
+                continue;
+            }
             let host = self.processes[process].host;
-            seen[host].extend(entry.map(|entry| (process, entry)));
+            let view = self.view(process);
+            let entries = lives
+                .iter()
+                .filter_map(|life| view.known_incarnation(*life));
+            seen[host].extend(entries.map(|entry| (process, entry)));
         }
-        let times = self.news_times(self.processes[at].host);
-        let mut registry = self.registry.lock();
-        let mut entries = registry.entries.iter_mut();
-        if let Some(entry) = entries.find(|entry| entry.incarnation == life) {
-            entry.left.clone_from(&times);
+        let times = self.news_times(host);
+        for life in lives {
+            self.registry.lock().end(*life, &times);
         }
-        drop(registry);
-        while self.take(at, life)? {}
-        self.processes[at].core.deregister(life);
-        self.carry_out(at)?;
-        for (host, departed) in seen.into_iter().enumerate() {
-            self.at(times[host], Event::News { host, departed });
-        }
-        self.after_ms(3, Event::Settle { name });
-        Ok(())
+        self.tell(&times, seen);
     }
 
     /// It is registered in another process, under the same name.
@@ -48,27 +57,25 @@ impl World {
         let Some(&at) = self.random.choice(&robots) else {
             let later = self.now + Duration::from_millis(100);
             self.at(later, Event::Settle { name });
+            self.fault_until(later);
             return Ok(());
         };
         let life = self.incarnation();
         let known = self.news_times(self.processes[at].host);
-        for (host, time) in known.iter().enumerate() {
-            let departed = Vec::new();
-            self.at(*time, Event::News { host, departed });
-        }
         let process = &mut self.processes[at];
         process.core.register(Arc::clone(&name), life);
         process.agents.push((Arc::clone(&name), life));
         self.names.insert(life, Arc::clone(&name));
-        self.registry.lock().entries.push(Registered {
+        self.registry.lock().register(Registered {
             name,
             incarnation: life,
             host: process.host,
             mts: process.incarnation,
             role: Role::Agent,
-            known,
+            known: known.clone(),
             left: Vec::new(),
         });
+        self.tell(&known, Vec::new());
         Ok(())
     }
 
@@ -88,31 +95,5 @@ impl World {
             }
         }
         Ok(())
-    }
-
-    /// When something that happens on this host now is known on each.
-    fn news_times(&mut self, host: usize) -> Vec<Instant> {
-        let times = (0..self.weather.hosts).map(|other| {
-            let most = if other == host {
-                0
-            } else {
-                self.weather.news_ms
-            };
-            self.now + Duration::from_micros(self.random.u64(..=most * 1000))
-        });
-        times.collect()
-    }
-
-    fn robots(&self) -> impl Iterator<Item = usize> {
-        let robot = |at: &usize| self.processes[*at].alive && !self.processes[*at].gateway;
-        (0..self.processes.len()).filter(robot)
-    }
-
-    fn view(&self, at: usize) -> View {
-        View {
-            registry: Arc::clone(&self.registry),
-            host: self.processes[at].host,
-            gateway: self.processes[at].gateway,
-        }
     }
 }

@@ -1,6 +1,5 @@
 //! The directory of a simulated world, as it is seen from each of its processes.
 
-use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
@@ -8,10 +7,20 @@ use fipa_sds::{Directory, Entry, Mts, Reach, Role, Source, Subscriber};
 use fipa_transport::{Incarnation, Kind, Location};
 use parking_lot::Mutex;
 
-/// What everybody knows of everybody, as a directory seen from one process.
+use super::{Map, Set};
+
+/// All registrations of a world, and when each host knows of each.
 #[derive(Default)]
 pub(super) struct Registry {
-    pub(super) entries: Vec<Registered>,
+    entries: Vec<Registered>,
+    by_incarnation: Map<Incarnation, usize>,
+    by_name: Map<Arc<str>, Vec<usize>>,
+    gateways: Vec<usize>,
+    /// Changes of a gateway's address.
+    readdressed: Vec<Readdressed>,
+    /// Entries as processes see them, by the place of the registration, the host that looks, and
+    /// whether its gateway looks. An entry changes with its locations only.
+    seen: Map<(usize, usize, bool), (Reached, Arc<Entry>)>,
     pub(super) now: Option<Instant>,
 }
 
@@ -21,16 +30,76 @@ pub(super) struct Registered {
     pub(super) host: usize,
     pub(super) mts: Incarnation,
     pub(super) role: Role,
-    /// When it is known on each host, if not from the beginning.
+    /// When it is known on each host.
     pub(super) known: Vec<Instant>,
-    /// When it is known on each host that it has left, once it has.
+    /// When its end is known on each host, once it has ended.
     pub(super) left: Vec<Instant>,
+}
+
+/// Two locations: kind, service, and number of the address.
+type Reached = [(Kind, Incarnation, usize); 2];
+
+struct Readdressed {
+    host: usize,
+    kind: Kind,
+    known: Vec<Instant>,
 }
 
 impl Registered {
     fn is_seen(&self, host: usize, now: Option<Instant>) -> bool {
-        let past = |times: &[Instant]| Some(*times.get(host)? <= now?);
-        past(&self.known).unwrap_or(true) && !past(&self.left).unwrap_or(false)
+        let past = |times: &[Instant]| times.get(host).is_some_and(|at| now >= Some(*at));
+        past(&self.known) && !past(&self.left)
+    }
+}
+
+impl Registry {
+    pub(super) fn register(&mut self, registered: Registered) {
+        let place = self.entries.len();
+        self.by_incarnation.insert(registered.incarnation, place);
+        let named = self.by_name.entry(Arc::clone(&registered.name));
+        named.or_default().push(place);
+        if registered.role == Role::Gateway {
+            self.gateways.push(place);
+        }
+        self.entries.push(registered);
+    }
+
+    /// This registration has ended, which each host knows at its time.
+    pub(super) fn end(&mut self, incarnation: Incarnation, left: &[Instant]) {
+        if let Some(place) = self.by_incarnation.get(&incarnation) {
+            self.entries[*place].left = left.to_vec();
+        }
+    }
+
+    /// The gateway of this host has another address of this kind, which each host knows at its
+    /// time.
+    pub(super) fn readdress(&mut self, host: usize, kind: Kind, known: Vec<Instant>) {
+        self.readdressed.push(Readdressed { host, kind, known });
+    }
+
+    /// The address of this host's gateway, as this other one knows it.
+    fn address(&self, host: usize, kind: Kind, seen_from: usize) -> usize {
+        let changes = self.readdressed.iter();
+        let known = changes.filter(|change| {
+            (change.host, change.kind) == (host, kind) && self.now >= Some(change.known[seen_from])
+        });
+        known.count()
+    }
+
+    /// The present address of this host's gateway.
+    pub(super) fn present_address(&self, host: usize, kind: Kind) -> usize {
+        self.address(host, kind, host)
+    }
+
+    fn gateway(&self, host: usize, seen_from: usize) -> Option<Incarnation> {
+        let gateways = self
+            .gateways
+            .iter()
+            .rev()
+            .map(|place| &self.entries[*place]);
+        let mut here = gateways.filter(|gateway| gateway.host == host);
+        let found = here.find(|gateway| gateway.is_seen(seen_from, self.now))?;
+        Some(found.mts)
     }
 }
 
@@ -41,73 +110,75 @@ pub(super) struct View {
 }
 
 impl View {
-    fn entry(&self, registry: &Registry, registered: &Registered) -> Option<Arc<Entry>> {
-        let gateway_of = |host: usize| {
-            let mut all = registry.entries.iter();
-            all.find(|e| e.role == Role::Gateway && e.host == host)
-                .map(|e| e.mts)
-        };
+    fn entry(&self, registry: &mut Registry, place: usize) -> Option<Arc<Entry>> {
+        let registered = registry.entries.get(place)?;
+        if !registered.is_seen(self.host, registry.now) {
+            return None;
+        }
         let (locations, reach) = if registered.host == self.host {
-            (
-                vec![
-                    way(Kind::Shm, registered.mts),
-                    way(Kind::Tcp, registered.mts),
-                ],
-                Reach::Local,
-            )
+            let mts = registered.mts;
+            ([(Kind::Shm, mts, 0), (Kind::Tcp, mts, 0)], Reach::Local)
         } else if self.gateway {
-            let gateway = gateway_of(registered.host)?;
-            let ways = vec![way(Kind::Udp, gateway), way(Kind::Tcp, gateway)];
-            (ways, Reach::Remote { gateway })
+            let host = registered.host;
+            let gateway = registry.gateway(host, self.host)?;
+            let address = |kind| (kind, gateway, registry.address(host, kind, self.host));
+            let locations = [address(Kind::Udp), address(Kind::Tcp)];
+            (locations, Reach::Remote { gateway })
         } else {
-            let gateway = gateway_of(self.host)?;
-            let ways = vec![way(Kind::Shm, gateway), way(Kind::Tcp, gateway)];
-            (ways, Reach::Remote { gateway })
+            // Only what the gateway knows a way to is known to the other processes.
+            registry.gateway(registered.host, self.host)?;
+            let gateway = registry.gateway(self.host, self.host)?;
+            let locations = [(Kind::Shm, gateway, 0), (Kind::Tcp, gateway, 0)];
+            (locations, Reach::Remote { gateway })
         };
-        Some(Arc::new(Entry {
+        let key = (place, self.host, self.gateway);
+        if let Some((reached, entry)) = registry.seen.get(&key)
+            && *reached == locations
+        {
+            return Some(Arc::clone(entry));
+        }
+        let reached = locations;
+        let locations = reached.map(|(kind, mts, address)| way(kind, mts, address));
+        let entry = Arc::new(Entry {
             name: Arc::clone(&registered.name),
             agent_type: String::new(),
             incarnation: registered.incarnation,
-            locations,
+            locations: locations.to_vec(),
             mts: Mts::new("mts", registered.mts),
             description: String::new(),
             registered: SystemTime::UNIX_EPOCH,
             source: Source::Host,
             reach,
             role: registered.role.clone(),
-        }))
-    }
-
-    fn find(&self, matches: impl Fn(&Registered) -> bool) -> Option<Arc<Entry>> {
-        let registry = self.registry.lock();
-        let mut seen = registry
-            .entries
-            .iter()
-            .filter(|entry| entry.is_seen(self.host, registry.now));
-        let found = seen.find(|entry| matches(entry))?;
-        self.entry(&registry, found)
+        });
+        registry.seen.insert(key, (reached, Arc::clone(&entry)));
+        Some(entry)
     }
 }
 
 impl Directory for View {
     fn known(&self, name: &str) -> Option<Arc<Entry>> {
-        self.find(|entry| *entry.name == *name)
+        let mut registry = self.registry.lock();
+        // The registration that has the name keeps it, until it is known to have ended.
+        let count = registry.by_name.get(name)?.len();
+        (0..count).find_map(|nth| {
+            let place = *registry.by_name.get(name)?.get(nth)?;
+            self.entry(&mut registry, place)
+        })
     }
 
     fn known_incarnation(&self, incarnation: Incarnation) -> Option<Arc<Entry>> {
-        self.find(|entry| entry.incarnation == incarnation)
+        let mut registry = self.registry.lock();
+        let place = *registry.by_incarnation.get(&incarnation)?;
+        self.entry(&mut registry, place)
     }
 
     fn entries(&self) -> Arc<[Arc<Entry>]> {
-        let registry = self.registry.lock();
-        // Who has the name keeps it, until it is known to have left.
-        let mut names = HashSet::new();
-        registry
-            .entries
-            .iter()
-            .filter(|entry| entry.is_seen(self.host, registry.now))
+        let mut registry = self.registry.lock();
+        let mut names = Set::default();
+        (0..registry.entries.len())
+            .filter_map(|place| self.entry(&mut registry, place))
             .filter(|entry| names.insert(Arc::clone(&entry.name)))
-            .filter_map(|entry| self.entry(&registry, entry))
             .collect()
     }
 
@@ -118,8 +189,14 @@ impl Directory for View {
     fn subscribe(&self, _: &Subscriber) {}
 }
 
-pub(super) fn way(kind: Kind, mts: Incarnation) -> Location {
-    Location::new(kind, &mts.to_string())
+/// The location of a service. The number stands for the address of its host, which may change.
+pub(super) fn way(kind: Kind, mts: Incarnation, address: usize) -> Location {
+    Location::new(kind, &format!("{mts}:{address}"))
         .expect("an address")
         .with_incarnation(mts)
+}
+
+/// The number of the address in a location.
+pub(super) fn address_of(location: &Location) -> Option<usize> {
+    location.address().rsplit_once(':')?.1.parse().ok()
 }

@@ -1,7 +1,7 @@
 //! Somebody who watches each host: every letter is seen once, in order, with the outcome that its
 //! sender is told.
 
-use std::collections::HashMap;
+use super::Map;
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
@@ -10,6 +10,7 @@ use fipa_mts::watch::record::{self, Wish};
 use fipa_mts::watch::{Event, Fate, Joiner, Passage, Record, Source};
 use fipa_transport::{Incarnation, Outcome, wire};
 
+use super::gates::number_in;
 use super::{Breach, World};
 
 /// The watcher of a host, and what it has seen.
@@ -17,8 +18,8 @@ use super::{Breach, World};
 pub(super) struct Watching {
     joiner: Joiner,
     /// By the sender's life and its sequence.
-    seen: HashMap<(Incarnation, u64), Arc<Passage>>,
-    last: HashMap<Incarnation, u64>,
+    seen: Map<(Incarnation, u64), Arc<Passage>>,
+    last: Map<Incarnation, u64>,
 }
 
 impl Watching {
@@ -29,7 +30,7 @@ impl Watching {
         process: usize,
         notice: &Notice,
     ) -> Result<(), Breach> {
-        // The content is the number of the letter.
+        // The content begins with the number of the letter.
         let bytes = record::of(notice, Wish { content: 64 }, utc);
         let record = Record::parse(&bytes.into()).map_err(|error| error.to_string())?;
         self.joiner.handle(now, Source(process as u64), record);
@@ -83,7 +84,7 @@ impl World {
         if !self.watched {
             return Ok(());
         }
-        let mut settled = HashMap::new();
+        let mut settled = Map::default();
         for watching in &self.watching {
             for passage in watching.seen.values().filter(|it| !it.from_service) {
                 let outcome = match (&passage.fate, passage.via) {
@@ -95,13 +96,15 @@ impl World {
                     },
                     _ => continue,
                 };
-                let number = String::from_utf8_lossy(&passage.content).into_owned();
+                let Some(number) = number_in(&passage.content) else {
+                    continue;
+                };
                 settled.insert((number, Arc::clone(&passage.receiver)), outcome);
             }
         }
         for (number, sent) in &self.sent {
             for (receiver, outcome) in &sent.outcomes {
-                let seen = settled.get(&(number.to_string(), Arc::clone(receiver)));
+                let seen = settled.get(&(*number, Arc::clone(receiver)));
                 // Of very many attempts the first are not told.
                 if seen.map(wire::write_outcome) != Some(wire::write_outcome(outcome)) {
                     return Err(format!(

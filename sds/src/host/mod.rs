@@ -23,8 +23,10 @@ use std::io;
 use std::os::fd::OwnedFd;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 
-use fipa_transport::Incarnation;
+use fipa_transport::{Forked, Incarnation, OwnerProcess};
+use parking_lot::Mutex;
 use tokio::sync::watch;
 
 use self::place::{Id, Place};
@@ -54,7 +56,9 @@ pub struct HostConfig {
 pub struct HostDirectory {
     shared: Arc<Shared>,
     config: HostConfig,
-    task: tokio::task::JoinHandle<()>,
+    owner: OwnerProcess,
+    runtime: tokio::runtime::Handle,
+    task: Mutex<tokio::task::JoinHandle<()>>,
 }
 
 impl HostDirectory {
@@ -69,24 +73,19 @@ impl HostDirectory {
         let place = Place::join(&config.dir, id)?;
         let shared = Arc::new(Shared::new(place, config.mts.clone()));
         // Watching before reading, so that nothing is missed in between.
-        let begun = Watcher::new(&shared.place).and_then(|watcher| {
-            shared.refresh()?;
-            shared.find_sockets()?;
-            Ok(watcher)
-        });
-        let watcher = match begun {
-            Ok(watcher) => watcher,
-            Err(error) => {
-                // The first error is the one to be told.
-                let _ = shared.close();
-                return Err(error);
-            }
-        };
-        let task = runtime.spawn(watcher.run(Arc::clone(&shared)));
+        let watcher = Watcher::new(&shared.place());
+        if let Err(error) = shared.refresh().and_then(|()| shared.find_sockets()) {
+            // The first error is the one to be told.
+            let _ = shared.close();
+            return Err(error);
+        }
+        let task = runtime.spawn(watcher.run(Arc::clone(&shared), None));
         Ok(Self {
             shared,
             config,
-            task,
+            owner: OwnerProcess::this(),
+            runtime,
+            task: Mutex::new(task),
         })
     }
 
@@ -98,6 +97,7 @@ impl HostDirectory {
     /// When this is no gateway, an entry is not valid, there are too many, or they cannot be
     /// written. Nothing has changed then.
     pub fn publish_remote(&self, entries: Vec<Entry>) -> Result<(), HostError> {
+        self.owner.check()?;
         if !self.config.gateway {
             return Err(HostError::NoGateway);
         }
@@ -128,6 +128,7 @@ impl HostDirectory {
         registrations: Vec<Registration>,
         leaving: &[(&str, Incarnation)],
     ) -> Result<(), RegisterError> {
+        self.owner.check()?;
         let entries = registrations.into_iter();
         let entries = entries.map(|one| one.into_entry(&self.config.mts, Source::Host));
         self.shared
@@ -147,7 +148,8 @@ impl HostDirectory {
     /// # Errors
     /// When the directory was closed, or the system refuses the socket.
     pub fn listen(&self) -> Result<OwnedFd, HostError> {
-        self.shared.place.lock()?.listen()
+        self.owner.check()?;
+        self.shared.place().lock()?.listen()
     }
 
     /// The other processes that can be connected to, as they come and go.
@@ -162,7 +164,50 @@ impl HostDirectory {
     /// When it has ended, has too many connections that it has not accepted yet
     /// ([`io::ErrorKind::WouldBlock`]), or is not a socket of this user.
     pub fn connect(&self, socket: SocketId) -> Result<OwnedFd, HostError> {
-        self.shared.place.connect(socket.0)
+        self.shared.place().connect(socket.0)
+    }
+
+    /// Waits until the directory may have been removed by another program, which
+    /// [`rejoin`](Self::rejoin) finds out. Not every removal is reported: ask
+    /// [`is_there`](Self::is_there) from time to time, too.
+    pub async fn disturbed(&self) {
+        self.shared.disturbed().await;
+    }
+
+    /// Whether other processes can find what this one has registered. False when another program
+    /// has removed the directory, or files in it.
+    ///
+    /// # Errors
+    /// When the directory cannot be examined.
+    pub fn is_there(&self) -> Result<bool, HostError> {
+        self.shared.is_there()
+    }
+
+    /// Joins the directory again if it was removed, with everything that is registered, and says
+    /// whether that was necessary. A name that another process registered meanwhile is lost.
+    /// Blocks for as long as others hold the lock of the directory. Sockets have to be made again
+    /// with [`listen`](Self::listen).
+    ///
+    /// # Errors
+    /// When the directory cannot be made or written; to be tried again.
+    pub fn rejoin(&self) -> Result<bool, HostError> {
+        self.owner.check()?;
+        let mut task = self.task.lock();
+        if !self.shared.rejoin()? {
+            return Ok(false);
+        }
+        task.abort();
+        let _context = self.runtime.enter();
+        let watcher = Watcher::new(&self.shared.place());
+        // What others wrote before the watcher was there.
+        let read = self
+            .shared
+            .refresh()
+            .and_then(|()| self.shared.find_sockets());
+        let settled = tokio::time::Instant::now() + SETTLING;
+        let run = watcher.run(Arc::clone(&self.shared), Some(settled));
+        *task = self.runtime.spawn(run);
+        read.map(|()| true)
     }
 
     /// Leaves the directory, with everything that was registered. The last process leaves it
@@ -171,10 +216,14 @@ impl HostDirectory {
     /// # Errors
     /// When files cannot be removed.
     pub fn close(&self) -> Result<(), HostError> {
-        self.task.abort();
+        self.owner.check()?;
+        self.task.lock().abort();
         self.shared.close()
     }
 }
+
+/// Time that other processes have to join again after the directory was removed.
+const SETTLING: Duration = Duration::from_secs(15);
 
 /// The ends of processes of this host.
 #[derive(Debug)]
@@ -190,6 +239,10 @@ impl Departures {
 
 impl Drop for HostDirectory {
     fn drop(&mut self) {
+        // In a forked child everything stays the parent's.
+        if !self.owner.is_this() {
+            return;
+        }
         if let Err(error) = self.close() {
             tracing::error!(%error, "the host's directory was not left in order");
         }
@@ -206,11 +259,13 @@ impl Directory for HostDirectory {
     }
 
     fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {
+        self.owner.check()?;
         let entry = registration.into_entry(&self.config.mts, Source::Host)?;
         self.shared.register(entry)
     }
 
     fn deregister(&self, name: &str, incarnation: Incarnation) -> Result<(), DeregisterError> {
+        self.owner.check()?;
         let ours = |entry: &Entry| entry.incarnation == incarnation;
         self.shared.deregister(name, ours)
     }
@@ -244,8 +299,8 @@ pub enum HostError {
     },
     /// Somebody has removed the files of living processes.
     #[error(
-        "the files in {} were removed while they were in use; end all processes of the domain and \
-         start them again",
+        "the files in {} were removed by another program; this process joins the directory again \
+         within seconds: retry, and exempt the directory from cleaning",
         path.display()
     )]
     Removed {
@@ -274,12 +329,8 @@ pub enum HostError {
         /// What the system said.
         source: io::Error,
     },
-    /// The directory cannot be watched.
-    #[error(
-        "cannot watch {}: {source}; if too many instances or watches are in use, raise \
-         fs.inotify.max_user_instances or fs.inotify.max_user_watches",
-        path.display()
-    )]
+    /// The events of the directory cannot be read.
+    #[error("cannot read inotify events of {}: {source}", path.display())]
     Watch {
         /// The directory.
         path: PathBuf,
@@ -303,6 +354,9 @@ pub enum HostError {
     /// The directory has been closed.
     #[error("the directory has been closed")]
     Closed,
+    /// This process is a forked child of the one that opened the directory.
+    #[error(transparent)]
+    Forked(#[from] Forked),
     /// A task is needed, and there is nobody to run it.
     #[error("the host's directory must be opened within a tokio runtime")]
     NoRuntime,

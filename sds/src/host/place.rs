@@ -154,6 +154,33 @@ impl Place {
         self.id
     }
 
+    /// Whether the directory, and the files with which this process takes part, can still be found
+    /// by others.
+    pub(super) fn is_there(&self) -> Result<bool, HostError> {
+        let examined = |found: Result<rustix::fs::Stat, Errno>| match found {
+            Ok(stat) => Ok(Some((stat.st_dev, stat.st_ino))),
+            Err(Errno::NOENT | Errno::NOTDIR) => Ok(None),
+            Err(error) => Err(HostError::Io {
+                what: "examine",
+                path: self.path.clone(),
+                source: error.into(),
+            }),
+        };
+        let named = |name: Name| {
+            let flags = AtFlags::SYMLINK_NOFOLLOW;
+            examined(rustix::fs::statat(&self.dir, name.to_string(), flags))
+        };
+        let process = self.process.lock();
+        let Some(process) = process.as_ref() else {
+            // Left in order.
+            return Ok(true);
+        };
+        let dir = examined(rustix::fs::fstat(&self.dir))?;
+        Ok(dir == examined(rustix::fs::lstat(&self.path))?
+            && examined(rustix::fs::fstat(&self.domain))? == named(Name::Domain)?
+            && examined(rustix::fs::fstat(process))? == named(Name::Process(self.id))?)
+    }
+
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
@@ -277,7 +304,7 @@ impl Place {
     }
 
     /// When a file has come, gone or been replaced for the last time.
-    fn changed(&self) -> Result<(i64, u64), HostError> {
+    pub(super) fn changed(&self) -> Result<(i64, u64), HostError> {
         match rustix::fs::fstat(&self.dir) {
             Ok(stat) => Ok((stat.st_mtime, stat.st_mtime_nsec)),
             Err(error) => Err(HostError::Io {
@@ -461,7 +488,11 @@ impl Guard<'_> {
                 tv_nsec: 0,
             };
             let times = Timestamps {
-                last_access: version,
+                // Cleaners of temporary files go by it.
+                last_access: Timespec {
+                    tv_sec: 0,
+                    tv_nsec: rustix::fs::UTIME_NOW,
+                },
                 last_modification: version,
             };
             rustix::fs::futimens(&file, &times).map_err(io::Error::from)

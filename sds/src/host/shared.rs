@@ -3,23 +3,25 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use arc_swap::ArcSwap;
 use fipa_transport::Incarnation;
 use parking_lot::Mutex;
-use tokio::sync::watch;
+use tokio::sync::{Notify, watch};
 
 use super::HostError;
 use super::SocketId;
 use super::file::{self, Entries, FileError};
 use super::place::{Guard, Id, MAX_ENTRIES_FILE, Name, Place, Version};
 use crate::table::Table;
-use crate::{DeregisterError, Entry, Mts, RegisterError};
+use crate::{DeregisterError, Entry, Mts, Reach, RegisterError};
 
 /// The state behind a [`HostDirectory`](super::HostDirectory), shared with its task.
 ///
 /// Locks are taken in this order: the domain's, `own`, `others`, the table's.
 #[derive(Debug)]
 pub(super) struct Shared {
-    pub(super) place: Place,
+    /// Another one after the directory was removed and joined again.
+    place: ArcSwap<Place>,
     pub(super) table: Table<Id>,
     mts: Mts,
     own: Mutex<Own>,
@@ -27,6 +29,8 @@ pub(super) struct Shared {
     /// Counts processes that have ended.
     ended: watch::Sender<u64>,
     sockets: watch::Sender<Vec<SocketId>>,
+    /// Is notified when the directory may have been removed.
+    disturbed: Notify,
 }
 
 /// What this process tells the others.
@@ -46,6 +50,17 @@ struct Others {
     processes: HashMap<Id, Process>,
 }
 
+impl Others {
+    /// Whether another process has registered an agent of this name, according to the files that
+    /// are there now.
+    fn has_registered(&self, name: &str) -> bool {
+        self.processes.values().any(|process| {
+            let entry = process.entries.get(name);
+            process.version.is_some() && entry.is_some_and(|entry| entry.reach == Reach::Local)
+        })
+    }
+}
+
 #[derive(Debug, Default)]
 struct Process {
     version: Option<Version>,
@@ -55,14 +70,91 @@ struct Process {
 impl Shared {
     pub(super) fn new(place: Place, mts: Mts) -> Self {
         Self {
-            place,
+            place: ArcSwap::from_pointee(place),
             table: Table::new(),
             mts,
             own: Mutex::default(),
             others: Mutex::default(),
             ended: watch::Sender::default(),
             sockets: watch::Sender::default(),
+            disturbed: Notify::new(),
         }
+    }
+
+    pub(super) fn place(&self) -> Arc<Place> {
+        self.place.load_full()
+    }
+
+    /// Says that the directory may have been removed.
+    pub(super) fn say_disturbed(&self) {
+        self.disturbed.notify_one();
+    }
+
+    pub(super) async fn disturbed(&self) {
+        self.disturbed.notified().await;
+    }
+
+    /// Whether others can find what this process has written.
+    pub(super) fn is_there(&self) -> Result<bool, HostError> {
+        let own = self.own.lock();
+        if own.closed {
+            return Ok(true);
+        }
+        let place = self.place();
+        let nothing = own.agents.is_empty() && own.remote.is_empty();
+        Ok(place.is_there()? && (nothing || place.version(place.id())?.is_some()))
+    }
+
+    /// Joins the directory again after it, or files of this process in it, were removed. Says
+    /// whether that was necessary.
+    ///
+    /// What others have registered stays known until [`rescan`](Self::rescan): they need a moment
+    /// to join again.
+    pub(super) fn rejoin(&self) -> Result<bool, HostError> {
+        if self.is_there()? {
+            return Ok(false);
+        }
+        let before = self.place();
+        let place = Arc::new(Place::join(before.path(), before.id())?);
+        let guard = place.lock()?;
+        let mut own = self.own.lock();
+        if own.closed {
+            drop(own);
+            guard.leave()?;
+            return Ok(false);
+        }
+        self.place.store(Arc::clone(&place));
+        let mut others = self.others.lock();
+        others.generation = 0;
+        for process in others.processes.values_mut() {
+            // A new file may have the version of the one that was removed.
+            process.version = None;
+        }
+        self.scan(&mut others)?;
+        let taken: Vec<Arc<str>> = own
+            .agents
+            .keys()
+            .filter(|name| others.has_registered(name))
+            .cloned()
+            .collect();
+        drop(others);
+        for name in taken {
+            if let Some(entry) = own.agents.remove(&name) {
+                tracing::error!(
+                    %name,
+                    "another process registered the name while the directory was gone; this agent \
+                     is no longer registered"
+                );
+                self.table.release(place.id(), &name, entry.incarnation);
+            }
+        }
+        self.write(&guard, &own).map_err(|error| match error {
+            WriteError::Full(why) => HostError::Full(why),
+            WriteError::Host(error) => error,
+        })?;
+        drop((own, guard));
+        self.find_sockets()?;
+        Ok(true)
     }
 
     pub(super) fn departures(&self) -> watch::Receiver<u64> {
@@ -80,11 +172,11 @@ impl Shared {
 
     /// Sees which processes have a socket.
     pub(super) fn find_sockets(&self) -> Result<(), HostError> {
-        let names = self.place.names()?;
+        let names = self.place().names()?;
         let mut found: Vec<SocketId> = names
             .into_iter()
             .filter_map(|name| match name {
-                Name::Socket(id) if id != self.place.id() => Some(SocketId(id)),
+                Name::Socket(id) if id != self.place().id() => Some(SocketId(id)),
                 _ => None,
             })
             .collect();
@@ -100,7 +192,7 @@ impl Shared {
     /// Reads what others have written, if anybody has since the last time: one system call when
     /// nobody has.
     pub(super) fn refresh(&self) -> Result<(), HostError> {
-        let generation = self.place.generation()?;
+        let generation = self.place().generation()?;
         let mut others = self.others.lock();
         if others.generation == generation {
             return Ok(());
@@ -116,7 +208,7 @@ impl Shared {
         let mut others = self.others.lock();
         let known: Vec<Id> = others.processes.keys().copied().collect();
         for id in known {
-            if !self.place.lives(id)? {
+            if !self.place().lives(id)? {
                 self.forget(&mut others, id);
             }
         }
@@ -128,9 +220,9 @@ impl Shared {
     }
 
     fn scan(&self, others: &mut Others) -> Result<(), HostError> {
-        for name in self.place.names()? {
+        for name in self.place().names()? {
             if let Name::Entries(id) = name
-                && id != self.place.id()
+                && id != self.place().id()
             {
                 self.read(others, id)?;
             }
@@ -140,7 +232,7 @@ impl Shared {
 
     /// Reads what a process has written, if it has written anything new.
     pub(super) fn process_wrote(&self, id: Id) -> Result<(), HostError> {
-        if id == self.place.id() {
+        if id == self.place().id() {
             return Ok(());
         }
         self.read(&mut self.others.lock(), id)
@@ -148,17 +240,17 @@ impl Shared {
 
     fn read(&self, others: &mut Others, id: Id) -> Result<(), HostError> {
         let known = others.processes.get(&id);
-        let version = self.place.version(id)?;
+        let version = self.place().version(id)?;
         if known.is_some_and(|process| process.version == version) {
             return Ok(());
         }
         // Somebody new may be somebody dead, whose files nobody has removed yet.
-        if known.is_none() && !self.place.lives(id)? {
+        if known.is_none() && !self.place().lives(id)? {
             return Ok(());
         }
         let entries = self.read_file(id).unwrap_or_else(|error| {
             // Its agents are not there for us, as if it had none; its next file may be better.
-            let path = self.place.path().join(Name::Entries(id).to_string());
+            let path = self.place().path().join(Name::Entries(id).to_string());
             tracing::error!(path = %path.display(), %error, "entries file ignored");
             Entries::new()
         });
@@ -171,7 +263,7 @@ impl Shared {
     }
 
     fn read_file(&self, id: Id) -> Result<Entries, ReadError> {
-        match self.place.read_entries(id)? {
+        match self.place().read_entries(id)? {
             Some(bytes) => Ok(file::read(&bytes)?),
             None => Ok(Entries::new()),
         }
@@ -189,7 +281,7 @@ impl Shared {
 
     /// Forgets a process if it is dead. False when it lives.
     pub(super) fn process_ended(&self, id: Id) -> Result<bool, HostError> {
-        if self.place.lives(id)? {
+        if self.place().lives(id)? {
             return Ok(false);
         }
         self.forget(&mut self.others.lock(), id);
@@ -205,17 +297,19 @@ impl Shared {
     /// Removes the files of a process if it is dead. False when somebody else is just changing
     /// the directory.
     pub(super) fn try_bury(&self, id: Id) -> Result<bool, HostError> {
-        let Some(guard) = self.place.try_lock()? else {
+        let place = self.place();
+        let Some(guard) = place.try_lock()? else {
             return Ok(false);
         };
-        if !self.place.lives(id)? {
+        if !self.place().lives(id)? {
             guard.bury(id)?;
         }
         Ok(true)
     }
 
     pub(super) fn register(&self, entry: Entry) -> Result<Arc<Entry>, RegisterError> {
-        let guard = self.place.lock().map_err(failed)?;
+        let place = self.place();
+        let guard = place.lock().map_err(failed)?;
         self.free(&guard, &entry)?;
         let mut own = self.own.lock();
         if own.closed {
@@ -230,7 +324,7 @@ impl Shared {
             };
             return Err(error.into());
         }
-        self.table.put(self.place.id(), Arc::clone(&entry));
+        self.table.put(self.place().id(), Arc::clone(&entry));
         Ok(entry)
     }
 
@@ -239,7 +333,8 @@ impl Shared {
         entries: Vec<Entry>,
         leaving: &[(&str, Incarnation)],
     ) -> Result<(), RegisterError> {
-        let guard = self.place.lock().map_err(failed)?;
+        let place = self.place();
+        let guard = place.lock().map_err(failed)?;
         for entry in &entries {
             self.free(&guard, entry)?;
         }
@@ -264,7 +359,7 @@ impl Shared {
             own.agents = before;
             return Err(error.into());
         }
-        self.tell(self.place.id(), &before, &own.agents);
+        self.tell(self.place().id(), &before, &own.agents);
         Ok(())
     }
 
@@ -272,11 +367,11 @@ impl Shared {
     fn free(&self, guard: &Guard<'_>, entry: &Entry) -> Result<(), RegisterError> {
         self.refresh().map_err(failed)?;
         while let Some((id, holder)) = self.table.holder(&entry.name) {
-            let ours = id == self.place.id();
+            let ours = id == self.place().id();
             if ours && holder.incarnation == entry.incarnation {
                 break;
             }
-            if ours || self.place.lives(id).map_err(failed)? {
+            if ours || self.place().lives(id).map_err(failed)? {
                 return Err(RegisterError::AlreadyRegistered { holder });
             }
             self.forget(&mut self.others.lock(), id);
@@ -291,42 +386,71 @@ impl Shared {
         of: impl Fn(&Entry) -> bool,
     ) -> Result<(), DeregisterError> {
         let failed = |error: WriteError| DeregisterError::Failed(Arc::new(error));
-        let guard = self.place.lock().map_err(|error| failed(error.into()))?;
-        let mut own = self.own.lock();
-        if own.closed {
-            return Err(DeregisterError::Closed);
-        }
-        let Some(entry) = own.agents.get(name).filter(|entry| of(entry)).cloned() else {
-            return Err(DeregisterError::NotRegistered(name.into()));
-        };
-        own.agents.remove(name);
-        if let Err(error) = self.write(&guard, &own) {
-            own.agents.insert(entry.name.clone(), entry);
-            return Err(failed(error));
-        }
-        let id = self.place.id();
-        self.table.release(id, name, entry.incarnation);
-        Ok(())
+        self.change(|guard, own| {
+            if own.closed {
+                return Err(DeregisterError::Closed);
+            }
+            let Some(entry) = own.agents.get(name).filter(|entry| of(entry)).cloned() else {
+                return Err(DeregisterError::NotRegistered(name.into()));
+            };
+            own.agents.remove(name);
+            if let Err(error) = self.write_now_or_later(guard, own) {
+                own.agents.insert(entry.name.clone(), entry);
+                return Err(failed(error));
+            }
+            let id = self.place().id();
+            self.table.release(id, name, entry.incarnation);
+            Ok(())
+        })
     }
 
     /// Replaces what this gateway publishes of other hosts.
     pub(super) fn publish(&self, remote: Vec<Arc<Entry>>) -> Result<(), HostError> {
-        let guard = self.place.lock()?;
-        let mut own = self.own.lock();
-        if own.closed {
-            return Err(HostError::Closed);
-        }
-        if own.remote == remote {
-            return Ok(());
-        }
-        let before = std::mem::replace(&mut own.remote, remote);
-        self.write(&guard, &own).map_err(|error| {
-            own.remote = before;
-            match error {
-                WriteError::Full(why) => HostError::Full(why),
-                WriteError::Host(error) => error,
+        self.change(|guard, own| {
+            if own.closed {
+                return Err(HostError::Closed);
             }
+            if own.remote == remote {
+                return Ok(());
+            }
+            let before = std::mem::replace(&mut own.remote, remote);
+            self.write_now_or_later(guard, own).map_err(|error| {
+                own.remote = before;
+                match error {
+                    WriteError::Full(why) => HostError::Full(why),
+                    WriteError::Host(error) => error,
+                }
+            })
         })
+    }
+
+    /// Changes what this process tells the others, under the lock of the domain unless the
+    /// directory was removed.
+    fn change<T>(&self, change: impl FnOnce(Result<Guard<'_>, HostError>, &mut Own) -> T) -> T {
+        loop {
+            let place = self.place();
+            let guard = place.lock();
+            let mut own = self.own.lock();
+            // Joined again meanwhile, the place is another one. Under this lock it stays.
+            if Arc::ptr_eq(&place, &self.place()) {
+                return change(guard, &mut own);
+            }
+        }
+    }
+
+    /// Writes what this process tells the others; when the directory was removed,
+    /// [`rejoin`](Self::rejoin) will.
+    fn write_now_or_later(
+        &self,
+        guard: Result<Guard<'_>, HostError>,
+        own: &Own,
+    ) -> Result<(), WriteError> {
+        let written = guard.map_err(WriteError::from);
+        let written = written.and_then(|guard| self.write(&guard, own));
+        match written {
+            Err(WriteError::Host(_)) if matches!(self.place().is_there(), Ok(false)) => Ok(()),
+            written => written,
+        }
     }
 
     fn write(&self, guard: &Guard<'_>, own: &Own) -> Result<(), WriteError> {
@@ -353,13 +477,14 @@ impl Shared {
 
     /// Leaves the directory. Doing it again does nothing.
     pub(super) fn close(&self) -> Result<(), HostError> {
-        let guard = self.place.lock();
+        let place = self.place();
+        let guard = place.lock();
         let mut own = self.own.lock();
         if std::mem::replace(&mut own.closed, true) {
             return Ok(());
         }
         let agents = std::mem::take(&mut own.agents);
-        self.tell(self.place.id(), &agents, &Entries::new());
+        self.tell(self.place().id(), &agents, &Entries::new());
         guard?.leave()
     }
 }

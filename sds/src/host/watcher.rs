@@ -1,12 +1,14 @@
 //! The task that listens to what happens in the directory.
 //!
 //! A process that ends, in whatever way, closes its lock file, which it had open for writing; the
-//! kernel reports that to everybody who watches the directory.
+//! kernel reports that to everybody who watches the directory. A process that cannot get an inotify
+//! instance, of which the kernel limits the number per user, polls the directory instead.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsStr;
 use std::future::poll_fn;
 use std::io::{self, ErrorKind};
+use std::ops::Bound;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::Poll;
@@ -21,50 +23,73 @@ use super::place::{Id, Name, Place};
 use super::shared::Shared;
 
 pub(super) struct Watcher {
-    events: EventStream<Vec<u8>>,
+    events: Events,
+}
+
+/// Source of the news about the directory.
+enum Events {
+    Inotify(EventStream<Vec<u8>>),
+    Polling(Poller),
 }
 
 impl Watcher {
     /// Watches from now on. Must be called within a tokio runtime.
-    pub(super) fn new(place: &Place) -> Result<Self, HostError> {
-        let failed = |source| HostError::Watch {
-            path: place.path().to_owned(),
-            source,
+    pub(super) fn new(place: &Place) -> Self {
+        let events = match Self::inotify(place) {
+            Ok(events) => Events::Inotify(events),
+            Err(error) => {
+                tracing::warn!(
+                    %error,
+                    "no inotify watch for {}: polling it every {} ms; raise \
+                     fs.inotify.max_user_instances (sysctl)",
+                    place.path().display(),
+                    POLL_EVERY.as_millis()
+                );
+                Events::Polling(Poller::default())
+            }
         };
-        let inotify = Inotify::init().map_err(failed)?;
+        Self { events }
+    }
+
+    fn inotify(place: &Place) -> io::Result<EventStream<Vec<u8>>> {
+        let inotify = Inotify::init()?;
         let mask = WatchMask::CLOSE_WRITE
             | WatchMask::MOVED_TO
             | WatchMask::DELETE
             | WatchMask::DELETE_SELF
             | WatchMask::ONLYDIR;
         let mut watches = inotify.watches();
-        watches.add(place.pinned_path(), mask).map_err(failed)?;
-        let buffer = vec![0; 16 * 1024];
-        let events = inotify.into_event_stream(buffer).map_err(failed)?;
-        Ok(Self { events })
+        watches.add(place.pinned_path(), mask)?;
+        inotify.into_event_stream(vec![0; 16 * 1024])
     }
 
-    /// Keeps the view up to date, for ever.
+    /// Keeps the view up to date, for ever. What others had registered when the directory was
+    /// removed is forgotten at `settled`, unless they have joined again.
     ///
     /// The first change is read at once, and what follows it together after a pause: a process that
     /// registers a hundred agents replaces its file a hundred times, and everybody who read it each
     /// time would read for as long as the square of that.
-    pub(super) async fn run(mut self, shared: Arc<Shared>) {
+    pub(super) async fn run(mut self, shared: Arc<Shared>, mut settled: Option<Instant>) {
         let mut ending = Ending::default();
         loop {
             let news = tokio::select! {
-                news = self.news() => news,
+                news = self.news(&shared) => news,
                 () = ending.due() => Ok(News::default()),
+                () = sleep_until(settled) => {
+                    settled = None;
+                    ending.rescan = true;
+                    Ok(News::default())
+                }
             };
             let began = Instant::now();
-            let handled = news
-                .map_err(|source| HostError::Watch {
-                    path: shared.place.path().to_owned(),
-                    source,
-                })
-                .and_then(|news| handle(&shared, news, &mut ending));
+            let handled = news.and_then(|news| handle(&shared, news, &mut ending));
             if let Err(error) = handled {
-                tracing::error!(%error, "the view of the host's directory may be out of date");
+                if matches!(shared.is_there(), Ok(false)) {
+                    // Joining it again ends this watcher.
+                    shared.say_disturbed();
+                } else {
+                    tracing::error!(%error, "the view of the host's directory may be out of date");
+                }
                 // Whatever it is (no descriptors left, say), not in a tight loop.
                 tokio::time::sleep(Duration::from_millis(100)).await;
                 ending.rescan = true;
@@ -74,25 +99,112 @@ impl Watcher {
     }
 
     /// Everything that has happened since the last time, at least one thing.
-    async fn news(&mut self) -> io::Result<News> {
-        let mut news = News::default();
-        poll_fn(|context| {
-            // So many at most, to let others run.
-            for _ in 0..4096 {
-                match Pin::new(&mut self.events).poll_next(context) {
-                    Poll::Ready(Some(event)) => {
-                        let event = event?;
-                        news.add(event.mask, event.name.as_deref().and_then(OsStr::to_str));
-                    }
-                    // The kernel does not end this.
-                    Poll::Ready(None) => return Poll::Ready(Err(ErrorKind::UnexpectedEof.into())),
-                    Poll::Pending if news.is_empty() => return Poll::Pending,
-                    Poll::Pending => break,
-                }
+    async fn news(&mut self, shared: &Shared) -> Result<News, HostError> {
+        match &mut self.events {
+            Events::Inotify(events) => {
+                next_events(events)
+                    .await
+                    .map_err(|source| HostError::Watch {
+                        path: shared.place().path().to_owned(),
+                        source,
+                    })
             }
-            Poll::Ready(Ok(std::mem::take(&mut news)))
-        })
-        .await
+            Events::Polling(poller) => loop {
+                tokio::time::sleep(POLL_EVERY).await;
+                let news = poller.poll(&shared.place())?;
+                if !news.is_empty() {
+                    return Ok(news);
+                }
+            },
+        }
+    }
+}
+
+async fn next_events(events: &mut EventStream<Vec<u8>>) -> io::Result<News> {
+    let mut news = News::default();
+    poll_fn(|context| {
+        // So many at most, to let others run.
+        for _ in 0..4096 {
+            match Pin::new(&mut *events).poll_next(context) {
+                Poll::Ready(Some(event)) => {
+                    let event = event?;
+                    news.add(event.mask, event.name.as_deref().and_then(OsStr::to_str));
+                }
+                // The kernel does not end this.
+                Poll::Ready(None) => return Poll::Ready(Err(ErrorKind::UnexpectedEof.into())),
+                Poll::Pending if news.is_empty() => return Poll::Pending,
+                Poll::Pending => break,
+            }
+        }
+        Poll::Ready(Ok(std::mem::take(&mut news)))
+    })
+    .await
+}
+
+/// Time between two looks at the directory without inotify.
+const POLL_EVERY: Duration = Duration::from_millis(100);
+
+/// Maximum number of processes whose lock is tried in one poll. Each costs four system calls. When
+/// another process has an inotify instance, it removes the files of the dead, which one poll finds.
+const LOCKS_PER_POLL: usize = 8;
+
+/// Finds out what inotify would report.
+#[derive(Debug, Default)]
+struct Poller {
+    /// Generation and time of the last change, as of the last poll.
+    seen: Option<(u64, (i64, u64))>,
+    /// Whether `seen` was the same in the last two polls. Two changes within one tick of the kernel's
+    /// clock have the same time, so the directory is read once more after each change.
+    settled: bool,
+    /// Processes that have files in the directory.
+    processes: BTreeSet<Id>,
+    /// Process whose lock was tried last.
+    tried: Option<Id>,
+}
+
+impl Poller {
+    fn poll(&mut self, place: &Place) -> Result<News, HostError> {
+        let mut news = News::default();
+        let now = Some((place.generation()?, place.changed()?));
+        let changed = self.seen != now;
+        if changed || !self.settled {
+            self.read(place, &mut news)?;
+        }
+        (self.seen, self.settled) = (now, !changed);
+        self.try_locks(place, &mut news)?;
+        Ok(news)
+    }
+
+    fn read(&mut self, place: &Place, news: &mut News) -> Result<(), HostError> {
+        let mut processes = BTreeSet::new();
+        for name in place.names()? {
+            match name {
+                Name::Process(id) => drop(processes.insert(id)),
+                Name::Entries(id) => drop(news.wrote.insert(id)),
+                _ => {}
+            }
+        }
+        news.sockets = true;
+        news.ended = self.processes.difference(&processes).copied().collect();
+        self.processes = processes;
+        Ok(())
+    }
+
+    /// Looks for processes that were killed, which changes nothing in the directory.
+    fn try_locks(&mut self, place: &Place, news: &mut News) -> Result<(), HostError> {
+        let after = self.tried.map_or(Bound::Unbounded, Bound::Excluded);
+        let later = self.processes.range((after, Bound::Unbounded));
+        let ids: Vec<Id> = later.take(LOCKS_PER_POLL).copied().collect();
+        for id in &ids {
+            if *id != place.id() && !place.lives(*id)? {
+                news.ended.insert(*id);
+            }
+        }
+        // At the end, the next poll begins again.
+        self.tried = (ids.len() == LOCKS_PER_POLL)
+            .then(|| ids.last().copied())
+            .flatten();
+        Ok(())
     }
 }
 
@@ -138,7 +250,20 @@ impl News {
     }
 }
 
+async fn sleep_until(time: Option<Instant>) {
+    match time {
+        Some(time) => tokio::time::sleep_until(time).await,
+        None => std::future::pending().await,
+    }
+}
+
 fn handle(shared: &Shared, news: News, ending: &mut Ending) -> Result<(), HostError> {
+    // Files that vanish together with the directory are no end of their processes.
+    if (news.lost || ending.rescan || !news.ended.is_empty()) && !shared.is_there()? {
+        return Err(HostError::Removed {
+            path: shared.place().path().to_owned(),
+        });
+    }
     if news.lost || std::mem::take(&mut ending.rescan) {
         shared.rescan()?;
     }
@@ -188,10 +313,7 @@ impl Ending {
         if self.rescan {
             return;
         }
-        match self.processes.values().map(|end| end.due).min() {
-            Some(due) => tokio::time::sleep_until(due).await,
-            None => std::future::pending().await,
-        }
+        sleep_until(self.processes.values().map(|end| end.due).min()).await;
     }
 
     fn handle(&mut self, shared: &Shared) -> Result<(), HostError> {

@@ -23,6 +23,8 @@ pub(super) struct Ear {
     next_beacon: Instant,
     /// When one may be said that cannot wait until then.
     next_urgent: Instant,
+    /// Until when the mDNS library looks at the interfaces more often than usual.
+    looks_soon: Option<Instant>,
 }
 
 impl Ear {
@@ -34,6 +36,7 @@ impl Ear {
             beacons: Beacons::default(),
             next_beacon: now,
             next_urgent: now,
+            looks_soon: None,
         }
     }
 
@@ -44,13 +47,30 @@ impl Ear {
             // Others wait for it.
             self.next_beacon = self.next_beacon.min(self.next_urgent.max(now));
         }
+        if shared.interfaces_changed.swap(false, Ordering::Relaxed) {
+            self.next_beacon = now;
+            self.looks_soon = Some(now + beacon::INTERVAL);
+            shared.daemon_looks(super::LOOKS_SOON);
+        }
+        if self.looks_soon.is_some_and(|until| until <= now) {
+            self.looks_soon = None;
+            shared.daemon_looks(super::LOOKS);
+        }
         if now >= self.next_beacon {
             self.next_beacon = now + beacon::INTERVAL + JITTER.mul_f64(fastrand::f64());
             self.next_urgent = now + BREATH;
             // Interfaces come and go.
             match self.sockets.refresh(&shared.config) {
-                Ok(false) => {}
-                Ok(true) => self.browser.start_again(now, fastrand::f64()),
+                Ok(changed) => {
+                    if changed.more {
+                        self.browser.start_again(now, fastrand::f64());
+                    }
+                    // An address that is gone is noticed by the daemon when it looks next. Until
+                    // then it would use that one instead of the new one.
+                    if changed.more && !changed.fewer {
+                        shared.daemon_adds_interfaces();
+                    }
+                }
                 Err(error) => shared.failed(format!("cannot open a multicast socket: {error}")),
             }
             let beacon = beacon::packet(shared.config.mts.incarnation, shared.announced());
@@ -59,6 +79,7 @@ impl Ear {
                 self.repair(shared, silent);
             }
         }
+        self.send(shared.moved());
         let doubtful = shared.held.lock().due(now);
         self.browser.doubt(now, &doubtful);
         let due = self.browser.handle_timeout(now, fastrand::f64());
@@ -67,7 +88,7 @@ impl Ear {
             shared.put(&fullname, None);
         }
         let later = shared.held.lock().poll_timeout(now);
-        let due = [Some(self.browser.poll_timeout()), later];
+        let due = [Some(self.browser.poll_timeout()), later, self.looks_soon];
         let due = due.into_iter().flatten().min();
         due.map_or(self.next_beacon, |due| due.min(self.next_beacon))
     }

@@ -144,6 +144,7 @@ impl MdnsDirectory {
             held: Mutex::default(),
             together: Mutex::default(),
             coalitions_changed: AtomicBool::new(false),
+            interfaces_changed: AtomicBool::new(false),
             own: Mutex::default(),
             withdrawals: broadcast::channel(64).0,
             status: Mutex::new(MdnsStatus {
@@ -198,6 +199,15 @@ impl MdnsDirectory {
         if doubted {
             self.shared.postponed.notify_one();
         }
+    }
+
+    /// The interfaces of this host have changed: speaks and listens on the new ones at once, rather
+    /// than when it looks next.
+    pub fn interfaces_changed(&self) {
+        self.shared
+            .interfaces_changed
+            .store(true, Ordering::Relaxed);
+        self.shared.postponed.notify_one();
     }
 
     /// Takes back everything that was announced, with a goodbye, and stops listening. Blocks for
@@ -286,6 +296,8 @@ struct Shared {
     together: Mutex<Together>,
     /// Whether others are to be told at once what coalitions there are.
     coalitions_changed: AtomicBool,
+    /// Whether to look at the interfaces at once.
+    interfaces_changed: AtomicBool,
     own: Mutex<Own>,
     withdrawals: broadcast::Sender<Withdrawal>,
     status: Mutex<MdnsStatus>,
@@ -315,7 +327,13 @@ struct Own {
     /// What was announced when the daemon was ended, until there is another one: nobody hears of
     /// what changes meanwhile, and who was told of it would ask in vain.
     meanwhile: Option<beacon::Announced>,
+    /// The names of records of which only the locations have changed, and which are announced at
+    /// once: the daemon needs about two seconds for that.
+    moved: Vec<Arc<str>>,
 }
+
+/// Most records that are announced at once; the others are by the daemon.
+const MAX_MOVED: usize = 256;
 
 impl Own {
     fn announced(&self) -> beacon::Announced {
@@ -349,10 +367,24 @@ struct Announced {
     told: Option<(Instant, Digest)>,
 }
 
+impl Announced {
+    fn host_name(&self) -> String {
+        format!("fipa-{}.local.", self.host)
+    }
+}
+
 /// How long a record stays as it is before it is changed again (RFC 6762 clause 8.4). It is probed
 /// for most of a second, announced twice a second apart, and only a second after that has the record
 /// before left the caches: one that came back earlier would be taken for the one that leaves.
 const SETTLING: Duration = Duration::from_secs(3);
+
+/// The same for a record of which only the locations change: letters do not arrive until others know
+/// them. It may be announced before the record before has left all caches.
+const MOVING: Duration = Duration::from_secs(1);
+
+/// How often the daemon looks at the interfaces: usually, and while they change.
+const LOOKS: u32 = mdns_sd::IP_CHECK_INTERVAL_IN_SECS_DEFAULT;
+const LOOKS_SOON: u32 = 1;
 
 /// How long a full name rests after a goodbye.
 const REST: Duration = Duration::from_secs(1);
@@ -411,9 +443,20 @@ impl Shared {
         let turn = match before {
             // What is announced already is changed when it has settled.
             Some(Announced {
+                entry: before,
                 told: Some((when, _)),
                 ..
-            }) => Some(*when + SETTLING).filter(|settled| *settled > now),
+            }) => {
+                let settling = match moves(before, entry) {
+                    true => MOVING,
+                    false => SETTLING,
+                };
+                if settling == MOVING && own.moved.len() < MAX_MOVED {
+                    own.moved.push(Arc::clone(&entry.name));
+                    self.postponed.notify_one();
+                }
+                Some(*when + settling).filter(|settled| *settled > now)
+            }
             Some(waiting) => waiting.due,
             None => own.pace.turn(now, fastrand::f64()),
         };
@@ -439,7 +482,7 @@ impl Shared {
 
     fn tell_daemon(&self, announced: &Announced) -> Result<(), mdns_sd::Error> {
         let label = record::label(&announced.entry.name, announced.attempt);
-        let host = format!("fipa-{}.local.", announced.host);
+        let host = announced.host_name();
         let properties = record::encode(&announced.entry);
         let properties: Vec<TxtProperty> = properties.into_iter().map(TxtProperty::from).collect();
         // The port stands in the locations; the addresses are those of this host.
@@ -447,6 +490,19 @@ impl Shared {
         let service = service.enable_addr_auto();
         self.ask(|daemon| daemon.register(service.clone()))?;
         Ok(())
+    }
+
+    /// Packets that announce the records of which only the locations have changed.
+    fn moved(&self) -> Vec<Vec<u8>> {
+        let mut own = self.own.lock();
+        let moved = std::mem::take(&mut own.moved);
+        let packets = moved.iter().filter_map(|name| {
+            let announced = own.agents.get(name)?;
+            let label = record::label(name, announced.attempt);
+            let says = record::encode(&announced.entry);
+            packet::announcement(&label, &announced.host_name(), &says)
+        });
+        packets.collect()
     }
 
     /// Announces what has been postponed and is due, and says when the next is.
@@ -500,6 +556,21 @@ impl Shared {
         }
         self.take_back(own, name)
             .map_err(|error| DeregisterError::Failed(Arc::new(error)))
+    }
+
+    /// Has the daemon look at the interfaces so often, the first time after that.
+    fn daemon_looks(&self, seconds: u32) {
+        if let Err(error) = self.ask(|daemon| daemon.set_ip_check_interval(seconds)) {
+            self.failed(format!("cannot look at the interfaces: {error}"));
+        }
+    }
+
+    /// Has the daemon use interfaces that are new, without waiting until it looks.
+    fn daemon_adds_interfaces(&self) {
+        let none = || Vec::<IfKind>::new();
+        if let Err(error) = self.ask(|daemon| daemon.enable_interface(none())) {
+            self.failed(format!("cannot use a new interface: {error}"));
+        }
     }
 
     /// Gives the daemon something to do. It takes so many things at a time and asks others to
@@ -614,6 +685,16 @@ impl Shared {
         tracing::warn!(%error, "multicast DNS");
         self.status.lock().last_error = Some(error);
     }
+}
+
+/// Whether two entries of a name differ in their locations only.
+fn moves(before: &Entry, now: &Entry) -> bool {
+    before.locations != now.locations
+        && *now
+            == Entry {
+                locations: now.locations.clone(),
+                ..before.clone()
+            }
 }
 
 /// The full name of a record with this label, in lower case. Labels have no dots and no

@@ -1,14 +1,19 @@
 //! Packets of multicast DNS about records of our type: questions written, answers taken apart.
 
-use simple_dns::rdata::{PTR, RData};
-use simple_dns::{CLASS, Label, Name, Packet, PacketFlag, QCLASS, QTYPE, Question, TYPE};
-use simple_dns::{ResourceRecord, rdata};
+use simple_dns::ResourceRecord;
+use simple_dns::rdata::{PTR, RData, SRV, TXT};
+use simple_dns::{
+    CLASS, CharacterString, Label, Name, Packet, PacketFlag, QCLASS, QTYPE, Question, TYPE,
+};
 
 use super::SERVICE_TYPE;
 use super::record::Properties;
 
 /// Largest packet of multicast DNS (RFC 6762 clause 17).
 pub(super) const MAX_PACKET: usize = 9000;
+/// Lifetimes of records that name a host, and of others, in seconds (RFC 6762 clause 10).
+const HOST_TTL: u32 = 120;
+const OTHER_TTL: u32 = 4500;
 /// Most questions in one packet: they fit the smallest packet every network carries.
 const QUESTIONS: usize = 12;
 /// Known answers in one packet, likewise.
@@ -56,7 +61,7 @@ fn is_of_our_type(labels: &[Label<'_>]) -> bool {
 }
 
 /// The strings of a TXT record, in order, all of them.
-pub(super) fn properties(txt: &rdata::TXT<'_>) -> Properties {
+pub(super) fn properties(txt: &TXT<'_>) -> Properties {
     let properties = txt.iter_raw().filter_map(|(key, value)| {
         let key = std::str::from_utf8(key).ok()?;
         Some((key.to_owned(), value.unwrap_or_default().to_vec()))
@@ -121,15 +126,43 @@ fn name_of(label: &str) -> Option<Name<'_>> {
     Some(Name::new_with_labels(&name))
 }
 
+/// A packet that announces a record of our type: its label, its host and what it says. Others
+/// replace what they hold of it (RFC 6762 clause 10.2). None when that does not fit a packet.
+pub(super) fn announcement(label: &str, host: &str, says: &Properties) -> Option<Vec<u8>> {
+    let strings: Vec<Vec<u8>> = says
+        .iter()
+        .map(|(key, value)| [key.as_bytes(), b"=", value].concat())
+        .collect();
+    let mut txt = TXT::new();
+    for string in &strings {
+        txt.add_char_string(CharacterString::new(string).ok()?);
+    }
+    let name = name_of(label)?;
+    let place = RData::SRV(SRV {
+        priority: 0,
+        weight: 0,
+        port: 0,
+        target: Name::new(host).ok()?,
+    });
+    let service = Name::new_unchecked(SERVICE_TYPE);
+    let introduced = RData::PTR(PTR(name.clone()));
+    let mut packet = Packet::new_reply(0);
+    packet.set_flags(PacketFlag::AUTHORITATIVE_ANSWER);
+    packet.answers = vec![
+        ResourceRecord::new(service, CLASS::IN, OTHER_TTL, introduced),
+        ResourceRecord::new(name.clone(), CLASS::IN, HOST_TTL, place).with_cache_flush(true),
+        ResourceRecord::new(name, CLASS::IN, OTHER_TTL, RData::TXT(txt)).with_cache_flush(true),
+    ];
+    let packet = packet.build_bytes_vec_compressed().ok()?;
+    (packet.len() <= MAX_PACKET).then_some(packet)
+}
+
 fn service_labels() -> impl Iterator<Item = &'static str> {
     SERVICE_TYPE.split_terminator('.')
 }
 
 #[cfg(test)]
 pub(super) mod tests {
-    use simple_dns::CharacterString;
-    use simple_dns::rdata::{SRV, TXT};
-
     use super::*;
 
     /// A record of a packet.
@@ -183,6 +216,30 @@ pub(super) mod tests {
             }
         }
         asked
+    }
+
+    #[test]
+    fn an_announcement_says_what_the_record_says() {
+        let says: Properties = vec![
+            ("fipa-name".into(), b"arm".to_vec()),
+            ("fipa-locations".into(), b"tcp://10.0.0.2:7788".to_vec()),
+        ];
+        let packet = announcement("arm", "fipa-1.local", &says).unwrap();
+        let packet = parse_answer(&packet).unwrap();
+        let [introduced, place, text] = &packet.answers[..] else {
+            panic!("{packet:?}")
+        };
+        assert!(is_service(&introduced.name) && !introduced.cache_flush);
+        for record in [place, text] {
+            assert_eq!(label_of(&record.name), Some("arm"));
+            assert!(record.cache_flush);
+        }
+        let RData::TXT(txt) = &text.rdata else {
+            panic!("{text:?}")
+        };
+        assert_eq!(properties(txt), says);
+        let long = vec![("x".to_owned(), vec![0; 250]); 40];
+        assert_eq!(announcement("arm", "fipa-1.local", &long), None);
     }
 
     #[test]

@@ -28,6 +28,15 @@ pub(super) struct Sockets {
     buffer: Vec<u8>,
 }
 
+/// How the addresses of interfaces differ from those before.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Changed {
+    /// There are some that there were not.
+    pub(super) more: bool,
+    /// Some are gone.
+    pub(super) fewer: bool,
+}
+
 impl Sockets {
     /// None yet.
     pub(super) fn new() -> Self {
@@ -39,11 +48,11 @@ impl Sockets {
     }
 
     /// Opens what can be opened of the interfaces that the configuration names, if they are not
-    /// the same as before. Says whether there are some that there were not.
-    pub(super) fn refresh(&mut self, config: &MdnsConfig) -> io::Result<bool> {
+    /// the same as before. Says what has become of them.
+    pub(super) fn refresh(&mut self, config: &MdnsConfig) -> io::Result<Changed> {
         let interfaces = interfaces(config)?;
         if interfaces == self.interfaces {
-            return Ok(false);
+            return Ok(Changed::default());
         }
         self.open.clear();
         let mut last_error = None;
@@ -58,10 +67,13 @@ impl Sockets {
             // An address that is not usable yet may be in a moment.
             Some(error) if self.open.is_empty() => Err(error),
             _ => {
-                let mut now = interfaces.iter();
-                let more = now.any(|interface| !self.interfaces.contains(interface));
+                let (mut now, mut before) = (interfaces.iter(), self.interfaces.iter());
+                let changed = Changed {
+                    more: now.any(|interface| !self.interfaces.contains(interface)),
+                    fewer: before.any(|interface| !interfaces.contains(interface)),
+                };
                 self.interfaces = interfaces;
-                Ok(more)
+                Ok(changed)
             }
         }
     }

@@ -13,7 +13,7 @@ fn mistakes_are_named_with_line_and_key() {
         (
             "domain = \"a\"\n[mts]\ndeadlin = \"5s\"\n",
             "fipa.toml:3: unknown key `mts.deadlin`; did you mean `mts.deadline`? \
-             (known in [mts]: name, transports, deadline, queue)",
+             (known in [mts]: name, transports, deadline, queue, queue_bytes)",
         ),
         (
             "deadline = \"5s\"\n",
@@ -47,7 +47,7 @@ fn mistakes_are_named_with_line_and_key() {
         (
             "\nmts = 5\n",
             "fipa.toml:2: `mts` is a section, not a value; \
-             write [mts], and below it its keys: name, transports, deadline, queue",
+             write [mts], and below it its keys: name, transports, deadline, queue, queue_bytes",
         ),
         (
             "routes = \"x\"\n",
@@ -354,7 +354,7 @@ fn mistakes_in_set_name_it() {
     assert_eq!(
         error("", &["mts.deadlin=5s"]),
         "--set mts.deadlin=5s: unknown key `mts.deadlin`; did you mean `mts.deadline`? \
-         (known in [mts]: name, transports, deadline, queue)"
+         (known in [mts]: name, transports, deadline, queue, queue_bytes)"
     );
     assert_eq!(
         error("", &["mts.transports=shm,quic"]),
@@ -364,7 +364,7 @@ fn mistakes_in_set_name_it() {
     assert_eq!(
         error("", &["mts=5"]),
         "--set mts=5: `mts` is a section, not a value; \
-         write [mts], and below it its keys: name, transports, deadline, queue"
+         write [mts], and below it its keys: name, transports, deadline, queue, queue_bytes"
     );
     assert_eq!(
         error("", &["mts.queue=x\u{1b}[31m"]),

@@ -22,7 +22,8 @@ pub(crate) mod streams;
 use std::sync::Arc;
 
 use fipa_transport::{
-    Answer, AttemptId, Kind, ListenError, Location, Parcel, Sink, Ticket, Transport, WayError,
+    Abandoned, Answer, AttemptId, Kind, ListenError, Location, Parcel, Sink, Ticket, Transport,
+    WayError,
 };
 use tokio::runtime::Handle;
 
@@ -120,8 +121,8 @@ impl Transport for QuicTransport {
         })
     }
 
-    fn abandon(&self, attempt: AttemptId) {
-        self.endpoint.abandon(attempt);
+    fn abandon(&self, attempt: AttemptId) -> Abandoned {
+        self.endpoint.abandon(attempt)
     }
 
     fn answer(&self, ticket: Ticket, answer: Answer) {

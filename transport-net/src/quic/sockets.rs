@@ -38,8 +38,8 @@ impl Sockets {
         }
     }
 
-    /// Listens on an address of the configuration. Says where that is reached.
-    pub(super) fn listen(&self, text: &str) -> Result<(Endpoint, Vec<SocketAddr>), ListenError> {
+    /// Listens on an address of the configuration. Returns the address that the socket is bound to.
+    pub(super) fn listen(&self, text: &str) -> Result<(Endpoint, SocketAddr), ListenError> {
         let unavailable = |error: String| ListenError::Unavailable(error);
         let bind = address::numeric(text).map_err(|error| unavailable(error.to_string()))?;
         let socket = open(bind).map_err(|error| address::cannot_bind(text, &error))?;
@@ -50,9 +50,7 @@ impl Sockets {
         let bound = socket.local_addr().map_err(failed)?;
         let server = settings::server(&self.security, &self.transport).map_err(unavailable)?;
         let socket = endpoint(Some(server), socket).map_err(failed)?;
-        let reachable =
-            address::reachable(bound).map_err(|error| unavailable(error.to_string()))?;
-        Ok((socket, reachable))
+        Ok((socket, bound))
     }
 
     /// Goes on with the handshake of a peer.

@@ -8,6 +8,7 @@
 
 use std::future::{pending, poll_fn};
 use std::io::{self, IoSlice};
+use std::net::IpAddr;
 use std::pin::Pin;
 use std::task::{Context, Poll, Waker};
 
@@ -168,6 +169,12 @@ impl Outgoing {
                 blocked: Lane::Control,
             }),
         }
+    }
+
+    /// The address of this host that the peer dialled. A connection that this side dialled has none:
+    /// it goes on from another address (RFC 9000 section 9).
+    pub(crate) fn local_ip(&self) -> Option<IpAddr> {
+        self.connection.local_ip()
     }
 
     /// Takes what there is room for.

@@ -9,10 +9,12 @@ use std::time::{Duration, Instant};
 use bytes::BytesMut;
 use fipa_transport::ListenError;
 use socket2::{Domain, Protocol, SockRef, Socket, Type};
-use tokio::io::AsyncReadExt;
 use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::oneshot;
+use tokio::task::AbortHandle;
 use tokio::time::{sleep, sleep_until, timeout};
 
+use super::accept_queue::{self, Full, Place, TURN};
 use super::config::Limits;
 use super::counters::count;
 use super::endpoint::{Endpoint, Stranger};
@@ -21,22 +23,21 @@ use super::link::Running;
 use super::proof::Proof;
 #[cfg(feature = "secure")]
 use super::tls;
-use super::unframed;
-use super::wire::{Reading, Writing};
+use super::unframed::{self, UnframedError};
+use super::wire;
 use crate::address::{self, AddressError};
 use crate::seldom::warn_seldom;
 
-/// Connections that the system holds until they are accepted.
-const BACKLOG: i32 = 256;
-
-/// Bytes read at first.
-const FIRST_READ: usize = 4096;
+/// Connections that the system holds until they are accepted: the letters of a legacy peer wait there
+/// while this process is stopped.
+const BACKLOG: i32 = 1024;
 
 /// How long accepting rests when the system has no descriptors left.
 const REST: Duration = Duration::from_millis(100);
 
-/// Opens a listening socket, and says where it is reached. To be called within a runtime.
-pub(crate) fn listen(text: &str) -> Result<(TcpListener, Vec<SocketAddr>), ListenError> {
+/// Opens a listening socket, and returns the address that it is bound to. To be called within a
+/// runtime.
+pub(crate) fn listen(text: &str) -> Result<(TcpListener, SocketAddr), ListenError> {
     let unavailable = |error: AddressError| ListenError::Unavailable(error.to_string());
     let failed = |source| ListenError::Bind {
         address: text.to_owned(),
@@ -45,9 +46,8 @@ pub(crate) fn listen(text: &str) -> Result<(TcpListener, Vec<SocketAddr>), Liste
     let address = address::numeric(text).map_err(unavailable)?;
     let socket = open(address).map_err(|error| address::cannot_bind(text, &error))?;
     let bound = socket.local_addr().map_err(failed)?;
-    let reachable = address::reachable(bound).map_err(unavailable)?;
     let socket = TcpListener::from_std(socket).map_err(failed)?;
-    Ok((socket, reachable))
+    Ok((socket, bound))
 }
 
 fn open(address: SocketAddr) -> io::Result<std::net::TcpListener> {
@@ -76,16 +76,20 @@ pub(crate) fn prepare(stream: &TcpStream, limits: &Limits) -> io::Result<()> {
 
 /// Accepts connections until it is aborted.
 pub(crate) async fn accept(endpoint: Arc<Endpoint>, listener: TcpListener) {
+    let mut pace = Pace::default();
     loop {
         match listener.accept().await {
             Ok((stream, from)) => {
-                let Some(place) = endpoint.receive_stranger(from.ip()) else {
-                    return;
-                };
-                let number = place.number;
-                let task = receive(endpoint.clone(), place, stream, from);
-                let task = tokio::spawn(task).abort_handle();
-                endpoint.stranger_started(number, task);
+                let stream = Arc::new(stream);
+                match endpoint.accept_queue.admit(&endpoint, from.ip(), &stream) {
+                    Ok(place) => serve(&endpoint, place, stream, from),
+                    Err(Full::Closed) => return,
+                    Err(full) => reset(&endpoint, stream, from, full),
+                }
+                let (waiting, left) = endpoint.accept_queue.progress();
+                if pace.pauses(waiting, left) {
+                    sleep(Pace::PAUSE).await;
+                }
             }
             Err(error) => {
                 let before = endpoint
@@ -102,61 +106,244 @@ pub(crate) async fn accept(endpoint: Arc<Endpoint>, listener: TcpListener) {
     }
 }
 
-async fn receive(endpoint: Arc<Endpoint>, place: Stranger, stream: TcpStream, from: SocketAddr) {
+/// The pace of accepting. Accepting a connection is faster than reading a letter, and the letters
+/// that are not accepted yet are safe in the system's queue. So while many connections wait and are
+/// served, accepting pauses in between. A peer that keeps its connections from being served does not
+/// slow down accepting for longer than [`Pace::PATIENCE`] pauses.
+#[derive(Debug, Default)]
+struct Pace {
+    /// Connections that had left the queues at the last pause.
+    left: u64,
+    /// Pauses since one of them left.
+    fruitless: u32,
+}
+
+impl Pace {
+    const PAUSE: Duration = Duration::from_millis(1);
+
+    /// Number of waiting connections from which on there are pauses.
+    const BUSY: usize = 64;
+
+    /// Most pauses in a row in which no connection leaves the queues.
+    const PATIENCE: u32 = 50;
+
+    fn pauses(&mut self, waiting: usize, left: u64) -> bool {
+        if left != self.left {
+            *self = Self { left, fruitless: 0 };
+        }
+        let pauses = waiting >= Self::BUSY && self.fruitless < Self::PATIENCE;
+        if pauses {
+            self.fruitless += 1;
+        }
+        pauses
+    }
+}
+
+/// Starts the task of an accepted connection.
+fn serve(endpoint: &Arc<Endpoint>, place: Place, stream: Arc<TcpStream>, from: SocketAddr) {
+    // The task ends itself when others push it out, so it begins when it has its own handle.
+    let (handle, own) = oneshot::channel();
+    let receiving = receive(endpoint.clone(), place, stream, from, own);
+    let _ended = handle.send(tokio::spawn(receiving).abort_handle());
+}
+
+fn reset(endpoint: &Arc<Endpoint>, stream: Arc<TcpStream>, from: SocketAddr, full: Full) {
+    if let Some(stream) = Arc::into_inner(stream) {
+        endpoint.reset(stream, from, full);
+    }
+}
+
+/// The place of a connection whose first byte is awaited.
+enum Waiting {
+    /// In the accept queue, with its turn.
+    InTurn(Place),
+    /// Among those that have not introduced themselves.
+    Late(Stranger),
+}
+
+/// The first byte of a connection.
+enum First {
+    Byte(u8),
+    /// The peer only checked whether the port is open.
+    End,
+    Broken(io::Error),
+    /// No byte came in time.
+    Silence,
+}
+
+async fn receive(
+    endpoint: Arc<Endpoint>,
+    place: Place,
+    stream: Arc<TcpStream>,
+    from: SocketAddr,
+    own: oneshot::Receiver<AbortHandle>,
+) {
+    let Ok(task) = own.await else {
+        return;
+    };
+    if !place.started(task.clone()) {
+        return;
+    }
     if let Err(error) = prepare(&stream, endpoint.limits()) {
         tracing::debug!(%from, "connection broke at once: {error}");
         return;
     }
-    let patience = endpoint.limits().handshake_timeout;
-    let max_letter = endpoint.limits().max_letter;
+    let Some((waiting, first)) = first_byte(&endpoint, place, &stream, from, &task).await else {
+        return;
+    };
     #[cfg(feature = "secure")]
-    let (stream, place) = match prove(&endpoint, place, stream, from, patience).await {
+    let (waiting, stream) = match prove(&endpoint, waiting, stream, from, &first, &task).await {
         Some(unproved) => unproved,
         None => return,
     };
-    let may_frame = endpoint.config.takes_frames_of(from.ip());
-    let (mut read, write) = stream.into_split();
-    let mut begun = BytesMut::with_capacity(FIRST_READ);
-    let refused = match timeout(patience, read.read_buf(&mut begun)).await {
-        Ok(Ok(1..)) => match begun.first() {
-            Some(first) if *first == MAGIC[0] && may_frame => {
-                let Some((link, sink)) = endpoint.accepted() else {
-                    return;
-                };
-                let reader = FrameReader::new(max_letter, begun);
-                let ends = (Reading::Plain(read), Writing::Plain(write));
-                Running::new(endpoint, link, sink, None)
-                    .serve(ends, Proof::default(), reader, from, || drop(place))
-                    .await;
+    let refused = match first {
+        First::Byte(byte) if byte == MAGIC[0] && endpoint.config.takes_frames_of(from.ip()) => {
+            let Some(place) = waiting.introduces_itself(&endpoint, from, task) else {
                 return;
-            }
-            // A bit-efficient or an XML envelope.
-            Some(0xfe | 0xfd | b'<') => match unframed::read(&endpoint, &mut read, begun).await {
-                Ok(letter) => {
-                    if let Some(ration) = endpoint.ration(from.ip())
-                        && let Some(until) = ration.spend(1, letter.len(), Instant::now())
-                    {
-                        count(&endpoint.tally().held_back);
-                        sleep_until(until.into()).await;
-                    }
-                    unframed::hand_on(&endpoint, letter, from.ip());
-                    return;
-                }
+            };
+            let (Some(stream), Some((link, sink))) = (Arc::into_inner(stream), endpoint.accepted())
+            else {
+                return;
+            };
+            let reader = FrameReader::new(endpoint.limits().max_letter, BytesMut::new());
+            Running::new(endpoint, link, sink, None)
+                .serve(wire::plain(stream), Proof::default(), reader, from, || {
+                    drop(place);
+                })
+                .await;
+            return;
+        }
+        // A bit-efficient or an XML envelope.
+        First::Byte(0xfe | 0xfd | b'<') => {
+            let place = match waiting.takes_turn(&endpoint, from, &stream, task) {
+                Ok(place) => place,
+                Err(full) => return reset(&endpoint, stream, from, full),
+            };
+            match receive_letter(&endpoint, place, stream, from).await {
+                Ok(()) => return,
                 Err(refused) => refused.to_string(),
-            },
-            first => format!("nothing begins with {first:02x?}"),
-        },
-        // Somebody only looked whether the port is open.
-        Ok(Ok(0)) => return,
-        Ok(Err(error)) => {
+            }
+        }
+        First::Byte(byte) => format!("nothing begins with {byte:#04x}"),
+        First::End => return,
+        First::Broken(error) => {
             tracing::debug!(%from, "connection broke at once: {error}");
             return;
         }
-        Err(_) => "no byte came in time".to_owned(),
+        First::Silence => "no byte came in time".to_owned(),
     };
     let counter = &endpoint.tally().refused_nonsense;
     let before = counter.fetch_add(1, Ordering::Relaxed);
     warn_seldom(before, format_args!("{from}: connection closed: {refused}"));
+}
+
+/// Waits for the first byte, which stays in the kernel's buffer. A connection without one loses its
+/// turn. Returns `None` when the endpoint has been closed.
+async fn first_byte(
+    endpoint: &Arc<Endpoint>,
+    place: Place,
+    stream: &TcpStream,
+    from: SocketAddr,
+    task: &AbortHandle,
+) -> Option<(Waiting, First)> {
+    let patience = endpoint.limits().handshake_timeout;
+    let turn = TURN.min(patience);
+    let mut byte = [0];
+    let mut waiting = Waiting::InTurn(place);
+    let mut peeked = timeout(turn, stream.peek(&mut byte)).await;
+    if peeked.is_err() && accept_queue::is_silent(stream) {
+        drop(waiting);
+        waiting = Waiting::Late(stranger(endpoint, from, task.clone())?);
+        peeked = timeout(patience - turn, stream.peek(&mut byte)).await;
+    } else if peeked.is_err() {
+        peeked = Ok(stream.peek(&mut byte).await);
+    }
+    let first = match peeked {
+        Ok(Ok(0)) => First::End,
+        Ok(Ok(_)) => {
+            let [byte] = byte;
+            First::Byte(byte)
+        }
+        Ok(Err(error)) => First::Broken(error),
+        Err(_) => First::Silence,
+    };
+    if let Waiting::InTurn(place) = &waiting {
+        place.has_bytes();
+    }
+    Some((waiting, first))
+}
+
+/// A place among those that have not introduced themselves.
+fn stranger(endpoint: &Arc<Endpoint>, from: SocketAddr, task: AbortHandle) -> Option<Stranger> {
+    let place = endpoint.receive_stranger(from.ip())?;
+    endpoint.stranger_started(place.number, task);
+    Some(place)
+}
+
+impl Waiting {
+    /// Leaves the accept queue, because the peer is going to introduce itself.
+    fn introduces_itself(
+        self,
+        endpoint: &Arc<Endpoint>,
+        from: SocketAddr,
+        task: AbortHandle,
+    ) -> Option<Stranger> {
+        match self {
+            Self::InTurn(place) => {
+                drop(place);
+                stranger(endpoint, from, task)
+            }
+            Self::Late(place) => Some(place),
+        }
+    }
+
+    /// Goes back to the accept queue, behind all others, when the turn has been lost.
+    fn takes_turn(
+        self,
+        endpoint: &Arc<Endpoint>,
+        from: SocketAddr,
+        stream: &Arc<TcpStream>,
+        task: AbortHandle,
+    ) -> Result<Place, Full> {
+        match self {
+            Self::InTurn(place) => Ok(place),
+            Self::Late(stranger) => {
+                drop(stranger);
+                let place = endpoint.accept_queue.admit(endpoint, from.ip(), stream)?;
+                place.has_bytes();
+                if place.started(task) {
+                    Ok(place)
+                } else {
+                    Err(Full::Closed)
+                }
+            }
+        }
+    }
+}
+
+/// Reads a legacy peer's letter when its turn to be read has come, and hands it on when those of its
+/// address that were accepted before it have been.
+async fn receive_letter(
+    endpoint: &Arc<Endpoint>,
+    place: Place,
+    stream: Arc<TcpStream>,
+    from: SocketAddr,
+) -> Result<(), UnframedError> {
+    place.may_read().await;
+    let Some(mut stream) = Arc::into_inner(stream) else {
+        return Ok(());
+    };
+    let letter = unframed::read(endpoint, &mut stream, || place.stalled()).await?;
+    drop(stream);
+    place.is_first().await;
+    if let Some(ration) = endpoint.ration(from.ip())
+        && let Some(until) = ration.spend(1, letter.len(), Instant::now())
+    {
+        count(&endpoint.tally().held_back);
+        sleep_until(until.into()).await;
+    }
+    unframed::hand_on(endpoint, letter, from.ip());
+    Ok(())
 }
 
 /// Has a peer prove who it is, and serves it to its end; or gives back the connection of one that
@@ -164,18 +351,20 @@ async fn receive(endpoint: Arc<Endpoint>, place: Stranger, stream: TcpStream, fr
 #[cfg(feature = "secure")]
 async fn prove(
     endpoint: &Arc<Endpoint>,
-    place: Stranger,
-    stream: TcpStream,
+    waiting: Waiting,
+    stream: Arc<TcpStream>,
     from: SocketAddr,
-    patience: Duration,
-) -> Option<(TcpStream, Stranger)> {
+    first: &First,
+    task: &AbortHandle,
+) -> Option<(Waiting, Arc<TcpStream>)> {
     let Some(security) = &endpoint.config.security else {
-        return Some((stream, place));
+        return Some((waiting, stream));
     };
-    let mut first = [0];
-    let refused = match timeout(patience, stream.peek(&mut first)).await {
-        Ok(Ok(1..)) if first == [tls::FIRST_BYTE] => {
-            match tls::accept(security, stream, patience).await {
+    let patience = endpoint.limits().handshake_timeout;
+    let refused = match first {
+        First::Byte(tls::FIRST_BYTE) => {
+            let place = waiting.introduces_itself(endpoint, from, task.clone())?;
+            match tls::accept(security, Arc::into_inner(stream)?, patience).await {
                 Ok(secured) => {
                     let (link, sink) = endpoint.accepted()?;
                     let proof = Proof::of(security, secured.certificate);
@@ -188,14 +377,13 @@ async fn prove(
                 Err(why) => why,
             }
         }
-        Ok(Ok(1..)) if !security.covers(from.ip()) || security.excepts(from.ip()) => {
-            return Some((stream, place));
+        First::Byte(_) if !security.covers(from.ip()) || security.excepts(from.ip()) => {
+            return Some((waiting, stream));
         }
-        Ok(Ok(1..)) => "it did not prove who is there".to_owned(),
-        // Somebody only looked whether the port is open.
-        Ok(Ok(0)) => return None,
-        Ok(Err(error)) => error.to_string(),
-        Err(_) => "no byte came in time".to_owned(),
+        First::Byte(_) => "it did not prove who is there".to_owned(),
+        First::End => return None,
+        First::Broken(error) => error.to_string(),
+        First::Silence => "no byte came in time".to_owned(),
     };
     let counter = &endpoint.tally().refused_unproved;
     let before = counter.fetch_add(1, Ordering::Relaxed);
@@ -204,4 +392,22 @@ async fn prove(
         format_args!("{from}: connection refused: {refused}"),
     );
     None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn accepting_pauses_while_many_wait_and_are_served() {
+        let mut pace = Pace::default();
+        assert!(!pace.pauses(Pace::BUSY - 1, 0));
+        for left in 0..1000 {
+            assert!(pace.pauses(Pace::BUSY, left));
+        }
+        // Nothing is served any more.
+        let pauses = (0..1000).filter(|_| pace.pauses(500, 999)).count();
+        assert_eq!(pauses as u32, Pace::PATIENCE - 1);
+        assert!(pace.pauses(500, 1000));
+    }
 }

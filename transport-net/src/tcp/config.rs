@@ -65,10 +65,19 @@ pub struct Limits {
     pub max_letter: usize,
     /// Most connections whose peer has introduced itself, or that this side opened. Default 256.
     pub max_connections: usize,
-    /// Most accepted connections that have not introduced themselves (an old peer never does).
-    /// One more pushes out the oldest of the address (with IPv6, the network of 64 bits) that has the
-    /// most. Default 64.
+    /// Maximum number of accepted connections that have not introduced themselves: those whose
+    /// handshake has begun and those that have been silent for 250 ms. One more pushes out the oldest
+    /// of the address (with IPv6, the network of 64 bits) that has the most. Default 64. As many
+    /// letters of legacy peers are read at once, and one of each address in any case.
     pub max_strangers: usize,
+    /// Maximum number of legacy peers' letters of one address that are read at once. Default 32.
+    pub max_reads_per_address: usize,
+    /// Maximum number of connections of one address that wait unread beside these, in the order of
+    /// acceptance. The next one pushes out the oldest that has sent nothing; when all have sent
+    /// something, the next one itself is reset. Default 512.
+    pub max_unread_per_address: usize,
+    /// The same for all addresses together. Default 1024.
+    pub max_unread: usize,
     /// Most connections that the peers at one address have opened and introduced themselves on.
     /// Default 64. This and the next two are not for loopback addresses, unless peers there have to
     /// prove who they are, too.
@@ -119,6 +128,9 @@ impl Default for Limits {
             max_letter: 64 << 20,
             max_connections: 256,
             max_strangers: 64,
+            max_reads_per_address: 32,
+            max_unread_per_address: 512,
+            max_unread: 1024,
             max_per_address: 64,
             peer_letters: 20_000,
             peer_bytes: 256 << 20,

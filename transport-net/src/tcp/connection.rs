@@ -7,11 +7,11 @@
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::io::IoSlice;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use fipa_acl::{EnvelopeView, Letter, MessageView};
 use fipa_transport::{
-    Answer, AttemptId, Body, Conclusion, Incarnation, Parcel, WayError, WayFault,
+    Abandoned, Answer, AttemptId, Body, Conclusion, Incarnation, Parcel, WayError, WayFault,
 };
 
 use super::config::Limits;
@@ -106,6 +106,8 @@ struct Clock {
     /// When something last went on that makes the connection useful.
     busy: Instant,
     pinged: bool,
+    /// Since when the connection is in doubt; see [`Connection::doubt`].
+    doubted: Option<Instant>,
     /// Since when a frame has been half arrived, and the bytes that came since.
     partial: Option<(Instant, u64)>,
 }
@@ -140,6 +142,7 @@ impl Connection {
                 written: now,
                 busy: now,
                 pinged: false,
+                doubted: None,
                 partial: None,
             },
         }
@@ -259,17 +262,20 @@ impl Connection {
         Ok(())
     }
 
-    /// Forgets an attempt: it is not sent if that can still be helped, and not concluded.
-    pub(crate) fn abandon(&mut self, attempt: AttemptId) {
+    /// Ends an attempt: it is not sent if the kernel has taken nothing of it.
+    pub(crate) fn abandon(&mut self, attempt: AttemptId) -> Abandoned {
         let Some(id) = self.attempts.remove(&attempt) else {
-            return;
+            return Abandoned::Unconfirmed;
         };
         if self.outbox.remove_parcel(id) {
             self.sent.remove(&id);
-        } else if let Some(sent) = self.sent.get_mut(&id) {
+            return Abandoned::NotSent;
+        }
+        if let Some(sent) = self.sent.get_mut(&id) {
             // The peer counts it until it has answered, so it goes on filling the window.
             sent.attempt = None;
         }
+        Abandoned::Unconfirmed
     }
 
     /// Answers a parcel that arrived. Unknown ones are ignored.
@@ -286,11 +292,44 @@ impl Connection {
     pub(crate) fn received(&mut self, bytes: usize, partial: bool, now: Instant) {
         self.clock.received = now;
         self.clock.pinged = false;
+        self.clock.doubted = None;
         self.clock.partial = match (self.clock.partial, partial) {
             (_, false) => None,
             (None, true) => Some((now, 0)),
             (Some((since, before)), true) => Some((since, before.saturating_add(bytes as u64))),
         };
+    }
+
+    /// There is reason to believe that the peer is elsewhere by now: it is asked for a sign of life,
+    /// with less patience than usual. Does nothing when the peer has been heard within `quiet`.
+    /// Returns whether the connection is in doubt.
+    pub(crate) fn doubt(&mut self, now: Instant, quiet: Duration) -> bool {
+        if self.ended || self.peer.is_none() || now < self.clock.received + quiet {
+            return false;
+        }
+        if self.clock.doubted.is_none() {
+            self.clock.doubted = Some(now);
+            if !self.clock.pinged {
+                self.push_control(frame::ping());
+            }
+        }
+        true
+    }
+
+    /// How long a peer in doubt has to give a sign of life.
+    pub(crate) fn doubt_patience(&self) -> Duration {
+        self.limits.keep_alive / 4
+    }
+
+    /// When a connection in doubt is given up. While something waits to be written, bytes that the
+    /// kernel still takes show that the peer reads.
+    fn doubt_due(&self) -> Option<Instant> {
+        let doubted = self.clock.doubted?;
+        let since = match self.is_flushed() {
+            true => doubted,
+            false => doubted.max(self.clock.written),
+        };
+        Some(since + self.doubt_patience())
     }
 
     /// Takes a frame from the peer.
@@ -381,7 +420,10 @@ impl Connection {
         let idle = self
             .is_idle()
             .then(|| self.clock.busy + self.limits.idle_close);
-        [stalled, Some(alive), idle].into_iter().flatten().min()
+        [stalled, Some(alive), idle, self.doubt_due()]
+            .into_iter()
+            .flatten()
+            .min()
     }
 
     /// Does what is due.
@@ -410,6 +452,9 @@ impl Connection {
         if self.is_idle() && now >= self.clock.busy + self.limits.idle_close {
             self.retiring = true;
             return Err(End::Idle);
+        }
+        if self.doubt_due().is_some_and(|due| now >= due) {
+            return Err(End::Silent);
         }
         if now >= self.sign_of_life_due() {
             if self.clock.pinged {
@@ -570,7 +615,7 @@ impl Connection {
 pub(crate) fn letter_len(parcel: &Parcel) -> u64 {
     match &parcel.body {
         Body::Letter(letter) => letter.len() as u64,
-        Body::Report(_) | Body::Credit => 0,
+        Body::Report(_) | Body::Credit | Body::Predecessor => 0,
     }
 }
 

@@ -19,7 +19,7 @@ fn parcel(sequence: u64, len: usize) -> Parcel {
         sequence,
         after: 0,
         remaining: Duration::from_secs(1),
-        hops: 0,
+        transfer: 0,
         body: Body::Letter(Letter::new(
             Bytes::from_static(b"e"),
             Bytes::from(vec![7; len]),
@@ -420,6 +420,46 @@ fn silence_is_asked_about_and_then_ends_it() {
     a.connection.handle_timeout(now).unwrap();
     a.transmit(usize::MAX, &mut b.coming, now);
     now += keep_alive;
+    assert_eq!(a.connection.handle_timeout(now), Err(End::Silent));
+}
+
+#[test]
+fn a_peer_in_doubt_has_a_quarter_of_the_usual_time() {
+    let start = Instant::now();
+    let (mut a, mut b) = greeted(start);
+    let patience = limits().keep_alive / 4;
+    assert!(!a.connection.doubt(start, patience), "heard a moment ago");
+    // A peer that answers stays.
+    let mut now = start + patience;
+    assert!(a.connection.doubt(now, patience));
+    settle(&mut a, &mut b, now);
+    now += patience;
+    a.connection.handle_timeout(now).unwrap();
+    // One that does not is given up; doubting again grants no more time.
+    assert!(a.connection.doubt(now, Duration::ZERO));
+    a.transmit(usize::MAX, &mut b.coming, now);
+    let due = a.connection.poll_timeout().unwrap();
+    assert_eq!(due, now + patience);
+    now += patience / 2;
+    assert!(a.connection.doubt(now, Duration::ZERO));
+    a.connection.handle_timeout(now).unwrap();
+    assert_eq!(a.connection.handle_timeout(due), Err(End::Silent));
+}
+
+#[test]
+fn a_peer_in_doubt_that_still_reads_is_not_given_up() {
+    let start = Instant::now();
+    let (mut a, _b) = greeted(start);
+    a.dispatch(4000).unwrap();
+    let patience = limits().keep_alive / 4;
+    assert!(a.connection.doubt(start, Duration::ZERO));
+    let mut now = start;
+    for _ in 0..10 {
+        now += patience / 2;
+        a.transmit(100, &mut BytesMut::new(), now);
+        a.connection.handle_timeout(now).unwrap();
+    }
+    now += patience;
     assert_eq!(a.connection.handle_timeout(now), Err(End::Silent));
 }
 

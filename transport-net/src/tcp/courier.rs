@@ -12,7 +12,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use fipa_acl::Letter;
 use fipa_transport::{
-    AttemptId, Body, Conclusion, Location, Parcel, Signature, Sink, WayError, WayFault,
+    Abandoned, AttemptId, Body, Conclusion, Location, Parcel, Signature, Sink, WayError, WayFault,
 };
 use parking_lot::Mutex;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -47,6 +47,8 @@ struct Queue {
     bytes: usize,
     /// The letter whose connection is open or being opened.
     current: Option<AttemptId>,
+    /// Whether the first byte of the current letter has been written, or is about to be.
+    begun: bool,
 }
 
 #[derive(Debug)]
@@ -108,16 +110,31 @@ impl Couriers {
         Ok(fresh)
     }
 
-    pub(crate) fn abandon(&self, attempt: AttemptId) {
+    /// Ends an attempt: the letter is not sent if nothing of it has been written.
+    pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
         for queue in self.queues.lock().values_mut() {
             if queue.current == Some(attempt) {
                 queue.current = None;
+                return match queue.begun {
+                    true => Abandoned::Unconfirmed,
+                    false => Abandoned::NotSent,
+                };
             }
             let place = queue.waiting.iter().position(|e| e.attempt == attempt);
             if let Some(errand) = place.and_then(|place| queue.waiting.remove(place)) {
                 queue.bytes -= errand.letter.len();
+                return Abandoned::NotSent;
             }
         }
+        Abandoned::Unconfirmed
+    }
+
+    /// The first byte of the current letter is about to be written. Returns false when the letter
+    /// was abandoned, and must not be sent.
+    fn begin(&self, to: &Location) -> bool {
+        let mut queues = self.queues.lock();
+        let wanted = queues.get_mut(to).filter(|queue| queue.current.is_some());
+        wanted.map(|queue| queue.begun = true).is_some()
     }
 
     /// Takes back the first letter for a location. Says whether its task had not begun.
@@ -144,6 +161,7 @@ impl Couriers {
             Some(errand) => {
                 queue.bytes -= errand.letter.len();
                 queue.current = Some(errand.attempt);
+                queue.begun = false;
                 Some(errand)
             }
             None => {
@@ -283,6 +301,10 @@ async fn deliver(round: &Round, errand: &Errand, begun: &Mutex<bool>) -> Conclus
     }
     if let Err(error) = prepare(&stream, endpoint.limits()) {
         return Conclusion::NotSent(WayError::new(WayFault::Broken, error));
+    }
+    if !endpoint.couriers.begin(to) {
+        let detail = "the letter was abandoned";
+        return Conclusion::NotSent(WayError::new(WayFault::TimedOut, detail));
     }
     for piece in letter {
         let patience = endpoint.limits().stall_timeout;

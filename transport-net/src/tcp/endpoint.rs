@@ -10,29 +10,34 @@
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap};
 use std::net::{IpAddr, SocketAddr};
-use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::time::Instant;
+use std::sync::{Arc, Weak};
+use std::time::{Duration, Instant};
 
 use fipa_transport::{
-    Answer, AttemptId, Hop, Incarnation, Kind, ListenError, Location, Parcel, Sink, Ticket,
-    WayError, WayFault,
+    Abandoned, Answer, AttemptId, Hop, Incarnation, Kind, ListenError, Location, Parcel, Sink,
+    Ticket, WayError, WayFault,
 };
 use parking_lot::Mutex;
+use socket2::SockRef;
+use tokio::net::TcpStream;
 use tokio::runtime::Handle;
 use tokio::task::{AbortHandle, JoinHandle};
+use tokio::time::sleep;
 
+use super::accept_queue::{AcceptQueue, Full};
 use super::config::{Limits, TcpConfig};
 use super::connection::{Connection, Role, SendError, letter_len};
 use super::counters::{Tally, count};
 use super::courier::{self, Couriers};
 use super::link::{Link, MAX_LINKS, of_ticket};
 use super::place::Rooms;
-use crate::address;
+use crate::address::{self, Listening};
 use crate::end::End;
 use crate::hello::Hello;
+use crate::interfaces::Changes;
 use crate::ration::{Ration, Rations, whose};
-use crate::seldom::warn_seldom;
+use crate::seldom::{PerSecond, warn_seldom};
 
 #[derive(Debug)]
 pub(crate) struct Endpoint {
@@ -41,6 +46,10 @@ pub(crate) struct Endpoint {
     pub(crate) runtime: Handle,
     /// Letters to old peers.
     pub(crate) couriers: Couriers,
+    /// Accepted connections that may bring a letter of a legacy peer.
+    pub(crate) accept_queue: AcceptQueue,
+    /// Connections that were reset because the accept queue was full.
+    resets: PerSecond,
     /// What is taken for content that is arriving.
     pub(crate) rooms: Rooms,
     /// What peers may still send.
@@ -53,7 +62,8 @@ pub(crate) struct Endpoint {
 struct Registry {
     phase: Phase,
     sink: Option<Arc<dyn Sink>>,
-    listening: Vec<String>,
+    listening: Listening,
+    /// The tasks that accept connections, and the one that watches the interfaces.
     listeners: Vec<AbortHandle>,
     /// Connections that were dialled, or whose peer has said hello.
     links: HashMap<u32, Arc<Link>>,
@@ -65,6 +75,8 @@ struct Registry {
     inbound: HashMap<Inbound, (u64, Arc<Link>)>,
     /// Whose the accepted ones are.
     homes: HashMap<u32, IpAddr>,
+    /// The address at which the peer of a link was when it introduced itself.
+    places: HashMap<u32, IpAddr>,
     /// Accepted connections that have not introduced themselves, oldest first, and whose they are.
     strangers: BTreeMap<u64, (IpAddr, Option<AbortHandle>)>,
     last_stranger: u64,
@@ -116,6 +128,8 @@ impl Endpoint {
             config,
             runtime,
             couriers: Couriers::default(),
+            accept_queue: AcceptQueue::default(),
+            resets: PerSecond::default(),
             rooms: Rooms::default(),
             rations: Rations::default(),
             tally: Tally::default(),
@@ -142,15 +156,16 @@ impl Endpoint {
         self.registry.lock().sink.clone()
     }
 
-    /// Begins to exist: opens a socket at every address of the configuration with `open`, which
-    /// says where it is reached too, and has `accept` start the task that serves it.
+    /// Opens a socket at every address of the configuration with `open`, which returns the address
+    /// that the socket is bound to as well, and has `accept` start the task that serves it. Returns
+    /// where the endpoint is reached at present; the sink is told when that changes.
     ///
     /// # Errors
-    /// When it was opened before, or one of them cannot be.
+    /// When the endpoint was opened before, or a socket cannot be opened.
     pub(crate) fn listen<S>(
-        &self,
+        self: &Arc<Self>,
         sink: Arc<dyn Sink>,
-        open: impl Fn(&str) -> Result<(S, Vec<SocketAddr>), ListenError>,
+        open: impl Fn(&str) -> Result<(S, SocketAddr), ListenError>,
         accept: impl Fn(S) -> JoinHandle<()>,
     ) -> Result<Vec<Location>, ListenError> {
         if self.registry.lock().phase != Phase::New {
@@ -161,18 +176,22 @@ impl Endpoint {
             return Err(ListenError::Unavailable(fault));
         }
         let _inside = self.runtime.enter();
-        let (mut sockets, mut listening) = (Vec::new(), Vec::new());
+        let (mut sockets, mut bound) = (Vec::new(), Vec::new());
         for text in &self.config.listen {
-            let (socket, reachable) = open(text)?;
-            listening.extend(reachable.iter().map(ToString::to_string));
+            let (socket, address) = open(text)?;
+            bound.push(address);
             sockets.push(socket);
         }
-        let locations = listening
+        let unavailable =
+            |error: &dyn std::fmt::Display| ListenError::Unavailable(error.to_string());
+        // Subscribed before the interfaces are listed, so that no change is missed.
+        let changes = bound
             .iter()
-            .map(|text| Location::new(self.kind, text))
-            .map(|location| location.map(|it| it.with_incarnation(identity.incarnation)))
-            .collect::<Result<_, _>>()
-            .map_err(|error| ListenError::Unavailable(error.to_string()))?;
+            .any(|bound| !bound.ip().is_loopback())
+            .then(Changes::subscribe);
+        let listening = Listening::new(bound).map_err(|error| unavailable(&error))?;
+        let locations = listening.locations(self.kind, identity.incarnation);
+        let locations = locations.map_err(|error| unavailable(&error))?;
         let mut registry = self.registry.lock();
         if registry.phase != Phase::New {
             return Err(ListenError::OpenedBefore);
@@ -181,18 +200,65 @@ impl Endpoint {
         registry.sink = Some(sink);
         registry.listening = listening;
         let tasks = sockets.into_iter().map(accept);
-        registry.listeners = tasks.map(|task| task.abort_handle()).collect();
+        let watch = changes.map(|changes| {
+            let watch = follow_interfaces(Arc::downgrade(self), changes);
+            self.runtime.spawn(watch)
+        });
+        registry.listeners = tasks.chain(watch).map(|task| task.abort_handle()).collect();
         Ok(locations)
     }
 
     /// Where others reach this endpoint at the address that a socket of it has, as a URL.
     pub(crate) fn reachable_at(&self, local: SocketAddr) -> Option<String> {
-        courier::listening_at(&self.registry.lock().listening, local)
+        courier::listening_at(&self.registry.lock().listening.texts(), local)
+    }
+
+    /// The interfaces of this host have changed: tells the sink where the endpoint is reached now,
+    /// and ends the connections of addresses that this host has no more, on which nothing can
+    /// arrive.
+    fn interfaces_changed(&self) {
+        let (sink, told, lost, links) = {
+            let mut registry = self.registry.lock();
+            let moved = match registry.listening.refresh() {
+                Ok(moved) => moved,
+                Err(error) => {
+                    tracing::warn!(kind = %self.kind, %error, "the locations stay as they were");
+                    return;
+                }
+            };
+            let incarnation = self.config.identity.incarnation;
+            let told = moved
+                .relocated
+                .then(|| registry.listening.locations(self.kind, incarnation));
+            let links: Vec<_> = match moved.lost.is_empty() {
+                true => Vec::new(),
+                false => registry.links.values().cloned().collect(),
+            };
+            (registry.sink.clone(), told, moved.lost, links)
+        };
+        for link in links {
+            if let Some(ip) = link.local_ip()
+                && lost.contains(&ip)
+            {
+                let what = format!("this host no longer has the address {ip}");
+                link.leave(End::Broken(what));
+                // What is dispatched from now on needs another connection.
+                self.forget(&link);
+            }
+        }
+        match (sink, told) {
+            (Some(sink), Some(Ok(locations))) => sink.relocated(locations),
+            (_, Some(Err(error))) => {
+                tracing::warn!(kind = %self.kind, %error, "the locations stay as they were");
+            }
+            _ => {}
+        }
     }
 
     /// Ends everything. The connections' tasks conclude what is outstanding.
     pub(crate) fn close(&self) {
         self.couriers.close();
+        self.accept_queue.close();
         let (links, tasks) = {
             let mut registry = self.registry.lock();
             registry.phase = Phase::Closed;
@@ -279,12 +345,13 @@ impl Endpoint {
             _ => return Err(End::Closed.after()),
         };
         let known = registry.known.get(&to.incarnation());
-        let there = registry
-            .dialled
-            .get(to)
-            .or_else(|| known.and_then(|links| links.first()));
-        if let Some(link) = there {
+        if let Some(link) = registry.dialled.get(to) {
             return Ok(Way::There(link.clone()));
+        }
+        if let Some(link) = known.and_then(|links| links.first()).cloned() {
+            drop(registry);
+            link.is_used_for(to);
+            return Ok(Way::There(link));
         }
         if registry.links.len() >= self.limits().max_connections {
             return Err(End::Crowd.after());
@@ -309,13 +376,14 @@ impl Endpoint {
         }
     }
 
-    /// Nobody waits for the end of this attempt any more.
-    pub(crate) fn abandon(&self, attempt: AttemptId) {
+    /// Ends an attempt, on whichever connection it is.
+    pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
         let links: Vec<_> = self.registry.lock().links.values().cloned().collect();
-        for link in links {
-            link.abandon(attempt);
+        let unsent = |link: &Arc<Link>| link.abandon(attempt) == Abandoned::NotSent;
+        if links.iter().any(unsent) {
+            return Abandoned::NotSent;
         }
-        self.couriers.abandon(attempt);
+        self.couriers.abandon(attempt)
     }
 
     /// A link for a connection that was accepted, unless the endpoint has been closed.
@@ -339,7 +407,7 @@ impl Endpoint {
             max_in_flight: u32::try_from(self.limits().max_in_flight.max(1)).unwrap_or(u32::MAX),
             serial,
             dialled,
-            listening: registry.listening.clone(),
+            listening: registry.listening.texts(),
         };
         loop {
             registry.last_number = (registry.last_number + 1) % MAX_LINKS;
@@ -368,6 +436,7 @@ impl Endpoint {
             dialled: peer.dialled.clone(),
         };
         let mut superseded = None;
+        let mut others: Vec<Arc<Link>>;
         {
             let mut registry = self.registry.lock();
             if registry.phase != Phase::Open {
@@ -399,9 +468,21 @@ impl Endpoint {
                 let this = (peer.serial, link.clone());
                 registry.inbound.insert(inbound, this);
             }
+            registry.places.insert(link.number, from.ip());
             let known = registry.known.entry(incarnation).or_default();
+            others = known.clone();
             known.push(link.clone());
             count(&self.tally.connections);
+            let elsewhere = |other: &Arc<Link>| {
+                let place = registry.places.get(&other.number);
+                place.is_some_and(|place| *place != from.ip())
+            };
+            others.retain(elsewhere);
+        }
+        // The peer may have moved here. Asked, because a stranger must not end the connections of
+        // the service that it claims to be.
+        for other in others {
+            other.doubt();
         }
         if let Some(superseded) = superseded {
             // What the peer sent on its connection before this one must not arrive after what it
@@ -441,6 +522,7 @@ impl Endpoint {
         {
             registry.links.remove(&link.number);
             registry.homes.remove(&link.number);
+            registry.places.remove(&link.number);
         }
         let is_other = |other: &Arc<Link>| !Arc::ptr_eq(other, link);
         registry.dialled.retain(|_, other| is_other(other));
@@ -494,6 +576,46 @@ impl Endpoint {
         self.registry.lock().strangers.len() * 2 >= self.limits().max_strangers
     }
 
+    /// Resets a connection for which the accept queue has no room, so that its sender sees an error.
+    pub(crate) fn reset(self: &Arc<Self>, stream: TcpStream, from: SocketAddr, full: Full) {
+        let limits = self.limits();
+        let (whose, most) = match full {
+            Full::Address => ("of its address", limits.max_unread_per_address),
+            Full::All => ("of all addresses", limits.max_unread),
+            Full::Closed => return,
+        };
+        count(&self.tally.refused_crowd);
+        // Without the time to linger, closing sends a reset.
+        if let Err(error) = SockRef::from(&stream).set_linger(Some(Duration::ZERO)) {
+            tracing::debug!(%from, "cannot reset a connection: {error}");
+        }
+        drop(stream);
+        if !self.resets.count() {
+            return;
+        }
+        tracing::warn!(
+            %from,
+            "connection reset: {most} connections {whose} wait to be read; a letter on it is lost, let \
+             its sender send more slowly"
+        );
+        let endpoint = Arc::downgrade(self);
+        self.runtime.spawn(async move {
+            loop {
+                sleep(Duration::from_secs(1)).await;
+                let Some(endpoint) = endpoint.upgrade() else {
+                    return;
+                };
+                let Some(resets) = endpoint.resets.take() else {
+                    return;
+                };
+                tracing::warn!(
+                    resets,
+                    "connections reset within a second: too many wait to be read"
+                );
+            }
+        });
+    }
+
     /// The stranger with this number is served by this task.
     pub(crate) fn stranger_started(&self, number: u64, task: AbortHandle) {
         // Otherwise it is no stranger any more, or gone.
@@ -517,6 +639,17 @@ impl Registry {
         }
         let most = homes.into_values().max();
         most.map(|(_, Reverse(oldest))| oldest)
+    }
+}
+
+/// Tells an endpoint of changes of the interfaces, until it is gone or the task is aborted.
+async fn follow_interfaces(endpoint: Weak<Endpoint>, mut changes: Changes) {
+    loop {
+        changes.next().await;
+        match endpoint.upgrade() {
+            Some(endpoint) => endpoint.interfaces_changed(),
+            None => return,
+        }
     }
 }
 

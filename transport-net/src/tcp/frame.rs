@@ -44,7 +44,7 @@ struct FrameHeader {
 
 pub(crate) const HEADER_LEN: usize = size_of::<FrameHeader>();
 pub(crate) const MAGIC: [u8; 4] = *b"fipa";
-const VERSION: u8 = 1;
+const VERSION: u8 = 2;
 
 const HELLO: u8 = 1;
 const PARCEL: u8 = 2;

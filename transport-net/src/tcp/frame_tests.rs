@@ -23,7 +23,7 @@ fn letter_parcel(head: Vec<u8>, content: Vec<u8>) -> Parcel {
         sequence: 1,
         after: 1,
         remaining: Duration::from_secs(1),
-        hops: 0,
+        transfer: 0,
         body: Body::Letter(Letter::new(Bytes::from_static(b"envelope"), payload)),
     }
 }
@@ -241,11 +241,11 @@ fn what_is_no_frame_is_refused_at_once() {
     let refused = |bytes: &[u8]| read(&mut reader(1 << 20), bytes, &[1]).unwrap_err();
     assert_eq!(refused(b"GET / HTTP/1.1"), FrameError::Magic(*b"G\0\0\0"));
     assert_eq!(refused(b"fipx"), FrameError::Magic(*b"fipx"));
-    assert_eq!(refused(&header(2, HELLO, 0)), FrameError::Version(2));
+    assert_eq!(refused(&header(1, HELLO, 0)), FrameError::Version(1));
     assert_eq!(refused(&header(VERSION, 77, 0)), FrameError::Kind(77));
     for (kind, len) in [
         (HELLO, MAX_HELLO as u64 + 1),
-        (PARCEL, 63),
+        (PARCEL, 71),
         (PARCEL, (1 << 20) + PARCEL_ALLOWANCE + 1),
         (PARCEL, u64::MAX),
         (ANSWER, MAX_ANSWER as u64 + 1),
@@ -255,8 +255,8 @@ fn what_is_no_frame_is_refused_at_once() {
         let error = refused(&header(VERSION, kind, len));
         assert!(matches!(error, FrameError::Length { .. }), "{kind} {len}");
     }
-    let mut parcel = header(VERSION, PARCEL, 64);
-    parcel.extend([0; 64]);
+    let mut parcel = header(VERSION, PARCEL, 72);
+    parcel.extend([0; 72]);
     assert_eq!(refused(&parcel), FrameError::Parcel(WireError::Name));
 }
 

@@ -5,13 +5,14 @@
 //! the sink.
 
 use std::io::{self, IoSlice};
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use fipa_transport::{
-    Answer, Arriving, AttemptId, Body, FailureReason, Introduction, Location, Parcel, Sink, Ticket,
+    Abandoned, Answer, Arriving, AttemptId, Body, FailureReason, Introduction, Location, Parcel,
+    Sink, Ticket,
 };
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
@@ -54,6 +55,8 @@ struct State {
     writer: Option<Arc<Writing>>,
     /// Why the task is to end the connection.
     ending: Option<End>,
+    /// Where the peer has been found to be, of what it was last looked for.
+    leads_to: Option<Location>,
 }
 
 /// How far writing got.
@@ -73,6 +76,7 @@ impl Link {
                 connection,
                 writer: None,
                 ending: None,
+                leads_to: None,
             }),
             wake: Notify::new(),
             over: watch::Sender::new(false),
@@ -103,8 +107,8 @@ impl Link {
         Ok(())
     }
 
-    pub(crate) fn abandon(&self, attempt: AttemptId) {
-        self.state.lock().connection.abandon(attempt);
+    pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
+        self.state.lock().connection.abandon(attempt)
     }
 
     /// Answers a parcel that arrived on this link, by its number.
@@ -114,10 +118,42 @@ impl Link {
         self.flush(&mut state);
     }
 
+    /// The peer is looked for at a location that this connection was not opened for. When the peer
+    /// did not list that address it may have moved there, so the connection is in doubt.
+    pub(crate) fn is_used_for(&self, to: &Location) {
+        let mut state = self.state.lock();
+        if state.leads_to.as_ref() == Some(to) {
+            return;
+        }
+        let peer = state.connection.peer();
+        let listed = peer.is_some_and(|peer| peer.listening.iter().any(|it| it == to.address()));
+        let quiet = state.connection.doubt_patience();
+        if listed || state.connection.doubt(Instant::now(), quiet) {
+            state.leads_to = Some(to.clone());
+        }
+        if !listed {
+            self.flush(&mut state);
+            self.wake.notify_one();
+        }
+    }
+
+    /// Another connection with the same service comes from another address.
+    pub(crate) fn doubt(&self) {
+        let mut state = self.state.lock();
+        state.connection.doubt(Instant::now(), Duration::ZERO);
+        self.flush(&mut state);
+        self.wake.notify_one();
+    }
+
     /// Asks the task to end the connection.
     pub(crate) fn leave(&self, end: End) {
         self.state.lock().ending.get_or_insert(end);
         self.wake.notify_one();
+    }
+
+    /// The address of this host that the connection stays with; see [`Writing::local_ip`].
+    pub(crate) fn local_ip(&self) -> Option<IpAddr> {
+        self.state.lock().writer.as_ref()?.local_ip()
     }
 
     /// Waits until somebody asks for the end.

@@ -4,10 +4,12 @@
 //! * [`connection`] with its [`outbox`]: the protocol of one connection, without socket or clock.
 //! * [`link`]: a connection with its socket; [`dial`] and [`accept`] make them.
 //! * [`endpoint`]: what the connections share.
+//! * [`accept_queue`]: the order in which accepted connections are read.
 //! * [`unframed`]: letters of old peers, on the same port.
 //! * [`courier`]: letters to old peers, in their [`dialect`].
 
 pub(crate) mod accept;
+mod accept_queue;
 pub(crate) mod config;
 mod connection;
 pub(crate) mod counters;
@@ -28,8 +30,8 @@ pub(crate) mod wire;
 use std::sync::Arc;
 
 use fipa_transport::{
-    Answer, AttemptId, Kind, ListenError, Location, Parcel, Signature, Sink, Ticket, Transport,
-    WayError, WayFault,
+    Abandoned, Answer, AttemptId, Kind, ListenError, Location, Parcel, Signature, Sink, Ticket,
+    Transport, WayError, WayFault,
 };
 use tokio::runtime::Handle;
 
@@ -123,8 +125,8 @@ impl Transport for TcpTransport {
         })
     }
 
-    fn abandon(&self, attempt: AttemptId) {
-        self.endpoint.abandon(attempt);
+    fn abandon(&self, attempt: AttemptId) -> Abandoned {
+        self.endpoint.abandon(attempt)
     }
 
     fn answer(&self, ticket: Ticket, answer: Answer) {

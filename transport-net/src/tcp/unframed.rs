@@ -9,9 +9,13 @@ use fipa_transport::Kind;
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::time::{Instant, timeout_at};
 
+use super::accept_queue::TURN;
 use super::config::Limits;
 use super::counters::count;
 use super::endpoint::Endpoint;
+
+/// Bytes read at first.
+const FIRST_READ: usize = 4096;
 
 /// Why an old peer's letter is not taken.
 #[derive(Debug, thiserror::Error)]
@@ -29,14 +33,14 @@ pub(crate) enum UnframedError {
     Standard(#[from] EncodeError),
 }
 
-/// Reads a letter that has `begun` to its end. Its envelope is brought into the standard dialect;
-/// the message behind it is not touched.
+/// Reads a letter to its end. Its envelope is brought into the standard dialect; the message behind
+/// it is not touched. Calls `stalled` whenever no byte has come for [`TURN`].
 pub(crate) async fn read(
     endpoint: &Endpoint,
     source: &mut (impl AsyncRead + Unpin),
-    begun: BytesMut,
+    stalled: impl FnMut(),
 ) -> Result<Letter, UnframedError> {
-    let whole = read_to_end(endpoint.limits(), source, begun).await?;
+    let whole = read_to_end(endpoint.limits(), source, stalled).await?;
     let (envelope, length) = Envelope::decode(&whole)?;
     let message = whole.slice(length.min(whole.len())..);
     let envelope = with_stamped_extensions(envelope).encode_standard()?;
@@ -102,8 +106,9 @@ pub(crate) fn hand_on(endpoint: &Endpoint, letter: Letter, from: IpAddr) {
 async fn read_to_end(
     limits: &Limits,
     source: &mut (impl AsyncRead + Unpin),
-    mut bytes: BytesMut,
+    mut stalled: impl FnMut(),
 ) -> Result<Bytes, UnframedError> {
+    let mut bytes = BytesMut::with_capacity(FIRST_READ);
     let mut window = (Instant::now() + limits.stall_timeout, bytes.len());
     loop {
         if bytes.len() > limits.max_letter {
@@ -112,10 +117,12 @@ async fn read_to_end(
         if bytes.len() == bytes.capacity() {
             bytes.reserve(bytes.len().max(4096));
         }
-        match timeout_at(window.0, source.read_buf(&mut bytes)).await {
+        let turn = Instant::now() + TURN;
+        match timeout_at(window.0.min(turn), source.read_buf(&mut bytes)).await {
             Ok(Ok(0)) => return Ok(bytes.freeze()),
             Ok(Ok(_)) => {}
             Ok(Err(error)) => return Err(error.into()),
+            Err(_) if turn < window.0 => stalled(),
             Err(_) => {
                 let progress = (bytes.len() - window.1) as u64;
                 if progress < Limits::MIN_PROGRESS {

@@ -4,6 +4,7 @@
 //! to the kernel does: it may arrive.
 
 use std::io::{self, IoSlice};
+use std::net::IpAddr;
 #[cfg(feature = "secure")]
 use std::sync::Arc;
 
@@ -117,6 +118,18 @@ impl Reading {
 }
 
 impl Writing {
+    /// The address of this host that the connection stays with. None when the connection can go on
+    /// from another one.
+    pub(crate) fn local_ip(&self) -> Option<IpAddr> {
+        match self {
+            Self::Plain(socket) => Some(socket.local_addr().ok()?.ip()),
+            #[cfg(feature = "secure")]
+            Self::Tls(socket, _) => Some(socket.local_addr().ok()?.ip()),
+            #[cfg(feature = "quic")]
+            Self::Quic(outgoing) => outgoing.local_ip(),
+        }
+    }
+
     /// Hands over what is taken at once.
     pub(crate) fn try_write(&self, slices: &[IoSlice<'_>]) -> io::Result<usize> {
         match self {

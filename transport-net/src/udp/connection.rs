@@ -11,11 +11,13 @@ mod sending;
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use bytes::{Bytes, BytesMut};
 use fipa_transport::wire::ParcelHeader;
-use fipa_transport::{Answer, AttemptId, Conclusion, Incarnation, Parcel, WayError, WayFault};
+use fipa_transport::{
+    Abandoned, Answer, AttemptId, Conclusion, Incarnation, Location, Parcel, WayError, WayFault,
+};
 
 use super::config::UdpLimits;
 use super::counters::UdpCounters;
@@ -100,6 +102,10 @@ pub(crate) struct Connection {
     mtu: Mtu,
     events: VecDeque<Event>,
     heard: Option<Instant>,
+    /// Since when the connection is in doubt; see [`Connection::doubt`].
+    doubted: Option<Instant>,
+    /// Where the peer has been found to be, of what it was last looked for.
+    leads_to: Option<Location>,
     spoken: Instant,
     busy: Instant,
 }
@@ -190,6 +196,8 @@ impl Connection {
             mtu: Mtu::new(limits.max_datagram),
             events: VecDeque::new(),
             heard: None,
+            doubted: None,
+            leads_to: None,
             spoken: now,
             busy: now,
             limits,
@@ -269,8 +277,9 @@ impl Connection {
         Ok(())
     }
 
-    /// Forgets an attempt: it is not sent if that can still be helped, and not concluded.
-    pub(crate) fn abandon(&mut self, attempt: AttemptId) {
+    /// Ends an attempt: it is not sent if no datagram of it has left.
+    pub(crate) fn abandon(&mut self, attempt: AttemptId) -> Abandoned {
+        let mut end = Abandoned::Unconfirmed;
         if let Some(id) = self.attempts.remove(&attempt) {
             if let Some(sent) = self.sent.get_mut(&id) {
                 sent.attempt = None;
@@ -279,9 +288,11 @@ impl Connection {
             && let Some(outgoing) = self.waiting.remove(place)
         {
             self.waiting_bytes -= outgoing.size;
+            end = Abandoned::NotSent;
         }
         self.events
             .retain(|event| !matches!(event, Event::Concluded(other, _) if *other == attempt));
+        end
     }
 
     /// Answers a parcel that arrived. Unknown ones are ignored.
@@ -325,6 +336,43 @@ impl Connection {
         }
         self.peer = Some(peer);
         Ok(())
+    }
+
+    /// There is reason to believe that the peer is elsewhere by now: it is asked for a sign of life,
+    /// with less patience than usual. Does nothing when the peer has been heard within `quiet`.
+    /// Returns whether the connection is in doubt.
+    pub(crate) fn doubt(&mut self, now: Instant, quiet: Duration) -> bool {
+        let heard = self.heard.is_some_and(|heard| now < heard + quiet);
+        if self.peer.is_none() || heard {
+            return false;
+        }
+        if self.doubted.is_none() {
+            self.doubted = Some(now);
+            self.urgent.push_back(Kept::Ping);
+        }
+        true
+    }
+
+    /// The peer is looked for at a location that this connection was not opened for. When the peer
+    /// did not list that address it may have moved there, so the connection is in doubt.
+    pub(crate) fn is_used_for(&mut self, now: Instant, to: &Location) {
+        if self.leads_to.as_ref() == Some(to) {
+            return;
+        }
+        let peer = self.peer.as_ref();
+        let listed = peer.is_some_and(|peer| peer.listening.iter().any(|it| it == to.address()));
+        if listed || self.doubt(now, self.doubt_patience()) {
+            self.leads_to = Some(to.clone());
+        }
+    }
+
+    /// How long a peer in doubt has to give a sign of life.
+    fn doubt_patience(&self) -> Duration {
+        self.limits.silence / 4
+    }
+
+    fn doubt_due(&self) -> Option<Instant> {
+        Some(self.doubted? + self.doubt_patience())
     }
 
     /// The datagram that was taken last is larger than what can be sent from here.
@@ -436,6 +484,7 @@ impl Connection {
             self.received.due(),
             self.recovery.timeout(),
             silent,
+            self.doubt_due(),
             self.ping_due(),
             self.idle_due(),
         ]
@@ -456,6 +505,9 @@ impl Connection {
             && tries >= MIN_TRIES
             && now >= since + self.limits.silence
         {
+            return Err(End::Silent);
+        }
+        if self.doubt_due().is_some_and(|due| now >= due) {
             return Err(End::Silent);
         }
         if self.idle_due().is_some_and(|due| now >= due) {

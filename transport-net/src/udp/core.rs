@@ -11,15 +11,15 @@
 
 mod greeting;
 
-use std::collections::{BTreeSet, HashMap, VecDeque};
+use std::collections::{BTreeSet, HashMap, HashSet, VecDeque};
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use fipa_transport::{
-    Answer, AttemptId, Conclusion, Hop, Incarnation, Introduction, Location, Parcel, Ticket,
-    WayError, WayFault,
+    Abandoned, Answer, AttemptId, Conclusion, Hop, Incarnation, Introduction, Location, Parcel,
+    Ticket, WayError, WayFault,
 };
 
 use super::config::UdpLimits;
@@ -171,18 +171,19 @@ impl Core {
         to: &Location,
         parcel: &Parcel,
     ) -> Result<Option<u32>, WayError> {
+        let dialled = self.dialled.get(to).copied();
         let known = self.known.get(&to.incarnation());
-        let there = self
-            .dialled
-            .get(to)
-            .or_else(|| known.and_then(|numbers| numbers.first()));
+        let there = dialled.or_else(|| known.and_then(|numbers| numbers.first().copied()));
         let (number, fresh) = match there {
-            Some(number) => (*number, false),
+            Some(number) => (number, false),
             None => (self.make_up(now, to)?, true),
         };
         let Some(entry) = self.connections.get_mut(&number) else {
             return Err(WayError::new(WayFault::Broken, "the connection is gone"));
         };
+        if dialled.is_none() && !fresh {
+            entry.connection.is_used_for(now, to);
+        }
         if let Err(error) = entry.connection.send(attempt, parcel) {
             if fresh {
                 self.remove(number);
@@ -191,6 +192,29 @@ impl Core {
         }
         self.touch(number);
         Ok(fresh.then_some(number))
+    }
+
+    /// What others are told from now on of the addresses that this endpoint listens on.
+    pub(crate) fn listens_on(&mut self, listening: Vec<String>) {
+        self.listening = listening;
+    }
+
+    /// This host no longer has these addresses: nothing arrives any more on the connections that
+    /// stay with them. `local` is the address of a socket that belongs to one connection.
+    pub(crate) fn lost(&mut self, lost: &HashSet<IpAddr>, local: impl Fn(u32) -> Option<IpAddr>) {
+        let numbers: Vec<(u32, IpAddr)> = self
+            .connections
+            .iter()
+            .filter_map(|(number, entry)| {
+                let path = entry.connection.path()?;
+                let ip = path.local.or_else(|| local(path.socket))?;
+                lost.contains(&ip).then_some((*number, ip))
+            })
+            .collect();
+        for (number, ip) in numbers {
+            let what = format!("this host no longer has the address {ip}");
+            self.end(number, &End::Broken(what));
+        }
     }
 
     /// Whether a connection that was made up is still to be opened.
@@ -214,11 +238,14 @@ impl Core {
         self.end(number, &End::NotOpened(error));
     }
 
-    pub(crate) fn abandon(&mut self, attempt: AttemptId) {
+    pub(crate) fn abandon(&mut self, attempt: AttemptId) -> Abandoned {
         self.notes
             .retain(|told| !matches!(told, Told::Concluded(other, _) if *other == attempt));
-        for entry in self.connections.values_mut() {
-            entry.connection.abandon(attempt);
+        let mut connections = self.connections.values_mut();
+        let unsent = connections.any(|it| it.connection.abandon(attempt) == Abandoned::NotSent);
+        match unsent {
+            true => Abandoned::NotSent,
+            false => Abandoned::Unconfirmed,
         }
     }
 
@@ -510,7 +537,8 @@ impl Core {
     }
 
     /// The peer of a connection is known.
-    fn enter(&mut self, number: u32, name: Arc<str>, hop: Hop) {
+    fn enter(&mut self, now: Instant, number: u32, name: Arc<str>, hop: Hop) {
+        self.doubt_others(now, number, hop.location.incarnation());
         if let Some(entry) = self.connections.get_mut(&number) {
             let incarnation = hop.location.incarnation();
             let peer = Introduction {
@@ -522,6 +550,23 @@ impl Core {
             entry.peer = Some(peer);
             self.known.entry(incarnation).or_default().push(number);
             self.counters.connections += 1;
+        }
+    }
+
+    /// The service of a connection may have moved to where it comes from: its connections from
+    /// elsewhere are in doubt. They are asked, because a stranger must not end the connections of
+    /// the service that it claims to be.
+    fn doubt_others(&mut self, now: Instant, number: u32, incarnation: Incarnation) {
+        let place = |entry: &Entry| Some(entry.connection.path()?.remote.ip());
+        let here = self.connections.get(&number).and_then(place);
+        let others = self.known.get(&incarnation).cloned().unwrap_or_default();
+        for other in others {
+            if let Some(entry) = self.connections.get_mut(&other)
+                && place(entry) != here
+            {
+                entry.connection.doubt(now, Duration::ZERO);
+                self.touch(other);
+            }
         }
     }
 

@@ -10,8 +10,8 @@ use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 use fipa_transport::{
-    Answer, Arrival, AttemptId, ListenError, Location, Parcel, Sink, Ticket, Verdict, WayError,
-    WayFault,
+    Abandoned, Answer, Arrival, AttemptId, Kind, ListenError, Location, Parcel, Sink, Ticket,
+    Verdict, WayError, WayFault,
 };
 use parking_lot::Mutex;
 use tokio::net::lookup_host;
@@ -25,8 +25,9 @@ use super::connection::Path;
 use super::core::{Core, Random, Told};
 use super::counters::UdpCounters;
 use super::socket::{Buffers, Sent, Socket};
-use crate::address::{self, Target};
+use crate::address::{self, Listening, Target};
 use crate::end::End;
+use crate::interfaces::Changes;
 
 /// Most addresses of one name that are greeted.
 const MAX_TARGETS: usize = 8;
@@ -53,6 +54,9 @@ struct State {
     last_socket: u32,
     /// When the task that keeps time wakes.
     armed: Option<Instant>,
+    listening: Listening,
+    /// Watches the interfaces.
+    watch: Option<AbortHandle>,
 }
 
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -80,12 +84,13 @@ impl Endpoint {
         state.core.as_ref().map(Core::counters).unwrap_or_default()
     }
 
-    /// Opens the sockets and begins to work. Returns the addresses others can use.
+    /// Opens the sockets and begins to work. Returns where the endpoint is reached at present; the
+    /// sink is told when that changes.
     pub(crate) fn open(
         &self,
         sink: Arc<dyn Sink>,
         random: Random,
-    ) -> Result<Vec<SocketAddr>, ListenError> {
+    ) -> Result<Vec<Location>, ListenError> {
         let mut state = self.state.lock();
         if state.phase != Phase::New {
             return Err(ListenError::OpenedBefore);
@@ -94,21 +99,28 @@ impl Endpoint {
         let unavailable =
             |error: &dyn std::fmt::Display| ListenError::Unavailable(error.to_string());
         let mut sockets = Vec::new();
-        let mut reachable = Vec::new();
+        let mut bound = Vec::new();
         for text in &self.config.listen {
             let address = address::numeric(text).map_err(|error| unavailable(&error))?;
             let number = state.last_socket + 1;
             state.last_socket = number;
             let cannot = |error| address::cannot_bind(text, &error);
             let socket = Socket::listen(number, address).map_err(cannot)?;
-            let bound = socket.address().map_err(cannot)?;
-            reachable.extend(address::reachable(bound).map_err(|error| unavailable(&error))?);
+            bound.push(socket.address().map_err(cannot)?);
             sockets.push(socket);
         }
+        // Subscribed before the interfaces are listed, so that no change is missed.
+        let changes = bound
+            .iter()
+            .any(|bound| !bound.ip().is_loopback())
+            .then(Changes::subscribe);
+        state.listening = Listening::new(bound).map_err(|error| unavailable(&error))?;
         let UdpConfig {
             identity, limits, ..
         } = &self.config;
-        let listening = reachable.iter().map(ToString::to_string).collect();
+        let locations = state.listening.locations(Kind::Udp, identity.incarnation);
+        let locations = locations.map_err(|error| unavailable(&error))?;
+        let listening = state.listening.texts();
         let now = Instant::now();
         let core = Core::new(identity.clone(), limits.clone(), listening, random, now);
         state.core = Some(core);
@@ -118,9 +130,51 @@ impl Endpoint {
             self.start(&mut state, socket);
         }
         if let Some(this) = self.this.upgrade() {
+            let watch = changes.map(|changes| {
+                let watch = follow_interfaces(Weak::clone(&self.this), changes);
+                self.runtime.spawn(watch).abort_handle()
+            });
+            state.watch = watch;
             self.runtime.spawn(keep_time(Running(this)));
         }
-        Ok(reachable)
+        Ok(locations)
+    }
+
+    /// The interfaces of this host have changed: tells the sink where the endpoint is reached now,
+    /// and ends the connections of addresses that this host has no more.
+    fn interfaces_changed(&self) {
+        let (sink, told) = {
+            let mut state = self.state.lock();
+            let moved = match state.listening.refresh() {
+                Ok(moved) => moved,
+                Err(error) => {
+                    tracing::warn!(kind = %Kind::Udp, %error, "the locations stay as they were");
+                    return;
+                }
+            };
+            let texts = state.listening.texts();
+            let State { core, sockets, .. } = &mut *state;
+            if let Some(core) = core {
+                core.listens_on(texts);
+                core.lost(&moved.lost, |socket| {
+                    let (socket, _) = sockets.get(&socket)?;
+                    Some(socket.address().ok()?.ip())
+                });
+            }
+            self.go_on(&mut state);
+            let incarnation = self.config.identity.incarnation;
+            let told = moved
+                .relocated
+                .then(|| state.listening.locations(Kind::Udp, incarnation));
+            (state.sink.clone(), told)
+        };
+        match (sink, told) {
+            (Some(sink), Some(Ok(locations))) => sink.relocated(locations),
+            (_, Some(Err(error))) => {
+                tracing::warn!(kind = %Kind::Udp, %error, "the locations stay as they were");
+            }
+            _ => {}
+        }
     }
 
     pub(crate) fn dispatch(
@@ -145,10 +199,10 @@ impl Endpoint {
         Ok(())
     }
 
-    pub(crate) fn abandon(&self, attempt: AttemptId) {
-        if let Some(core) = self.state.lock().core.as_mut() {
-            core.abandon(attempt);
-        }
+    pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
+        let mut state = self.state.lock();
+        let core = state.core.as_mut();
+        core.map_or(Abandoned::Unconfirmed, |core| core.abandon(attempt))
     }
 
     pub(crate) fn answer(&self, ticket: Ticket, answer: &Answer) {
@@ -169,6 +223,9 @@ impl Endpoint {
         self.flush(&mut state);
         for (_, (_, task)) in state.sockets.drain() {
             task.abort();
+        }
+        if let Some(watch) = state.watch.take() {
+            watch.abort();
         }
         self.wake.notify_one();
     }
@@ -370,6 +427,17 @@ async fn look_up(endpoint: Arc<Endpoint>, connection: u32, name: String, port: u
     endpoint.go_on(&mut state);
 }
 
+/// Tells an endpoint of changes of the interfaces, until it is gone or the task is aborted.
+async fn follow_interfaces(endpoint: Weak<Endpoint>, mut changes: Changes) {
+    loop {
+        changes.next().await;
+        match endpoint.upgrade() {
+            Some(endpoint) => endpoint.interfaces_changed(),
+            None => return,
+        }
+    }
+}
+
 /// Does what is due, until the endpoint is closed.
 async fn keep_time(running: Running) {
     let endpoint = &running.0;
@@ -416,7 +484,7 @@ mod tests {
     use std::net::IpAddr;
 
     use fipa_acl::Letter;
-    use fipa_transport::{Conclusion, Incarnation, Kind};
+    use fipa_transport::{Conclusion, Incarnation};
 
     use super::*;
     use crate::{Identity, UdpLimits};
@@ -464,7 +532,7 @@ mod tests {
             sequence: 1,
             after: 0,
             remaining: Duration::from_secs(1),
-            hops: 0,
+            transfer: 0,
             body: fipa_transport::Body::Credit,
         };
         let fresh = core.dispatch(now, attempt, &to, &parcel).unwrap().unwrap();

@@ -23,8 +23,8 @@ mod socket;
 use std::sync::Arc;
 
 use fipa_transport::{
-    Answer, AttemptId, Body, Incarnation, Kind, ListenError, Location, Parcel, Signature, Sink,
-    Ticket, Transport, WayError, WayFault,
+    Abandoned, Answer, AttemptId, Body, Incarnation, Kind, ListenError, Location, Parcel,
+    Signature, Sink, Ticket, Transport, WayError, WayFault,
 };
 use tokio::runtime::Handle;
 
@@ -105,17 +105,9 @@ impl Transport for UdpTransport {
         if let Some(fault) = identity.fault() {
             return Err(ListenError::Unavailable(fault));
         }
-        let unavailable =
-            |error: &dyn std::fmt::Display| ListenError::Unavailable(error.to_string());
         // As unpredictable as an incarnation.
         let random = Box::new(|| Incarnation::random().as_u64());
-        let reachable = self.endpoint.open(sink, random)?;
-        reachable
-            .iter()
-            .map(|address| Location::new(Kind::Udp, &address.to_string()))
-            .map(|location| location.map(|it| it.with_incarnation(identity.incarnation)))
-            .collect::<Result<_, _>>()
-            .map_err(|error| unavailable(&error))
+        self.endpoint.open(sink, random)
     }
 
     fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
@@ -123,8 +115,8 @@ impl Transport for UdpTransport {
         self.endpoint.dispatch(attempt, to, &parcel)
     }
 
-    fn abandon(&self, attempt: AttemptId) {
-        self.endpoint.abandon(attempt);
+    fn abandon(&self, attempt: AttemptId) -> Abandoned {
+        self.endpoint.abandon(attempt)
     }
 
     fn answer(&self, ticket: Ticket, answer: Answer) {

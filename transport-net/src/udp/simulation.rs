@@ -1,7 +1,7 @@
 //! Two endpoints on virtual time, with a network between them that a seed makes lose, delay,
 //! reorder and repeat datagrams, and the promises checked in every run.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
@@ -262,7 +262,7 @@ fn parcel(sequence: u64, len: usize) -> Parcel {
         sequence,
         after: 0,
         remaining: Duration::from_secs(5),
-        hops: 0,
+        transfer: 0,
         body: Body::Letter(Letter::new(Bytes::from_static(b"envelope"), payload)),
     }
 }
@@ -604,4 +604,85 @@ fn an_interface_that_takes_less_than_every_path_carries_ends_the_connection() {
     };
     assert_eq!(error.fault, WayFault::Broken);
     assert!(error.detail.contains("1200"), "{error}");
+}
+
+/// A peer at another address sends A a hello with the identity of B.
+fn says_to_be_b(world: &mut World) {
+    let hello = crate::hello::Hello {
+        serial: 1,
+        dialled: "x".into(),
+        ..world.cores[B].own_hello(0, String::new())
+    };
+    let from: SocketAddr = "192.0.2.99:7788".parse().unwrap();
+    world.receive(A, from, &packet::hello(99, &NO_COOKIE, &hello));
+    let reply = world.cores[A].poll_transmit(world.now).unwrap();
+    let Some(Datagram::Cookie { cookie, .. }) = Datagram::read(&reply.contents) else {
+        panic!("no cookie");
+    };
+    world.receive(A, from, &packet::hello(99, &cookie, &hello));
+    // What A sends there goes nowhere.
+    while let Some(transmit) = world.cores[A].poll_transmit(world.now) {
+        if transmit.path.remote != from {
+            world.transmit(A, transmit);
+        }
+    }
+}
+
+#[test]
+fn a_service_that_comes_from_elsewhere_is_asked_where_it_was() {
+    let limits = UdpLimits {
+        // Nothing else ends a connection here.
+        connect_timeout: Duration::from_secs(1000),
+        idle_close: Duration::from_secs(1000),
+        ..UdpLimits::default()
+    };
+    for moved in [false, true] {
+        let mut world = World::new(1, FAIR, &limits);
+        world.send(A, 1, 10).unwrap();
+        world.until_concluded(A, &BTreeSet::from([1]));
+        assert_eq!(world.cores[A].counters().connections, 1);
+        world.cut = moved;
+        let begun = world.now;
+        says_to_be_b(&mut world);
+        assert_eq!(world.cores[A].counters().connections, 2);
+        while world.now < begun + limits.silence / 4 && world.step() {}
+        let left = if moved { 1 } else { 2 };
+        assert_eq!(world.cores[A].counters().connections, left, "{moved}");
+    }
+}
+
+#[test]
+fn a_peer_that_is_looked_for_elsewhere_is_asked_where_it_was() {
+    let limits = UdpLimits {
+        idle_close: Duration::from_secs(1000),
+        ..UdpLimits::default()
+    };
+    let mut world = World::new(1, FAIR, &limits);
+    world.send(A, 1, 10).unwrap();
+    world.until_concluded(A, &BTreeSet::from([1]));
+    world.cut = true;
+    let begun = world.now;
+    world.now += limits.silence / 4;
+    let peer = world.cores[B].own_hello(0, String::new()).identity;
+    let elsewhere = Location::new(Kind::Udp, "192.0.2.99:7788").unwrap();
+    let elsewhere = elsewhere.with_incarnation(peer.incarnation);
+    let fresh = world.cores[A].dispatch(world.now, AttemptId(2), &elsewhere, &parcel(2, 10));
+    assert_eq!(fresh.unwrap(), None, "by the connection that is there");
+    world.flush();
+    world.until_concluded(A, &BTreeSet::from([1, 2]));
+    assert!(world.now - begun <= limits.silence / 2);
+    let fresh = world.cores[A].dispatch(world.now, AttemptId(3), &elsewhere, &parcel(3, 10));
+    assert!(fresh.unwrap().is_some(), "by another one");
+}
+
+#[test]
+fn connections_of_an_address_that_is_gone_end() {
+    let mut world = World::new(1, FAIR, &UdpLimits::default());
+    world.send(A, 1, 10).unwrap();
+    world.until_concluded(A, &BTreeSet::from([1]));
+    let lost = HashSet::from([address(A).ip()]);
+    world.cores[A].lost(&lost, |_| Some(address(B).ip()));
+    assert_eq!(world.cores[A].counters().connections, 1);
+    world.cores[A].lost(&lost, |_| Some(address(A).ip()));
+    assert_eq!(world.cores[A].counters().connections, 0);
 }

@@ -361,7 +361,7 @@ pub(crate) fn letter_parcel(sequence: u64, letter: Letter) -> Parcel {
         sequence,
         after: 0,
         remaining: Duration::from_secs(5),
-        hops: 0,
+        transfer: 0,
         body: Body::Letter(letter),
     }
 }

@@ -182,7 +182,7 @@ pub(crate) fn parcel(content: Bytes) -> Parcel {
         sequence: 1,
         after: 0,
         remaining: Duration::from_secs(5),
-        hops: 0,
+        transfer: 0,
         body: Body::Letter(Letter::new(Bytes::from_static(b"envelope"), payload)),
     }
 }

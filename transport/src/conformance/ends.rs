@@ -9,10 +9,12 @@ use parking_lot::Mutex;
 
 use super::Fixture;
 use super::party::{Party, accepted, assert_same, concluded, letter, parcel, pattern, until};
-use crate::{Answer, Arrival, AttemptId, Body, Conclusion, Location, Transport, Verdict, WayFault};
+use crate::{
+    Abandoned, Answer, Arrival, AttemptId, Body, Conclusion, Location, Transport, Verdict, WayFault,
+};
 
-/// An abandoned attempt is heard of no more, and its neighbours are not harmed.
-pub fn an_abandoned_attempt_is_not_concluded(fixture: &dyn Fixture) {
+/// An abandoned attempt has its conclusion at once and no other, and its neighbors go on.
+pub fn an_abandoned_attempt_is_concluded_at_once(fixture: &dyn Fixture) {
     let a = Party::new(fixture);
     // The answer must not be there before the attempt is abandoned.
     let abandoned = Arc::new(AtomicBool::new(false));
@@ -23,13 +25,63 @@ pub fn an_abandoned_attempt_is_not_concluded(fixture: &dyn Fixture) {
         }
         Verdict::Now(Answer::Accepted)
     });
-    a.transport.abandon(AttemptId(77));
+    let unknown = a.transport.abandon(AttemptId(77));
+    assert_eq!(unknown, Abandoned::Unconfirmed, "of an unknown attempt");
     a.send(1, &b, parcel(1, letter("x")));
-    a.transport.abandon(AttemptId(1));
+    let end = a.transport.abandon(AttemptId(1));
+    let twice = a.transport.abandon(AttemptId(1));
+    assert_eq!(
+        twice,
+        Abandoned::Unconfirmed,
+        "of an attempt that has ended"
+    );
     abandoned.store(true, Ordering::Release);
     a.send(2, &b, parcel(2, letter("y")));
     assert_eq!(concluded(&[&a, &b], &a, 2), accepted());
     assert_eq!(a.conclusion(1), None);
+    if end == Abandoned::NotSent {
+        assert!(!b.has_arrived(1), "not sent, and it arrived");
+    }
+}
+
+/// What was abandoned as not sent never arrives, at whatever moment that was: while the
+/// connection is opened, while other parcels fill the window, and when nothing is in the way.
+pub fn an_attempt_that_is_abandoned_unsent_never_arrives(fixture: &dyn Fixture) {
+    let a = Party::new(fixture);
+    let b = Party::new(fixture);
+    let mut open = Vec::new();
+    let mut unsent = Vec::new();
+    for attempt in 1..=64 {
+        let text = "x".repeat(1 << (attempt % 12));
+        let to = &b.location;
+        let sent = a
+            .transport
+            .dispatch(AttemptId(attempt), to, parcel(attempt, letter(text)));
+        match sent {
+            Ok(()) if attempt % 3 == 0 => {
+                if a.transport.abandon(AttemptId(attempt)) == Abandoned::NotSent {
+                    unsent.push(attempt);
+                }
+            }
+            Ok(()) => open.push(attempt),
+            Err(_) => {}
+        }
+        if attempt == 40
+            && let Some(attempt) = open.pop()
+        {
+            concluded(&[&a, &b], &a, attempt);
+        }
+    }
+    for attempt in open {
+        concluded(&[&a, &b], &a, attempt);
+    }
+    for attempt in unsent {
+        assert!(
+            !b.has_arrived(attempt),
+            "{attempt} was not sent, and it arrived"
+        );
+        assert_eq!(a.conclusion(attempt), None, "{attempt} has two conclusions");
+    }
 }
 
 /// When the receiver goes away, every attempt towards it still gets its conclusion.
@@ -54,13 +106,7 @@ pub fn a_closing_receiver_leaves_no_attempt_open(fixture: &dyn Fixture) {
     b.transport.close();
     for attempt in open {
         let end = concluded(&[&a], &a, attempt);
-        let arrived = b
-            .sink
-            .record
-            .lock()
-            .arrivals
-            .iter()
-            .any(|(parcel, ..)| parcel.sequence == attempt);
+        let arrived = b.has_arrived(attempt);
         match end {
             Conclusion::NotSent(_) => assert!(!arrived, "{attempt} arrived, but was not sent"),
             Conclusion::Answered(Answer::Accepted) => assert!(arrived, "{attempt} did not arrive"),

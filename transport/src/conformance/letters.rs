@@ -28,8 +28,10 @@ pub fn every_field_and_kind_arrives(fixture: &dyn Fixture) {
     };
     let bodies = [
         letter("content"),
-        Body::Report(Report { outcome }),
+        Body::Report(Report::Settled(outcome)),
+        Body::Report(Report::Returned { uncertain: true }),
         Body::Credit,
+        Body::Predecessor,
     ];
     for (index, body) in bodies.into_iter().enumerate() {
         let sent = Parcel {
@@ -40,8 +42,8 @@ pub fn every_field_and_kind_arrives(fixture: &dyn Fixture) {
             },
             sequence: u64::MAX - 1,
             after: 1 << 40,
+            transfer: 1 << 41,
             remaining: Duration::from_micros(1_234_567),
-            hops: 2,
             body,
         };
         a.send(index as u64, &b, sent.clone());
@@ -57,6 +59,9 @@ pub fn answers_come_back_as_given(fixture: &dyn Fixture) {
         Answer::Custody,
         Answer::Busy,
         Answer::OutOfOrder { last: u64::MAX },
+        Answer::Returned { uncertain: false },
+        Answer::Returned { uncertain: true },
+        Answer::Moved,
         Answer::failed(FailureReason::NoSuchAgent, "arm_1 left"),
         Answer::failed(FailureReason::Loop, ""),
     ];

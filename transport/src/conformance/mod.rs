@@ -46,7 +46,8 @@ macro_rules! conformance_tests {
             nobody_is_nowhere
             another_incarnation_is_somebody_else
             a_hop_can_be_answered
-            an_abandoned_attempt_is_not_concluded
+            an_abandoned_attempt_is_concluded_at_once
+            an_attempt_that_is_abandoned_unsent_never_arrives
             a_closing_receiver_leaves_no_attempt_open
             a_closing_sender_leaves_no_attempt_open
             a_closed_transport_takes_nothing

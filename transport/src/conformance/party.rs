@@ -114,6 +114,15 @@ impl Party {
         self.sink.record.lock().arrivals.len()
     }
 
+    /// Whether a parcel with this sequence has arrived here.
+    pub(super) fn has_arrived(&self, sequence: u64) -> bool {
+        let record = self.sink.record.lock();
+        record
+            .arrivals
+            .iter()
+            .any(|(parcel, ..)| parcel.sequence == sequence)
+    }
+
     pub(super) fn arrived(&self, index: usize) -> Parcel {
         self.sink.record.lock().arrivals[index].0.clone()
     }
@@ -180,8 +189,8 @@ pub(super) fn parcel(sequence: u64, body: Body) -> Parcel {
         },
         sequence,
         after: 0,
+        transfer: 1,
         remaining: Duration::from_millis(2500),
-        hops: 0,
         body,
     }
 }

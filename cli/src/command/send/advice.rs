@@ -61,7 +61,7 @@ fn advice(reason: FailureReason, config: &Config) -> String {
     match reason {
         FailureReason::QueueFull => {
             "it takes its messages too slowly: give it more time with --deadline, or a longer \
-             queue with mts.queue"
+             queue with mts.queue and mts.queue_bytes"
                 .to_owned()
         }
         FailureReason::Unreachable => {

@@ -1,17 +1,20 @@
-//! What a lane does with answers, with the end of attempts, and with news of those it relies on.
+//! What a lane does with answers, with the end of attempts, with reports of custodians, and with
+//! changes of the directory.
 
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use fipa_sds::Entry;
 use fipa_transport::{
-    Answer, AttemptId, Conclusion, FailureReason, Kind, Location, Outcome, Report, Signature,
-    WayError, WayFault,
+    Answer, AttemptId, Conclusion, FailureReason, Incarnation, Kind, Location, Outcome, Report,
+    Signature, WayError, WayFault,
 };
 
-use super::super::desk::Desk;
+use super::super::desk::{Desk, Settlement};
 use super::super::routes::Tally;
+use super::super::rules::{self, Belief, End, Told};
+use super::custody::PREDECESSOR_PATIENCE;
 use super::delivery::State;
-use super::{BUSY_PAUSE, CONGESTED_PAUSE, CONGESTED_TRIES, Lane, Moved};
+use super::{BUSY_PAUSE, CONGESTED_PAUSE, CONGESTED_TRIES, ENDED_PATIENCE, Lane, MOVING_PATIENCE};
 
 impl Lane {
     /// What became of an attempt.
@@ -22,7 +25,6 @@ impl Lane {
         attempt: AttemptId,
         conclusion: Conclusion,
         desk: &mut Desk,
-        moved: &mut Vec<Moved>,
     ) {
         let Some(index) = self.index(sequence) else {
             return;
@@ -36,7 +38,10 @@ impl Lane {
             _ => return,
         };
         self.back();
+        self.heard(now);
         self.letters[index].progress.state = State::Waiting;
+        // The clock decides about the letter again, also when its deadline has passed meanwhile.
+        self.due_at(self.letters[index].deadline);
         match conclusion {
             Conclusion::Answered(answer) => {
                 if let Some(tally) = self.tally() {
@@ -46,7 +51,7 @@ impl Lane {
                     });
                 }
                 desk.way_worked(&location);
-                self.answered(now, index, location, answer, desk, moved);
+                self.answered(now, index, (attempt, location), answer, desk);
             }
             Conclusion::Handed => {
                 if let Some(tally) = self.tally() {
@@ -54,64 +59,58 @@ impl Lane {
                 }
                 desk.way_worked(&location);
                 let attempts = std::mem::take(&mut self.letters[index].progress.attempts);
-                self.settle(
-                    index,
-                    Outcome::Sent {
-                        via: location.kind(),
-                        attempts,
-                    },
-                    desk,
-                );
+                let via = location.kind();
+                let outcome = Outcome::Sent { via, attempts };
+                self.settle(now, index, Settlement::Outcome(outcome), desk);
             }
             Conclusion::NotSent(error) => self.came_back(now, index, &location, error, desk),
             Conclusion::Unconfirmed(error) if location.signature() != Signature::Frames => {
-                // An old peer would take a copy for another letter.
-                let delivery = &mut self.letters[index];
-                delivery.failed_at(&location, error);
-                self.fail(index, FailureReason::Unconfirmed, desk);
+                // A legacy peer takes a copy for another letter.
+                self.letters[index].failed_at(&location, error);
+                self.fail(now, index, FailureReason::Unconfirmed, desk);
             }
             Conclusion::Unconfirmed(error) => {
-                self.letters[index].progress.unconfirmed = true;
+                self.letters[index].ended(End::Unknown);
                 self.came_back(now, index, &location, error, desk);
             }
             other => {
-                let text = format!("conclusion not understood: {other:?}");
-                self.letters[index].progress.unconfirmed = true;
+                let text = format!("unknown conclusion of the attempt: {other:?}");
+                self.letters[index].ended(End::Unknown);
                 let error = WayError::new(WayFault::Incompatible, text);
                 self.came_back(now, index, &location, error, desk);
             }
         }
-        self.pump(now, desk, moved);
+        self.pump(now, desk);
     }
 
     fn answered(
         &mut self,
         now: Instant,
         index: usize,
-        location: Location,
+        (attempt, location): (AttemptId, Location),
         answer: Answer,
         desk: &mut Desk,
-        moved: &mut Vec<Moved>,
     ) {
         match answer {
             Answer::Accepted => {
                 self.pauses = 0;
                 self.congested = 0;
+                self.busy = false;
                 let attempts = std::mem::take(&mut self.letters[index].progress.attempts);
-                self.settle(
-                    index,
-                    Outcome::Delivered {
-                        via: location.kind(),
-                        attempts,
-                    },
-                    desk,
-                );
+                let via = location.kind();
+                let outcome = Outcome::Delivered { via, attempts };
+                self.settle(now, index, Settlement::Outcome(outcome), desk);
             }
             Answer::Custody => {
                 let delivery = &mut self.letters[index];
-                delivery.progress.state = State::Custody { location };
+                delivery.progress.state = State::Custody { attempt, location };
+                // A letter before it may have failed since this copy left.
+                if !self.is_custody() {
+                    self.tell_predecessor(index, desk);
+                }
             }
             Answer::Busy => {
+                self.busy = true;
                 let delivery = &mut self.letters[index];
                 delivery.progress.busy = true;
                 delivery.progress.tried.clear();
@@ -119,56 +118,107 @@ impl Lane {
                 self.recovering = true;
                 self.pause_until(now + BUSY_PAUSE);
             }
-            Answer::OutOfOrder { .. } => {
-                self.letters[index].progress.tried.clear();
-                self.recovering = true;
-                // What is missing is under way here, or on another way: no need to wait for the
-                // one, no way to know of the other.
-                if index == 0 {
-                    self.pause(now);
-                }
+            Answer::OutOfOrder { last } => {
+                self.came_early(now, index, (last, PREDECESSOR_PATIENCE), desk);
             }
+            Answer::Returned { uncertain } => {
+                self.letters[index].ended(end_of(uncertain));
+                self.came_early(now, index, (0, Duration::ZERO), desk);
+            }
+            Answer::Moved => self.receiver_moved(now, index, desk),
             Answer::Failed {
                 reason: FailureReason::NoSuchAgent,
                 detail,
             } => {
-                if self.has_no_entry_any_more(desk) {
+                if self.is_registered_no_more(index, desk) {
                     self.recovering = true;
-                    self.receiver_left(index, desk, moved);
+                    self.receiver_left(now, index, desk);
                 } else {
-                    self.refused(index, &location, FailureReason::NoSuchAgent, detail, desk);
+                    let reason = FailureReason::NoSuchAgent;
+                    self.refused(now, index, &location, (reason, detail), desk);
                 }
             }
             Answer::Failed { reason, detail } => {
-                self.refused(index, &location, reason, detail, desk);
+                self.refused(now, index, &location, (reason, detail), desk);
             }
             other => {
-                let detail = format!("answer not understood: {other:?}");
-                self.refused(index, &location, FailureReason::Refused, detail, desk);
+                let detail = format!("unknown answer: {other:?}");
+                let refused = (FailureReason::Refused, detail);
+                self.refused(now, index, &location, refused, desk);
             }
         }
+    }
+
+    /// The letter came back because an earlier one is missing at the other side, where `last` was
+    /// taken, if that is known. The way is not at fault.
+    fn came_early(
+        &mut self,
+        now: Instant,
+        index: usize,
+        (last, patience): (u64, Duration),
+        desk: &mut Desk,
+    ) {
+        self.recovering = true;
+        self.letters[index].progress.tried.clear();
+        if self.is_custody() {
+            if !rules::goes_again(self.letters[index].after, last) {
+                self.hold(now, index, patience, desk);
+            }
+            return;
+        }
+        let lower_is_here = index
+            .checked_sub(1)
+            .is_some_and(|lower| self.letters[lower].is_waiting());
+        let same = self.after(index) >= self.letters[index].after;
+        if same && !lower_is_here && self.paused_until.is_none() {
+            // The letter before it is elsewhere, and slow.
+            self.pause(now);
+            self.paused_for_lower = true;
+        }
+    }
+
+    /// A service says that this registration of the receiver has left its host a moment ago.
+    fn receiver_moved(&mut self, now: Instant, index: usize, desk: &mut Desk) {
+        self.recovering = true;
+        let delivery = &self.letters[index];
+        let registration = delivery.registration;
+        if self.is_custody() {
+            match rules::may_move(delivery.progress.uncertain) {
+                true => self.settle(now, index, Settlement::Moved, desk),
+                false => self.fail(now, index, FailureReason::Unconfirmed, desk),
+            }
+            return;
+        }
+        if self.moving.is_none_or(|(moved, _)| moved != registration) {
+            let until = now + MOVING_PATIENCE;
+            self.moving = Some((registration, until));
+            self.due_at(until);
+        }
+        self.receiver_left(now, index, desk);
+    }
+
+    /// Whether the registration that the letter is for, of which others say that it is not there,
+    /// is not in the directory either: it may have ended a moment ago.
+    fn is_registered_no_more(&self, index: usize, desk: &Desk) -> bool {
+        desk.directory.refresh();
+        self.entry(self.letters[index].registration, desk).is_none()
     }
 
     /// The other side said finally that it does not take the letter.
     fn refused(
         &mut self,
+        now: Instant,
         index: usize,
         location: &Location,
-        reason: FailureReason,
-        detail: String,
+        (reason, detail): (FailureReason, String),
         desk: &mut Desk,
     ) {
-        self.letters[index].failed_at(
-            location,
-            WayError {
-                fault: WayFault::Refused,
-                detail,
-            },
-        );
-        self.fail(index, reason, desk);
+        let fault = WayFault::Refused;
+        self.letters[index].failed_at(location, WayError { fault, detail });
+        self.fail(now, index, reason, desk);
     }
 
-    /// An attempt did not reach the other side, or nobody knows.
+    /// An attempt did not reach the other side, or may not have.
     pub(super) fn came_back(
         &mut self,
         now: Instant,
@@ -188,7 +238,7 @@ impl Lane {
                 .progress
                 .tried
                 .retain(|tried| tried != location);
-            desk.wait_for_room(location, self.stream);
+            desk.wait_for_room(location, self.id);
             self.pause_until(now + CONGESTED_PAUSE);
             return;
         }
@@ -198,97 +248,183 @@ impl Lane {
         self.letters[index].failed_at(location, error);
     }
 
-    /// The outcome of a letter that somebody had in custody.
+    /// The custody of a letter has ended, as this service reports of the hand-over `transfer`.
     pub(crate) fn reported(
         &mut self,
         now: Instant,
-        sequence: u64,
+        from: Incarnation,
+        (registration, sequence, transfer): (Incarnation, u64, u64),
         report: Report,
         desk: &mut Desk,
-        moved: &mut Vec<Moved>,
     ) {
         let Some(index) = self.index(sequence) else {
             return;
         };
-        let delivered = !matches!(report.outcome, Outcome::Failed { .. });
-        let taken_by = match &self.letters[index].progress.state {
-            // It is being tried again; that somebody failed with it before changes nothing.
-            State::Waiting if !delivered => return,
-            // It got there by an attempt that nothing was heard of, the last one most likely.
-            State::Waiting => self.letters[index]
-                .progress
-                .attempts
-                .last()
-                .map(|it| it.via),
-            State::Custody { location } => Some(location.kind()),
-            // The report overtook the answer.
-            State::UnderWay {
-                attempt, location, ..
-            } => {
-                let kind = location.kind();
-                desk.abandon(kind, *attempt);
-                // If another way was tried before, the report may be from there.
-                if self.letters[index].progress.attempts.is_empty() {
-                    desk.way_worked(location);
-                    if let Some(tally) = self.tally() {
-                        Tally::add(&tally.taken);
-                    }
-                }
-                self.back();
-                Some(kind)
-            }
-        };
         let delivery = &mut self.letters[index];
-        delivery.progress.state = State::Waiting;
+        if delivery.registration != registration {
+            return;
+        }
+        let told = match &report {
+            Report::Settled(Outcome::Delivered { .. } | Outcome::Sent { .. }) => Told::Delivered,
+            Report::Settled(Outcome::Failed { reason, .. }) => Told::NotDelivered {
+                uncertain: *reason == FailureReason::Unconfirmed,
+            },
+            Report::Returned { uncertain } => Told::NotDelivered {
+                uncertain: *uncertain,
+            },
+            Report::Moved => Told::NotDelivered { uncertain: false },
+            // What a later version knows says nothing to this one.
+            _ => Told::NotDelivered { uncertain: true },
+        };
+        let handed = delivery.was_handed_to(from);
+        let current = delivery.progress.state.handed_over();
+        let current = current.map(|(attempt, location)| (attempt.0, location.kind()));
+        match rules::believe(handed, told, transfer, current.map(|(attempt, _)| attempt)) {
+            Belief::Believed => {}
+            Belief::OnlyUncertain => {
+                delivery.ended(End::Unknown);
+                return;
+            }
+            Belief::Ignored => return,
+        }
+        let taken_by = match current {
+            Some((_, kind)) => Some(kind),
+            // An attempt that nothing was heard of delivered it, the last one most likely.
+            None => delivery.progress.attempts.last().map(|it| it.via),
+        };
+        self.end_hand_over(index, transfer, desk);
+        self.heard(now);
+        match report {
+            Report::Settled(outcome) => {
+                self.settled_by_report(now, index, taken_by, outcome, desk);
+            }
+            Report::Returned { uncertain } => {
+                self.letters[index].ended(end_of(uncertain));
+                self.came_early(now, index, (0, Duration::ZERO), desk);
+            }
+            Report::Moved => self.receiver_moved(now, index, desk),
+            _ => self.fail(now, index, FailureReason::Unconfirmed, desk),
+        }
+        self.pump(now, desk);
+    }
+
+    /// The letter is here again: an attempt that a report overtook has ended.
+    fn end_hand_over(&mut self, index: usize, transfer: u64, desk: &mut Desk) {
+        let state = &mut self.letters[index].progress.state;
+        let before = std::mem::replace(state, State::Waiting);
+        if let State::UnderWay {
+            attempt, location, ..
+        } = before
+        {
+            desk.drop_attempt(location.kind(), attempt);
+            // If the report is of an earlier hand-over, this way has not shown that it works.
+            if attempt.0 == transfer {
+                desk.way_worked(&location);
+                if let Some(tally) = self.tally() {
+                    Tally::add(&tally.taken);
+                }
+            }
+            self.back();
+        }
+    }
+
+    fn settled_by_report(
+        &mut self,
+        now: Instant,
+        index: usize,
+        taken_by: Option<Kind>,
+        outcome: Outcome,
+        desk: &mut Desk,
+    ) {
         // The sender is told the way between the hosts, which only this side may have seen.
         let way = |theirs| match taken_by {
             None | Some(Kind::Shm) => theirs,
             Some(ours) => ours,
         };
+        let delivery = &mut self.letters[index];
         let mut attempts = std::mem::take(&mut delivery.progress.attempts);
-        attempts.extend_from_slice(report.outcome.attempts());
-        match report.outcome {
+        attempts.extend_from_slice(outcome.attempts());
+        let outcome = match outcome {
             Outcome::Delivered { via, .. } => {
-                let via = way(via);
-                self.settle(index, Outcome::Delivered { via, attempts }, desk);
-            }
-            Outcome::Sent { via, .. } => {
-                let via = way(via);
-                self.settle(index, Outcome::Sent { via, attempts }, desk);
-            }
-            Outcome::Failed { reason, .. } => {
-                delivery.progress.attempts = attempts;
-                if reason == FailureReason::NoSuchAgent && self.has_no_entry_any_more(desk) {
-                    self.receiver_left(index, desk, moved);
-                } else {
-                    self.fail(index, reason, desk);
+                self.busy = false;
+                Outcome::Delivered {
+                    via: way(via),
+                    attempts,
                 }
             }
-            // An outcome that a later version knows says nothing to this one.
-            _ => self.fail(index, FailureReason::Unconfirmed, desk),
-        }
-        self.pump(now, desk, moved);
+            Outcome::Sent { via, .. } => Outcome::Sent {
+                via: way(via),
+                attempts,
+            },
+            Outcome::Failed { reason, .. } => {
+                delivery.progress.attempts = attempts;
+                if reason == FailureReason::NoSuchAgent && self.is_registered_no_more(index, desk) {
+                    self.recovering = true;
+                    self.receiver_left(now, index, desk);
+                } else {
+                    self.fail(now, index, reason, desk);
+                }
+                return;
+            }
+            _ => return self.fail(now, index, FailureReason::Unconfirmed, desk),
+        };
+        self.settle(now, index, Settlement::Outcome(outcome), desk);
     }
 
-    /// The directory has changed: who has letters in custody may be gone.
-    pub(crate) fn directory_changed(
-        &mut self,
-        now: Instant,
-        desk: &mut Desk,
-        moved: &mut Vec<Moved>,
-    ) {
-        // When the receiver itself is gone, its custodian says so, or the deadline does.
-        if let Some(entry) = self.entry(desk) {
-            for index in 0..self.letters.len() {
+    /// The directory has changed: services that have letters in custody may be gone.
+    pub(crate) fn directory_changed(&mut self, now: Instant, desk: &mut Desk) {
+        let mut entry: Option<(Incarnation, Option<std::sync::Arc<Entry>>)> = None;
+        for index in 0..self.letters.len() {
+            let registration = self.letters[index].registration;
+            let known = match &entry {
+                Some((of, known)) if *of == registration => known.clone(),
+                _ => {
+                    let known = desk.receiver(registration, &self.receiver);
+                    let known = known.or_else(|| self.said.clone());
+                    entry = Some((registration, known.clone()));
+                    known
+                }
+            };
+            // When the receiver itself is gone, its custodian says so, or the clock does.
+            if let Some(entry) = known {
                 self.check_custodian(now, index, &entry, desk);
             }
         }
-        self.pump(now, desk, moved);
+        self.notice_end(now, desk);
+        self.pump(now, desk);
     }
 
-    /// A custodian that the receiver cannot be reached through any more will not report.
+    /// Notices that the registration which the first letters are for has left the directory:
+    /// letters for its successor do not wait for long.
+    fn notice_end(&mut self, now: Instant, desk: &Desk) {
+        if self.is_custody() {
+            return;
+        }
+        let Some(first) = self.letters.front().map(|first| first.registration) else {
+            return;
+        };
+        let is_there = self.said.is_some() || desk.receiver(first, &self.receiver).is_some();
+        match self.ended {
+            _ if is_there => self.ended = None,
+            Some((ended, _)) if ended == first => {}
+            _ => {
+                self.ended = Some((first, now));
+                self.due_at(now + ENDED_PATIENCE);
+            }
+        }
+    }
+
+    /// Something was heard of the letters: those for a registration that has ended are waited for
+    /// anew.
+    fn heard(&mut self, now: Instant) {
+        if let Some((_, heard)) = &mut self.ended {
+            *heard = now;
+        }
+    }
+
+    /// A custodian that the receiver cannot be reached through any more does not report.
     fn check_custodian(&mut self, now: Instant, index: usize, entry: &Entry, desk: &mut Desk) {
-        let State::Custody { location } = &self.letters[index].progress.state else {
+        let State::Custody { location, .. } = &self.letters[index].progress.state else {
             return;
         };
         let custodian = location.incarnation();
@@ -299,9 +435,17 @@ impl Lane {
         let location = location.clone();
         let delivery = &mut self.letters[index];
         delivery.progress.state = State::Waiting;
-        delivery.progress.unconfirmed = true;
+        delivery.ended(End::CustodianLost);
         let text = "the gateway that had the letter in custody is gone";
         let error = WayError::new(WayFault::Broken, text);
         self.came_back(now, index, &location, error, desk);
+    }
+}
+
+/// The end of a custody that handed the letter back.
+fn end_of(uncertain: bool) -> End {
+    match uncertain {
+        true => End::Unknown,
+        false => End::NotTaken,
     }
 }

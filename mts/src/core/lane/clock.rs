@@ -2,64 +2,65 @@
 
 use std::time::Instant;
 
-use fipa_transport::{FailureReason, Signature, WayError, WayFault};
+use fipa_transport::{FailureReason, WayError, WayFault};
 
 use super::super::desk::Desk;
-use super::Lane;
-use super::delivery::State;
+use super::delivery::{Holding, State};
+use super::{ENDED_PATIENCE, Lane};
 
 impl Lane {
-    /// What is due by the clock: deadlines, attempts without an answer, custody to be told.
+    /// What is due by the clock: deadlines, attempts without an answer, custody to be told, letters
+    /// to be handed back.
     pub(super) fn expire(&mut self, now: Instant, desk: &mut Desk) {
         if self.due.is_none_or(|due| due > now) {
             return;
         }
+        let ended = self
+            .ended
+            .filter(|(_, heard)| now >= *heard + ENDED_PATIENCE);
         let mut index = 0;
-        while index < self.letters.len() {
-            let delivery = &mut self.letters[index];
-            if delivery.deadline <= now {
-                let reason = delivery.reason_at_deadline();
-                if let State::UnderWay {
-                    attempt, location, ..
-                } = &delivery.progress.state
-                {
-                    let (attempt, location) = (*attempt, location.clone());
-                    desk.abandon(location.kind(), attempt);
-                    delivery.progress.state = State::Waiting;
-                    self.back();
-                    self.recovering = true;
-                    let error = WayError::new(WayFault::TimedOut, "the letter's deadline passed");
-                    if let Some(tally) = self.tally() {
-                        tally.fail(now, &error);
-                    }
-                    self.letters[index].failed_at(&location, error);
-                }
-                self.fail(index, reason, desk);
-                continue;
-            }
+        while let Some(delivery) = self.letters.get_mut(index) {
+            let expired = delivery.deadline <= now;
+            let abandoned = ended.is_some_and(|(gone, _)| gone == delivery.registration);
             if delivery.custody_due.is_some_and(|due| due <= now) {
                 delivery.custody_taken(desk);
             }
-            if let State::UnderWay {
-                attempt,
-                location,
-                times_out,
-            } = &delivery.progress.state
-                && *times_out <= now
-            {
-                let (attempt, location) = (*attempt, location.clone());
-                desk.abandon(location.kind(), attempt);
-                delivery.progress.state = State::Waiting;
-                delivery.progress.unconfirmed = true;
-                self.back();
-                let error = WayError::new(WayFault::TimedOut, "");
-                if location.signature() != Signature::Frames {
-                    // An old peer would take a copy for another letter.
-                    self.letters[index].failed_at(&location, error);
-                    self.fail(index, FailureReason::Unconfirmed, desk);
+            match &mut delivery.progress.state {
+                State::UnderWay {
+                    attempt,
+                    location,
+                    times_out,
+                    abandoned: asked,
+                } => {
+                    let ends = expired || abandoned || *times_out <= now;
+                    if ends && !std::mem::replace(asked, true) {
+                        let error = match expired {
+                            true => {
+                                WayError::new(WayFault::TimedOut, "the letter's deadline passed")
+                            }
+                            false => WayError::new(WayFault::TimedOut, ""),
+                        };
+                        desk.abandon(location.kind(), *attempt, error);
+                    }
+                }
+                State::Custody { .. } if expired || abandoned => {
+                    self.fail(now, index, FailureReason::Unconfirmed, desk);
                     continue;
                 }
-                self.came_back(now, index, &location, error, desk);
+                State::Waiting if expired => {
+                    let reason = delivery.reason_at_deadline(self.busy);
+                    self.fail(now, index, reason, desk);
+                    continue;
+                }
+                State::Waiting => {
+                    if let Some(Holding::Until(until)) = delivery.progress.hold
+                        && until <= now
+                    {
+                        self.return_letter(now, index, desk);
+                        continue;
+                    }
+                }
+                State::Custody { .. } => {}
             }
             index += 1;
         }
@@ -68,13 +69,28 @@ impl Lane {
 
     fn next_due(&self, now: Instant) -> Option<Instant> {
         let letters = self.letters.iter().flat_map(|delivery| {
-            let times_out = match &delivery.progress.state {
-                State::UnderWay { times_out, .. } => Some(*times_out),
+            let progress = &delivery.progress;
+            // The end of an abandoned attempt is on its way, and decides about the letter.
+            let (deadline, times_out) = match &progress.state {
+                State::UnderWay {
+                    abandoned: true, ..
+                } => (None, None),
+                State::UnderWay { times_out, .. } => (Some(delivery.deadline), Some(*times_out)),
+                _ => (Some(delivery.deadline), None),
+            };
+            let held = match progress.hold {
+                Some(Holding::Until(until)) => Some(until),
                 _ => None,
             };
-            [Some(delivery.deadline), delivery.custody_due, times_out]
+            [deadline, delivery.custody_due, times_out, held]
         });
         let paused = self.paused_until.filter(|until| *until > now);
-        letters.chain([paused]).flatten().min()
+        let moving = self
+            .moving
+            .map(|(_, until)| until)
+            .filter(|until| *until > now);
+        let ended = self.ended.map(|(_, heard)| heard + ENDED_PATIENCE);
+        let ended = ended.filter(|due| *due > now);
+        letters.chain([paused, moving, ended]).flatten().min()
     }
 }

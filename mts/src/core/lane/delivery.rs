@@ -3,12 +3,20 @@
 use std::time::Instant;
 
 use fipa_acl::Letter;
-use fipa_transport::{Answer, Attempt, AttemptId, FailureReason, Location, WayError};
+use fipa_transport::{
+    Answer, Attempt, AttemptId, FailureReason, Incarnation, Location, WayError, WayFault,
+};
+use smallvec::SmallVec;
 
-use super::super::desk::{Action, Desk, Origin};
+use super::super::desk::{Action, Desk, Origin, Upstream};
+use super::super::rules::{self, End};
 
-/// How many failed attempts are remembered for one letter's outcome.
+/// Failed attempts that are remembered for one letter's outcome.
 const MAX_ATTEMPTS: usize = 16;
+/// Services that hand over copies of one letter and are told its outcome.
+const MAX_UPSTREAMS: usize = 4;
+/// Services that one letter was handed to, whose reports are believed.
+const MAX_HANDED: usize = 16;
 
 /// One letter on its way to one receiver.
 #[derive(Debug)]
@@ -16,11 +24,16 @@ pub(crate) struct Delivery {
     pub(crate) origin: Origin,
     pub(crate) letter: Letter,
     pub(crate) sequence: u64,
-    /// The letter that this one comes after, as it was told by whoever handed it over.
+    /// The receiver's registration that the letter is for.
+    pub(crate) registration: Incarnation,
+    /// The predecessor. At a custodian as the letter's sender told it; at the sender's process as
+    /// the latest copy says it.
     pub(crate) after: u64,
     pub(crate) deadline: Instant,
-    pub(crate) hops: u8,
-    /// When whoever handed it over is told that it is in custody, if nothing happened before.
+    /// When the letter came here.
+    pub(crate) since: Instant,
+    /// When the service that handed the letter over is told that it is in custody, unless its
+    /// outcome is known before.
     pub(crate) custody_due: Option<Instant>,
     pub(super) progress: Progress,
 }
@@ -29,14 +42,27 @@ pub(crate) struct Delivery {
 #[derive(Debug)]
 pub(super) struct Progress {
     pub(super) state: State,
-    /// What was tried, for the outcome.
+    /// Failed attempts, for the outcome.
     pub(super) attempts: Vec<Attempt>,
     /// The ways tried in this round.
-    pub(super) tried: Vec<Location>,
-    /// Some attempt may have delivered it.
-    pub(super) unconfirmed: bool,
+    pub(super) tried: SmallVec<[Location; 1]>,
+    /// The services that the letter was handed to.
+    pub(super) handed: SmallVec<[Incarnation; 2]>,
+    /// An attempt may have delivered it. Never cleared.
+    pub(super) uncertain: bool,
     /// The receiver's queue was full.
     pub(super) busy: bool,
+    /// The letter came back because its predecessor was not taken.
+    pub(super) hold: Option<Holding>,
+}
+
+/// What a letter that came back as out of order waits for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Holding {
+    /// The end of this attempt or custody of its predecessor, which is in this lane.
+    ForPredecessor(AttemptId),
+    /// The arrival of the predecessor, until this time; then the letter is handed back.
+    Until(Instant),
 }
 
 /// Where a letter is.
@@ -47,29 +73,55 @@ pub(super) enum State {
         attempt: AttemptId,
         location: Location,
         times_out: Instant,
+        /// The transport has been asked to end the attempt, and concludes it at once.
+        abandoned: bool,
     },
     Custody {
+        /// The attempt that handed it over.
+        attempt: AttemptId,
         location: Location,
     },
 }
 
+impl State {
+    /// The latest hand-over, and where it went, unless the letter is here.
+    pub(super) fn handed_over(&self) -> Option<(AttemptId, &Location)> {
+        match self {
+            Self::Waiting => None,
+            Self::UnderWay {
+                attempt, location, ..
+            }
+            | Self::Custody { attempt, location } => Some((*attempt, location)),
+        }
+    }
+}
+
 impl Delivery {
-    /// A letter that comes after none that others know of, and has not been on the network.
-    pub(crate) fn new(origin: Origin, letter: Letter, sequence: u64, deadline: Instant) -> Self {
+    /// A letter for this registration of its receiver.
+    pub(crate) fn new(
+        now: Instant,
+        origin: Origin,
+        letter: Letter,
+        (registration, sequence): (Incarnation, u64),
+        deadline: Instant,
+    ) -> Self {
         let progress = Progress {
             state: State::Waiting,
             attempts: Vec::new(),
-            tried: Vec::new(),
-            unconfirmed: false,
+            tried: SmallVec::new(),
+            handed: SmallVec::new(),
+            uncertain: false,
             busy: false,
+            hold: None,
         };
         Self {
             origin,
             letter,
             sequence,
+            registration,
             after: 0,
             deadline,
-            hops: 0,
+            since: now,
             custody_due: None,
             progress,
         }
@@ -77,6 +129,11 @@ impl Delivery {
 
     pub(super) fn is_waiting(&self) -> bool {
         matches!(self.progress.state, State::Waiting)
+    }
+
+    /// An attempt, or a custody, has ended like this.
+    pub(super) fn ended(&mut self, end: End) {
+        self.progress.uncertain = rules::stays_uncertain(self.progress.uncertain, end);
     }
 
     pub(super) fn failed_at(&mut self, location: &Location, error: WayError) {
@@ -90,30 +147,84 @@ impl Delivery {
         }
     }
 
-    /// Why it failed when its time is over.
-    pub(super) fn reason_at_deadline(&self) -> FailureReason {
+    /// Remembers that reports of the service at this location are believed.
+    pub(super) fn handed_to(&mut self, location: &Location) {
+        let service = location.incarnation();
+        let handed = &mut self.progress.handed;
+        if service.is_known() && !handed.contains(&service) && handed.len() < MAX_HANDED {
+            handed.push(service);
+        }
+    }
+
+    /// Whether the letter was ever handed to this service.
+    pub(super) fn was_handed_to(&self, service: Incarnation) -> bool {
+        self.progress.handed.contains(&service)
+    }
+
+    /// Whether every attempt failed because the letter is too large.
+    pub(super) fn only_too_large(&self) -> bool {
+        let attempts = &self.progress.attempts;
+        let mut faults = attempts.iter().map(|attempt| attempt.error.fault);
+        !attempts.is_empty() && faults.all(|fault| fault == WayFault::TooLarge)
+    }
+
+    /// The reason when its deadline has passed. `behind_full_queue` is whether a letter before it
+    /// met a full queue.
+    pub(super) fn reason_at_deadline(&self, behind_full_queue: bool) -> FailureReason {
         let progress = &self.progress;
-        if progress.unconfirmed || !self.is_waiting() {
+        if progress.uncertain || !self.is_waiting() {
             FailureReason::Unconfirmed
-        } else if progress.busy {
+        } else if progress.busy || (behind_full_queue && progress.attempts.is_empty()) {
             FailureReason::QueueFull
         } else if progress.attempts.is_empty() {
             FailureReason::TimedOut
+        } else if self.only_too_large() {
+            FailureReason::TooLarge
         } else {
             FailureReason::Unreachable
         }
     }
 
+    /// Tells the services that wait for an answer that the letter is in custody.
     pub(super) fn custody_taken(&mut self, desk: &mut Desk) {
-        if let Origin::Forwarded { unanswered, .. } = &mut self.origin
-            && let Some((kind, ticket)) = unanswered.take()
-        {
-            desk.actions.push_back(Action::Answer {
-                kind,
-                ticket,
-                answer: Answer::Custody,
-            });
+        if let Origin::Forwarded { upstreams } = &mut self.origin {
+            for upstream in upstreams {
+                if let Some((kind, ticket)) = upstream.unanswered.take() {
+                    desk.actions.push_back(Action::Answer {
+                        kind,
+                        ticket,
+                        answer: Answer::Custody,
+                    });
+                }
+            }
         }
         self.custody_due = None;
+    }
+
+    /// Another copy has come: the service that handed it over is told the outcome of this letter,
+    /// for the latest copy that it handed over.
+    pub(super) fn add_upstream(&mut self, upstream: Upstream) {
+        let Origin::Forwarded { upstreams } = &mut self.origin else {
+            return;
+        };
+        let service = upstream.back.incarnation();
+        let mut known = upstreams.iter_mut();
+        if let Some(known) = known.find(|known| known.back.incarnation() == service) {
+            if upstream.transfer >= known.transfer {
+                *known = upstream;
+            }
+        } else if upstreams.len() < MAX_UPSTREAMS {
+            upstreams.push(upstream);
+        }
+    }
+
+    /// Whether this service has handed the letter over.
+    pub(super) fn came_from(&self, service: Incarnation) -> bool {
+        match &self.origin {
+            Origin::Forwarded { upstreams } => upstreams
+                .iter()
+                .any(|upstream| upstream.back.incarnation() == service),
+            _ => false,
+        }
     }
 }

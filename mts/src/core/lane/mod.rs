@@ -1,16 +1,21 @@
-//! A lane: the letters of one stream that have no outcome yet, in order, and where each of them
-//! stands.
+//! A lane: letters that have no outcome yet, in order, and where each of them stands.
+//!
+//! The sender's process has one lane for each pair of a sender and the *name* of a receiver, so
+//! that letters for a new registration wait for those of the old one. A custodian has one lane for
+//! each stream. [`rules`] has what the two must do and why; this is how they do it.
 //!
 //! Letters are dispatched in order and only along one way at a time. When one comes back, the
 //! lane waits until everything under way has been heard of, and goes on from the earliest letter
-//! without an outcome. The receiving end takes a letter only after the one before it
-//! ([`Parcel::after`]), so that nothing overtakes while ways change.
+//! that waits.
 //!
 //! Here is what moves letters on; [`answers`] is what comes back, [`clock`] what time does,
-//! [`delivery`] a single letter.
+//! [`custody`] what custodians do about predecessors, [`delivery`] a single letter.
+//!
+//! [`rules`]: super::rules
 
 mod answers;
 mod clock;
+mod custody;
 mod delivery;
 
 use std::collections::VecDeque;
@@ -19,38 +24,61 @@ use std::time::{Duration, Instant};
 
 use fipa_sds::Entry;
 use fipa_transport::{
-    Body, FailureReason, Incarnation, Location, Outcome, Parcel, Stream, WayFault,
+    Body, FailureReason, Incarnation, Kind, Location, Outcome, Parcel, Stream, WayError, WayFault,
 };
 
 pub(crate) use self::delivery::Delivery;
 use self::delivery::State;
-use super::desk::{Author, Desk, Origin, Purpose, Undelivered, life_of};
+use super::desk::{Author, Desk, Origin, Purpose, Settlement, Undelivered, life_of};
 use super::routes::Tally;
+use super::rules;
 
-/// How many failed letters of a stream are remembered to mend the order of later ones.
-const MAX_SKIPPED: usize = 64;
-/// Pauses between rounds over all ways.
+/// Pauses between rounds over all ways, and before a letter that was handed back goes out again.
 const FIRST_PAUSE: Duration = Duration::from_millis(10);
 const LONGEST_PAUSE: Duration = Duration::from_millis(500);
-/// How long a busy receiver is left alone when no credit comes.
+/// Pause towards a busy receiver when no credit comes.
 const BUSY_PAUSE: Duration = Duration::from_millis(100);
-/// How long a lane waits for room when nobody tells it, and how often before it counts as a
-/// failure of the way.
+/// Pause of a lane that waits for room on its way, and how many in a row count as a failure of
+/// the way.
 const CONGESTED_PAUSE: Duration = Duration::from_millis(20);
 const CONGESTED_TRIES: u32 = 25;
 /// A large letter may take longer: this many bytes a second are expected at least.
 const SLOWEST_BYTES_PER_SECOND: u64 = 1 << 20;
-/// What is taken off the remaining time at every hop, so that those further down the way give up
-/// and say why before those further up.
+/// What is taken off the remaining time at every hop, so that services further down the way give
+/// up first and can still say why.
 const HOP_MARGIN: Duration = Duration::from_millis(100);
+/// How long a letter waits for the new registration of a receiver that has moved.
+const MOVING_PATIENCE: Duration = Duration::from_secs(2);
+/// How long letters that were handed over for a registration that has ended are waited for.
+const ENDED_PATIENCE: Duration = Duration::from_secs(2);
+
+/// The number of a lane within its core.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(crate) struct LaneId(pub(crate) u64);
+
+/// What a lane is for.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(crate) enum LaneKey {
+    /// Letters that this process sends: from this agent or service, to all registrations of this
+    /// name.
+    Name(Incarnation, Arc<str>),
+    /// Letters that this process sends to this registration of a service, whose name others may
+    /// have too.
+    Service(Stream),
+    /// Letters of others in custody.
+    Custody(Stream),
+}
 
 #[derive(Debug)]
 pub(crate) struct Lane {
-    stream: Stream,
+    id: LaneId,
+    key: LaneKey,
+    sender: Incarnation,
     receiver: Arc<str>,
-    /// What the receiver said of itself, if the directory does not know it.
+    /// Where the receiver says that it can be reached, if the directory does not know it.
     said: Option<Arc<Entry>>,
     letters: VecDeque<Delivery>,
+    bytes: usize,
     under_way: usize,
     /// The way that letters under way go.
     way: Option<Location>,
@@ -59,11 +87,20 @@ pub(crate) struct Lane {
     /// Something came back: nothing is dispatched until all that is under way has been heard of.
     recovering: bool,
     paused_until: Option<Instant>,
+    /// The pause is for a lower letter, and ends with it.
+    paused_for_lower: bool,
     pauses: u32,
-    /// The last letter that has got there.
-    delivered: u64,
-    /// Letters that failed here, and what they came after: who came after them comes after that.
-    skipped: VecDeque<(u64, u64)>,
+    /// The receiver's queue was full when it was last heard of.
+    busy: bool,
+    /// A registration that has moved, and until when its successor is waited for.
+    moving: Option<(Incarnation, Instant)>,
+    /// A registration that has left the directory, and when something was last heard about
+    /// letters for it.
+    ended: Option<(Incarnation, Instant)>,
+    /// Whether a letter may wait for its predecessor to arrive.
+    holds: bool,
+    /// Letters that left this lane without being delivered, and when.
+    left: VecDeque<(u64, Instant)>,
     /// When something is due by the clock at the earliest.
     due: Option<Instant>,
     /// When the core's timer will look at this lane next.
@@ -72,32 +109,36 @@ pub(crate) struct Lane {
     congested: u32,
     /// When something last happened here.
     pub(crate) active: Instant,
-    /// Who was told that the lane is full and waits for a credit.
+    /// The service that was told that the lane is full, and waits for a credit.
     waiting: Option<Location>,
 }
 
-/// A letter for another lane: its receiver was registered anew, and it was certainly not delivered
-/// before.
-pub(crate) struct Moved {
-    pub(crate) to: Arc<Entry>,
-    pub(crate) delivery: Delivery,
-}
-
 impl Lane {
-    pub(crate) fn new(now: Instant, stream: Stream, receiver: Arc<str>) -> Self {
+    pub(crate) fn new(now: Instant, id: LaneId, key: LaneKey, receiver: Arc<str>) -> Self {
+        let sender = match &key {
+            LaneKey::Name(sender, _) => *sender,
+            LaneKey::Service(stream) | LaneKey::Custody(stream) => stream.sender,
+        };
         Self {
-            stream,
+            id,
+            key,
+            sender,
             receiver,
             said: None,
             letters: VecDeque::new(),
+            bytes: 0,
             under_way: 0,
             way: None,
             tally: None,
             recovering: false,
             paused_until: None,
+            paused_for_lower: false,
             pauses: 0,
-            delivered: 0,
-            skipped: VecDeque::new(),
+            busy: false,
+            moving: None,
+            ended: None,
+            holds: false,
+            left: VecDeque::new(),
             due: None,
             scheduled: None,
             congested: 0,
@@ -106,12 +147,38 @@ impl Lane {
         }
     }
 
+    pub(crate) fn key(&self) -> &LaneKey {
+        &self.key
+    }
+
+    /// The agent or service that sends in this lane.
+    pub(crate) fn sender(&self) -> Incarnation {
+        self.sender
+    }
+
     pub(crate) fn is_empty(&self) -> bool {
         self.letters.is_empty()
     }
 
-    pub(crate) fn len(&self) -> usize {
-        self.letters.len()
+    /// Nothing more to do.
+    pub(crate) fn is_idle(&self) -> bool {
+        self.letters.is_empty() && self.waiting.is_none()
+    }
+
+    /// Whether what becomes of letters that are still to come depends on this lane.
+    pub(crate) fn remembers(&self) -> bool {
+        !self.left.is_empty()
+    }
+
+    fn is_custody(&self) -> bool {
+        matches!(self.key, LaneKey::Custody(_))
+    }
+
+    fn stream_of(&self, delivery: &Delivery) -> Stream {
+        Stream {
+            sender: self.sender,
+            receiver: delivery.registration,
+        }
     }
 
     /// The way that a letter is going at the moment.
@@ -122,14 +189,37 @@ impl Lane {
         }
     }
 
-    /// Nothing more to do and nothing to remember.
-    pub(crate) fn is_idle(&self) -> bool {
-        self.letters.is_empty() && self.waiting.is_none()
+    /// Whether there is room for another letter of this process, of this many bytes.
+    pub(crate) fn has_room(&self, len: usize, desk: &Desk) -> bool {
+        let config = &desk.config;
+        let fits = self.bytes.saturating_add(len) <= config.lane_bytes;
+        self.letters.len() < config.lane && (fits || self.letters.is_empty())
     }
 
-    /// Whether the order of letters that are still to come depends on this lane.
-    pub(crate) fn remembers(&self) -> bool {
-        !self.skipped.is_empty()
+    /// Whether a custodian takes this letter. A letter below one that waits for it is taken beyond
+    /// the bounds, up to twice as far.
+    pub(crate) fn admits(&self, sequence: u64, len: usize, desk: &Desk) -> bool {
+        let config = &desk.config;
+        let held = desk.held.saturating_add(len);
+        if self.has_room(len, desk) && (held <= config.custody_bytes || desk.held == 0) {
+            return true;
+        }
+        let highest = self.letters.back().map(|delivery| delivery.sequence);
+        rules::admits_when_full(highest, sequence)
+            && self.letters.len() < 2 * config.lane
+            && self.bytes.saturating_add(len) <= config.lane_bytes.saturating_mul(2)
+            && held <= config.custody_bytes.saturating_mul(2)
+    }
+
+    /// Whether letters wait for a pause to end, and the receiver has such a location.
+    pub(crate) fn is_paused_towards(
+        &self,
+        desk: &Desk,
+        is_meant: impl Fn(&Location) -> bool,
+    ) -> bool {
+        let first = self.letters.front().filter(|_| self.paused_until.is_some());
+        let entry = first.and_then(|first| self.entry(first.registration, desk));
+        entry.is_some_and(|entry| entry.locations.iter().any(is_meant))
     }
 
     /// When the lane must be looked at again at the latest.
@@ -143,18 +233,14 @@ impl Lane {
         }
     }
 
-    /// Where the receiver can be reached: as the directory has it, or as it said itself when the
-    /// directory does not know it.
-    fn entry(&self, desk: &Desk) -> Option<Arc<Entry>> {
-        let known = desk.receiver(self.stream.receiver, &self.receiver);
+    /// Where this registration of the receiver can be reached: as the directory has it, or as it
+    /// said itself when the directory does not know it. None when it has moved.
+    fn entry(&self, registration: Incarnation, desk: &Desk) -> Option<Arc<Entry>> {
+        if self.moving.is_some_and(|(moved, _)| moved == registration) {
+            return None;
+        }
+        let known = desk.receiver(registration, &self.receiver);
         known.or_else(|| self.said.clone())
-    }
-
-    /// Whether the receiver, of which others say that it is not there, is not in the directory
-    /// either: it may have been registered anew, a moment ago.
-    fn has_no_entry_any_more(&self, desk: &Desk) -> bool {
-        desk.directory.refresh();
-        self.entry(desk).is_none()
     }
 
     /// The receiver is not in the directory, but has said where it can be reached.
@@ -163,37 +249,20 @@ impl Lane {
     }
 
     /// Puts a letter in, at its place in the order.
-    pub(crate) fn push(&mut self, mut delivery: Delivery, desk: &mut Desk) {
-        desk.held += delivery.letter.len();
-        // A copy that strayed, most likely: the letter itself has got there, and this one's fate must
-        // not tell otherwise.
-        let forwarded = matches!(delivery.origin, Origin::Forwarded { .. });
-        delivery.progress.unconfirmed |= forwarded && delivery.sequence <= self.delivered;
-        let place = self
-            .letters
-            .partition_point(|other| other.sequence < delivery.sequence);
+    pub(crate) fn push(&mut self, delivery: Delivery, desk: &mut Desk) {
+        let len = delivery.letter.len();
+        desk.held += len;
+        self.bytes += len;
         self.due_at(delivery.deadline);
         if let Some(due) = delivery.custody_due {
             self.due_at(due);
         }
+        let sequence = delivery.sequence;
+        let place = self
+            .letters
+            .partition_point(|other| other.sequence < sequence);
         self.letters.insert(place, delivery);
-    }
-
-    /// A copy of a letter that is here already: its sender has not heard of the first one, and is
-    /// told of this one. Says whether there was one.
-    pub(crate) fn adopt(
-        &mut self,
-        sequence: u64,
-        origin: Origin,
-        desk: &mut Desk,
-    ) -> Option<Origin> {
-        let Some(index) = self.index(sequence) else {
-            return Some(origin);
-        };
-        let delivery = &mut self.letters[index];
-        delivery.custody_taken(desk);
-        delivery.origin = origin;
-        None
+        self.predecessor_came(sequence);
     }
 
     pub(crate) fn wait_for_credit(&mut self, back: Location) {
@@ -201,7 +270,7 @@ impl Lane {
     }
 
     /// Dispatches what can be dispatched.
-    pub(crate) fn pump(&mut self, now: Instant, desk: &mut Desk, moved: &mut Vec<Moved>) {
+    pub(crate) fn pump(&mut self, now: Instant, desk: &mut Desk) {
         self.active = now;
         self.expire(now, desk);
         if self.recovering && self.under_way == 0 {
@@ -210,20 +279,26 @@ impl Lane {
         }
         if !self.recovering && self.paused_until.is_none_or(|until| until <= now) {
             self.paused_until = None;
-            self.dispatch_waiting(now, desk, moved);
+            self.paused_for_lower = false;
+            self.dispatch_waiting(now, desk);
         }
         self.give_credit(desk);
     }
 
-    fn dispatch_waiting(&mut self, now: Instant, desk: &mut Desk, moved: &mut Vec<Moved>) {
+    fn dispatch_waiting(&mut self, now: Instant, desk: &mut Desk) {
         let mut index = 0;
         while index < self.letters.len() && self.under_way < desk.config.window {
-            if !self.letters[index].is_waiting() {
+            let registration = self.letters[index].registration;
+            // All between have the same, or the loop would not have come here.
+            if !rules::may_dispatch(self.first_registration(), registration) {
+                break;
+            }
+            if !self.letters[index].is_waiting() || self.is_held_back(index) {
                 index += 1;
                 continue;
             }
-            let Some(entry) = self.entry(desk) else {
-                if self.receiver_left(index, desk, moved) {
+            let Some(entry) = self.entry(registration, desk) else {
+                if self.receiver_left(now, index, desk) {
                     continue;
                 }
                 break;
@@ -245,42 +320,64 @@ impl Lane {
         }
     }
 
+    fn first_registration(&self) -> impl Iterator<Item = Incarnation> {
+        self.letters
+            .front()
+            .map(|first| first.registration)
+            .into_iter()
+    }
+
     fn dispatch(&mut self, now: Instant, index: usize, way: Location, desk: &mut Desk) {
         let after = self.after(index);
         if let Some(tally) = self.tally_of(&way, desk) {
             Tally::add(&tally.tried);
         }
+        let attempt = desk.next_attempt();
+        let stream = self.stream_of(&self.letters[index]);
         let delivery = &mut self.letters[index];
+        delivery.after = after;
         let left = delivery.deadline.saturating_duration_since(now);
         let parcel = Parcel {
             receiver: Arc::clone(&self.receiver),
-            stream: self.stream,
+            stream,
             sequence: delivery.sequence,
             after,
+            transfer: attempt.0,
             remaining: left - HOP_MARGIN.min(left / 8),
-            hops: match delivery.progress.unconfirmed {
-                true => delivery.hops.max(Parcel::LAST_HOPS),
-                false => delivery.hops,
-            },
             body: Body::Letter(delivery.letter.clone()),
         };
         let size = delivery.letter.len() as u64;
         let allowance = Duration::from_millis(size.saturating_mul(1000) / SLOWEST_BYTES_PER_SECOND);
         let times_out = now + desk.config.attempt_timeout + allowance;
         let purpose = Purpose::Letter {
-            stream: self.stream,
+            lane: self.id,
             sequence: delivery.sequence,
         };
-        let attempt = desk.dispatch(purpose, way.clone(), parcel);
+        desk.dispatch(attempt, purpose, way.clone(), parcel);
+        delivery.handed_to(&way);
         delivery.progress.tried.push(way.clone());
+        delivery.progress.hold = None;
         delivery.progress.state = State::UnderWay {
             attempt,
             location: way.clone(),
             times_out,
+            abandoned: false,
         };
         self.due_at(times_out);
         self.under_way += 1;
         self.way = Some(way);
+    }
+
+    /// The predecessor that the letter at `index` is dispatched with: at a custodian the one it
+    /// came with, at the sender's process the nearest open one before it.
+    fn after(&self, index: usize) -> u64 {
+        let delivery = &self.letters[index];
+        if self.is_custody() {
+            return delivery.after;
+        }
+        // Of all registrations: a letter that waits for a new one must not be passed over, either.
+        let open = self.letters.iter().take(index);
+        rules::predecessor(open.map(|other| other.sequence), delivery.sequence)
     }
 
     /// The tally of the way that letters take now: looked up when the way changes, not for each.
@@ -307,40 +404,33 @@ impl Lane {
         }
     }
 
-    /// The letter that the one at `index` comes after: what it was told, unless that failed here,
-    /// or the one before it here, whichever is later. What it was told may not have come yet. Ends,
-    /// because every letter comes after an earlier one ([`Core::handle_arrival`] sees to it).
-    ///
-    /// [`Core::handle_arrival`]: super::Core::handle_arrival
-    fn after(&self, index: usize) -> u64 {
-        let mut told = self.letters[index].after;
-        while let Some((_, before)) = self.skipped.iter().find(|(failed, _)| *failed == told) {
-            told = *before;
-        }
-        let before = index
-            .checked_sub(1)
-            .map_or(0, |before| self.letters[before].sequence);
-        told.max(before)
-    }
-
     /// Every way was tried. Says whether the letter was settled.
     fn end_of_round(&mut self, now: Instant, index: usize, desk: &mut Desk) -> bool {
         let progress = &mut self.letters[index].progress;
         if progress.tried.is_empty() {
-            self.fail(index, FailureReason::Unreachable, desk);
-            return true;
-        }
-        let too_large = progress
-            .attempts
-            .iter()
-            .all(|a| a.error.fault == WayFault::TooLarge);
-        if too_large && !progress.attempts.is_empty() {
-            self.fail(index, FailureReason::TooLarge, desk);
+            self.fail(now, index, FailureReason::Unreachable, desk);
             return true;
         }
         progress.tried.clear();
+        if self.is_too_large(index, desk) {
+            self.fail(now, index, FailureReason::TooLarge, desk);
+            return true;
+        }
         self.pause(now);
         false
+    }
+
+    /// Whether the letter is larger than every kind of way takes that may lead to the receiver. A
+    /// kind that the directory does not show at present may come back. Shared memory is left out,
+    /// because it does not lead to other hosts.
+    fn is_too_large(&self, index: usize, desk: &Desk) -> bool {
+        let delivery = &self.letters[index];
+        let attempts = &delivery.progress.attempts;
+        let mut order = desk.config.order_for(&self.receiver).iter();
+        delivery.only_too_large()
+            && order.all(|kind| {
+                *kind == Kind::Shm || attempts.iter().any(|attempt| attempt.via == *kind)
+            })
     }
 
     fn pause(&mut self, now: Instant) {
@@ -353,75 +443,99 @@ impl Lane {
 
     fn pause_until(&mut self, until: Instant) {
         self.paused_until = Some(until);
+        self.paused_for_lower = false;
         self.due_at(until);
     }
 
-    /// The receiver's life has ended. Says whether the letter has left this lane.
-    fn receiver_left(&mut self, index: usize, desk: &mut Desk, moved: &mut Vec<Moved>) -> bool {
-        let progress = &self.letters[index].progress;
-        // Whoever handed the letter over decides about a successor: only the sender knows whether
-        // another copy may have been delivered.
-        let may_move =
-            matches!(self.letters[index].origin, Origin::Local { .. }) && !progress.unconfirmed;
-        let successor = desk.directory.lookup(&self.receiver);
-        let successor = successor.filter(|entry| life_of(entry) != self.stream.receiver);
-        match successor.filter(|_| may_move) {
-            // Those before it may have to go there too, and first.
-            Some(_) if index > 0 => false,
-            Some(entry) => {
-                if let Some(mut delivery) = self.letters.pop_front() {
-                    desk.held -= delivery.letter.len();
-                    delivery.progress.tried.clear();
-                    moved.push(Moved {
-                        to: entry,
-                        delivery,
-                    });
-                }
-                true
+    /// The registration that the letter is for has ended. Says whether the lane may go on with the
+    /// letter at this index: another one, or the same for the new registration.
+    fn receiver_left(&mut self, now: Instant, index: usize, desk: &mut Desk) -> bool {
+        let delivery = &self.letters[index];
+        let registration = delivery.registration;
+        if !rules::may_move(delivery.progress.uncertain) {
+            self.fail(now, index, FailureReason::Unconfirmed, desk);
+            return true;
+        }
+        if self.is_custody() {
+            // Only the sender's process moves letters to another registration.
+            match desk.departed.contains(now, registration) {
+                true => self.settle(now, index, Settlement::Moved, desk),
+                false => self.fail(now, index, FailureReason::NoSuchAgent, desk),
             }
-            None => {
-                self.fail(index, FailureReason::NoSuchAgent, desk);
+            return true;
+        }
+        let successor = desk.directory.lookup(&self.receiver);
+        let successor = successor.map(|entry| life_of(&entry));
+        if let Some(successor) = successor.filter(|successor| *successor != registration) {
+            let delivery = &mut self.letters[index];
+            delivery.registration = successor;
+            delivery.after = 0;
+            delivery.progress.tried.clear();
+            return true;
+        }
+        match self.moving {
+            Some((moved, until)) if moved == registration && now < until => {
+                self.due_at(until);
+                false
+            }
+            _ => {
+                self.fail(now, index, FailureReason::NoSuchAgent, desk);
                 true
             }
         }
     }
 
     /// There is room again, at the receiver or on the way to it.
-    pub(crate) fn resume(&mut self, now: Instant, desk: &mut Desk, moved: &mut Vec<Moved>) {
+    pub(crate) fn resume(&mut self, now: Instant, desk: &mut Desk) {
         self.paused_until = None;
         self.pauses = 0;
-        self.pump(now, desk, moved);
+        self.pump(now, desk);
     }
 
-    /// Gives up everything, when the sending agent goes away or the service ends.
-    pub(crate) fn give_up(&mut self, desk: &mut Desk) {
-        while let Some(delivery) = self.letters.front() {
-            if let State::UnderWay {
-                attempt, location, ..
-            } = &delivery.progress.state
-            {
-                desk.abandon(location.kind(), *attempt);
-                self.back();
+    /// Gives up everything, when the sending agent goes away or the service ends. What is under
+    /// way has its outcome when its transport has concluded it, which is at once.
+    pub(crate) fn give_up(&mut self, now: Instant, desk: &mut Desk) {
+        self.recovering = true;
+        let mut index = 0;
+        while let Some(delivery) = self.letters.get_mut(index) {
+            delivery.deadline = now;
+            match &mut delivery.progress.state {
+                State::UnderWay {
+                    attempt,
+                    location,
+                    abandoned,
+                    ..
+                } => {
+                    if !std::mem::replace(abandoned, true) {
+                        let error = WayError::new(WayFault::Closed, "the sender went away");
+                        desk.abandon(location.kind(), *attempt, error);
+                    }
+                    index += 1;
+                }
+                State::Custody { .. } => {
+                    self.fail(now, index, FailureReason::Unconfirmed, desk);
+                }
+                State::Waiting => {
+                    let reason = match delivery.reason_at_deadline(false) {
+                        FailureReason::TimedOut => FailureReason::Closed,
+                        reason => reason,
+                    };
+                    self.fail(now, index, reason, desk);
+                }
             }
-            let delivery = &self.letters[0];
-            let reason = match delivery.reason_at_deadline() {
-                FailureReason::TimedOut => FailureReason::Unreachable,
-                reason => reason,
-            };
-            self.fail(0, reason, desk);
         }
     }
 
-    /// Gives a letter up. If it may have been delivered, that is what its sender has to know.
-    fn fail(&mut self, index: usize, reason: FailureReason, desk: &mut Desk) {
+    /// Gives a letter up. If an attempt may have delivered it, its sender is told so.
+    fn fail(&mut self, now: Instant, index: usize, reason: FailureReason, desk: &mut Desk) {
         let delivery = &mut self.letters[index];
-        let reason = match delivery.progress.unconfirmed {
+        let reason = match delivery.progress.uncertain {
             true => FailureReason::Unconfirmed,
             false => reason,
         };
         let attempts = std::mem::take(&mut delivery.progress.attempts);
         let sender = match delivery.origin {
-            Origin::Local { .. } => Some(Author::Ours(self.stream.sender)),
+            Origin::Local { .. } => Some(Author::Ours(self.sender)),
             Origin::OldPeer { from } => Some(Author::OldPeer { from }),
             Origin::Forwarded { .. } | Origin::Nobody => None,
         };
@@ -435,48 +549,70 @@ impl Lane {
                 detail,
             });
         }
-        self.note_skipped(index);
-        self.settle(index, Outcome::Failed { reason, attempts }, desk);
+        let outcome = Outcome::Failed { reason, attempts };
+        self.settle(now, index, Settlement::Outcome(outcome), desk);
     }
 
-    fn note_skipped(&mut self, index: usize) {
-        let delivery = &self.letters[index];
-        if matches!(delivery.origin, Origin::Forwarded { .. }) {
-            let after = self.after(index);
-            if self.skipped.len() >= MAX_SKIPPED {
-                self.skipped.pop_front();
-            }
-            self.skipped
-                .push_back((self.letters[index].sequence, after));
-        }
-    }
-
-    fn settle(&mut self, index: usize, outcome: Outcome, desk: &mut Desk) {
+    /// Takes a letter out of the lane, and tells those it came from.
+    fn settle(&mut self, now: Instant, index: usize, settlement: Settlement, desk: &mut Desk) {
         let Some(delivery) = self.letters.remove(index) else {
             return;
         };
-        desk.held -= delivery.letter.len();
-        if !matches!(outcome, Outcome::Failed { .. }) {
-            self.delivered = self.delivered.max(delivery.sequence);
-        }
+        let len = delivery.letter.len();
+        desk.held -= len;
+        self.bytes -= len;
         if self.letters.is_empty() {
             self.way = None;
+            self.busy = false;
+            self.ended = None;
+            self.moving = None;
         }
-        let receiver = Arc::clone(&self.receiver);
-        desk.settle(
-            delivery.origin,
-            self.stream,
-            delivery.sequence,
-            receiver,
-            outcome,
+        if self.paused_for_lower {
+            self.paused_until = None;
+            self.paused_for_lower = false;
+            self.pauses = 0;
+        }
+        let delivered = matches!(
+            settlement,
+            Settlement::Outcome(Outcome::Delivered { .. } | Outcome::Sent { .. })
         );
+        match self.is_custody() {
+            _ if delivered => {}
+            true => self.predecessor_failed(now, delivery.sequence),
+            false => self.tell_predecessor(index, desk),
+        }
+        let stream = self.stream_of(&delivery);
+        desk.settle(delivery, stream, Arc::clone(&self.receiver), settlement);
+    }
+
+    /// The letter before the one at `index` has failed at its sender's process: the service that
+    /// holds this one is told the predecessor that it has now.
+    fn tell_predecessor(&mut self, index: usize, desk: &mut Desk) {
+        let Some(delivery) = self.letters.get(index) else {
+            return;
+        };
+        let State::Custody { location, .. } = &delivery.progress.state else {
+            return;
+        };
+        let after = self.after(index);
+        if after < delivery.after {
+            let stream = self.stream_of(delivery);
+            let letter = (delivery.sequence, after);
+            desk.predecessor(stream, Arc::clone(&self.receiver), letter, location.clone());
+            self.letters[index].after = after;
+        }
     }
 
     fn give_credit(&mut self, desk: &mut Desk) {
-        if self.letters.len() * 2 <= desk.config.lane
+        let config = &desk.config;
+        if self.letters.len() * 2 <= config.lane
+            && self.bytes <= config.lane_bytes / 2
             && let Some(back) = self.waiting.take()
         {
-            desk.credit(self.stream, Arc::clone(&self.receiver), back);
+            // Only custodians tell that they are full.
+            if let LaneKey::Custody(stream) = &self.key {
+                desk.credit(*stream, Arc::clone(&self.receiver), back);
+            }
         }
     }
 
@@ -484,10 +620,5 @@ impl Lane {
         self.letters
             .binary_search_by_key(&sequence, |delivery| delivery.sequence)
             .ok()
-    }
-
-    /// The agent that sends in this lane.
-    pub(crate) fn sender(&self) -> Incarnation {
-        self.stream.sender
     }
 }

@@ -27,6 +27,7 @@ impl Connection {
             return Ok(());
         }
         self.heard = Some(now);
+        self.doubted = None;
         if !self.received.is_new(number) {
             counters.duplicates += 1;
             self.received.wants_ack(now, true);

@@ -78,7 +78,7 @@ impl Core {
         let number = self.insert(connection, None, Some((from, initiator)));
         self.greeted.insert((from, initiator), number);
         self.inbound.insert(inbound, (serial, number));
-        self.enter(number, name, hop);
+        self.enter(now, number, name, hop);
         self.counters.accepted += 1;
         let own = self.own_hello(0, String::new());
         self.reply(path, packet::welcome(initiator, id, &own));
@@ -110,7 +110,7 @@ impl Core {
         });
         if let (Some((number, name)), Some(hop)) = (greeted, hop) {
             self.counters.dialled += 1;
-            self.enter(number, name, hop);
+            self.enter(now, number, name, hop);
         }
     }
 
@@ -162,7 +162,7 @@ impl Core {
         })
     }
 
-    pub(super) fn own_hello(&self, serial: u64, dialled: String) -> Hello {
+    pub(in crate::udp) fn own_hello(&self, serial: u64, dialled: String) -> Hello {
         Hello {
             identity: self.identity.clone(),
             max_letter: self.limits.max_datagram as u64,

@@ -192,7 +192,7 @@ fn parcel(content: Bytes) -> Parcel {
         sequence: 1,
         after: 0,
         remaining: REMAINING,
-        hops: 0,
+        transfer: 0,
         body: Body::Letter(Letter::new(Bytes::from_static(ENVELOPE), payload)),
     }
 }

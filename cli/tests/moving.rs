@@ -1,0 +1,477 @@
+//! Hosts whose addresses change: a gateway that listens on all addresses is reached where it is now,
+//! also by peers that have never been told the new address.
+//!
+//! The hosts are network namespaces of the test's own; see `fipa-testbed`. They speak IPv4 only, so
+//! that a host without an address cannot be heard at all.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(
+    clippy::print_stderr,
+    reason = "the time that a move takes is worth knowing"
+)]
+
+use std::io::{BufRead as _, BufReader};
+use std::process::Stdio;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use fipa::config::Sources;
+use fipa::keys::{Keys, VALID};
+use fipa::{Agent, AgentId, Config, Deliveries, Domain, Entry, Incarnation, Outcome, Performative};
+use fipa_testbed::{Host, Network, Running, enter, isolated};
+use serde_json::Value;
+use tempfile::TempDir;
+use tokio::runtime::Runtime;
+
+/// The deadline of a letter that is sent at the moment a new address is usable: the longest that a
+/// gateway may be unreachable.
+const BOUND: Duration = Duration::from_secs(3);
+/// Ends a test that hangs.
+const WATCHDOG: Duration = Duration::from_secs(60);
+const PORT: u16 = 7788;
+
+/// A test that the harness sees, and the one that it runs in namespaces of its own.
+macro_rules! on_a_network {
+    ($(#[$doc:meta])* $name:ident, $inside:ident, $work:expr) => {
+        $(#[$doc])*
+        #[test]
+        fn $name() {
+            isolated(stringify!($inside), &["nft"]);
+        }
+
+        #[test]
+        #[ignore = "is run by the other test in namespaces of its own"]
+        fn $inside() {
+            enter();
+            let work: fn() = $work;
+            work();
+        }
+    };
+}
+
+on_a_network!(
+    /// The host only receives: no letter of its own tells the others where it is.
+    a_receiver_moves_five_times_by_tcp,
+    inside_a_receiver_moves_five_times_by_tcp,
+    || a_receiver_moves_five_times(&["tcp"])
+);
+
+on_a_network!(
+    a_receiver_moves_five_times_by_udp,
+    inside_a_receiver_moves_five_times_by_udp,
+    || a_receiver_moves_five_times(&["udp"])
+);
+
+on_a_network!(
+    a_receiver_moves_five_times_by_quic,
+    inside_a_receiver_moves_five_times_by_quic,
+    || a_receiver_moves_five_times(&["quic"])
+);
+
+fn a_receiver_moves_five_times(transports: &[&str]) {
+    let (network, robots) = two_hosts(transports, &Discovery::Mdns);
+    for address in 51..56 {
+        move_to(network.host(1), &format!("10.99.0.{address}"));
+        robots[0].reaches(&robots[1]);
+    }
+}
+
+on_a_network!(
+    /// The host that sends moves, and its letters and their answers go on.
+    a_sender_moves_five_times,
+    inside_a_sender_moves_five_times,
+    || {
+        let (network, robots) = two_hosts(&["tcp"], &Discovery::Mdns);
+        for address in 51..56 {
+            move_to(network.host(0), &format!("10.99.0.{address}"));
+            robots[0].reaches(&robots[1]);
+            robots[1].reaches(&robots[0]);
+        }
+    }
+);
+
+on_a_network!(
+    /// The host cannot say hello from its new address: only multicast tells where it is.
+    a_receiver_that_cannot_dial_moves_five_times,
+    inside_a_receiver_that_cannot_dial_moves_five_times,
+    || {
+        let (network, robots) = two_hosts(&["tcp"], &Discovery::Mdns);
+        for rule in [
+            "add table inet wall",
+            "add chain inet wall in { type filter hook input priority 0; }",
+            "add rule inet wall in iifname eth0 tcp dport 7788 drop",
+        ] {
+            let nft = network.host(0).command("nft").arg(rule).status();
+            assert!(nft.unwrap().success(), "nft {rule}");
+        }
+        for address in 51..56 {
+            move_to(network.host(1), &format!("10.99.0.{address}"));
+            robots[0].reaches(&robots[1]);
+        }
+    }
+);
+
+on_a_network!(
+    /// A host has no address for so long that it is forgotten, and gets another one then.
+    a_receiver_is_away_and_comes_back_elsewhere,
+    inside_a_receiver_is_away_and_comes_back_elsewhere,
+    || {
+        let (network, robots) = two_hosts(&["tcp"], &Discovery::Mdns);
+        let ([here, there], host) = (&robots[..], network.host(1)) else {
+            panic!("two robots")
+        };
+        flush(host);
+        here.misses(&there.name);
+        host.ip("addr add 10.99.0.52/24 dev eth0");
+        here.finds_at_once(there);
+        here.reaches(there);
+    }
+);
+
+on_a_network!(
+    /// A gateway that starts on a host without an address announces nothing that leads elsewhere,
+    /// and everything once there is one.
+    a_gateway_starts_before_its_interface,
+    inside_a_gateway_starts_before_its_interface,
+    || {
+        let network = Network::new(2);
+        prepare(&network);
+        let host = network.host(1);
+        flush(host);
+        let all = robots_on(&network, &["tcp"], &Discovery::Mdns);
+        let [here, there] = &all[..] else {
+            panic!("two robots")
+        };
+        let own = there.own_gateway();
+        assert!(own.contains("127.0.0.1"), "processes of the host use it: {own}");
+        // Its record would be heard on any interface that multicast passes.
+        host.ip("addr add 10.99.0.2/24 dev eth0");
+        here.finds_at_once(there);
+        let routes = here.fipa(network.host(0), &["routes", "--json", &there.name]);
+        let ways = routes["gateway"]["routes"].to_string();
+        assert!(ways.contains("10.99.0.2:7788"), "{routes}");
+        assert!(!ways.contains("127.0.0.1"), "{routes}");
+        here.reaches(there);
+    }
+);
+
+on_a_network!(
+    /// The peer of the configuration is somewhere else by now. It dials, and letters go back on that
+    /// connection, those as well that were sent while it was away.
+    a_static_peer_moves_and_dials,
+    inside_a_static_peer_moves_and_dials,
+    || {
+        let (network, robots) = two_hosts(&["tcp"], &Discovery::Both);
+        let host = network.host(1);
+        flush(host);
+        let waiting = robots[0].sends(&robots[1], Duration::from_secs(30));
+        std::thread::sleep(Duration::from_secs(6));
+        host.ip("addr add 10.99.0.52/24 dev eth0");
+        robots[0].reaches(&robots[1]);
+        robots[0].was_delivered(waiting);
+        for address in 53..57 {
+            move_to(host, &format!("10.99.0.{address}"));
+            robots[0].reaches(&robots[1]);
+        }
+    }
+);
+
+on_a_network!(
+    /// The host that moves has no static peers: it connects to the gateways that it was connected with.
+    a_dialled_static_peer_moves,
+    inside_a_dialled_static_peer_moves,
+    || {
+        let (network, robots) = two_hosts(&["tcp"], &Discovery::FirstDials);
+        for address in 51..56 {
+            move_to(network.host(1), &format!("10.99.0.{address}"));
+            robots[0].reaches(&robots[1]);
+        }
+    }
+);
+
+on_a_network!(
+    a_dialled_static_peer_moves_by_udp,
+    inside_a_dialled_static_peer_moves_by_udp,
+    || {
+        let (network, robots) = two_hosts(&["udp"], &Discovery::FirstDials);
+        for address in 51..56 {
+            move_to(network.host(1), &format!("10.99.0.{address}"));
+            robots[0].reaches(&robots[1]);
+        }
+    }
+);
+
+on_a_network!(
+    commands_show_where_a_gateway_is_now,
+    inside_commands_show_where_a_gateway_is_now,
+    || {
+        let (network, robots) = two_hosts(&["tcp"], &Discovery::Both);
+        let host = network.host(1);
+        move_to(host, "10.99.0.52");
+        let now = robots[1].gateway_has("10.99.0.52:7788");
+        assert!(!now.contains("10.99.0.2:"), "{now}");
+        let report = robots[1].fipa(host, &["routes", "--json"]);
+        let told = report["gateway"]["locations"].to_string();
+        assert!(told.contains("tcp://10.99.0.52:7788"), "{report}");
+        assert!(!told.contains("10.99.0.2:"), "{report}");
+        let report = robots[1].fipa(host, &["doctor", "--json"]);
+        let checks = report["checks"].as_array().unwrap();
+        let listens = checks.iter().find(|it| it["check"] == "locations").unwrap();
+        let found = listens["found"].as_str().unwrap();
+        assert!(found.contains("10.99.0.52"), "{found}");
+        assert!(!found.contains("10.99.0.2:"), "{found}");
+    }
+);
+
+/// How gateways find each other.
+#[derive(Debug, PartialEq, Eq)]
+enum Discovery {
+    Mdns,
+    /// Each is told the usual address of the other.
+    Both,
+    /// The first is told the usual address of the second.
+    FirstDials,
+}
+
+/// A gateway process and an agent on one host.
+struct Robot {
+    name: String,
+    settings: Vec<String>,
+    _gateway: Running,
+    runtime: Runtime,
+    agent: Arc<Agent>,
+    _keys: Arc<TempDir>,
+}
+
+/// A letter that is under way.
+type Waiting = tokio::task::JoinHandle<Deliveries>;
+
+/// Two hosts whose agents know each other.
+fn two_hosts(transports: &[&str], discovery: &Discovery) -> (Network, Vec<Robot>) {
+    let network = Network::new(2);
+    prepare(&network);
+    let robots = robots_on(&network, transports, discovery);
+    for (robot, other) in [(&robots[0], &robots[1]), (&robots[1], &robots[0])] {
+        robot.waits_for(&other.name);
+        robot.reaches(other);
+    }
+    (network, robots)
+}
+
+fn prepare(network: &Network) {
+    fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
+    for host in network.hosts() {
+        let ipv6_off = || std::fs::write("/proc/sys/net/ipv6/conf/all/disable_ipv6", "1");
+        host.enter(ipv6_off).unwrap();
+    }
+}
+
+fn robots_on(network: &Network, transports: &[&str], discovery: &Discovery) -> Vec<Robot> {
+    let dir = Arc::new(tempfile::tempdir().unwrap());
+    let keys = |at: usize| Keys::at(dir.path().join(at.to_string()));
+    if transports.contains(&"quic") {
+        for at in 0..2 {
+            keys(at).init(&format!("gateway{at}"), &[], VALID).unwrap();
+        }
+        for (at, other) in [(0, 1), (1, 0)] {
+            let pem = std::fs::read(keys(other).own_file()).unwrap();
+            keys(at).trust(&pem).unwrap();
+        }
+    }
+    let robots = (0..2).map(|at| {
+        let security = match transports.contains(&"quic") {
+            true => format!("security.keys={}", keys(at).dir().display()),
+            false => "security.insecure=true".to_owned(),
+        };
+        Robot::start(
+            network,
+            at,
+            transports,
+            discovery,
+            (security, Arc::clone(&dir)),
+        )
+    });
+    robots.collect()
+}
+
+impl Robot {
+    fn start(
+        network: &Network,
+        at: usize,
+        transports: &[&str],
+        discovery: &Discovery,
+        (security, keys): (String, Arc<TempDir>),
+    ) -> Self {
+        let host = network.host(at);
+        let mut settings = vec![
+            // A directory of its own, so that tests run side by side.
+            format!("domain=moving-{}", Incarnation::random()),
+            format!("mts.name=gateway{at}"),
+            format!("mts.transports=shm,{}", transports.join(",")),
+            format!("discovery.mdns={}", *discovery == Discovery::Mdns),
+            security,
+        ];
+        for transport in transports {
+            settings.push(format!("transport.{transport}.listen=[\"0.0.0.0:{PORT}\"]"));
+        }
+        let dials = match discovery {
+            Discovery::Mdns => false,
+            Discovery::Both => true,
+            Discovery::FirstDials => at == 0,
+        };
+        if dials {
+            let other = 1 - at;
+            let ways = transports.iter();
+            let ways: Vec<String> = ways
+                .map(|kind| format!("\"{kind}://10.99.0.{}:{PORT}\"", other + 1))
+                .collect();
+            let line = format!("gateway{other} = [{}]", ways.join(", "));
+            settings.push(format!("discovery.static={{ {line} }}"));
+        }
+        let mut up = host.command(env!("CARGO_BIN_EXE_fipa"));
+        up.args(["up", "--json"]);
+        for setting in &settings {
+            up.args(["--set", setting]);
+        }
+        if std::env::var_os("FIPA_TEST_LOG").is_some() {
+            up.arg("-v");
+        }
+        let mut gateway = Running::start(up.stdin(Stdio::null()).stdout(Stdio::piped()));
+        let mut ready = String::new();
+        let stdout = gateway.child().stdout.take().unwrap();
+        BufReader::new(stdout).read_line(&mut ready).unwrap();
+        assert!(ready.starts_with('{'), "the gateway is not ready: {ready}");
+        let config = Config::load(&Sources {
+            set: settings.clone(),
+            ..Sources::default()
+        });
+        let (config, name) = (config.unwrap(), format!("agent{at}"));
+        let (runtime, agent) = host.enter(|| {
+            let mut builder = tokio::runtime::Builder::new_multi_thread();
+            let runtime = builder.worker_threads(1).enable_all().build().unwrap();
+            let domain = runtime.block_on(Domain::open(&config)).unwrap();
+            let agent = runtime.block_on(async { domain.register(&name) }).unwrap();
+            (runtime, Arc::new(agent))
+        });
+        Self {
+            name,
+            settings,
+            _gateway: gateway,
+            runtime,
+            agent,
+            _keys: keys,
+        }
+    }
+
+    /// Waits until this host's directory has the agent.
+    fn waits_for(&self, name: &str) -> Arc<Entry> {
+        let started = Instant::now();
+        loop {
+            if let Some(entry) = self.agent.domain().directory().lookup(name) {
+                return entry;
+            }
+            assert!(started.elapsed() < WATCHDOG, "{name} is never found");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    /// The other agent, whose host has got an address a moment ago, is found within the bound.
+    fn finds_at_once(&self, other: &Self) {
+        let usable = Instant::now();
+        self.waits_for(&other.name);
+        let took = usable.elapsed();
+        eprintln!("{} was found after {took:.1?}", other.name);
+        assert!(took < BOUND, "found after {took:?}");
+    }
+
+    /// Waits until this host's directory no longer has the agent.
+    fn misses(&self, name: &str) {
+        let started = Instant::now();
+        while self.agent.domain().directory().lookup(name).is_some() {
+            assert!(started.elapsed() < WATCHDOG, "{name} is never missed");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    /// The locations of this host's gateway, as the directory of the host has them.
+    fn own_gateway(&self) -> String {
+        let directory = self.agent.domain().directory();
+        directory.refresh();
+        let entries = directory.entries();
+        let mut gateways = entries
+            .iter()
+            .filter(|entry| entry.role == fipa::Role::Gateway);
+        gateways.next().map(|it| places(it)).unwrap_or_default()
+    }
+
+    /// Waits until the directory of this host has the gateway at this address.
+    fn gateway_has(&self, address: &str) -> String {
+        let started = Instant::now();
+        loop {
+            let places = self.own_gateway();
+            if places.contains(address) {
+                return places;
+            }
+            assert!(started.elapsed() < WATCHDOG, "still at {places}");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    fn sends(&self, to: &Self, deadline: Duration) -> Waiting {
+        let message = self
+            .agent
+            .message(Performative::Inform)
+            .receiver(AgentId::new(&*to.name).unwrap())
+            .content("here you are")
+            .build()
+            .unwrap();
+        let agent = Arc::clone(&self.agent);
+        self.runtime
+            .spawn(async move { agent.send_within(message, deadline).await.unwrap() })
+    }
+
+    /// A letter that is sent now arrives within the bound.
+    fn reaches(&self, to: &Self) {
+        let sent = Instant::now();
+        let letter = self.sends(to, BOUND);
+        self.was_delivered(letter);
+        eprintln!("{} to {}: {:.1?}", self.name, to.name, sent.elapsed());
+    }
+
+    fn was_delivered(&self, letter: Waiting) {
+        let deliveries = self.runtime.block_on(letter).unwrap();
+        let [delivery] = &deliveries.0[..] else {
+            panic!("one receiver: {deliveries}")
+        };
+        let delivered = matches!(delivery.outcome, Outcome::Delivered { .. });
+        assert!(delivered, "{}", delivery.outcome);
+    }
+
+    /// What a command says in JSON.
+    fn fipa(&self, host: &Host, args: &[&str]) -> Value {
+        let mut command = host.command(env!("CARGO_BIN_EXE_fipa"));
+        command.args(args);
+        for setting in &self.settings {
+            command.args(["--set", setting]);
+        }
+        let output = command.output().unwrap();
+        let told = String::from_utf8_lossy(&output.stderr);
+        serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{error}: {told}"))
+    }
+}
+
+fn places(entry: &Entry) -> String {
+    let places: Vec<String> = entry.locations.iter().map(ToString::to_string).collect();
+    places.join(" ")
+}
+
+/// The host has no address any more.
+fn flush(host: &Host) {
+    host.ip("addr flush dev eth0");
+}
+
+/// The host has another address, from one moment to the next.
+fn move_to(host: &Host, address: &str) {
+    flush(host);
+    host.ip(&format!("addr add {address}/24 dev eth0"));
+}

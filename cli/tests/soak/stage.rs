@@ -1,0 +1,728 @@
+//! Three hosts with gateways, processes and agents that move, and all that happens to them.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::{BufRead as _, BufReader, Write as _};
+use std::process::{ChildStdin, Command, Stdio};
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use fastrand::Rng;
+use fipa_testbed::{Network, Running};
+use parking_lot::Mutex;
+
+use super::actor::{PART, Part};
+use super::checker::{Life, Quiet};
+use super::journal::now;
+use crate::hosts::{PORT, filter, gateway, keys, make_keys, nft};
+
+/// Ends what hangs.
+const WATCHDOG: Duration = Duration::from_secs(90);
+const HOSTS: usize = 3;
+const PROCESSES_PER_HOST: usize = 2;
+const MOVERS: usize = 2;
+/// Transports between hosts.
+const ORDERS: [&[&str]; 3] = [&["tcp"], &["udp", "tcp"], &["quic", "tcp"]];
+
+/// A name for `FIPA_SOAK_FAULTS`, and the fault.
+type Fault = (&'static str, fn(&mut Stage));
+
+/// All faults. Those that stand here twice are twice as frequent.
+const FAULTS: [Fault; 13] = [
+    ("kill", Stage::kill_process),
+    ("kill", Stage::kill_process),
+    ("restart", Stage::restart_process),
+    ("kill-gateway", Stage::kill_gateway),
+    ("stop", Stage::stop_process),
+    ("stop-gateway", Stage::stop_gateway),
+    ("cut", Stage::cut),
+    ("cut", Stage::cut),
+    ("filter", Stage::filter),
+    ("filter", Stage::filter),
+    ("address", Stage::change_address),
+    ("move", Stage::move_agent),
+    ("move", Stage::move_agent),
+];
+
+/// Returns the faults of this run: those that `FIPA_SOAK_FAULTS` names, or all.
+fn faults() -> Vec<Fault> {
+    let asked = std::env::var("FIPA_SOAK_FAULTS").unwrap_or_default();
+    let all = FAULTS.iter().copied();
+    let faults: Vec<Fault> = match asked.as_str() {
+        "" => all.collect(),
+        names => all
+            .filter(|(name, _)| names.split(',').any(|it| it == *name))
+            .collect(),
+    };
+    assert!(
+        !faults.is_empty(),
+        "FIPA_SOAK_FAULTS names no fault: {asked}"
+    );
+    faults
+}
+
+/// The last number of each address that a host can have.
+fn addresses(at: usize) -> [usize; 3] {
+    [at + 1, at + 51, at + 101]
+}
+
+/// What runs, or does not.
+enum State<T> {
+    Runs(T),
+    Stopped(T),
+    /// It was told to end.
+    Ends(T),
+    Down,
+}
+
+struct Host {
+    settings: Vec<String>,
+    gateway: State<Running>,
+    starting: Option<JoinHandle<Running>>,
+    address: usize,
+    /// Whether its network has a fault.
+    disturbed: bool,
+}
+
+/// A process with its agents, which is started again when it was killed.
+struct Seat {
+    host: usize,
+    /// Agents that belong here, now.
+    names: BTreeSet<String>,
+    process: State<Process>,
+}
+
+struct Process {
+    running: Running,
+    input: ChildStdin,
+    said: Arc<Mutex<Vec<String>>>,
+    life: usize,
+}
+
+impl Process {
+    fn tell(&mut self, line: &str) {
+        // The end of a process that was not killed is noticed elsewhere.
+        let _ = writeln!(self.input, "{line}");
+    }
+
+    fn has_said(&self, line: &str) -> bool {
+        self.said.lock().iter().any(|said| said == line)
+    }
+
+    fn count_left(&self, name: &str) -> usize {
+        let left = format!("left {name}");
+        self.said
+            .lock()
+            .iter()
+            .filter(|said| **said == left)
+            .count()
+    }
+
+    /// Whether the agent is registered here: agents that move come and go.
+    fn has(&self, name: &str) -> bool {
+        let (came, left) = (format!("registered {name}"), format!("left {name}"));
+        let said = self.said.lock();
+        let last = said.iter().rev().find(|said| [&came, &left].contains(said));
+        last == Some(&came)
+    }
+
+    fn signal(&mut self, signal: &str) {
+        send_signal(&mut self.running, signal);
+    }
+}
+
+fn send_signal(running: &mut Running, signal: &str) {
+    let pid = running.child().id().to_string();
+    let sent = Command::new("kill").args([signal, &pid]).status();
+    assert!(sent.unwrap().success(), "kill {signal} {pid}");
+}
+
+/// The end of a fault.
+#[derive(Debug, Clone, Copy)]
+enum Repair {
+    StartGateway(usize),
+    StartProcess(usize),
+    ContinueGateway(usize),
+    ContinueProcess(usize),
+    Network(usize),
+}
+
+/// An agent on its way to another process.
+struct Move {
+    name: String,
+    /// The process that it leaves, and how often it had left that before.
+    life: usize,
+    left_before: usize,
+    to: usize,
+}
+
+pub(crate) struct Stage {
+    network: Network,
+    hosts: Vec<Host>,
+    seats: Vec<Seat>,
+    moves: Vec<Move>,
+    repairs: Vec<(Instant, Repair)>,
+    names: Vec<String>,
+    faults: Vec<Fault>,
+    random: Rng,
+    proofs: u32,
+    pub(crate) lives: Vec<Life>,
+    pub(crate) quiet: Vec<Quiet>,
+    pub(crate) counts: BTreeMap<&'static str, usize>,
+    pub(crate) setup: String,
+}
+
+impl Stage {
+    pub(crate) fn new(seed: u64) -> Self {
+        fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
+        let mut random = Rng::with_seed(seed);
+        let order = ORDERS[random.usize(..ORDERS.len())];
+        let mdns = random.bool();
+        if order.contains(&"quic") {
+            make_keys(HOSTS);
+        }
+        let network = Network::new(HOSTS as u8);
+        let hosts = (0..HOSTS).map(|at| Host {
+            settings: settings(at, order, mdns),
+            gateway: State::Down,
+            starting: None,
+            address: 0,
+            disturbed: false,
+        });
+        let hosts: Vec<Host> = hosts.collect();
+        let mut seats: Vec<Seat> = (0..HOSTS * PROCESSES_PER_HOST)
+            .map(|seat| Seat {
+                host: seat % HOSTS,
+                names: BTreeSet::from([format!("fixed{seat}")]),
+                process: State::Down,
+            })
+            .collect();
+        for (mover, seat) in seats.iter_mut().take(MOVERS).enumerate() {
+            seat.names.insert(format!("mover{mover}"));
+        }
+        let names = seats.iter().flat_map(|seat| seat.names.clone());
+        let mut stage = Self {
+            network,
+            hosts,
+            names: names.collect(),
+            seats,
+            faults: faults(),
+            moves: Vec::new(),
+            repairs: Vec::new(),
+            random,
+            proofs: 0,
+            lives: Vec::new(),
+            quiet: Vec::new(),
+            counts: BTreeMap::new(),
+            setup: format!(
+                "{}, {}",
+                order.join("+"),
+                if mdns { "mDNS" } else { "static peers" }
+            ),
+        };
+        for at in 0..HOSTS {
+            stage.start_gateway(at);
+        }
+        for seat in 0..stage.seats.len() {
+            stage.start_process(seat);
+        }
+        stage.settle();
+        stage
+    }
+
+    /// Faults for this long, and then quiet for at least this long.
+    pub(crate) fn disturb(&mut self, faults: Duration, quiet: Duration) {
+        if let Some(last) = self.quiet.last_mut() {
+            last.end = now();
+        }
+        let end = Instant::now() + faults;
+        while Instant::now() < end {
+            self.fault();
+            let until = Instant::now() + Duration::from_millis(self.random.u64(30..500));
+            while Instant::now() < until {
+                self.work(Instant::now());
+                std::thread::sleep(Duration::from_millis(5));
+            }
+        }
+        let healed = self.settle();
+        let waited = waited_for_processors();
+        let proved = self.prove();
+        let waited = waited_for_processors().saturating_sub(waited);
+        std::thread::sleep(quiet);
+        self.quiet.push(Quiet {
+            healed,
+            proved,
+            end: now(),
+            busy_percent: 100 * waited / (proved - healed).max(1),
+        });
+    }
+
+    /// No new letters; every letter gets its outcomes, and all processes end.
+    pub(crate) fn close(&mut self) {
+        if let Some(last) = self.quiet.last_mut() {
+            last.end = now();
+        }
+        self.tell_all("rest");
+        self.wait_for_all("idle");
+        self.tell_all("quit");
+        self.wait_for_all("bye");
+    }
+
+    fn tell_all(&mut self, line: &str) {
+        for seat in &mut self.seats {
+            if let State::Runs(process) = &mut seat.process {
+                process.tell(line);
+            }
+        }
+    }
+
+    fn wait_for_all(&mut self, line: &str) {
+        let started = Instant::now();
+        loop {
+            let mut processes = self.seats.iter().filter_map(|seat| match &seat.process {
+                State::Runs(process) => Some(process),
+                _ => None,
+            });
+            if processes.all(|process| process.has_said(line)) {
+                return;
+            }
+            if line != "bye" {
+                self.notice_ends();
+            }
+            assert!(
+                started.elapsed() < WATCHDOG,
+                "not all processes say {line}: {}",
+                self.stand()
+            );
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+
+    fn stand(&self) -> String {
+        let seats = self.seats.iter().enumerate().map(|(at, seat)| {
+            let (state, said) = match &seat.process {
+                State::Runs(process) => (process.life.to_string(), process.said.lock().clone()),
+                State::Stopped(_) => ("stopped".to_owned(), Vec::new()),
+                State::Ends(process) => ("ending".to_owned(), process.said.lock().clone()),
+                State::Down => ("down".to_owned(), Vec::new()),
+            };
+            let last: Vec<_> = said.iter().rev().take(4).collect();
+            format!(
+                "\n  seat {at} (host {}), life {state}, {:?}: {last:?}",
+                seat.host, seat.names
+            )
+        });
+        seats.collect()
+    }
+
+    /// Ends every fault, and waits until all gateways and agents are there. Returns when that was.
+    fn settle(&mut self) -> u64 {
+        let started = Instant::now();
+        loop {
+            self.work(Instant::now() + WATCHDOG);
+            let gateways = self
+                .hosts
+                .iter()
+                .all(|host| matches!(host.gateway, State::Runs(_)));
+            let agents = self.seats.iter().all(|seat| match &seat.process {
+                State::Runs(process) => seat.names.iter().all(|name| process.has(name)),
+                _ => false,
+            });
+            if gateways && agents && self.moves.is_empty() {
+                return now();
+            }
+            assert!(
+                started.elapsed() < WATCHDOG,
+                "not all are there: {}",
+                self.stand()
+            );
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+
+    /// Waits until a letter of every stream that was sent after the last fault is delivered.
+    fn prove(&mut self) -> u64 {
+        self.proofs += 1;
+        let token = self.proofs;
+        self.tell_all(&format!("prove {token}"));
+        self.wait_for_all(&format!("proved {token}"));
+        now()
+    }
+
+    /// Carries out what is due, and notices processes that ended by themselves.
+    fn work(&mut self, due: Instant) {
+        self.notice_ends();
+        let (due, later) = self.repairs.drain(..).partition(|(at, _)| *at <= due);
+        self.repairs = later;
+        let due: Vec<(Instant, Repair)> = due;
+        for (_, repair) in due {
+            self.repair(repair);
+        }
+        for host in &mut self.hosts {
+            if host.starting.as_ref().is_some_and(JoinHandle::is_finished) {
+                let started = host.starting.take().unwrap().join();
+                host.gateway = State::Runs(started.expect("a gateway starts"));
+            }
+        }
+        for at in 0..self.seats.len() {
+            if let State::Ends(process) = &mut self.seats[at].process
+                && let Some(status) = process.running.ended()
+            {
+                assert!(
+                    status.success(),
+                    "the process of seat {at} ended with {status}"
+                );
+                self.seats[at].process = State::Down;
+                self.later(1..300, Repair::StartProcess(at));
+            }
+        }
+        let (gone, waiting) = self.moves.drain(..).partition(|going: &Move| {
+            let mut processes = self.seats.iter().filter_map(|seat| match &seat.process {
+                State::Runs(process) | State::Stopped(process) | State::Ends(process) => {
+                    Some(process)
+                }
+                State::Down => None,
+            });
+            let from = processes.find(|process| process.life == going.life);
+            from.is_none_or(|process| process.count_left(&going.name) > going.left_before)
+        });
+        self.moves = waiting;
+        let gone: Vec<Move> = gone;
+        for Move { name, to, .. } in gone {
+            let seat = &mut self.seats[to];
+            seat.names.insert(name.clone());
+            if let State::Runs(process) | State::Stopped(process) = &mut seat.process {
+                process.tell(&format!("register {name}"));
+            }
+        }
+    }
+
+    fn notice_ends(&mut self) {
+        for (at, seat) in self.seats.iter_mut().enumerate() {
+            if let State::Runs(process) = &mut seat.process
+                && let Some(status) = process.running.ended()
+            {
+                panic!("the process of seat {at} ended by itself: {status}");
+            }
+        }
+        for (at, host) in self.hosts.iter_mut().enumerate() {
+            if let State::Runs(gateway) = &mut host.gateway
+                && let Some(status) = gateway.ended()
+            {
+                panic!("the gateway of host {at} ended by itself: {status}");
+            }
+        }
+    }
+
+    fn later(&mut self, milliseconds: std::ops::Range<u64>, repair: Repair) {
+        let after = Duration::from_millis(self.random.u64(milliseconds));
+        self.repairs.push((Instant::now() + after, repair));
+    }
+
+    fn count(&mut self, what: &'static str) {
+        *self.counts.entry(what).or_default() += 1;
+    }
+
+    fn fault(&mut self) {
+        let (_, fault) = self.faults[self.random.usize(..self.faults.len())];
+        fault(self);
+    }
+
+    fn any_host(&mut self) -> usize {
+        self.random.usize(..HOSTS)
+    }
+
+    fn any_seat(&mut self) -> usize {
+        self.random.usize(..self.seats.len())
+    }
+
+    fn kill_process(&mut self) {
+        let seat = self.any_seat();
+        let state = std::mem::replace(&mut self.seats[seat].process, State::Down);
+        let what = match &state {
+            State::Down => return,
+            State::Runs(_) => "processes killed",
+            State::Stopped(_) => "stopped processes killed",
+            State::Ends(_) => "ending processes killed",
+        };
+        self.count(what);
+        if let State::Runs(mut process) | State::Stopped(mut process) | State::Ends(mut process) =
+            state
+        {
+            process.signal("-KILL");
+            let life = process.life;
+            drop(process);
+            self.lives[life].killed = Some(now());
+        }
+        let continues =
+            |repair: &Repair| matches!(repair, Repair::ContinueProcess(it) if *it == seat);
+        self.repairs.retain(|(_, repair)| !continues(repair));
+        self.later(1..700, Repair::StartProcess(seat));
+    }
+
+    /// The process ends in order, and is started again.
+    fn restart_process(&mut self) {
+        let seat = self.any_seat();
+        let state = std::mem::replace(&mut self.seats[seat].process, State::Down);
+        self.seats[seat].process = match state {
+            State::Runs(mut process) => {
+                process.tell("quit");
+                self.count("orderly restarts");
+                State::Ends(process)
+            }
+            other => other,
+        };
+    }
+
+    fn kill_gateway(&mut self) {
+        let at = self.any_host();
+        let state = std::mem::replace(&mut self.hosts[at].gateway, State::Down);
+        if let State::Down = state {
+            return;
+        }
+        let stopped = matches!(state, State::Stopped(_));
+        drop(state);
+        self.count(if stopped {
+            "stopped gateways killed"
+        } else {
+            "gateways killed"
+        });
+        self.repairs
+            .retain(|(_, repair)| !matches!(repair, Repair::ContinueGateway(it) if *it == at));
+        self.later(50..1200, Repair::StartGateway(at));
+    }
+
+    fn stop_process(&mut self) {
+        let seat = self.any_seat();
+        let state = std::mem::replace(&mut self.seats[seat].process, State::Down);
+        self.seats[seat].process = match state {
+            State::Runs(mut process) => {
+                process.signal("-STOP");
+                self.count("processes stopped");
+                self.later(30..2000, Repair::ContinueProcess(seat));
+                State::Stopped(process)
+            }
+            other => other,
+        };
+    }
+
+    fn stop_gateway(&mut self) {
+        let at = self.any_host();
+        let state = std::mem::replace(&mut self.hosts[at].gateway, State::Down);
+        self.hosts[at].gateway = match state {
+            State::Runs(mut gateway) => {
+                send_signal(&mut gateway, "-STOP");
+                self.count("gateways stopped");
+                self.later(30..2000, Repair::ContinueGateway(at));
+                State::Stopped(gateway)
+            }
+            other => other,
+        };
+    }
+
+    fn cut(&mut self) {
+        let at = self.any_host();
+        if std::mem::replace(&mut self.hosts[at].disturbed, true) {
+            return;
+        }
+        if self.random.bool() {
+            self.network.host(at).unplug();
+            self.count("hosts unplugged");
+        } else {
+            self.network.host(at).ip("link set eth0 down");
+            self.count("links down");
+        }
+        self.later(50..3000, Repair::Network(at));
+    }
+
+    fn filter(&mut self) {
+        let at = self.any_host();
+        if std::mem::replace(&mut self.hosts[at].disturbed, true) {
+            return;
+        }
+        let protocol = ["tcp", "udp"][self.random.usize(..2)];
+        let host = self.network.host(at);
+        let what = format!("iifname eth0 meta l4proto {protocol}");
+        let rule = match self.random.u8(..4) {
+            0 => format!("{what} drop"),
+            1 if protocol == "tcp" => format!("{what} reject with tcp reset"),
+            2 => format!("{what} numgen random mod 100 < 10 drop"),
+            _ => format!("{what} numgen random mod 100 < 40 drop"),
+        };
+        filter(host, &rule);
+        self.count("packet filters");
+        self.later(50..3000, Repair::Network(at));
+    }
+
+    fn change_address(&mut self) {
+        let at = self.any_host();
+        let host = &mut self.hosts[at];
+        let all = addresses(at);
+        let next = (host.address + self.random.usize(1..all.len())) % all.len();
+        let old = all[std::mem::replace(&mut host.address, next)];
+        let network = self.network.host(at);
+        network.ip(&format!("addr add 10.99.0.{}/24 dev eth0", all[next]));
+        network.ip(&format!("addr del 10.99.0.{old}/24 dev eth0"));
+        // A deleted first address may take the others with it.
+        let promoted = network
+            .command("ip")
+            .args(["-4", "addr", "show", "dev", "eth0"])
+            .output();
+        let has = String::from_utf8(promoted.unwrap().stdout).unwrap();
+        if !has.contains(&format!("10.99.0.{}/", all[next])) {
+            network.ip(&format!("addr add 10.99.0.{}/24 dev eth0", all[next]));
+        }
+        self.count("address changes");
+    }
+
+    fn move_agent(&mut self) {
+        let name = format!("mover{}", self.random.usize(..MOVERS));
+        let to = self.random.usize(..self.seats.len());
+        let mut seats = self.seats.iter_mut().enumerate();
+        let Some((from, seat)) = seats.find(|(_, seat)| seat.names.contains(&name)) else {
+            return;
+        };
+        if from == to {
+            return;
+        }
+        if let State::Runs(process) = &mut seat.process {
+            let (life, left_before) = (process.life, process.count_left(&name));
+            process.tell(&format!("leave {name}"));
+            seat.names.remove(&name);
+            self.moves.push(Move {
+                name,
+                life,
+                left_before,
+                to,
+            });
+            self.count("moves");
+        }
+    }
+
+    fn repair(&mut self, repair: Repair) {
+        match repair {
+            Repair::StartGateway(at) => self.start_gateway(at),
+            Repair::StartProcess(seat) => self.start_process(seat),
+            Repair::ContinueGateway(at) => {
+                let state = std::mem::replace(&mut self.hosts[at].gateway, State::Down);
+                self.hosts[at].gateway = match state {
+                    State::Stopped(mut gateway) => {
+                        send_signal(&mut gateway, "-CONT");
+                        State::Runs(gateway)
+                    }
+                    other => other,
+                };
+            }
+            Repair::ContinueProcess(seat) => {
+                let state = std::mem::replace(&mut self.seats[seat].process, State::Down);
+                self.seats[seat].process = match state {
+                    State::Stopped(mut process) => {
+                        process.signal("-CONT");
+                        State::Runs(process)
+                    }
+                    other => other,
+                };
+            }
+            Repair::Network(at) => {
+                self.hosts[at].disturbed = false;
+                let host = self.network.host(at);
+                host.plug();
+                host.ip("link set eth0 up");
+                nft(host, "flush ruleset");
+            }
+        }
+    }
+
+    fn start_gateway(&mut self, at: usize) {
+        let mut command = gateway(self.network.host(at), &self.hosts[at].settings);
+        // A stopped process may hold it up, so nothing waits for it here.
+        self.hosts[at].starting = Some(std::thread::spawn(move || {
+            let (gateway, ready) = Running::until_ready(&mut command);
+            assert!(ready.starts_with('{'), "the gateway is not ready: {ready}");
+            gateway
+        }));
+    }
+
+    fn start_process(&mut self, at: usize) {
+        let life = self.lives.len();
+        let log = fipa_testbed::directory().join(format!("log{life}"));
+        let seat = &self.seats[at];
+        let part = Part {
+            seed: self.random.u64(..),
+            log: log.to_str().unwrap().to_owned(),
+            names: self.names.clone(),
+            settings: self.hosts[seat.host].settings.clone(),
+        };
+        let mut command = self
+            .network
+            .host(seat.host)
+            .command(std::env::current_exe().unwrap());
+        command
+            .args([
+                "--ignored",
+                "--exact",
+                "--nocapture",
+                "a_process_of_its_own",
+            ])
+            .env(PART, part.to_text())
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped());
+        let mut running = Running::start(&mut command);
+        let input = running.child().stdin.take().unwrap();
+        let said = Arc::<Mutex<Vec<String>>>::default();
+        let (output, heard) = (running.child().stdout.take().unwrap(), said.clone());
+        std::thread::spawn(move || {
+            for line in BufReader::new(output).lines().map_while(Result::ok) {
+                heard.lock().push(line);
+            }
+        });
+        let mut process = Process {
+            running,
+            input,
+            said,
+            life,
+        };
+        for name in &seat.names {
+            process.tell(&format!("register {name}"));
+        }
+        self.seats[at].process = State::Runs(process);
+        self.lives.push(Life { log, killed: None });
+    }
+}
+
+/// Returns the time, in microseconds, in which some process of the machine waited for a processor.
+fn waited_for_processors() -> u64 {
+    let pressure = std::fs::read_to_string("/proc/pressure/cpu").unwrap_or_default();
+    let total = pressure.split("total=").nth(1);
+    let total = total.and_then(|it| it.split_whitespace().next());
+    total.and_then(|it| it.parse().ok()).unwrap_or(0)
+}
+
+fn settings(at: usize, order: &[&str], mdns: bool) -> Vec<String> {
+    let mut settings = vec![
+        format!("domain=host{at}"),
+        format!("mts.name=gateway{at}"),
+        format!("mts.transports=shm,{}", order.join(",")),
+        format!("discovery.mdns={mdns}"),
+        "access.deny={ \".*\" = [\".* performative=cancel\"] }".to_owned(),
+    ];
+    for kind in order {
+        settings.push(format!("transport.{kind}.listen=[\"0.0.0.0:{PORT}\"]"));
+    }
+    settings.push(match order.contains(&"quic") {
+        true => format!("security.keys={}", keys(at).dir().display()),
+        false => "security.insecure=true".to_owned(),
+    });
+    if !mdns {
+        let peers = (0..HOSTS).filter(|other| *other != at).map(|other| {
+            let ways = order.iter().flat_map(|kind| {
+                let all = addresses(other).into_iter();
+                all.map(move |address| format!("\"{kind}://10.99.0.{address}:{PORT}\""))
+            });
+            format!("gateway{other} = [{}]", ways.collect::<Vec<_>>().join(", "))
+        });
+        let peers: Vec<String> = peers.collect();
+        settings.push(format!("discovery.static={{ {} }}", peers.join(", ")));
+    }
+    settings
+}

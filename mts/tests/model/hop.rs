@@ -1,0 +1,187 @@
+//! One hop: messages between services, the receiver, and the meaning of answers and reports to the
+//! service that handed a letter over.
+
+use fipa_mts::core::rules::{self, Belief, End, Offer, Told};
+
+use crate::protocol::{Mutant, Protocol};
+use crate::state::{CUSTODIANS, Custodian, Key, Message, Place, SENDER, Service, State, What};
+
+/// The meaning of an answer or a report to the service that handed the letter over.
+pub(crate) enum Heard {
+    Nothing,
+    /// It may have been delivered by an earlier hand-over.
+    Doubt,
+    Delivered,
+    /// It is dispatched again.
+    NotNow(End),
+    OutOfOrder(End, u8),
+    Returned(End),
+    Moved,
+    Failed(End),
+}
+
+impl Protocol {
+    pub(crate) fn send(state: &mut State, message: Message) {
+        if let Some(custodian) = message.to.custodian()
+            && state.custodians[custodian].life != message.to.life
+        {
+            return;
+        }
+        let place = state.network.partition_point(|other| *other < message);
+        state.network.insert(place, message);
+    }
+
+    pub(crate) fn remove(state: &mut State, message: Message) {
+        let place = state.network.binary_search(&message);
+        state.network.remove(place.expect("it is under way"));
+    }
+
+    pub(crate) fn service(state: &State, node: u8) -> Service {
+        let mut service = Service { node, life: 0 };
+        if let Some(custodian) = service.custodian() {
+            service.life = state.custodians[custodian].life;
+        }
+        service
+    }
+
+    pub(crate) fn at(state: &State, custodian: usize) -> Service {
+        Self::service(state, CUSTODIANS[custodian])
+    }
+
+    pub(crate) fn reply(state: &mut State, to: Message, what: What) {
+        let answer = Message {
+            from: to.to,
+            to: to.from,
+            what,
+            ..to
+        };
+        Self::send(state, answer);
+    }
+
+    /// Returns the place of a letter in a service, if the service holds the letter.
+    pub(crate) fn place_of(state: &State, at: Service, key: Key) -> Option<Place> {
+        match at.custodian() {
+            None => {
+                let letter = &state.letters[usize::from(key.sequence) - 1];
+                (at == SENDER
+                    && letter.outcome.is_none()
+                    && letter.registration == key.registration)
+                    .then_some(letter.place)
+            }
+            Some(custodian) if Self::at(state, custodian) == at => {
+                let mut lane = state.custodians[custodian].held.iter();
+                lane.find(|held| held.key == key).map(|held| held.place)
+            }
+            Some(_) => None,
+        }
+    }
+
+    pub(crate) fn mark(uncertain: &mut bool, end: End) {
+        *uncertain = rules::stays_uncertain(*uncertain, end);
+    }
+
+    /// Returns the meaning of an answer or a report to a service that holds the letter.
+    pub(crate) fn heard(&self, message: Message, place: Place, handed: u8) -> Heard {
+        let current = match place {
+            Place::Out { transfer, .. } => Some(transfer.into()),
+            _ => None,
+        };
+        let answers = matches!(place, Place::Out { to, transfer, .. }
+            if to == message.from && transfer == message.transfer);
+        let told = match message.what {
+            What::Delivered => Told::Delivered,
+            What::Failed { uncertain } | What::Returned { uncertain } => {
+                Told::NotDelivered { uncertain }
+            }
+            _ if !answers => return Heard::Nothing,
+            What::Accepted => return Heard::Delivered,
+            What::OutOfOrder { last } => return Heard::OutOfOrder(End::NotTaken, last),
+            What::Busy => return Heard::NotNow(End::NotTaken),
+            What::Refused => return Heard::Failed(End::NotTaken),
+            What::Gone => return Heard::Moved,
+            What::Copy { .. } | What::Predecessor { .. } => return Heard::Nothing,
+        };
+        let handed = handed & message.from.bit() != 0;
+        let mut belief = rules::believe(handed, told, message.transfer.into(), current);
+        if self.is(Mutant::BelieveAny) && handed {
+            belief = Belief::Believed;
+        }
+        let end = match told {
+            Told::NotDelivered { uncertain: true } => End::Unknown,
+            _ => End::NotTaken,
+        };
+        match (belief, message.what) {
+            (Belief::Ignored, _) => Heard::Nothing,
+            (Belief::OnlyUncertain, _) => Heard::Doubt,
+            (Belief::Believed, What::Delivered) => Heard::Delivered,
+            (Belief::Believed, What::Failed { .. }) => Heard::Failed(end),
+            (Belief::Believed, _) => Heard::Returned(end),
+        }
+    }
+
+    pub(crate) fn to_receiver(&self, state: &mut State, copy: Message) {
+        let What::Copy { after } = copy.what else {
+            return;
+        };
+        let Key {
+            registration,
+            sequence,
+        } = copy.key;
+        if registration == 0 && state.old_gone {
+            return Self::reply(state, copy, What::Gone);
+        }
+        let bit = 1 << sequence;
+        let taken = state.taken();
+        let passed_over = state
+            .open()
+            .any(|(other, _)| other < sequence && taken & (1 << other) == 0);
+        let receiver = &mut state.registrations[usize::from(registration)];
+        let answer = match rules::offer(receiver.last.into(), sequence.into(), after.into()) {
+            Offer::Take => {
+                state.out_of_order |= receiver.taken >= bit;
+                state.passed_over |= passed_over;
+                receiver.last = sequence;
+                receiver.taken |= bit;
+                What::Accepted
+            }
+            Offer::Earlier if receiver.taken & bit != 0 => What::Accepted,
+            Offer::Earlier => What::Refused,
+            Offer::OutOfOrder => What::OutOfOrder {
+                last: receiver.last,
+            },
+        };
+        Self::reply(state, copy, answer);
+    }
+
+    /// Ends an attempt or a custody without an answer or a report.
+    pub(crate) fn give_up(&self, state: &mut State, at: Service, key: Key, end: End) {
+        let (place, uncertain) = match at.custodian() {
+            None => {
+                let letter = &mut state.letters[usize::from(key.sequence) - 1];
+                (&mut letter.place, &mut letter.uncertain)
+            }
+            Some(custodian) => {
+                let Some(held) = Self::held(state, custodian, key) else {
+                    return;
+                };
+                (&mut held.place, &mut held.uncertain)
+            }
+        };
+        *place = Place::Ready;
+        if !(self.is(Mutant::CertainLoss) && end == End::CustodianLost) {
+            Self::mark(uncertain, end);
+        }
+    }
+
+    pub(crate) fn die(&self, state: &mut State, custodian: usize, reports_lost: bool) {
+        let dead = Self::at(state, custodian);
+        state.custodians[custodian] = Custodian {
+            life: dead.life + 1,
+            held: Vec::new(),
+        };
+        state.network.retain(|message| {
+            let copy = matches!(message.what, What::Copy { .. });
+            message.to != dead && (message.from != dead || copy || !reports_lost)
+        });
+    }
+}

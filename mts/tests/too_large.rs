@@ -1,0 +1,145 @@
+//! A letter that is too large for one route waits for another that the directory does not show at
+//! present.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use fipa_acl::{AgentId, Message, Performative};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
+use fipa_mts::letter_for;
+use fipa_sds::{Directory as _, MemoryDirectory, Mts, Registration};
+use fipa_transport::{
+    Answer, AttemptId, Conclusion, FailureReason, Incarnation, Kind, Location, Outcome, WayError,
+    WayFault,
+};
+
+const ARM: Incarnation = Incarnation::from_u64(0xa);
+const ROVER: Incarnation = Incarnation::from_u64(0xb);
+
+struct Bench {
+    directory: Arc<MemoryDirectory>,
+    core: Core,
+    start: Instant,
+}
+
+impl Bench {
+    fn new() -> Self {
+        let mts = Mts::new("mts", Incarnation::from_u64(1));
+        let directory = Arc::new(MemoryDirectory::new(mts));
+        let order = vec![Kind::Shm, Kind::Udp, Kind::Tcp];
+        let config = CoreConfig::new("mts", Incarnation::from_u64(1), order);
+        let shared: Arc<dyn fipa_sds::Directory> = Arc::clone(&directory) as _;
+        let mut core = Core::new(config, shared);
+        core.register("rover".into(), ROVER);
+        let start = Instant::now();
+        Self {
+            directory,
+            core,
+            start,
+        }
+    }
+
+    fn at(&self, ms: u64) -> Now {
+        Now {
+            instant: self.start + Duration::from_millis(ms),
+            utc: SystemTime::UNIX_EPOCH,
+        }
+    }
+
+    /// The arm is reached by these routes from now on.
+    fn reached_by(&mut self, ms: u64, routes: &[&str]) {
+        let _ = self.directory.deregister("arm", ARM);
+        let locations: Vec<Location> = routes.iter().map(|it| it.parse().unwrap()).collect();
+        let arm = Registration::new("arm", ARM, locations);
+        self.directory.register(arm).unwrap();
+        self.core.handle_directory_change(self.at(ms));
+    }
+
+    fn send(&mut self) {
+        let message = Message::builder(Performative::Inform)
+            .sender(AgentId::new("rover").unwrap())
+            .receiver(AgentId::new("arm").unwrap())
+            .build()
+            .unwrap();
+        let submission = Submission {
+            sender: ROVER,
+            letter: letter_for(&message, SystemTime::UNIX_EPOCH).unwrap(),
+            receivers: vec!["arm".into()],
+            deadline: Duration::from_secs(5),
+        };
+        self.core.send(self.at(0), submission);
+    }
+
+    fn dispatched(&mut self) -> (AttemptId, Kind) {
+        match self.core.poll_action() {
+            Some(Action::Dispatch {
+                attempt, location, ..
+            }) => (attempt, location.kind()),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    fn is_too_large(&mut self, ms: u64, attempt: AttemptId) {
+        let error = WayError::new(WayFault::TooLarge, "");
+        let conclusion = Conclusion::NotSent(error);
+        self.core
+            .handle_conclusion(self.at(ms), attempt, conclusion);
+    }
+
+    fn outcome(&mut self) -> Option<Outcome> {
+        std::iter::from_fn(|| self.core.poll_action()).find_map(|action| match action {
+            Action::Outcome { outcome, .. } => Some(outcome),
+            _ => None,
+        })
+    }
+}
+
+#[test]
+fn a_route_that_comes_back_carries_the_letter() {
+    let mut bench = Bench::new();
+    bench.reached_by(0, &["udp://192.0.2.1:1"]);
+    bench.send();
+    let (attempt, kind) = bench.dispatched();
+    assert_eq!(kind, Kind::Udp);
+    bench.is_too_large(1, attempt);
+    assert_eq!(bench.outcome(), None);
+    bench.reached_by(500, &["tcp://192.0.2.1:1"]);
+    bench.core.handle_timeout(bench.at(600));
+    let (attempt, kind) = bench.dispatched();
+    assert_eq!(kind, Kind::Tcp);
+    let accepted = Conclusion::Answered(Answer::Accepted);
+    bench
+        .core
+        .handle_conclusion(bench.at(601), attempt, accepted);
+    let outcome = bench.outcome().unwrap();
+    assert!(outcome.is_success(), "{outcome}");
+}
+
+#[test]
+fn a_letter_too_large_for_every_route_fails_at_once() {
+    let mut bench = Bench::new();
+    bench.reached_by(0, &["udp://192.0.2.1:1", "tcp://192.0.2.1:1"]);
+    bench.send();
+    for _ in 0..2 {
+        let (attempt, _) = bench.dispatched();
+        bench.is_too_large(1, attempt);
+    }
+    let outcome = bench.outcome().unwrap();
+    let reason = FailureReason::TooLarge;
+    assert!(matches!(outcome, Outcome::Failed { reason: it, .. } if it == reason));
+}
+
+#[test]
+fn the_reason_at_the_deadline_is_the_size() {
+    let mut bench = Bench::new();
+    bench.reached_by(0, &["udp://192.0.2.1:1"]);
+    bench.send();
+    let (attempt, _) = bench.dispatched();
+    bench.is_too_large(1, attempt);
+    bench.core.handle_timeout(bench.at(5001));
+    let outcome = bench.outcome().unwrap();
+    let reason = FailureReason::TooLarge;
+    assert!(matches!(outcome, Outcome::Failed { reason: it, .. } if it == reason));
+}

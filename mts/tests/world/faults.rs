@@ -1,0 +1,194 @@
+//! Faults that begin at some time and end: deaths, outages, stalls, changes of addresses.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use fipa_transport::{Incarnation, Kind};
+
+use super::gates::Denied;
+use super::{Breach, Event, PROCESSES, World};
+
+/// How long a sender may keep letters for a registration that has ended (rule 16 of the stream
+/// protocol): letters for the next one wait for them.
+pub(super) const ENDED: Duration = Duration::from_secs(2);
+
+impl World {
+    /// Every fault begins before the world heals.
+    pub(super) fn plan_faults(&mut self) {
+        let w = self.weather;
+        type Fault = (u32, fn() -> Event);
+        let faults: [Fault; 7] = [
+            (w.deaths, || Event::Die),
+            (w.restarts, || Event::Restart),
+            (w.moves, || Event::Move),
+            (w.partitions, || Event::CutOff),
+            (w.stalls, || Event::Stall),
+            (w.addresses, || Event::Readdress),
+            (w.outages, || Event::Outage),
+        ];
+        for (count, fault) in faults {
+            for _ in 0..count {
+                let at = self.before_healing();
+                self.at(at, fault());
+            }
+        }
+    }
+
+    pub(super) fn draw_denials(&mut self) {
+        for _ in 0..self.weather.denials {
+            let from = self.before_healing();
+            let until = from + Duration::from_millis(self.random.u64(20..400));
+            let host = self.random.usize(..self.weather.hosts);
+            let name = format!("h{host}_p{}_0", self.random.usize(..PROCESSES));
+            let gateway = self.random.usize(..self.weather.hosts);
+            let name = name.as_str().into();
+            self.denied.push((gateway, Denied { name, from, until }));
+            self.fault_until(until);
+        }
+    }
+
+    fn before_healing(&mut self) -> Instant {
+        let active = (self.heals - self.start).as_micros() as u64;
+        self.start + Duration::from_micros(self.random.u64(..active))
+    }
+
+    /// A process dies.
+    pub(super) fn die(&mut self) -> Result<(), Breach> {
+        let living: Vec<usize> = (0..self.processes.len())
+            .filter(|&at| self.processes[at].alive)
+            .collect();
+        let Some(&dead) = self.random.choice(&living) else {
+            return Ok(());
+        };
+        let returns = self.random.f64() < 0.8;
+        self.kill(dead, returns)
+    }
+
+    /// A robot process is killed and started again.
+    pub(super) fn restart(&mut self) -> Result<(), Breach> {
+        let robots: Vec<usize> = self.robots().collect();
+        match self.random.choice(&robots) {
+            Some(&dead) => self.kill(dead, true),
+            None => Ok(()),
+        }
+    }
+
+    /// What the process had is gone, what was under way to it breaks off, and after a moment the
+    /// directory has noticed.
+    fn kill(&mut self, dead: usize, returns: bool) -> Result<(), Breach> {
+        // What lay in its queues had been delivered: that is where the promise ends.
+        for (_, agent) in self.processes[dead].agents.clone() {
+            while self.take(dead, agent) {}
+        }
+        self.processes[dead].alive = false;
+        self.break_off(dead);
+        let forgotten = Event::Forgotten {
+            process: dead,
+            returns,
+        };
+        let at = self.after_ms(200, forgotten);
+        self.fault_until(at);
+        Ok(())
+    }
+
+    /// The host of a dead process has noticed.
+    pub(super) fn forgotten(&mut self, dead: usize, returns: bool) -> Result<(), Breach> {
+        let process = &self.processes[dead];
+        let (host, own) = (process.host, process.incarnation);
+        let agents = process.agents.iter().map(|(_, agent)| *agent);
+        let lives: Vec<Incarnation> = match process.gateway {
+            true => vec![own],
+            false => agents.collect(),
+        };
+        self.end_registrations(host, &lives);
+        if returns {
+            let pause = Duration::from_millis(self.random.u64(5..400));
+            self.at(self.now + pause, Event::Reborn { process: dead });
+            self.fault_until(self.now + pause);
+        }
+        Ok(())
+    }
+
+    pub(super) fn reborn(&mut self, dead: usize) -> Result<(), Breach> {
+        let process = &self.processes[dead];
+        let (host, gateway) = (process.host, process.gateway);
+        let names: Vec<String> = match gateway {
+            true => vec![format!("gateway{host}")],
+            false => process.agents.iter().map(|(n, _)| n.to_string()).collect(),
+        };
+        let known = self.news_times(host);
+        self.birth(host, gateway, &names, &known);
+        self.tell(&known, Vec::new());
+        Ok(())
+    }
+
+    /// The gateway of a host has another address of one kind.
+    pub(super) fn readdress(&mut self) -> Result<(), Breach> {
+        let host = self.random.usize(..self.weather.hosts);
+        let kind = match self.random.bool() {
+            true => Kind::Udp,
+            false => Kind::Tcp,
+        };
+        let known = self.news_times(host);
+        self.tell(&known, Vec::new());
+        self.registry.lock().readdress(host, kind, known);
+        Ok(())
+    }
+
+    /// A host is cut off from all others, for long enough that attempts are given up.
+    pub(super) fn cut_off(&mut self) {
+        let host = self.random.usize(..self.weather.hosts);
+        self.cut_off.insert(host);
+        let end = self.after_ms(1500, Event::JoinedAgain { host });
+        self.fault_until(end);
+    }
+
+    /// TCP between a host and the others stands still.
+    pub(super) fn stall(&mut self) {
+        let host = self.random.usize(..self.weather.hosts);
+        let end = self.now + Duration::from_millis(self.random.u64(100..1500));
+        let until = self.stalled.entry(host).or_insert(end);
+        *until = (*until).max(end);
+        self.fault_until(end);
+    }
+
+    /// One kind of transport stops working on one host.
+    pub(super) fn outage(&mut self) {
+        let host = self.random.usize(..self.weather.hosts);
+        let kind = match self.random.u32(..3) {
+            0 => Kind::Shm,
+            1 => Kind::Tcp,
+            _ => Kind::Udp,
+        };
+        self.down.insert((host, kind));
+        let end = self.after_ms(800, Event::OutageEnds { host, kind });
+        self.fault_until(end);
+    }
+
+    /// When something that happens on this host now is known on each.
+    pub(super) fn news_times(&mut self, host: usize) -> Vec<Instant> {
+        let times = (0..self.weather.hosts).map(|other| {
+            let most = match other == host {
+                true => 0,
+                false => self.weather.news_ms,
+            };
+            self.now + Duration::from_micros(self.random.u64(..=most * 1000))
+        });
+        times.collect()
+    }
+
+    /// Tells the processes of each host at its time that the directory has changed, and which
+    /// entries have left it.
+    pub(super) fn tell(
+        &mut self,
+        times: &[Instant],
+        departed: Vec<Vec<(usize, Arc<fipa_sds::Entry>)>>,
+    ) {
+        let mut departed = departed.into_iter();
+        for (host, time) in times.iter().enumerate() {
+            let departed = departed.next().unwrap_or_default();
+            self.at(*time, Event::News { host, departed });
+            self.fault_until(*time + ENDED);
+        }
+    }
+}

@@ -1,0 +1,92 @@
+//! Rules of access: which letters gateways and receiving processes take.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use fipa_acl::Letter;
+use fipa_mts::Gate;
+use fipa_transport::Allowance;
+use parking_lot::Mutex;
+
+use super::Set;
+
+/// Letters that some gate refused, by number and receiver.
+pub(super) type Refused = Arc<Mutex<Set<(u64, Arc<str>)>>>;
+
+/// The rules of one process.
+pub(super) struct Rules {
+    pub(super) seed: u64,
+    /// Share of letters that are refused.
+    pub(super) share: f64,
+    /// Names whose letters are refused for a while.
+    pub(super) denied: Vec<Denied>,
+    /// Letters a second, and until when that is a limit.
+    pub(super) rate: Option<(f64, Instant)>,
+    pub(super) taken: Mutex<Option<Allowance>>,
+    pub(super) refused: Refused,
+}
+
+/// All letters for one name are refused for a while.
+#[derive(Debug, Clone)]
+pub(super) struct Denied {
+    pub(super) name: Arc<str>,
+    pub(super) from: Instant,
+    pub(super) until: Instant,
+}
+
+impl Rules {
+    fn refuses(&self, now: Instant, receiver: &str, number: u64) -> Option<&'static str> {
+        let share = fastrand::Rng::with_seed(self.seed ^ number.wrapping_mul(0x9e37_79b9)).f64();
+        if share < self.share {
+            return Some("this letter is refused");
+        }
+        let mut denied = self.denied.iter();
+        if denied.any(|it| *it.name == *receiver && (it.from..it.until).contains(&now)) {
+            return Some("this receiver is denied");
+        }
+        let (rate, until) = self.rate?;
+        let mut taken = self.taken.lock();
+        let taken = taken.get_or_insert_with(|| Allowance::new(rate, now));
+        let refused = now < until && !taken.take(1.0, rate, now);
+        refused.then_some("too many letters")
+    }
+}
+
+impl Gate for Rules {
+    fn admits(&self, now: Instant, receiver: &str, letter: &Letter) -> Result<(), String> {
+        let Some(number) = number_of(letter) else {
+            return Ok(());
+        };
+        match self.refuses(now, receiver, number) {
+            None => Ok(()),
+            Some(why) => {
+                self.refused.lock().insert((number, receiver.into()));
+                Err(why.to_owned())
+            }
+        }
+    }
+}
+
+/// The content of the letter with this number, at least as long as this.
+pub(super) fn content_of(number: u64, size: usize) -> Vec<u8> {
+    let mut content = format!("<<{number}>>").into_bytes();
+    content.resize(size.max(content.len()), b'.');
+    content
+}
+
+/// The number of a letter, which stands at the beginning of its content.
+pub(super) fn number_of(letter: &Letter) -> Option<u64> {
+    let payload = letter.payload();
+    let bytes = match payload.is_split() {
+        true => &payload.content,
+        false => &payload.head,
+    };
+    number_in(bytes)
+}
+
+/// The number of the letter with this content, or with this content somewhere in its message.
+pub(super) fn number_in(bytes: &[u8]) -> Option<u64> {
+    let start = bytes.windows(2).position(|window| window == b"<<")? + 2;
+    let digits = bytes[start..].split(|byte| *byte == b'>').next()?;
+    std::str::from_utf8(digits).ok()?.parse().ok()
+}

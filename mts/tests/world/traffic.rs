@@ -1,0 +1,248 @@
+//! Agents that send letters and read them.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use fipa_acl::{AgentId, Message, Performative};
+use fipa_mts::core::{SendId, Submission};
+use fipa_mts::letter_for;
+use fipa_sds::Directory;
+use fipa_transport::{Incarnation, Outcome};
+
+use super::checks::Invariant;
+use super::gates::{content_of, number_in};
+use super::links::MAX_DATAGRAM;
+use super::{AGENTS, Breach, Event, PROCESSES, World};
+
+/// Outcomes may come this much after the deadline: one turn of the core's timer.
+const SLACK: Duration = Duration::from_millis(5);
+/// How long letters are still sent when all faults are over.
+const AFTER: Duration = Duration::from_millis(1500);
+
+/// What is remembered of a sent letter, by its number.
+pub(super) struct Sent {
+    pub(super) process: usize,
+    pub(super) sender: Incarnation,
+    /// The names of the receivers, as far as they are known.
+    pub(super) receivers: Vec<Arc<str>>,
+    /// The registration of the only receiver that its sender knew of.
+    pub(super) known: Option<Incarnation>,
+    pub(super) expected: usize,
+    pub(super) outcomes: BTreeMap<Arc<str>, Outcome>,
+    pub(super) at: Instant,
+    pub(super) deadline: Duration,
+    pub(super) size: usize,
+    /// How long delivery may take, when every fault was over before the letter was sent.
+    pub(super) bound: Option<Duration>,
+}
+
+impl World {
+    pub(super) fn plan_traffic(&mut self) {
+        let active = (self.heals - self.start) + AFTER;
+        for _ in 0..self.weather.bursts {
+            let at =
+                self.start + Duration::from_micros(self.random.u64(..active.as_micros() as u64));
+            self.at(at, Event::Send);
+        }
+        let hosts = self.weather.hosts;
+        for pair in 0..self.weather.streams {
+            let from = self.random.usize(..hosts);
+            let to = (from + self.random.usize(1..hosts)) % hosts;
+            let mut process = || self.random.usize(..PROCESSES);
+            let sender = format!("h{from}_p{}_{}", process(), AGENTS - 1);
+            let receiver = format!("h{to}_p{}_0", process());
+            self.pairs.push((sender.into(), receiver.into()));
+            self.at(self.start, Event::Stream { pair });
+        }
+    }
+
+    /// An agent sends a few letters.
+    pub(super) fn send_burst(&mut self) -> Result<(), Breach> {
+        let living: Vec<usize> = self.robots().collect();
+        let Some(&at) = self.random.choice(&living) else {
+            return Ok(());
+        };
+        let agents = self.processes[at].agents.iter();
+        let Some((name, sender)) = self.random.choice(agents).cloned() else {
+            return Ok(());
+        };
+        let host = self.random.usize(..self.weather.hosts);
+        // Few pairs and bursts, so that many letters share a stream.
+        // Few patterns: to compile them takes longer than all the rest.
+        let receiver = match self.random.u32(..100) {
+            0 => format!("h{host}_.*"),
+            1..=10 => "nobody".to_owned(),
+            _ => format!("h{host}_p{}_{}", self.random.usize(..PROCESSES), 0),
+        };
+        let receiver = receiver.as_str().into();
+        for _ in 0..self.random.u32(1..6) {
+            self.send(at, (&name, sender), &receiver)?;
+        }
+        Ok(())
+    }
+
+    /// The next letters of a pair that sends without a pause.
+    pub(super) fn send_on(&mut self, pair: usize) -> Result<(), Breach> {
+        if self.now > self.quiet + AFTER {
+            return Ok(());
+        }
+        let pause = Duration::from_millis(self.random.u64(10..150));
+        self.at(self.now + pause, Event::Stream { pair });
+        let (from, to) = self.pairs[pair].clone();
+        let robots: Vec<usize> = self.robots().collect();
+        for at in robots {
+            let mut agents = self.processes[at].agents.iter();
+            if let Some((_, sender)) = agents.find(|(name, _)| *name == from).cloned() {
+                for _ in 0..self.random.u32(1..4) {
+                    self.send(at, (&from, sender), &to)?;
+                }
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    fn send(
+        &mut self,
+        at: usize,
+        (name, sender): (&Arc<str>, Incarnation),
+        receiver: &Arc<str>,
+    ) -> Result<(), Breach> {
+        let number = self.sent.len() as u64 + 1;
+        let size = match self.random.f64() < self.weather.large {
+            true => self.random.usize(MAX_DATAGRAM + 1..MAX_DATAGRAM * 5),
+            false => 0,
+        };
+        let message = Message::builder(Performative::Inform)
+            .sender(AgentId::new(&**name).expect("a name"))
+            .receiver(AgentId::new(&**receiver).expect("a name"))
+            .content(content_of(number, size))
+            .build()
+            .expect("a message");
+        let letter = letter_for(&message, self.clocks().utc).expect("a letter");
+        let size = letter.len();
+        let healed = self.now >= self.quiet;
+        let deadline = self.weather.deadlines.draw(&mut self.random, healed);
+        let submission = Submission {
+            sender,
+            letter,
+            receivers: vec![Arc::clone(receiver)],
+            deadline,
+        };
+        let known = self.view(at).known(receiver).map(|it| it.incarnation);
+        let receivers = match known {
+            Some(_) => vec![Arc::clone(receiver)],
+            None => self.meant_by(at, name, receiver),
+        };
+        let now = self.clocks();
+        let (send, expected) = self.processes[at].core.send(now, submission);
+        self.sends.insert((at, send), number);
+        let bound = Some(self.bound(size))
+            .filter(|bound| self.now >= self.quiet && known.is_some() && deadline > *bound);
+        if let Some(bound) = bound {
+            self.bounded += 1;
+            self.at(self.now + bound, Event::Liveness { number });
+        }
+        for receiver in &receivers {
+            let stream = (sender, Arc::clone(receiver));
+            self.open.entry(stream).or_default().insert(number);
+            self.open_bytes += size;
+        }
+        self.sent.insert(
+            number,
+            Sent {
+                process: at,
+                sender,
+                receivers,
+                known,
+                expected,
+                outcomes: BTreeMap::new(),
+                at: self.now,
+                deadline,
+                size,
+                bound,
+            },
+        );
+        self.at(self.now + deadline + SLACK, Event::Deadline { number });
+        self.carry_out(at)
+    }
+
+    /// The names of those that get a letter for a pattern.
+    fn meant_by(&self, at: usize, sender: &str, pattern: &str) -> Vec<Arc<str>> {
+        let Some(start) = pattern.strip_suffix(".*") else {
+            return Vec::new();
+        };
+        let entries = self.view(at).entries();
+        let others = entries.iter().filter(|entry| *entry.name != *sender);
+        others
+            .filter(|entry| entry.name.starts_with(start))
+            .map(|entry| Arc::clone(&entry.name))
+            .collect()
+    }
+
+    pub(super) fn outcome(
+        &mut self,
+        sent: (usize, SendId),
+        receiver: Arc<str>,
+        outcome: Outcome,
+    ) -> Result<(), Breach> {
+        let Some(&number) = self.sends.get(&sent) else {
+            return Err(format!("an outcome of a letter nobody sent: {outcome}"));
+        };
+        self.trace(|| format!("letter {number} to {receiver}: {outcome}"));
+        let sent = self.sent.get_mut(&number).expect("it was sent");
+        let stream = (sent.sender, Arc::clone(&receiver));
+        if let Some(open) = self.open.get_mut(&stream)
+            && open.remove(&number)
+        {
+            self.open_bytes -= sent.size;
+        }
+        if sent.bound.is_some() && matches!(outcome, Outcome::Delivered { .. }) {
+            self.slowest = self.slowest.max(self.now - sent.at);
+        }
+        if let Some(first) = sent.outcomes.insert(receiver, outcome.clone()) {
+            self.breach(Invariant::OneOutcome, || {
+                format!("letter {number}: {first}, then {outcome}")
+            });
+        }
+        Ok(())
+    }
+
+    pub(super) fn read(&mut self, at: usize, agent: Incarnation) -> Result<(), Breach> {
+        if !self.processes[at].alive {
+            return Ok(());
+        }
+        // All at once when there is no pause to keep, so that queues do not fill in calm weather.
+        let most = match self.weather.reading_pause_ms > 1 {
+            true => 1,
+            false => usize::MAX,
+        };
+        let mut read = 0;
+        while read < most && self.take(at, agent) {
+            read += 1;
+        }
+        self.reading.remove(&agent);
+        if self.processes[at].core.waiting(agent) > 0 {
+            self.reading.insert(agent);
+            self.after_ms(1 + self.weather.reading_pause_ms, Event::Read { at, agent });
+        }
+        self.carry_out(at)
+    }
+
+    /// An agent takes the next letter out of its queue. Returns whether there was one.
+    pub(super) fn take(&mut self, at: usize, agent: Incarnation) -> bool {
+        let Some(received) = self.processes[at].core.take(agent) else {
+            return false;
+        };
+        if received.via.is_none() {
+            self.failures_told += 1;
+            return true;
+        }
+        let message = Message::decode(received.letter.payload()).expect("a message");
+        let content = message.content().expect("content");
+        let number = number_in(content).expect("a number");
+        self.check_take(agent, number);
+        true
+    }
+}

@@ -1,0 +1,67 @@
+//! What letters that wait may take of memory.
+
+use std::fs;
+
+use bytesize::ByteSize;
+
+use super::{Area, Check, Verdict};
+use crate::Config;
+
+const AREA: Area = Area("queues");
+
+pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
+    let available = fs::read_to_string("/proc/meminfo");
+    let available = available.ok().and_then(|text| available_in(&text));
+    checks.push(queues(config, available));
+}
+
+fn queues(config: &Config, available: Option<u64>) -> Check {
+    const CHECK: &str = "memory of waiting letters";
+    let bytes = config.mts.queue_bytes;
+    let each = format!(
+        "up to {} letters or {} wait for each agent",
+        config.mts.queue,
+        ByteSize::b(bytes)
+    );
+    match available {
+        Some(available) if available < bytes => AREA.wrong(
+            CHECK,
+            Verdict::Doubtful,
+            format!("{each}, and {} of memory is free", ByteSize::b(available)),
+            "make mts.queue_bytes smaller, so that one slow agent cannot take all memory",
+        ),
+        _ => AREA.fine(CHECK, each),
+    }
+}
+
+/// Bytes of memory that are available, as `/proc/meminfo` says.
+fn available_in(meminfo: &str) -> Option<u64> {
+    let line = meminfo
+        .lines()
+        .find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    let kib: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    kib.checked_mul(1024)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_queue_larger_than_free_memory_is_doubtful() {
+        let config = Config::for_host("sherpa");
+        assert_eq!(queues(&config, None).verdict, Verdict::Fine);
+        assert_eq!(queues(&config, Some(1 << 30)).verdict, Verdict::Fine);
+        let small = queues(&config, Some(1 << 20));
+        assert_eq!(small.verdict, Verdict::Doubtful);
+        assert!(small.found.contains("64.0 MiB"), "{}", small.found);
+    }
+
+    #[test]
+    fn available_memory_is_read() {
+        let text = "MemTotal:  100 kB\nMemAvailable:   12 kB\n";
+        assert_eq!(available_in(text), Some(12 * 1024));
+        assert_eq!(available_in("MemAvailable: x kB"), None);
+        assert_eq!(available_in(""), None);
+    }
+}

@@ -1,0 +1,85 @@
+//! A mailbox that as many processes have open as it has room for: the letters of further processes
+//! take the next route.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+mod services;
+
+use std::time::Duration;
+
+use fipa::{Kind, Outcome};
+use fipa_mts::core::Submission;
+use fipa_transport::Incarnation;
+use tokio::time::timeout;
+
+use services::{ARM, Place, host, letter, number};
+
+const ORDER: [Kind; 2] = [Kind::Shm, Kind::Tcp];
+
+/// Processes that can have the mailbox open.
+const CLIENTS: usize = 3;
+
+/// Processes that send.
+const SENDERS: usize = 6;
+
+#[tokio::test(flavor = "multi_thread")]
+async fn beyond_max_clients_letters_take_the_next_route() {
+    let host = host();
+    let arms = Place::with_clients(host.path(), "arms", &ORDER, CLIENTS);
+    arms.mts.register("arm".into(), ARM);
+    let mut senders = Vec::new();
+    for sender in 0..SENDERS {
+        let place = Place::start(host.path(), &format!("rovers-{sender}"), &ORDER, false);
+        place.knows_arm_at(arms.everywhere());
+        let rover = Incarnation::random();
+        place.mts.register("rover".into(), rover);
+        for letter in 0..3 {
+            let outcome = send((&place, rover), &arms, 10 * sender + letter).await;
+            let Outcome::Delivered { via, attempts } = outcome else {
+                panic!("{outcome}");
+            };
+            let expected = match sender < CLIENTS {
+                true => Kind::Shm,
+                false => Kind::Tcp,
+            };
+            assert_eq!(via, expected, "sender {sender}");
+            // The route says why it was not taken, at least the first time.
+            if letter == 0 && expected == Kind::Tcp {
+                let reasons: Vec<String> = attempts.iter().map(ToString::to_string).collect();
+                let reasons = reasons.join("; ");
+                assert!(reasons.contains("max_clients"), "{reasons}");
+            }
+        }
+        senders.push((place, rover));
+    }
+    assert_eq!(arms.shm().arrived, 3 * CLIENTS as u64);
+
+    // A process that leaves makes room for another one.
+    let (left, _) = senders.remove(0);
+    left.mts.close(Duration::from_secs(1)).await;
+    drop(left);
+    let (last, rover) = senders.pop().unwrap();
+    let patience = async {
+        for attempt in 100.. {
+            let outcome = send((&last, rover), &arms, attempt).await;
+            if matches!(outcome, Outcome::Delivered { via: Kind::Shm, .. }) {
+                return;
+            }
+            assert!(outcome.is_success(), "{outcome}");
+        }
+    };
+    timeout(Duration::from_secs(60), patience).await.unwrap();
+}
+
+/// Sends a letter with this number and takes it out.
+async fn send((from, rover): (&Place, Incarnation), to: &Place, sequence: usize) -> Outcome {
+    let sending = from.mts.send(Submission {
+        sender: rover,
+        letter: letter(sequence),
+        receivers: vec!["arm".into()],
+        deadline: Duration::from_secs(20),
+    });
+    let received = timeout(Duration::from_secs(60), to.mts.receive(ARM)).await;
+    assert_eq!(number(&received.unwrap().unwrap().letter), sequence);
+    sending.outcomes().await.remove(0).1
+}

@@ -1,0 +1,564 @@
+//! Connections that were accepted and whose letter has not been handed on yet.
+//!
+//! A legacy peer opens one connection per letter and closes it behind the letter, so the letters of
+//! one address have to be handed on in the order in which their connections were accepted. The queue
+//! of an address gives out two permissions in that order: to read (at most
+//! [`Limits::max_reads_per_address`] connections at once; the others wait in the kernel's buffers),
+//! and to hand on a letter that has been read.
+//!
+//! A connection without progress for [`TURN`] loses its turn: the letters behind it no longer wait
+//! for it. The first byte tells legacy letters from frames and TLS; those leave the queue at once.
+//!
+//! The queue contains no sockets of its own and reads no clock. The tasks in [`accept`](super::accept)
+//! do the I/O.
+
+use std::collections::{BTreeMap, HashMap};
+use std::mem::MaybeUninit;
+use std::net::IpAddr;
+use std::sync::{Arc, Weak};
+use std::time::Duration;
+
+use parking_lot::Mutex;
+use socket2::SockRef;
+use tokio::net::TcpStream;
+use tokio::sync::Notify;
+use tokio::task::AbortHandle;
+
+use super::config::Limits;
+use super::counters::count;
+use super::endpoint::Endpoint;
+use crate::ration::whose;
+
+/// A connection that has sent nothing for this long loses its turn.
+pub(crate) const TURN: Duration = Duration::from_millis(250);
+
+/// The queues of all addresses.
+#[derive(Debug, Default)]
+pub(crate) struct AcceptQueue(Mutex<State>);
+
+#[derive(Debug, Default)]
+struct State {
+    closed: bool,
+    last_ticket: u64,
+    peers: HashMap<IpAddr, Peer>,
+    /// Connections that may be read.
+    reading: usize,
+    /// Connections that may not be read yet.
+    waiting: usize,
+    /// Connections that have left the queues so far.
+    left: u64,
+}
+
+/// The connections of one address.
+#[derive(Debug, Default)]
+struct Peer {
+    /// In the order of acceptance.
+    turns: BTreeMap<u64, Entry>,
+    /// Connections that may be read, with or without a turn.
+    reading: usize,
+}
+
+#[derive(Debug)]
+struct Entry {
+    phase: Phase,
+    /// Wakes the connection's task when one of the permissions may have been granted.
+    wake: Arc<Notify>,
+    /// The connection's task, once it runs.
+    task: Option<AbortHandle>,
+    /// The socket, until its first byte has been seen.
+    silent: Option<Weak<TcpStream>>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    /// Waits for the permission to read.
+    Waiting,
+    /// May be read; the letters behind it wait for it.
+    Reading,
+    /// May be read, and has lost its turn.
+    Stalled,
+}
+
+/// Why a connection does not find room.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Full {
+    /// Too many connections of its address wait.
+    Address,
+    /// Too many connections of all addresses wait.
+    All,
+    /// The endpoint has been closed.
+    Closed,
+}
+
+/// Tasks to end because their connections were pushed out.
+type PushedOut = Vec<AbortHandle>;
+
+impl State {
+    /// Appends a connection to the queue of its address. When there is no room, the oldest
+    /// connection without a byte makes room, because no letter is lost with it.
+    fn admit(
+        &mut self,
+        limits: &Limits,
+        home: IpAddr,
+        entry: Entry,
+        is_silent: impl Fn(&Entry) -> bool,
+    ) -> Result<(u64, PushedOut), Full> {
+        if self.closed {
+            return Err(Full::Closed);
+        }
+        let of_home = self.peers.get(&home).map_or(0, Peer::waiting);
+        let full = if of_home >= limits.max_unread_per_address.max(1) {
+            Some(Full::Address)
+        } else if self.waiting >= limits.max_unread.max(1) {
+            Some(Full::All)
+        } else {
+            None
+        };
+        let mut pushed_out = PushedOut::new();
+        if let Some(full) = full {
+            let from = match full {
+                Full::All => self.most_waiting().unwrap_or(home),
+                _ => home,
+            };
+            let ticket = self.silent(from, is_silent).ok_or(full)?;
+            pushed_out.extend(self.remove(limits, from, ticket).and_then(|out| out.task));
+        }
+        self.last_ticket += 1;
+        let ticket = self.last_ticket;
+        let peer = self.peers.entry(home).or_default();
+        peer.turns.insert(ticket, entry);
+        self.waiting += 1;
+        self.grant(limits, home);
+        Ok((ticket, pushed_out))
+    }
+
+    /// The address of which most connections wait.
+    fn most_waiting(&self) -> Option<IpAddr> {
+        let peers = self.peers.iter();
+        let most = peers.max_by_key(|(_, peer)| peer.waiting());
+        most.map(|(home, _)| *home)
+    }
+
+    /// The oldest connection of an address that has not sent a byte.
+    fn silent(&self, home: IpAddr, is_silent: impl Fn(&Entry) -> bool) -> Option<u64> {
+        let mut turns = self.peers.get(&home)?.turns.iter();
+        let oldest = turns.find(|(_, entry)| entry.task.is_some() && is_silent(entry));
+        oldest.map(|(ticket, _)| *ticket)
+    }
+
+    /// Takes a connection out; what it held is granted to others.
+    fn remove(&mut self, limits: &Limits, home: IpAddr, ticket: u64) -> Option<Entry> {
+        let peer = self.peers.get_mut(&home)?;
+        let entry = peer.turns.remove(&ticket)?;
+        self.left = self.left.wrapping_add(1);
+        match entry.phase {
+            Phase::Waiting => self.waiting -= 1,
+            Phase::Reading | Phase::Stalled => {
+                peer.reading -= 1;
+                self.reading -= 1;
+            }
+        }
+        peer.wake_first();
+        if peer.turns.is_empty() {
+            self.peers.remove(&home);
+        }
+        self.grant(limits, home);
+        if self.reading < limits.max_strangers {
+            self.grant_others(limits);
+        }
+        Some(entry)
+    }
+
+    /// Lets connections of an address be read, in the order of acceptance, as far as there is room.
+    fn grant(&mut self, limits: &Limits, home: IpAddr) {
+        while self.grant_one(limits, home) {}
+    }
+
+    fn grant_one(&mut self, limits: &Limits, home: IpAddr) -> bool {
+        let Some(peer) = self.peers.get_mut(&home) else {
+            return false;
+        };
+        // One connection of each address may always be read, so that no other address stops it.
+        let has_room =
+            peer.reading < limits.max_reads_per_address && self.reading < limits.max_strangers;
+        let has_room = has_room || peer.reading == 0;
+        let mut entries = peer.turns.values_mut();
+        let next = entries.find(|entry| entry.phase == Phase::Waiting);
+        match next {
+            Some(entry) if has_room => {
+                entry.phase = Phase::Reading;
+                entry.wake.notify_one();
+                peer.reading += 1;
+                self.reading += 1;
+                self.waiting -= 1;
+                true
+            }
+            _ => false,
+        }
+    }
+
+    /// Lets connections of all addresses be read, first of those that have the fewest.
+    fn grant_others(&mut self, limits: &Limits) {
+        while self.reading < limits.max_strangers {
+            let peers = self.peers.iter();
+            let waits = peers.filter(|(_, peer)| {
+                peer.waiting() > 0 && peer.reading < limits.max_reads_per_address
+            });
+            let fewest = waits.min_by_key(|(_, peer)| peer.reading);
+            let Some(home) = fewest.map(|(home, _)| *home) else {
+                return;
+            };
+            self.grant_one(limits, home);
+        }
+    }
+
+    /// Takes the turn from a connection that is read and makes no progress. When all connections of
+    /// the address that may be read are such and others wait, the older half is pushed out.
+    fn stall(&mut self, limits: &Limits, home: IpAddr, ticket: u64) -> PushedOut {
+        let mut pushed_out = PushedOut::new();
+        let Some(peer) = self.peers.get_mut(&home) else {
+            return pushed_out;
+        };
+        match peer.turns.get_mut(&ticket) {
+            Some(entry) if entry.phase == Phase::Reading => entry.phase = Phase::Stalled,
+            _ => return pushed_out,
+        }
+        peer.wake_first();
+        let all_stalled = peer.reading >= limits.max_reads_per_address
+            && peer
+                .turns
+                .values()
+                .all(|entry| entry.phase != Phase::Reading);
+        if all_stalled && peer.waiting() > 0 {
+            let stalled = peer.turns.iter();
+            let stalled = stalled.filter(|(_, entry)| entry.phase == Phase::Stalled);
+            let half = peer.reading.div_ceil(2);
+            let oldest: Vec<u64> = stalled.take(half).map(|(ticket, _)| *ticket).collect();
+            for ticket in oldest {
+                pushed_out.extend(self.remove(limits, home, ticket).and_then(|out| out.task));
+            }
+        }
+        pushed_out
+    }
+
+    /// Whether nothing that was accepted before this connection has a turn.
+    fn is_first(&self, home: IpAddr, ticket: u64) -> bool {
+        let Some(peer) = self.peers.get(&home) else {
+            return true;
+        };
+        match peer.turns.get(&ticket) {
+            Some(entry) if entry.phase == Phase::Stalled => true,
+            _ => peer.first().is_none_or(|first| first == ticket),
+        }
+    }
+}
+
+impl Peer {
+    fn waiting(&self) -> usize {
+        self.turns.len() - self.reading
+    }
+
+    /// The connection whose turn it is.
+    fn first(&self) -> Option<u64> {
+        let mut turns = self.turns.iter();
+        let first = turns.find(|(_, entry)| entry.phase != Phase::Stalled);
+        first.map(|(ticket, _)| *ticket)
+    }
+
+    fn wake_first(&self) {
+        if let Some(entry) = self.first().and_then(|first| self.turns.get(&first)) {
+            entry.wake.notify_one();
+        }
+    }
+}
+
+impl Entry {
+    /// Whether the kernel has no byte of this connection.
+    fn is_silent(&self) -> bool {
+        let Some(socket) = self.silent.as_ref().and_then(Weak::upgrade) else {
+            return false;
+        };
+        is_silent(&socket)
+    }
+}
+
+/// Whether the kernel has neither a byte nor the end of this connection. The socket itself is asked,
+/// because the runtime learns of bytes later.
+pub(crate) fn is_silent(socket: &TcpStream) -> bool {
+    let mut byte = [MaybeUninit::uninit()];
+    match SockRef::from(socket).peek(&mut byte) {
+        Ok(_) => false,
+        Err(error) => error.kind() == std::io::ErrorKind::WouldBlock,
+    }
+}
+
+impl AcceptQueue {
+    /// Appends a connection from this address to its queue.
+    ///
+    /// # Errors
+    /// When there is no room.
+    pub(crate) fn admit(
+        &self,
+        endpoint: &Arc<Endpoint>,
+        from: IpAddr,
+        socket: &Arc<TcpStream>,
+    ) -> Result<Place, Full> {
+        let home = whose(from);
+        let wake = Arc::new(Notify::new());
+        let entry = Entry {
+            phase: Phase::Waiting,
+            wake: wake.clone(),
+            task: None,
+            silent: Some(Arc::downgrade(socket)),
+        };
+        let limits = endpoint.limits();
+        let mut state = self.0.lock();
+        let (ticket, pushed_out) = state.admit(limits, home, entry, Entry::is_silent)?;
+        drop(state);
+        end(endpoint, pushed_out);
+        Ok(Place {
+            endpoint: endpoint.clone(),
+            home,
+            ticket,
+            wake,
+        })
+    }
+
+    /// Number of connections that wait for the permission to read, and of those that have left the
+    /// queues so far.
+    pub(crate) fn progress(&self) -> (usize, u64) {
+        let state = self.0.lock();
+        (state.waiting, state.left)
+    }
+
+    /// Ends the tasks of all connections, and admits no more.
+    pub(crate) fn close(&self) {
+        let mut state = self.0.lock();
+        state.closed = true;
+        let entries = state.peers.values().flat_map(|peer| peer.turns.values());
+        let tasks: Vec<_> = entries.filter_map(|entry| entry.task.clone()).collect();
+        drop(state);
+        for task in tasks {
+            task.abort();
+        }
+    }
+}
+
+fn end(endpoint: &Endpoint, pushed_out: PushedOut) {
+    for task in pushed_out {
+        count(&endpoint.tally().refused_crowd);
+        task.abort();
+    }
+}
+
+/// The place of one connection in the queue of its address; dropping it lets the next one through.
+#[derive(Debug)]
+pub(crate) struct Place {
+    endpoint: Arc<Endpoint>,
+    home: IpAddr,
+    ticket: u64,
+    wake: Arc<Notify>,
+}
+
+impl Place {
+    /// Sets the task of this connection. Returns whether it is to go on.
+    pub(crate) fn started(&self, task: AbortHandle) -> bool {
+        self.with_entry(|entry| entry.task = Some(task)).is_some() && !self.state().closed
+    }
+
+    /// Notes that the first byte has been seen.
+    pub(crate) fn has_bytes(&self) {
+        self.with_entry(|entry| entry.silent = None);
+    }
+
+    /// Takes the turn from this connection: no byte came for [`TURN`].
+    pub(crate) fn stalled(&self) {
+        let limits = self.endpoint.limits();
+        let pushed_out = self.state().stall(limits, self.home, self.ticket);
+        end(&self.endpoint, pushed_out);
+    }
+
+    /// Waits for the permission to read this connection.
+    pub(crate) async fn may_read(&self) {
+        while self.with_entry(|entry| entry.phase) == Some(Phase::Waiting) {
+            self.wake.notified().await;
+        }
+    }
+
+    /// Waits until the letters of all connections before this one have been handed on.
+    pub(crate) async fn is_first(&self) {
+        loop {
+            let is_first = self.state().is_first(self.home, self.ticket);
+            if is_first {
+                return;
+            }
+            self.wake.notified().await;
+        }
+    }
+
+    fn state(&self) -> parking_lot::MutexGuard<'_, State> {
+        self.endpoint.accept_queue.0.lock()
+    }
+
+    fn with_entry<T>(&self, change: impl FnOnce(&mut Entry) -> T) -> Option<T> {
+        let mut state = self.state();
+        let peer = state.peers.get_mut(&self.home)?;
+        peer.turns.get_mut(&self.ticket).map(change)
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let limits = self.endpoint.limits();
+        self.state().remove(limits, self.home, self.ticket);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const HERE: IpAddr = IpAddr::V4(std::net::Ipv4Addr::new(10, 0, 0, 1));
+
+    fn limits() -> Limits {
+        Limits {
+            max_strangers: 4,
+            max_reads_per_address: 2,
+            max_unread_per_address: 5,
+            max_unread: 8,
+            ..Limits::default()
+        }
+    }
+
+    fn address(last: u8) -> IpAddr {
+        IpAddr::from([10, 0, 0, last])
+    }
+
+    fn entry() -> Entry {
+        Entry {
+            phase: Phase::Waiting,
+            wake: Arc::default(),
+            task: None,
+            silent: None,
+        }
+    }
+
+    fn admit(state: &mut State, home: IpAddr) -> Result<u64, Full> {
+        let admitted = state.admit(&limits(), home, entry(), |_| false);
+        admitted.map(|(ticket, _)| ticket)
+    }
+
+    fn may_read(state: &State, home: IpAddr) -> Vec<u64> {
+        let turns = state.peers.get(&home).into_iter().flat_map(|p| &p.turns);
+        let reading = turns.filter(|(_, entry)| entry.phase != Phase::Waiting);
+        reading.map(|(ticket, _)| *ticket).collect()
+    }
+
+    #[test]
+    fn permissions_are_granted_in_the_order_of_acceptance() {
+        let mut state = State::default();
+        let tickets: Vec<u64> = (0..5).map(|_| admit(&mut state, HERE).unwrap()).collect();
+        assert_eq!(may_read(&state, HERE), tickets[..2]);
+        // The second has been read first, and waits for the first.
+        assert!(!state.is_first(HERE, tickets[1]));
+        assert!(state.is_first(HERE, tickets[0]));
+        state.remove(&limits(), HERE, tickets[0]);
+        assert!(state.is_first(HERE, tickets[1]));
+        assert_eq!(may_read(&state, HERE), tickets[1..3]);
+        for ticket in &tickets[1..] {
+            state.remove(&limits(), HERE, *ticket);
+        }
+        assert!(state.peers.is_empty());
+        assert_eq!((state.reading, state.waiting), (0, 0));
+    }
+
+    #[test]
+    fn the_newest_connection_beyond_the_bounds_finds_no_room() {
+        let mut state = State::default();
+        for _ in 0..7 {
+            admit(&mut state, HERE).unwrap();
+        }
+        assert_eq!(admit(&mut state, HERE), Err(Full::Address));
+        for _ in 0..5 {
+            admit(&mut state, address(2)).unwrap();
+        }
+        assert_eq!(admit(&mut state, address(2)), Err(Full::All));
+        assert_eq!(may_read(&state, HERE).len(), 2);
+    }
+
+    #[test]
+    fn a_connection_without_a_byte_makes_room() {
+        let mut state = State::default();
+        let silent = admit(&mut state, HERE).unwrap();
+        for _ in 0..6 {
+            admit(&mut state, HERE).unwrap();
+        }
+        let runtime = tokio::runtime::Builder::new_current_thread().build();
+        let task = runtime.unwrap().spawn(async {}).abort_handle();
+        let turns = &mut state.peers.get_mut(&HERE).unwrap().turns;
+        turns.get_mut(&silent).unwrap().task = Some(task);
+        let admitted = state.admit(&limits(), HERE, entry(), |entry| entry.task.is_some());
+        let (_, pushed_out) = admitted.unwrap();
+        assert_eq!(pushed_out.len(), 1);
+        assert!(!state.peers[&HERE].turns.contains_key(&silent));
+    }
+
+    #[test]
+    fn letters_do_not_wait_for_a_stalled_connection() {
+        let mut state = State::default();
+        let stalled = admit(&mut state, HERE).unwrap();
+        let next = admit(&mut state, HERE).unwrap();
+        assert!(!state.is_first(HERE, next));
+        assert!(state.stall(&limits(), HERE, stalled).is_empty());
+        assert!(state.is_first(HERE, next));
+        // It is handed on when it is complete after all.
+        assert!(state.is_first(HERE, stalled));
+        // It still counts among those that are read.
+        let third = admit(&mut state, HERE).unwrap();
+        assert_eq!(may_read(&state, HERE), [stalled, next]);
+        state.remove(&limits(), HERE, next);
+        assert_eq!(may_read(&state, HERE), [stalled, third]);
+    }
+
+    #[test]
+    fn stalled_connections_do_not_stop_their_address() {
+        let mut state = State::default();
+        let tickets: Vec<u64> = (0..3).map(|_| admit(&mut state, HERE).unwrap()).collect();
+        state.stall(&limits(), HERE, tickets[0]);
+        assert_eq!(may_read(&state, HERE), tickets[..2]);
+        // Without a task there is nothing to end; the entry is removed all the same.
+        state.stall(&limits(), HERE, tickets[1]);
+        assert_eq!(may_read(&state, HERE), tickets[1..]);
+    }
+
+    #[test]
+    fn no_address_stops_another() {
+        let mut state = State::default();
+        for last in 1..=2 {
+            for _ in 0..3 {
+                admit(&mut state, address(last)).unwrap();
+            }
+        }
+        // All four places are taken; a third address is read all the same, one at a time.
+        let third = admit(&mut state, address(3)).unwrap();
+        let waits = admit(&mut state, address(3)).unwrap();
+        assert_eq!(may_read(&state, address(3)), [third]);
+        assert_eq!(state.reading, 5);
+        state.remove(&limits(), address(3), third);
+        assert_eq!(may_read(&state, address(3)), [waits]);
+        state.remove(&limits(), address(3), waits);
+        // A place that is given back goes to those that wait.
+        let first = may_read(&state, address(1))[0];
+        state.remove(&limits(), address(1), first);
+        assert_eq!(may_read(&state, address(1)).len(), 2);
+    }
+
+    #[test]
+    fn nothing_is_admitted_after_the_end() {
+        let mut state = State {
+            closed: true,
+            ..State::default()
+        };
+        assert_eq!(admit(&mut state, HERE), Err(Full::Closed));
+    }
+}

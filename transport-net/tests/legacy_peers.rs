@@ -1,0 +1,292 @@
+//! Letters of legacy peers, which send as fipa_services does: one connection per letter, closed
+//! behind it. None is lost, and those of one address arrive in the order of their connections.
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test or bench that cannot go on may panic"
+)]
+
+mod common;
+
+use std::io::{ErrorKind, Read as _, Write as _};
+use std::net::{IpAddr, Ipv4Addr, Shutdown, SocketAddr, TcpStream};
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use common::{Party, Threads, config, runtime, until};
+use fipa_acl::{Dialect, Envelope, Letter, Message, Performative, Representation};
+use fipa_transport::{Answer, Arrival, AttemptId, Conclusion, Kind, Sink, Transport as _, Verdict};
+use fipa_transport_net::{Limits, TcpTransport};
+use parking_lot::{Condvar, Mutex};
+use socket2::{Domain, Socket, Type};
+
+/// A letter as a fipa_services peer sent it, to an agent `echo`.
+const TCP_LETTER: &[u8] = include_bytes!("data/tcp_letter.bin");
+
+const HERE: [u8; 4] = [127, 0, 0, 1];
+
+/// Records what arrives, and can be made to hold up the letters of 127.0.0.1: then those wait for
+/// the core, as on a busy machine.
+#[derive(Default)]
+struct Recorder {
+    arrived: Mutex<Vec<(IpAddr, u64)>>,
+    held: Mutex<bool>,
+    released: Condvar,
+}
+
+impl Recorder {
+    fn hold(&self) {
+        *self.held.lock() = true;
+    }
+
+    fn release(&self) {
+        *self.held.lock() = false;
+        self.released.notify_all();
+    }
+
+    fn of(&self, ip: [u8; 4]) -> Vec<u64> {
+        let arrived = self.arrived.lock();
+        let of_ip = arrived.iter().filter(|(from, _)| *from == IpAddr::from(ip));
+        of_ip.map(|(_, number)| *number).collect()
+    }
+}
+
+impl Sink for Recorder {
+    fn arrived(&self, _: Arrival) -> Verdict {
+        Verdict::Now(Answer::Accepted)
+    }
+
+    fn arrived_unframed(&self, letter: Letter, via: Kind, from: IpAddr) {
+        assert_eq!(via, Kind::Tcp);
+        let (envelope, _) = Envelope::decode(&letter.envelope()).unwrap();
+        assert_eq!(envelope.effective().intended_receivers[0].name(), "echo");
+        let message = Message::decode(letter.payload()).unwrap();
+        let content = message.content().unwrap().to_vec();
+        let number = String::from_utf8(content).unwrap();
+        let number = number.trim_end_matches('.').parse().unwrap();
+        if from == IpAddr::from(HERE) {
+            // Other tasks of this thread go on.
+            tokio::task::block_in_place(|| {
+                let mut held = self.held.lock();
+                while *held {
+                    self.released.wait(&mut held);
+                }
+            });
+        }
+        self.arrived.lock().push((from, number));
+    }
+
+    fn concluded(&self, _: AttemptId, _: Conclusion) {}
+}
+
+/// An endpoint that listens on every loopback address.
+struct Gateway {
+    sink: Arc<Recorder>,
+    transport: TcpTransport,
+    at: SocketAddr,
+    _runtime: Threads,
+}
+
+impl Gateway {
+    fn new() -> Self {
+        let (runtime, sink) = (runtime(), Arc::new(Recorder::default()));
+        let transport = TcpTransport::new(config(&["127.0.0.1:0"]), runtime.handle().clone());
+        let locations = transport.listen(sink.clone()).unwrap();
+        let at = locations[0].address().parse().unwrap();
+        Self {
+            sink,
+            transport,
+            at,
+            _runtime: runtime,
+        }
+    }
+
+    fn connect_from(&self, ip: [u8; 4]) -> TcpStream {
+        let socket = Socket::new(Domain::IPV4, Type::STREAM, None).unwrap();
+        socket
+            .bind(&SocketAddr::from((Ipv4Addr::from(ip), 0)).into())
+            .unwrap();
+        socket.connect(&self.at.into()).unwrap();
+        let stream = TcpStream::from(socket);
+        // A watchdog for reads that never end.
+        stream
+            .set_read_timeout(Some(Duration::from_secs(60)))
+            .unwrap();
+        stream
+    }
+
+    /// Sends a letter over a connection of its own, to the end of which nobody has to listen.
+    fn send(&self, ip: [u8; 4], number: u64) {
+        self.connect_from(ip).write_all(&letter(number, 0)).unwrap();
+    }
+
+    fn refused_crowd(&self) -> u64 {
+        self.transport.counters().refused_crowd
+    }
+}
+
+impl Drop for Gateway {
+    fn drop(&mut self) {
+        self.sink.release();
+    }
+}
+
+/// The recorded letter with a number as its content, and as many bytes more.
+fn letter(number: u64, more: usize) -> Vec<u8> {
+    let (_, length) = Envelope::decode(TCP_LETTER).unwrap();
+    let payload = Bytes::from_static(&TCP_LETTER[length..]).into();
+    let recorded = Message::decode(&payload).unwrap();
+    let message = Message::builder(Performative::Inform)
+        .sender(recorded.sender().unwrap().clone())
+        .receivers(recorded.receivers().iter().cloned())
+        .content(format!("{number}{}", ".".repeat(more)))
+        .build()
+        .unwrap();
+    let mut letter = TCP_LETTER[..length].to_vec();
+    letter.extend(
+        message
+            .encode(Representation::BitEfficient, Dialect::FipaServices)
+            .unwrap(),
+    );
+    letter
+}
+
+fn numbers(numbers: std::ops::Range<u64>) -> Vec<u64> {
+    numbers.collect()
+}
+
+#[test]
+fn a_burst_arrives_whole_and_in_the_order_of_its_connections() {
+    let gateway = Gateway::new();
+    for number in 0..1000 {
+        gateway.send(HERE, number);
+    }
+    let arrived = until("all letters", || {
+        let arrived = gateway.sink.of(HERE);
+        (arrived.len() + gateway.refused_crowd() as usize >= 1000).then_some(arrived)
+    });
+    assert_eq!(arrived, numbers(0..1000));
+}
+
+#[test]
+fn letters_of_any_length_arrive_in_the_order_of_their_connections() {
+    let gateway = Gateway::new();
+    gateway.sink.hold();
+    for number in 0..200 {
+        let long = if number % 10 == 0 { 100_000 } else { 0 };
+        let mut stream = gateway.connect_from(HERE);
+        stream.write_all(&letter(number, long)).unwrap();
+    }
+    gateway.sink.release();
+    until("all letters", || {
+        (gateway.sink.of(HERE).len() == 200).then_some(())
+    });
+    assert_eq!(gateway.sink.of(HERE), numbers(0..200));
+}
+
+/// The letters lie complete in the kernel's buffers, and their senders have long gone.
+#[test]
+fn letters_that_wait_for_a_busy_gateway_are_all_read_later() {
+    let gateway = Gateway::new();
+    gateway.sink.hold();
+    for number in 0..500 {
+        gateway.send(HERE, number);
+    }
+    // Another address is not held up.
+    for number in 0..100 {
+        gateway.send([127, 0, 0, 2], number);
+    }
+    until("the letters of the other address", || {
+        (gateway.sink.of([127, 0, 0, 2]).len() == 100).then_some(())
+    });
+    assert_eq!(gateway.sink.of([127, 0, 0, 2]), numbers(0..100));
+    assert!(gateway.sink.of(HERE).is_empty());
+    gateway.sink.release();
+    until("the letters that waited", || {
+        (gateway.sink.of(HERE).len() == 500).then_some(())
+    });
+    assert_eq!(gateway.sink.of(HERE), numbers(0..500));
+    assert_eq!(gateway.refused_crowd(), 0);
+}
+
+#[test]
+fn beyond_the_bounds_the_newest_connection_is_reset_and_its_sender_sees_it() {
+    let gateway = Gateway::new();
+    gateway.sink.hold();
+    let limits = Limits::default();
+    let room = (limits.max_reads_per_address + limits.max_unread_per_address) as u64;
+    assert_eq!(room, 32 + 512);
+    for number in 0..room {
+        gateway.send(HERE, number);
+    }
+    for number in 1..=20 {
+        let mut stream = gateway.connect_from(HERE);
+        let told = stream
+            .write_all(&letter(number, 0))
+            .and_then(|()| stream.read(&mut [0]));
+        let told = told.unwrap_err().kind();
+        let reset = [ErrorKind::ConnectionReset, ErrorKind::BrokenPipe];
+        assert!(reset.contains(&told), "{told}");
+        until("the count", || {
+            (gateway.refused_crowd() == number).then_some(())
+        });
+    }
+    gateway.send([127, 0, 0, 2], 1);
+    until("a letter of another address", || {
+        (gateway.sink.of([127, 0, 0, 2]) == [1]).then_some(())
+    });
+    gateway.sink.release();
+    until("the letters that waited", || {
+        (gateway.sink.of(HERE).len() as u64 == room).then_some(())
+    });
+    assert_eq!(gateway.sink.of(HERE), numbers(0..room));
+    assert_eq!(gateway.refused_crowd(), 20);
+}
+
+#[test]
+fn letters_do_not_wait_for_connections_that_say_nothing() {
+    let gateway = Gateway::new();
+    let mut silent: Vec<TcpStream> = (0..40).map(|_| gateway.connect_from(HERE)).collect();
+    let mut half = gateway.connect_from(HERE);
+    half.write_all(&letter(4, 0)[..50]).unwrap();
+    for number in 0..3 {
+        gateway.send(HERE, number);
+    }
+    until("the letters behind them", || {
+        (gateway.sink.of(HERE).len() == 3).then_some(())
+    });
+    // Those that speak after all are read.
+    silent[7].write_all(&letter(3, 0)).unwrap();
+    silent[7].shutdown(Shutdown::Write).unwrap();
+    until("a late letter", || {
+        (gateway.sink.of(HERE).len() == 4).then_some(())
+    });
+    half.write_all(&letter(4, 0)[50..]).unwrap();
+    drop(half);
+    until("the letter that stopped half way", || {
+        (gateway.sink.of(HERE).len() == 5).then_some(())
+    });
+    assert_eq!(gateway.sink.of(HERE), numbers(0..5));
+    assert_eq!(gateway.refused_crowd(), 0);
+}
+
+#[test]
+fn half_letters_stop_neither_their_address_nor_framed_peers() {
+    let gateway = Gateway::new();
+    let _half: Vec<TcpStream> = (0..100)
+        .map(|_| {
+            let mut stream = gateway.connect_from(HERE);
+            stream.write_all(&letter(9, 0)[..50]).unwrap();
+            stream
+        })
+        .collect();
+    gateway.send(HERE, 1);
+    let framed = Party::new();
+    let to = gateway.at.to_string();
+    let to = fipa_transport::Location::new(Kind::Tcp, &to).unwrap();
+    framed.send(1, &to, common::parcel(1, "x")).unwrap();
+    assert_eq!(framed.conclusion(1), common::accepted());
+    until("the letter behind them", || {
+        (gateway.sink.of(HERE) == [1]).then_some(())
+    });
+}

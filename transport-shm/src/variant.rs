@@ -1,0 +1,48 @@
+//! The variant of iceoryx2 that this transport uses.
+
+use std::fmt::Debug;
+
+use iceoryx2::prelude::ZeroCopySend;
+use iceoryx2::service::Service;
+use iceoryx2::service::internal::ServiceInternal;
+use iceoryx2_bb_elementary_traits::testing::abandonable::Abandonable;
+use iceoryx2_cal::resizable_shared_memory::dynamic::DynamicMemory;
+use iceoryx2_cal::shared_memory::common::details::{AllocatorDetails, Memory};
+use iceoryx2_cal::shm_allocator::bump_allocator::BumpAllocator;
+use iceoryx2_cal::shm_allocator::pool_allocator::PoolAllocator;
+use iceoryx2_cal::zero_copy_connection::common::details::{Connection, SharedManagementData};
+use iceoryx2_cal::{
+    arc_sync_policy, bag, event, hash, monitoring, reactor, serialize, static_storage,
+};
+
+use crate::storage::Storage;
+
+/// Memory for payloads.
+type Payloads<A> = Memory<A, Storage<AllocatorDetails<A>, true>>;
+
+/// `ipc_threadsafe::Service`, except that the pages of its files are allocated before use.
+#[derive(Debug, Clone)]
+pub(crate) struct Svc {}
+
+impl Service for Svc {
+    type StaticStorage = static_storage::recommended::Ipc;
+    type ConfigSerializer = serialize::recommended::Recommended;
+    type PersistentDynamicStorage<T: Debug + Send + Sync + ZeroCopySend + 'static> =
+        Storage<T, false>;
+    type Bag = bag::recommended::Recommended;
+    type DynamicStorage<T: Debug + Send + Sync + ZeroCopySend + 'static> = Storage<T, false>;
+    type ServiceNameHasher = hash::recommended::Recommended;
+    type SharedMemory = Payloads<PoolAllocator>;
+    type ResizableSharedMemory = DynamicMemory<PoolAllocator, Payloads<PoolAllocator>>;
+    type Connection = Connection<Storage<SharedManagementData, false>>;
+    type Event = event::recommended::Ipc;
+    type Monitoring = monitoring::recommended::Ipc;
+    type Reactor = reactor::recommended::Ipc;
+    type ArcThreadSafetyPolicy<T: Send + Debug + Abandonable> =
+        arc_sync_policy::mutex_protected::MutexProtected<T>;
+    type BlackboardMgmt<T: Send + Sync + Debug + ZeroCopySend + 'static> = Storage<T, false>;
+    type BlackboardPayload = Payloads<BumpAllocator>;
+    type UniqueId = iceoryx2::unique_id_generator::unique_system_id::UniqueSystemId;
+}
+
+impl ServiceInternal<Self> for Svc {}
