@@ -329,6 +329,48 @@ fn entries_leave_with_their_gateway() {
     assert!(directory.lookup("arm").is_none());
 }
 
+/// A gateway that is killed and started again has another incarnation at the same location: the entries
+/// of the old one do not outlive the first letter of the new one.
+#[test]
+fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
+    let mut world = World::new(2, 4);
+    world.join(0, "arm");
+    world.connect();
+    world.run(Duration::from_millis(300));
+    let directory = world.gateways[1].exchange.directory();
+    let old = world.gateways[0].mts.incarnation;
+    let gateway = || directory.lookup("arm").map(|entry| entry.mts.incarnation);
+    assert_eq!(gateway(), Some(old));
+
+    let new = Incarnation::from_u64(77);
+    let at = location(0).with_incarnation(new);
+    let known = (world.gateways[0].mts.clone(), vec![location(0)]);
+    let restarted = (Mts::new("same-name-mts", new), vec![at]);
+    let told = br#"{"version":1,"tell":{"full":{"version":1,"first":true,"last":true,"agents":
+        [{"name":"arm","type":"arm","id":"00000000000003e9","registered":1001}]}}}"#;
+    let now = world.now;
+    let exchange = &mut world.gateways[1].exchange;
+    // A connection with the old one seems to be open: its entries stay.
+    exchange.handle_neighbours(now, &[known, restarted.clone()]);
+    exchange.handle_letter(now, new, told).unwrap();
+    assert!(directory.speaks_for(old));
+    // It ends: they leave at once, and those of the new one are there.
+    exchange.handle_neighbours(now, &[restarted.clone()]);
+    assert!(!directory.speaks_for(old));
+    assert_eq!(gateway(), Some(new));
+
+    // The connection with the old one ends first: its entries stay until the new one has told its own.
+    let newer = Incarnation::from_u64(78);
+    let at = location(0).with_incarnation(newer);
+    let started_again = (Mts::new("same-name-mts", newer), vec![at]);
+    exchange.handle_neighbours(now, &[]);
+    exchange.handle_neighbours(now, &[started_again]);
+    assert_eq!(gateway(), Some(new));
+    exchange.handle_letter(now, newer, told).unwrap();
+    assert_eq!(gateway(), Some(newer));
+    assert!(!directory.speaks_for(new));
+}
+
 /// A letter may be faster than the news that its sender can be written to.
 #[test]
 fn what_was_told_too_early_is_asked_for() {

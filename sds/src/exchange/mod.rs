@@ -213,6 +213,28 @@ impl Exchange {
             }
             self.neighbours.insert(mts.incarnation, neighbour);
         }
+        self.end_replaced();
+    }
+
+    /// Ends gateways that another incarnation has replaced: a gateway that was killed and started again
+    /// listens where it listened before. Its agents are those that the new incarnation tells of, and
+    /// letters in the custody of the old one are lost. Before the new one has told its agents, and while
+    /// a connection with the old one is open, the old entries stay.
+    fn end_replaced(&mut self) {
+        let all = &self.neighbours;
+        let successors = |old: &Neighbour| {
+            let tells = |new: &&Neighbour| new.gone.is_none() && new.held.is_some();
+            all.values()
+                .filter(tells)
+                .any(|new| new.is_at_a_location_of(old))
+        };
+        let gone = all.iter().filter(|(_, old)| old.gone.is_some());
+        let replaced = gone.filter(|(_, old)| successors(old));
+        let replaced: Vec<Incarnation> = replaced.map(|(incarnation, _)| *incarnation).collect();
+        for incarnation in replaced {
+            self.neighbours.remove(&incarnation);
+            self.directory.forget(incarnation);
+        }
     }
 
     /// What a letter of this gateway, with [`EXCHANGE_ONTOLOGY`], has as its content.
@@ -251,7 +273,11 @@ impl Exchange {
                 self.directory.forget(from);
                 Ok(())
             }
-            Told::Full(full) => neighbour.told_all(now, full, &self.directory),
+            Told::Full(full) => {
+                neighbour.told_all(now, full, &self.directory)?;
+                self.end_replaced();
+                Ok(())
+            }
             Told::Changes(changes) => neighbour.told_changes(now, changes, &self.directory),
         }
     }
@@ -514,6 +540,15 @@ impl Neighbour {
             asked: None,
             told: None,
         }
+    }
+
+    /// Whether it takes letters where the other one does or did, under another incarnation.
+    fn is_at_a_location_of(&self, other: &Self) -> bool {
+        let same = |one: &Location, two: &Location| {
+            one.kind() == two.kind() && one.address() == two.address()
+        };
+        let mut own = self.locations.iter();
+        own.any(|one| other.locations.iter().any(|two| same(one, two)))
     }
 
     /// When the next letter to it may go.
