@@ -83,7 +83,33 @@ pub trait Tap: Send + Sync {
 /// Cheap to clone; all clones are the same service. It runs until [`close`](Self::close).
 #[derive(Clone)]
 pub struct Mts {
-    shared: Arc<Shared>,
+    shared: Arc<Running>,
+}
+
+/// The service as its users hold it. The last of them closes the transports.
+///
+/// Sinks and tasks hold the inner value, and only while they are called. One of them may be the last
+/// to let go of it, in the middle of a call by a transport; that transport is closed by then, because
+/// `close` waits for such calls.
+struct Running(Arc<Shared>);
+
+impl std::ops::Deref for Running {
+    type Target = Shared;
+
+    fn deref(&self) -> &Shared {
+        &self.0
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        // In a forked child, closing would end the parent's connections.
+        if self.owner.is_this() {
+            for transport in &self.transports {
+                transport.close();
+            }
+        }
+    }
 }
 
 struct Shared {
@@ -222,7 +248,9 @@ impl Mts {
         ];
         shared.tasks.lock().extend(tasks);
         Started {
-            mts: Self { shared },
+            mts: Self {
+                shared: Arc::new(Running(shared)),
+            },
             locations,
             failed,
         }
@@ -621,7 +649,7 @@ fn no_such_transport(kind: Kind) -> WayError {
 /// The outcomes of one letter, to be awaited.
 #[must_use = "await it to learn what became of the letter"]
 pub struct Sending {
-    shared: Arc<Shared>,
+    shared: Arc<Running>,
     slot: Arc<Slot>,
 }
 

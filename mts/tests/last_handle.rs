@@ -1,0 +1,139 @@
+//! The last handle of a service is dropped while a transport calls the service.
+
+use std::sync::mpsc::{self, Receiver, Sender};
+use std::sync::{Arc, OnceLock};
+use std::thread::{self, ThreadId};
+use std::time::Duration;
+
+use fipa_mts::core::CoreConfig;
+use fipa_mts::{Contacts, Mts, RuntimeConfig};
+use fipa_sds::MemoryDirectory;
+use fipa_transport::{
+    Abandoned, Answer, AttemptId, Hop, Incarnation, Introduction, Kind, ListenError, Location,
+    Parcel, Sink, Ticket, Transport, WayError, WayFault,
+};
+use parking_lot::Mutex;
+
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A transport that calls its sink with a lock held, and takes this lock when it is closed.
+struct Locked {
+    sink: OnceLock<Arc<dyn Sink>>,
+    /// Tells which thread closes it.
+    closing: Mutex<Sender<ThreadId>>,
+    /// Serializes calls of the sink and `close`.
+    turn: Mutex<()>,
+}
+
+impl Locked {
+    fn call(&self, introduction: &Introduction) {
+        let _turn = self.turn.lock();
+        if let Some(sink) = self.sink.get() {
+            sink.introduced(introduction);
+        }
+    }
+}
+
+impl Transport for Locked {
+    fn kind(&self) -> Kind {
+        Kind::Shm
+    }
+
+    fn max_letter(&self) -> usize {
+        0
+    }
+
+    fn answers_at_once(&self) -> bool {
+        true
+    }
+
+    fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
+        let _ = self.sink.set(sink);
+        Ok(Vec::new())
+    }
+
+    fn dispatch(&self, _: AttemptId, _: &Location, _: Parcel) -> Result<(), WayError> {
+        Err(WayError::new(WayFault::Unreachable, ""))
+    }
+
+    fn abandon(&self, _: AttemptId) -> Abandoned {
+        Abandoned::Unconfirmed
+    }
+
+    fn answer(&self, _: Ticket, _: Answer) {}
+
+    fn close(&self) {
+        let _ = self.closing.lock().send(thread::current().id());
+        drop(self.turn.lock());
+    }
+}
+
+/// Stops in the middle of a call until the test lets it go on.
+struct Halting {
+    called: Mutex<Sender<()>>,
+    go_on: Mutex<Receiver<()>>,
+}
+
+impl Contacts for Halting {
+    fn heard(&self, _: &str, _: Incarnation, _: Location) {}
+
+    fn doubtful(&self, _: Incarnation) {}
+
+    fn introduced(&self, _: &Introduction) {
+        let _ = self.called.lock().send(());
+        let _ = self.go_on.lock().recv_timeout(PATIENCE);
+    }
+
+    fn parted(&self, _: &Introduction) {}
+}
+
+#[test]
+fn no_transport_is_closed_from_within_a_call_of_its_own() {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .unwrap();
+    let (called, call) = mpsc::channel();
+    let (go_on, going_on) = mpsc::channel();
+    let (closing, closes) = mpsc::channel();
+    let transport = Arc::new(Locked {
+        sink: OnceLock::new(),
+        closing: Mutex::new(closing),
+        turn: Mutex::default(),
+    });
+    let config = RuntimeConfig {
+        spin: Duration::ZERO,
+        unframed_deadline: Duration::from_secs(1),
+        contacts: Some(Arc::new(Halting {
+            called: Mutex::new(called),
+            go_on: Mutex::new(going_on),
+        })),
+        tap: None,
+        gate: None,
+    };
+    let own = Incarnation::from_u64(1);
+    let directory = MemoryDirectory::new(fipa_sds::Mts::new("mts", own));
+    let core = CoreConfig::new("mts", own, vec![Kind::Shm]);
+    let transports: Vec<Arc<dyn Transport>> = vec![transport.clone()];
+    let directory = Arc::new(directory);
+    let started = Mts::start(core, config, directory, transports, runtime.handle());
+    drop(runtime);
+    let introduction = Introduction {
+        name: "crex-mts".into(),
+        hop: Hop {
+            location: "shm://crex".parse().unwrap(),
+            remote: true,
+        },
+        dialled: None,
+    };
+
+    let caller = thread::spawn(move || transport.call(&introduction));
+    call.recv_timeout(PATIENCE).unwrap();
+    let mts = started.mts;
+    let dropping = thread::spawn(move || drop(mts));
+    let closed_by = closes.recv_timeout(PATIENCE).unwrap();
+    assert_eq!(closed_by, dropping.thread().id());
+    go_on.send(()).unwrap();
+    dropping.join().unwrap();
+    caller.join().unwrap();
+}
