@@ -37,7 +37,7 @@ const SECONDS: u64 = 15;
 /// Longest run of a soak, in seconds.
 const EPISODE: u64 = 120;
 /// A recovery, in microseconds, that is worth a look at the logs.
-const SLOW: u64 = 10_000_000;
+const SLOW: u64 = 3_000_000;
 /// Breaches that are printed.
 const SHOWN: usize = 20;
 
@@ -97,8 +97,9 @@ fn print(stage: &Stage, report: &Report) {
     );
     for quiet in &stage.quiet {
         println!(
-            "  a letter of every stream was delivered {} ms after the last fault (processors {} % busy)",
+            "  a letter of every stream was delivered {} ms after the last fault, at {} (processors {} % busy)",
             (quiet.proved - quiet.healed) / 1000,
+            quiet.healed,
             quiet.busy_percent
         );
     }

@@ -94,7 +94,7 @@ fn every_location_is_asked_and_then_again_after_growing_pauses() {
     }
     assert!(pauses.is_sorted(), "{pauses:?}");
     assert_eq!(pauses.first(), Some(&Duration::from_millis(100)));
-    assert_eq!(pauses.last(), Some(&Duration::from_secs(5)));
+    assert_eq!(pauses.last(), Some(&Duration::from_secs(2)));
     let state = &bench.core.peers(bench.now)[0];
     assert_eq!((state.failures.len(), state.rounds), (3, 9));
     assert_eq!(state.answers, None);
@@ -124,18 +124,46 @@ fn who_answers_is_asked_seldom_and_at_once_when_the_connection_ends() {
 }
 
 #[test]
-fn silence_counts_as_nobody() {
+fn a_location_that_is_silent_delays_no_other() {
     let mut bench = Bench::new();
-    bench
-        .core
-        .keep_in_touch(bench.now, vec![peer(&["tcp://a:2", "tcp://b:2"])]);
+    let both = vec![peer(&["tcp://a:2", "tcp://b:2"])];
+    bench.core.keep_in_touch(bench.now, both);
+    let (silent, at) = bench.asked().unwrap();
+    assert_eq!(at, "tcp://a:2");
+    let (answered, at) = bench.asked().unwrap();
+    assert_eq!(at, "tcp://b:2");
+    bench.answers(answered);
+    let state = &bench.core.peers(bench.now)[0];
+    assert_eq!(state.answers, Some("tcp://b:2".parse().unwrap()));
+    bench.wait();
+    let abandoned = bench.core.poll_action();
+    assert!(
+        matches!(abandoned, Some(Action::Abandon { attempt, .. }) if attempt == silent),
+        "{abandoned:?}"
+    );
+    // While the peer answers at one location, only that one is asked.
+    bench.wait();
+    let (attempt, at) = bench.asked().unwrap();
+    assert_eq!(at, "tcp://b:2");
+    assert!(bench.asked().is_none());
+    // It answers there no more: all are asked.
+    bench.fails(attempt);
+    assert_eq!(bench.asked().unwrap().1, "tcp://a:2");
+    assert_eq!(bench.wait(), Duration::from_millis(100));
+    assert_eq!(bench.asked().unwrap().1, "tcp://b:2");
+}
+
+#[test]
+fn silence_counts_as_a_failure() {
+    let mut bench = Bench::new();
+    let listed = vec![peer(&["tcp://a:2"])];
+    bench.core.keep_in_touch(bench.now, listed);
     bench.asked().unwrap();
     bench.wait();
     assert!(matches!(
         bench.core.poll_action(),
         Some(Action::Abandon { .. })
     ));
-    assert_eq!(bench.asked().unwrap().1, "tcp://b:2");
     let state = &bench.core.peers(bench.now)[0];
     assert_eq!(state.failures[0].1.fault, WayFault::TimedOut);
 }

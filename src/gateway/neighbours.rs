@@ -75,8 +75,7 @@ impl From<Neighbour> for Connected {
 }
 
 impl Neighbours {
-    /// The peers that the configuration names, whose locations are known better than by what a
-    /// connection shows of them.
+    /// The peers that the configuration names, with their locations.
     pub(crate) fn name_peers(&self, peers: Vec<Peer>) {
         self.state.lock().peers = peers;
     }
@@ -225,13 +224,21 @@ impl State {
 }
 
 impl Neighbour {
-    /// Brings the locations of the entry up to date: those of the configuration, then those of the
-    /// open connections, the latest first. Says whether they have changed.
+    /// Brings the locations of the entry up to date: those of the open connections, the latest first,
+    /// then those of the configuration over transports that no connection is open by. Another location
+    /// of the configuration may be an address that the peer does not have at present, and each letter
+    /// that tries it waits for an answer. Says whether they have changed.
     fn locate(&mut self) -> bool {
-        let mut locations = self.configured.clone();
-        for hop in self.hops.iter().rev() {
-            if locations.len() < Entry::MAX_LOCATIONS && !locations.contains(hop) {
-                locations.push(hop.clone());
+        let hops: Vec<&Location> = self.hops.iter().rev().collect();
+        let is_open = |kind| hops.iter().any(|hop| hop.kind() == kind);
+        // Those at an address that the peer has come first.
+        let configured = self.configured.iter();
+        let mut others: Vec<&Location> = configured.filter(|it| !is_open(it.kind())).collect();
+        others.sort_by_key(|location| !hops.iter().any(|hop| host(hop) == host(location)));
+        let mut locations: Vec<Location> = Vec::new();
+        for location in hops.iter().copied().chain(others) {
+            if locations.len() < Entry::MAX_LOCATIONS && !locations.contains(location) {
+                locations.push(location.clone());
             }
         }
         if locations == self.entry.locations {
@@ -240,6 +247,12 @@ impl Neighbour {
         Arc::make_mut(&mut self.entry).locations = locations;
         true
     }
+}
+
+/// The host of an address with a port.
+fn host(location: &Location) -> &str {
+    let address = location.address();
+    address.rsplit_once(':').map_or(address, |(host, _)| host)
 }
 
 /// The directory as the gateway looks up receivers in it: what everybody sees, and neighbours by
@@ -340,11 +353,13 @@ mod tests {
     }
 
     #[test]
-    fn what_the_configuration_says_stays() {
+    fn what_the_configuration_says_counts_where_no_connection_is_open() {
         let (neighbours, now) = (Neighbours::default(), Instant::now());
         neighbours.name_peers(vec![Peer {
             name: "crex".into(),
-            locations: vec!["tcp://crex.local:1".parse().unwrap()],
+            locations: ["tcp://crex.local:1", "udp://crex.local:1"]
+                .map(|text| text.parse().unwrap())
+                .to_vec(),
         }]);
         let (accepted, dialled) = (
             introduction("10.0.0.2:1", None),
@@ -353,7 +368,9 @@ mod tests {
         neighbours.introduced(&accepted);
         assert_eq!(neighbours.all()[0].peer, None);
         neighbours.introduced(&dialled);
-        let known = [at("crex.local:1"), at("10.0.0.2:1")];
+        // No letter tries another address while a connection shows the present one.
+        let udp: Location = "udp://crex.local:1".parse().unwrap();
+        let known = [at("10.0.0.2:1"), udp.with_incarnation(GATEWAY)];
         assert_eq!(locations(&neighbours), known);
         assert_eq!(neighbours.all()[0].peer.as_deref(), Some("crex"));
         neighbours.parted(now, &dialled);

@@ -1,9 +1,12 @@
 //! Static peers: message transport services that the configuration names, and that this one keeps
 //! in touch with before any letter needs it.
 //!
-//! Being in touch means that a parcel without consequences (a credit that nobody waits for) was
+//! Being in touch means that a parcel without consequences (a credit that no lane waits for) was
 //! answered a moment ago. Asking opens the connection, keeps it from being closed as idle, and
-//! notices when it is worth nothing any more; who is at its other end is told by the transport.
+//! notices when it leads nowhere any more; the transport tells which service is at its other end.
+//!
+//! All locations of a peer are asked at the same time until one answers, so that addresses at which
+//! no host is (a peer may be listed with several, and have one of them) delay nothing.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -23,7 +26,7 @@ pub struct Peer {
     pub locations: Vec<Location>,
 }
 
-/// How it stands with a static peer.
+/// The state of contact with a static peer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PeerState {
     /// The peer.
@@ -40,10 +43,10 @@ pub struct PeerState {
 
 /// How often a peer that answers is asked.
 const KEEP: Duration = Duration::from_secs(5);
-/// Pauses after nobody was found at any of its locations.
+/// Pauses before a location is asked again that did not answer.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
-const LONGEST_PAUSE: Duration = Duration::from_secs(5);
-/// Pause before asking again when a connection with it has ended.
+const LONGEST_PAUSE: Duration = Duration::from_secs(2);
+/// Pause before asking again when a connection with the peer has ended.
 const PARTED_PAUSE: Duration = Duration::from_millis(200);
 
 /// The static peers of a service.
@@ -60,13 +63,20 @@ struct Watched {
     id: u64,
     peer: Peer,
     /// Its locations in the order of the configuration's transports.
-    ways: Vec<Location>,
-    /// Which of them is asked next, or was asked.
-    current: usize,
+    ways: Vec<Way>,
+    /// Where the peer answers. No other location is asked meanwhile.
+    answers: Option<Location>,
+}
+
+/// A location of a peer.
+#[derive(Debug)]
+struct Way {
+    location: Location,
     state: State,
-    answers: bool,
-    failures: Vec<(Location, WayError)>,
-    rounds: u32,
+    /// Failures in a row.
+    failures: u32,
+    /// Why it did not answer, since the peer last did at any of its locations.
+    error: Option<WayError>,
     last_asked: Option<Instant>,
 }
 
@@ -74,15 +84,6 @@ struct Watched {
 enum State {
     AskAt(Instant),
     Asked { attempt: AttemptId, until: Instant },
-}
-
-impl State {
-    fn due(self) -> Instant {
-        match self {
-            Self::AskAt(at) => at,
-            Self::Asked { until, .. } => until,
-        }
-    }
 }
 
 impl Peers {
@@ -95,48 +96,44 @@ impl Peers {
                 Some(index) => before.swap_remove(index),
                 None => {
                     self.next += 1;
-                    Watched::new(self.next, peer, now)
+                    Watched::new(self.next, peer)
                 }
             };
-            watched.order(desk);
+            watched.order(now, desk);
             self.all.push(watched);
         }
         for gone in before {
-            gone.give_up(desk);
+            gone.ways.into_iter().for_each(|way| way.give_up(desk));
         }
-        self.ask_who_is_due(now, desk);
+        self.ask_those_due(now, desk);
     }
 
     /// The order of transports has changed.
     pub(super) fn reorder(&mut self, now: Instant, desk: &mut Desk) {
         for watched in &mut self.all {
-            watched.order(desk);
+            watched.order(now, desk);
         }
-        self.ask_who_is_due(now, desk);
+        self.ask_those_due(now, desk);
     }
 
     /// A connection that had been opened for this location has ended.
     pub(super) fn parted(&mut self, now: Instant, location: &Location) {
-        for watched in &mut self.all {
-            if let State::AskAt(at) = watched.state
-                && watched.ways.get(watched.current) == Some(location)
-            {
-                let soon = watched.last_asked.map_or(now, |asked| asked + PARTED_PAUSE);
-                watched.state = State::AskAt(at.min(soon.max(now)));
-            }
+        let ways = self.all.iter_mut().flat_map(|watched| &mut watched.ways);
+        for way in ways.filter(|way| way.location == *location) {
+            let soon = way.last_asked.map_or(now, |asked| asked + PARTED_PAUSE);
+            way.ask_by(soon.max(now));
         }
         self.look_ahead();
     }
 
     /// The network of this host has changed: peers that did not answer are asked at once.
     pub(super) fn ask_again(&mut self, now: Instant, desk: &mut Desk) {
-        for watched in &mut self.all {
-            watched.rounds = 0;
-            if let State::AskAt(at) = watched.state {
-                watched.state = State::AskAt(at.min(now));
-            }
+        let ways = self.all.iter_mut().flat_map(|watched| &mut watched.ways);
+        for way in ways {
+            way.failures = 0;
+            way.ask_by(now);
         }
-        self.ask_who_is_due(now, desk);
+        self.ask_those_due(now, desk);
     }
 
     /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
@@ -149,19 +146,22 @@ impl Peers {
             return;
         }
         for watched in &mut self.all {
-            if let State::Asked { attempt, until } = watched.state
-                && until <= now
-            {
-                if let Some(way) = watched.ways.get(watched.current) {
-                    desk.drop_attempt(way.kind(), attempt);
+            for index in 0..watched.ways.len() {
+                let Some(way) = watched.ways.get(index) else {
+                    break;
+                };
+                if let State::Asked { attempt, until } = way.state
+                    && until <= now
+                {
+                    desk.drop_attempt(way.location.kind(), attempt);
+                    watched.failed(now, index, WayError::new(WayFault::TimedOut, ""));
                 }
-                watched.failed(now, WayError::new(WayFault::TimedOut, ""));
             }
         }
-        self.ask_who_is_due(now, desk);
+        self.ask_those_due(now, desk);
     }
 
-    /// What became of asking one of them.
+    /// The conclusion of asking one of them.
     pub(super) fn concluded(
         &mut self,
         now: Instant,
@@ -172,89 +172,171 @@ impl Peers {
         let Some(watched) = self.all.iter_mut().find(|watched| watched.id == peer) else {
             return;
         };
-        if !matches!(watched.state, State::Asked { attempt: asked, .. } if asked == attempt) {
+        let is_asked = |way: &Way| matches!(way.state, State::Asked { attempt: asked, .. } if asked == attempt);
+        let Some(index) = watched.ways.iter().position(is_asked) else {
             return;
-        }
+        };
         match conclusion {
             Conclusion::NotSent(error) | Conclusion::Unconfirmed(error) => {
-                watched.failed(now, error);
+                watched.failed(now, index, error);
             }
-            // Whatever it said: it is there.
-            _ => watched.answered(now),
+            // Any answer shows that the peer is there.
+            _ => watched.answered(now, index),
         }
-        self.ask_who_is_due(now, desk);
+        self.ask_those_due(now, desk);
     }
 
     pub(super) fn states(&self, now: Instant) -> Vec<PeerState> {
         self.all.iter().map(|watched| watched.tell(now)).collect()
     }
 
-    fn ask_who_is_due(&mut self, now: Instant, desk: &mut Desk) {
+    fn ask_those_due(&mut self, now: Instant, desk: &mut Desk) {
         for watched in &mut self.all {
-            watched.ask_if_due(now, desk);
+            watched.ask_those_due(now, desk);
         }
         self.look_ahead();
     }
 
     fn look_ahead(&mut self) {
-        let with_ways = self.all.iter().filter(|watched| !watched.ways.is_empty());
-        self.due = with_ways.map(|watched| watched.state.due()).min();
+        self.due = self.all.iter().filter_map(Watched::due).min();
     }
 }
 
 impl Watched {
-    fn new(id: u64, peer: Peer, now: Instant) -> Self {
+    fn new(id: u64, peer: Peer) -> Self {
         Self {
             id,
             peer,
             ways: Vec::new(),
-            current: 0,
+            answers: None,
+        }
+    }
+
+    /// Brings the ways into the order of transports, which may have changed.
+    fn order(&mut self, now: Instant, desk: &mut Desk) {
+        let mut before = std::mem::take(&mut self.ways);
+        let order = desk.config.order.iter();
+        let listed = order.flat_map(|kind| {
+            let all = self.peer.locations.iter();
+            // Legacy peers understand nothing but letters.
+            all.filter(move |location| {
+                location.kind() == *kind && location.signature() == Signature::Frames
+            })
+        });
+        for location in listed {
+            let known = before.iter().position(|way| way.location == *location);
+            self.ways.push(match known {
+                Some(index) => before.swap_remove(index),
+                None => Way::new(now, location.clone()),
+            });
+        }
+        for gone in before {
+            self.answers.take_if(|at| *at == gone.location);
+            gone.give_up(desk);
+        }
+    }
+
+    /// Whether this way is asked now and then: all are until one answers.
+    fn is_of_use(&self, way: &Way) -> bool {
+        self.answers.as_ref().is_none_or(|at| *at == way.location)
+    }
+
+    fn due(&self) -> Option<Instant> {
+        let due = |way: &Way| match way.state {
+            State::AskAt(at) => self.is_of_use(way).then_some(at),
+            State::Asked { until, .. } => Some(until),
+        };
+        self.ways.iter().filter_map(due).min()
+    }
+
+    fn ask_those_due(&mut self, now: Instant, desk: &mut Desk) {
+        let (id, name, answers) = (self.id, &self.peer.name, &self.answers);
+        let of_use = |way: &&mut Way| answers.as_ref().is_none_or(|at| *at == way.location);
+        for way in self.ways.iter_mut().filter(of_use) {
+            if matches!(way.state, State::AskAt(at) if at <= now) {
+                way.ask(now, (id, name), desk);
+            }
+        }
+    }
+
+    fn answered(&mut self, now: Instant, index: usize) {
+        let Some(way) = self.ways.get_mut(index) else {
+            return;
+        };
+        if self.answers.is_none() {
+            tracing::info!(peer = %self.peer.name, at = %way.location, "in touch");
+        }
+        way.state = State::AskAt(now + KEEP);
+        self.answers = Some(way.location.clone());
+        for way in &mut self.ways {
+            way.failures = 0;
+            way.error = None;
+        }
+    }
+
+    fn failed(&mut self, now: Instant, index: usize, error: WayError) {
+        let Some(way) = self.ways.get_mut(index) else {
+            return;
+        };
+        let parted = self.answers.take_if(|at| *at == way.location).is_some();
+        if parted || way.failures == 0 && self.answers.is_none() {
+            tracing::info!(peer = %self.peer.name, at = %way.location, %error, "not in touch");
+        }
+        let pause = FIRST_PAUSE.saturating_mul(1 << way.failures.min(10));
+        way.state = State::AskAt(now + pause.min(LONGEST_PAUSE));
+        way.failures = way.failures.saturating_add(1);
+        if self.answers.is_none() {
+            way.error = Some(error);
+        }
+        if parted {
+            let others = self.ways.iter_mut().enumerate();
+            others
+                .filter(|(other, _)| *other != index)
+                .for_each(|(_, way)| way.ask_by(now));
+        }
+    }
+
+    fn tell(&self, now: Instant) -> PeerState {
+        let failed = |way: &Way| Some((way.location.clone(), way.error.clone()?));
+        let awaited = |way: &Way| matches!(way.state, State::Asked { .. });
+        let due = self.due().filter(|_| !self.ways.iter().any(awaited));
+        PeerState {
+            peer: self.peer.clone(),
+            answers: self.answers.clone(),
+            failures: self.ways.iter().filter_map(failed).collect(),
+            rounds: self.ways.iter().map(|way| way.failures).min().unwrap_or(0),
+            asked_again_in: due.map(|due| due.saturating_duration_since(now)),
+        }
+    }
+}
+
+impl Way {
+    fn new(now: Instant, location: Location) -> Self {
+        Self {
+            location,
             state: State::AskAt(now),
-            answers: false,
-            failures: Vec::new(),
-            rounds: 0,
+            failures: 0,
+            error: None,
             last_asked: None,
         }
     }
 
-    /// The order of transports may have changed.
-    fn order(&mut self, desk: &Desk) {
-        let asked = self.ways.get(self.current).cloned();
-        let of = |kind| {
-            let all = self.peer.locations.iter();
-            // Old peers understand nothing that is not a letter.
-            all.filter(move |location| {
-                location.kind() == kind && location.signature() == Signature::Frames
-            })
-        };
-        let order = desk.config.order.iter();
-        self.ways = order.flat_map(|kind| of(*kind)).cloned().collect();
-        let still = self.ways.iter().position(|way| Some(way) == asked.as_ref());
-        self.current = still.unwrap_or(0);
-    }
-
-    fn give_up(self, desk: &mut Desk) {
-        if let (State::Asked { attempt, .. }, Some(way)) = (self.state, self.ways.get(self.current))
-        {
-            desk.drop_attempt(way.kind(), attempt);
+    /// Is asked at this time at the latest, unless an answer is awaited.
+    fn ask_by(&mut self, time: Instant) {
+        if let State::AskAt(at) = &mut self.state {
+            *at = time.min(*at);
         }
     }
 
-    fn ask_if_due(&mut self, now: Instant, desk: &mut Desk) {
-        let (State::AskAt(at), Some(way)) = (self.state, self.ways.get(self.current)) else {
-            return;
-        };
-        if at > now {
-            return;
-        }
-        let nobodys = Stream {
+    fn ask(&mut self, now: Instant, (peer, name): (u64, &Arc<str>), desk: &mut Desk) {
+        let no_stream = Stream {
             sender: Incarnation::UNKNOWN,
             receiver: Incarnation::UNKNOWN,
         };
-        let parcel = note_parcel(nobodys, Arc::clone(&self.peer.name), 0, Body::Credit);
+        let parcel = note_parcel(no_stream, Arc::clone(name), 0, Body::Credit);
         let attempt = desk.next_attempt();
-        let purpose = Purpose::Touch { peer: self.id };
-        desk.dispatch(attempt, purpose, way.clone(), parcel);
+        let purpose = Purpose::Touch { peer };
+        desk.dispatch(attempt, purpose, self.location.clone(), parcel);
         self.last_asked = Some(now);
         self.state = State::Asked {
             attempt,
@@ -263,46 +345,9 @@ impl Watched {
         };
     }
 
-    fn answered(&mut self, now: Instant) {
-        if !self.answers {
-            tracing::info!(peer = %self.peer.name, way = ?self.ways.get(self.current), "in touch");
-        }
-        self.answers = true;
-        self.failures.clear();
-        self.rounds = 0;
-        self.state = State::AskAt(now + KEEP);
-    }
-
-    fn failed(&mut self, now: Instant, error: WayError) {
-        if let Some(way) = self.ways.get(self.current) {
-            if self.answers || self.rounds == 0 {
-                tracing::info!(peer = %self.peer.name, %way, %error, "not in touch");
-            }
-            self.failures.retain(|(other, _)| other != way);
-            self.failures.push((way.clone(), error));
-        }
-        self.answers = false;
-        self.current += 1;
-        let mut pause = Duration::ZERO;
-        if self.current >= self.ways.len() {
-            self.current = 0;
-            pause = FIRST_PAUSE.saturating_mul(1 << self.rounds.min(10));
-            self.rounds = self.rounds.saturating_add(1);
-        }
-        self.state = State::AskAt(now + pause.min(LONGEST_PAUSE));
-    }
-
-    fn tell(&self, now: Instant) -> PeerState {
-        let answers = self.ways.get(self.current).filter(|_| self.answers);
-        PeerState {
-            peer: self.peer.clone(),
-            answers: answers.cloned(),
-            failures: self.failures.clone(),
-            rounds: self.rounds,
-            asked_again_in: match self.state {
-                State::AskAt(at) => Some(at.saturating_duration_since(now)),
-                State::Asked { .. } => None,
-            },
+    fn give_up(self, desk: &mut Desk) {
+        if let State::Asked { attempt, .. } = self.state {
+            desk.drop_attempt(self.location.kind(), attempt);
         }
     }
 }
