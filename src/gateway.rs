@@ -475,6 +475,7 @@ impl Contacts for Acquaintances {
     }
 
     fn doubtful(&self, mts: Incarnation) {
+        self.neighbours.doubt(mts);
         if let Some(network) = &*self.network.lock() {
             network.doubt(mts);
         }

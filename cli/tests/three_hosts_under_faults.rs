@@ -37,7 +37,7 @@ const SECONDS: u64 = 15;
 /// Longest run of a soak, in seconds.
 const EPISODE: u64 = 120;
 /// A recovery, in microseconds, that is worth a look at the logs.
-const SLOW: u64 = 3_000_000;
+const SLOW: u64 = 2_000_000;
 /// Breaches that are printed.
 const SHOWN: usize = 20;
 

@@ -364,11 +364,23 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     let at = location(0).with_incarnation(newer);
     let started_again = (Mts::new("same-name-mts", newer), vec![at]);
     exchange.handle_neighbours(now, &[]);
-    exchange.handle_neighbours(now, &[started_again]);
+    exchange.handle_neighbours(now, &[started_again.clone()]);
     assert_eq!(gateway(), Some(new));
     exchange.handle_letter(now, newer, told).unwrap();
     assert_eq!(gateway(), Some(newer));
     assert!(!directory.speaks_for(new));
+
+    // The connection with the old one seems to be open, but it does not answer.
+    let newest = Incarnation::from_u64(79);
+    let at = location(0).with_incarnation(newest);
+    let both = [started_again, (Mts::new("same-name-mts", newest), vec![at])];
+    exchange.handle_neighbours(now, &both);
+    exchange.handle_silence(newer);
+    assert_eq!(gateway(), Some(newer), "no other has told its agents");
+    exchange.handle_letter(now, newest, told).unwrap();
+    exchange.handle_silence(newer);
+    assert!(!directory.speaks_for(newer));
+    assert_eq!(gateway(), Some(newest));
 }
 
 /// A letter may be faster than the news that its sender can be written to.

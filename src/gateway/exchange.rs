@@ -138,6 +138,9 @@ impl Exchanging {
             .collect();
         let mut core = self.core.lock();
         core.handle_neighbours(now, &present);
+        for silent in means.neighbours.take_doubted() {
+            core.handle_silence(silent);
+        }
         core.handle_timeout(now);
         while let Some((to, content)) = core.poll_letter(now) {
             let mut there = neighbours.iter().map(|neighbour| &neighbour.entry);

@@ -5,7 +5,7 @@
 //! between them. A neighbour can be written to, gateway to gateway, by its incarnation; by name it
 //! cannot, because two robots may give their gateways one name.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -31,6 +31,8 @@ pub(crate) struct Neighbours {
 struct State {
     present: HashMap<Incarnation, Neighbour>,
     peers: Vec<Peer>,
+    /// Those that did not answer, although a connection with them seems to be open.
+    doubted: HashSet<Incarnation>,
     /// Those whose last connection has ended, and when, the latest last.
     parted: VecDeque<(Instant, Arc<Entry>)>,
 }
@@ -90,6 +92,19 @@ impl Neighbours {
         self.changed.notified().await;
     }
 
+    /// A neighbour did not answer.
+    pub(super) fn doubt(&self, incarnation: Incarnation) {
+        let mut state = self.state.lock();
+        if state.present.contains_key(&incarnation) && state.doubted.insert(incarnation) {
+            self.changed.notify_one();
+        }
+    }
+
+    /// The neighbours that did not answer since the last call.
+    pub(super) fn take_doubted(&self) -> HashSet<Incarnation> {
+        std::mem::take(&mut self.state.lock().doubted)
+    }
+
     pub(super) fn introduced(&self, peer: &Introduction) {
         let incarnation = peer.hop.location.incarnation();
         // Other processes of this host open connections, too.
@@ -133,6 +148,7 @@ impl Neighbours {
             }
             return;
         }
+        state.doubted.remove(&incarnation);
         if let Some(gone) = state.present.remove(&incarnation) {
             if state.parted.len() >= MAX_PARTED {
                 state.parted.pop_front();

@@ -216,25 +216,40 @@ impl Exchange {
         self.end_replaced();
     }
 
+    /// This gateway did not answer, although a connection with it seems to be open. Over datagrams a
+    /// connection outlives a gateway that was killed.
+    pub fn handle_silence(&mut self, gateway: Incarnation) {
+        let silent = self.neighbours.get(&gateway);
+        if silent.is_some_and(|silent| self.is_replaced(silent)) {
+            self.end(gateway);
+        }
+    }
+
     /// Ends gateways that another incarnation has replaced: a gateway that was killed and started again
     /// listens where it listened before. Its agents are those that the new incarnation tells of, and
-    /// letters in the custody of the old one are lost. Before the new one has told its agents, and while
-    /// a connection with the old one is open, the old entries stay.
+    /// letters in the custody of the old one are lost. While a connection with the old one is open and
+    /// it answers, its entries stay: two gateways behind one address translator show the same location.
     fn end_replaced(&mut self) {
-        let all = &self.neighbours;
-        let successors = |old: &Neighbour| {
-            let tells = |new: &&Neighbour| new.gone.is_none() && new.held.is_some();
-            all.values()
-                .filter(tells)
-                .any(|new| new.is_at_a_location_of(old))
-        };
-        let gone = all.iter().filter(|(_, old)| old.gone.is_some());
-        let replaced = gone.filter(|(_, old)| successors(old));
+        let gone = self.neighbours.iter().filter(|(_, old)| old.gone.is_some());
+        let replaced = gone.filter(|(_, old)| self.is_replaced(old));
         let replaced: Vec<Incarnation> = replaced.map(|(incarnation, _)| *incarnation).collect();
         for incarnation in replaced {
-            self.neighbours.remove(&incarnation);
-            self.directory.forget(incarnation);
+            self.end(incarnation);
         }
+    }
+
+    /// Whether another gateway takes letters at a location of this one, and has told its agents.
+    fn is_replaced(&self, old: &Neighbour) -> bool {
+        let mut others = self.neighbours.values();
+        others.any(|new| {
+            let is_other = new.mts.incarnation != old.mts.incarnation;
+            is_other && new.gone.is_none() && new.held.is_some() && new.is_at_a_location_of(old)
+        })
+    }
+
+    fn end(&mut self, gateway: Incarnation) {
+        self.neighbours.remove(&gateway);
+        self.directory.forget(gateway);
     }
 
     /// What a letter of this gateway, with [`EXCHANGE_ONTOLOGY`], has as its content.

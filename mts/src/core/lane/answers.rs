@@ -387,7 +387,7 @@ impl Lane {
             };
             // When the receiver itself is gone, its custodian says so, or the clock does.
             if let Some(entry) = known {
-                self.check_custodian(now, index, &entry, desk);
+                self.check_next_hop(now, index, &entry, desk);
             }
         }
         self.notice_end(now, desk);
@@ -422,23 +422,41 @@ impl Lane {
         }
     }
 
-    /// A custodian that the receiver cannot be reached through any more does not report.
-    fn check_custodian(&mut self, now: Instant, index: usize, entry: &Entry, desk: &mut Desk) {
-        let State::Custody { location, .. } = &self.letters[index].progress.state else {
+    /// The receiver cannot be reached through the service any more that the letter was handed to: no
+    /// answer or report of that service is waited for.
+    fn check_next_hop(&mut self, now: Instant, index: usize, entry: &Entry, desk: &mut Desk) {
+        let delivery = &mut self.letters[index];
+        let Some((_, location)) = delivery.progress.state.handed_over() else {
             return;
         };
-        let custodian = location.incarnation();
-        let stands = |way: &Location| way.incarnation() == custodian;
-        if !custodian.is_known() || entry.locations.iter().any(stands) {
+        let service = location.incarnation();
+        let stands = |way: &Location| way.incarnation() == service;
+        if !service.is_known() || entry.locations.iter().any(stands) {
             return;
         }
-        let location = location.clone();
-        let delivery = &mut self.letters[index];
-        delivery.progress.state = State::Waiting;
-        delivery.ended(End::CustodianLost);
-        let text = "the gateway that had the letter in custody is gone";
-        let error = WayError::new(WayFault::Broken, text);
-        self.came_back(now, index, &location, error, desk);
+        match &mut delivery.progress.state {
+            State::UnderWay {
+                attempt,
+                location,
+                abandoned,
+                ..
+            } => {
+                if !std::mem::replace(abandoned, true) {
+                    let text = "another service is there now";
+                    let error = WayError::new(WayFault::Broken, text);
+                    desk.abandon(location.kind(), *attempt, error);
+                }
+            }
+            State::Custody { location, .. } => {
+                let location = location.clone();
+                delivery.progress.state = State::Waiting;
+                delivery.ended(End::CustodianLost);
+                let text = "the gateway that had the letter in custody is gone";
+                let error = WayError::new(WayFault::Broken, text);
+                self.came_back(now, index, &location, error, desk);
+            }
+            State::Waiting => {}
+        }
     }
 }
 
