@@ -18,7 +18,7 @@ use fipa_sds::{
     ContactDirectory, Directory, Entry, MergedDirectory, RegisterError, Registration,
     Role as EntryRole, StaticDirectory,
 };
-use fipa_transport::{Incarnation, Introduction, Kind, Location, Signature};
+use fipa_transport::{Incarnation, Introduction, Kind, Location, Signature, WayFault};
 use parking_lot::Mutex;
 use tokio::task::JoinHandle;
 
@@ -78,7 +78,8 @@ impl Gateway {
                     let told = exchange.directory() as Arc<dyn Directory>;
                     let there = network.clone().map(Network::directory);
                     let old = Arc::new(old_peers(config)?) as Arc<dyn Directory>;
-                    let known = there.into_iter().chain([told, old]).collect();
+                    // What a connected gateway tells is newer than what was announced before.
+                    let known = [told].into_iter().chain(there).chain([old]).collect();
                     let known = Arc::new(MergedDirectory::new(known));
                     let heard = Arc::clone(&contacts.directory) as Arc<dyn Directory>;
                     let beyond = Arc::clone(&known) as Arc<dyn Directory>;
@@ -169,6 +170,7 @@ impl Gateway {
             service: Arc::clone(&self.service),
             id,
             neighbours: Arc::clone(&self.neighbours),
+            network: self.network.clone(),
         })
     }
 
@@ -398,6 +400,8 @@ trait Network: Send + Sync {
     fn problem(&self) -> Option<String>;
     /// Finds out whether this gateway is still there.
     fn doubt(&self, gateway: Incarnation);
+    /// This gateway is not there any more: another one has its place.
+    fn ended(&self, gateway: Incarnation);
     /// The interfaces of this host have changed: others are spoken to on the new ones at once.
     fn interfaces_changed(&self);
     fn close(&self);
@@ -415,6 +419,10 @@ impl Network for fipa_sds::MdnsDirectory {
 
     fn doubt(&self, gateway: Incarnation) {
         self.verify_gateway(gateway);
+    }
+
+    fn ended(&self, gateway: Incarnation) {
+        self.gateway_has_ended(gateway);
     }
 
     fn interfaces_changed(&self) {
@@ -474,10 +482,10 @@ impl Contacts for Acquaintances {
         }
     }
 
-    fn doubtful(&self, mts: Incarnation) {
-        self.neighbours.doubt(mts);
+    fn doubtful(&self, location: &Location, fault: WayFault) {
+        self.neighbours.doubt(location, fault);
         if let Some(network) = &*self.network.lock() {
-            network.doubt(mts);
+            network.doubt(location.incarnation());
         }
     }
 

@@ -58,7 +58,7 @@ pub trait Contacts: Send + Sync {
     fn heard(&self, name: &str, agent: Incarnation, location: Location);
 
     /// A service may be gone; see [`Action::Doubtful`].
-    fn doubtful(&self, mts: Incarnation);
+    fn doubtful(&self, location: &Location, fault: WayFault);
 
     /// A service has introduced itself on a connection; see
     /// [`Sink::introduced`](fipa_transport::Sink::introduced).
@@ -553,9 +553,9 @@ impl Shared {
                 } => {
                     state.outcome(send, receiver, outcome);
                 }
-                Action::Doubtful { mts } => {
+                Action::Doubtful { location, fault } => {
                     if let Some(contacts) = &self.config.contacts {
-                        contacts.doubtful(mts);
+                        contacts.doubtful(&location, fault);
                     }
                 }
                 Action::Heard {

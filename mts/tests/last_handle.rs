@@ -77,7 +77,7 @@ struct Halting {
 impl Contacts for Halting {
     fn heard(&self, _: &str, _: Incarnation, _: Location) {}
 
-    fn doubtful(&self, _: Incarnation) {}
+    fn doubtful(&self, _: &Location, _: WayFault) {}
 
     fn introduced(&self, _: &Introduction) {
         let _ = self.called.lock().send(());

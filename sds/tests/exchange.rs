@@ -375,12 +375,39 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     let at = location(0).with_incarnation(newest);
     let both = [started_again, (Mts::new("same-name-mts", newest), vec![at])];
     exchange.handle_neighbours(now, &both);
-    exchange.handle_silence(newer);
+    let silent = location(0).with_incarnation(newer);
+    assert!(!exchange.handle_silence(now, &silent));
     assert_eq!(gateway(), Some(newer), "no other has told its agents");
     exchange.handle_letter(now, newest, told).unwrap();
-    exchange.handle_silence(newer);
+    assert!(exchange.handle_silence(now, &silent));
     assert!(!directory.speaks_for(newer));
     assert_eq!(gateway(), Some(newest));
+    // It is asked for its agents, in case that it is there after all.
+    let later = now + Duration::from_secs(1);
+    let asked: Vec<_> = std::iter::from_fn(|| exchange.poll_letter(later)).collect();
+    assert!(asked.iter().any(|(to, _)| *to == newer), "{asked:?}");
+}
+
+/// What was announced by multicast may be newer than what a gateway told that is away.
+#[test]
+fn agents_of_a_gateway_that_is_away_are_left_to_other_directories() {
+    let mut world = World::new(2, 4);
+    world.join(0, "arm");
+    world.join(0, "leg");
+    world.connect();
+    world.run(Duration::from_millis(300));
+    let directory = world.gateways[1].exchange.directory();
+    let (is_arm, now) = (|entry: &Entry| &*entry.name == "arm", world.now);
+    let exchange = &mut world.gateways[1].exchange;
+    exchange.leave_to_others(is_arm);
+    assert!(directory.lookup("arm").is_some(), "the gateway is there");
+    exchange.handle_neighbours(now, &[]);
+    exchange.leave_to_others(is_arm);
+    assert!(directory.lookup("arm").is_none());
+    assert!(directory.lookup("leg").is_some());
+    world.connect();
+    world.run(Duration::from_millis(1500));
+    assert!(world.agrees());
 }
 
 /// A letter may be faster than the news that its sender can be written to.

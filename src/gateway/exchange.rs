@@ -13,11 +13,12 @@ use fipa_mts::{Sending, letter_for};
 use fipa_sds::{
     Directory, EXCHANGE_ONTOLOGY, Entry, Exchange, ExchangeDirectory, MergedDirectory, Mts,
 };
-use fipa_transport::{Incarnation, Location};
+use fipa_transport::{Incarnation, Location, WayFault};
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
+use super::Network;
 use super::neighbours::Neighbours;
 use super::publisher::{Contested, own_agents};
 use crate::service::Service;
@@ -44,6 +45,7 @@ pub(super) struct Means {
     pub(super) service: Arc<Service>,
     pub(super) id: AgentId,
     pub(super) neighbours: Arc<Neighbours>,
+    pub(super) network: Option<Arc<dyn Network>>,
 }
 
 impl Exchanging {
@@ -138,8 +140,19 @@ impl Exchanging {
             .collect();
         let mut core = self.core.lock();
         core.handle_neighbours(now, &present);
-        for silent in means.neighbours.take_doubted() {
-            core.handle_silence(silent);
+        for (location, fault) in means.neighbours.take_doubted() {
+            if core.handle_silence(now, &location) {
+                if let Some(network) = &means.network {
+                    network.ended(location.incarnation());
+                }
+            } else if fault == WayFault::WrongIncarnation {
+                // The service that is there introduces itself.
+                let at = location.with_incarnation(Incarnation::UNKNOWN);
+                means.service.mts.greet(vec![(at.address().into(), at)]);
+            }
+        }
+        if let Some(announced) = means.network.clone().map(Network::directory) {
+            core.leave_to_others(|entry| announced.known_incarnation(entry.incarnation).is_some());
         }
         core.handle_timeout(now);
         while let Some((to, content)) = core.poll_letter(now) {

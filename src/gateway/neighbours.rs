@@ -5,7 +5,7 @@
 //! between them. A neighbour can be written to, gateway to gateway, by its incarnation; by name it
 //! cannot, because two robots may give their gateways one name.
 
-use std::collections::{HashMap, HashSet, VecDeque};
+use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -14,7 +14,7 @@ use fipa_sds::{
     DeregisterError, Directory, Entry, MergedDirectory, Mts, Reach, RegisterError, Registration,
     Role, Source, Subscriber, Watch,
 };
-use fipa_transport::{Incarnation, Introduction, Location};
+use fipa_transport::{Incarnation, Introduction, Location, WayFault};
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 
@@ -31,8 +31,8 @@ pub(crate) struct Neighbours {
 struct State {
     present: HashMap<Incarnation, Neighbour>,
     peers: Vec<Peer>,
-    /// Those that did not answer, although a connection with them seems to be open.
-    doubted: HashSet<Incarnation>,
+    /// Locations at which an attempt failed, and why it did.
+    doubted: HashMap<Location, WayFault>,
     /// Those whose last connection has ended, and when, the latest last.
     parted: VecDeque<(Instant, Arc<Entry>)>,
 }
@@ -43,6 +43,9 @@ const PARTED: Duration = Duration::from_secs(600);
 
 /// Most parted neighbours that are remembered.
 const MAX_PARTED: usize = 64;
+
+/// Most locations in doubt that wait to be looked at.
+const MAX_DOUBTED: usize = 64;
 
 /// A gateway of another host that a connection is open with.
 #[derive(Debug, Clone)]
@@ -92,16 +95,17 @@ impl Neighbours {
         self.changed.notified().await;
     }
 
-    /// A neighbour did not answer.
-    pub(super) fn doubt(&self, incarnation: Incarnation) {
+    /// An attempt at this location failed: the gateway may not be there any more.
+    pub(super) fn doubt(&self, location: &Location, fault: WayFault) {
         let mut state = self.state.lock();
-        if state.present.contains_key(&incarnation) && state.doubted.insert(incarnation) {
+        if state.doubted.len() < MAX_DOUBTED {
+            state.doubted.insert(location.clone(), fault);
             self.changed.notify_one();
         }
     }
 
-    /// The neighbours that did not answer since the last call.
-    pub(super) fn take_doubted(&self) -> HashSet<Incarnation> {
+    /// The locations at which attempts failed since the last call.
+    pub(super) fn take_doubted(&self) -> HashMap<Location, WayFault> {
         std::mem::take(&mut self.state.lock().doubted)
     }
 
@@ -148,7 +152,6 @@ impl Neighbours {
             }
             return;
         }
-        state.doubted.remove(&incarnation);
         if let Some(gone) = state.present.remove(&incarnation) {
             if state.parted.len() >= MAX_PARTED {
                 state.parted.pop_front();

@@ -71,11 +71,13 @@ pub enum Action {
         /// Where its message transport service can be reached.
         location: Location,
     },
-    /// A way has failed that leads to this life of another service: it may be gone without having
-    /// said so. Told by gateways only.
+    /// An attempt at this location, of a known incarnation, has failed: the service may be gone without
+    /// having said so. Told by gateways only.
     Doubtful {
-        /// The service.
-        mts: Incarnation,
+        /// The location.
+        location: Location,
+        /// Why the attempt failed.
+        fault: WayFault,
     },
     /// Something was put into this agent's queue.
     Deliverable {
@@ -487,10 +489,12 @@ impl Desk {
         self.health.retain(|location, _| !which(location));
     }
 
-    pub(crate) fn way_failed(&mut self, now: Instant, location: &Location) {
-        let mts = location.incarnation();
-        if self.config.forwards && mts.is_known() {
-            self.actions.push_back(Action::Doubtful { mts });
+    pub(crate) fn way_failed(&mut self, now: Instant, location: &Location, fault: WayFault) {
+        if self.config.forwards && location.incarnation().is_known() {
+            self.actions.push_back(Action::Doubtful {
+                location: location.clone(),
+                fault,
+            });
         }
         if self.health.len() >= MAX_HEALTH && !self.health.contains_key(location) {
             self.health.retain(|_, health| health.retry_at > now);

@@ -8,7 +8,7 @@ use parking_lot::Mutex;
 
 use super::{Agents, Exchange, ExchangeError};
 use crate::table::Table;
-use crate::{Directory, Entry, Subscriber};
+use crate::{Directory, Entry, Role, Subscriber};
 
 /// The agents that neighbours have told of.
 #[derive(Debug)]
@@ -97,6 +97,32 @@ impl ExchangeDirectory {
             updates.push((gateway, Arc::clone(name), Some(Arc::clone(entry))));
         }
         self.table.update(updates);
+    }
+
+    /// Lets go of agents of the gateway that another directory knows. Says whether there were any.
+    /// Coalitions stay: this directory [speaks for](Directory::speaks_for) them.
+    pub(super) fn leave_to_others(
+        &self,
+        gateway: Incarnation,
+        knows: impl Fn(&Entry) -> bool,
+    ) -> bool {
+        let mut told = self.told.lock();
+        let Some(agents) = told.get_mut(&gateway) else {
+            return false;
+        };
+        let agent = |entry: &&Arc<Entry>| entry.role == Role::Agent && knows(entry);
+        let known = agents.values().filter(agent);
+        let known: Vec<Arc<str>> = known.map(|entry| Arc::clone(&entry.name)).collect();
+        for name in &known {
+            agents.remove(name);
+        }
+        let any = !known.is_empty();
+        let updates: Vec<Update> = known
+            .into_iter()
+            .map(|name| (gateway, name, None))
+            .collect();
+        self.table.update(updates);
+        any
     }
 
     /// The gateway is gone, and all its agents with it.

@@ -190,6 +190,9 @@ impl Exchange {
                     // It may have forgotten meanwhile what it was told, and then says so.
                     neighbour.failures = 0;
                     neighbour.due = now;
+                    if neighbour.held.is_none() {
+                        neighbour.ask_again(now);
+                    }
                 }
             } else if neighbour.gone.is_none() {
                 neighbour.gone = Some(now);
@@ -216,13 +219,35 @@ impl Exchange {
         self.end_replaced();
     }
 
-    /// This gateway did not answer, although a connection with it seems to be open. Over datagrams a
-    /// connection outlives a gateway that was killed.
-    pub fn handle_silence(&mut self, gateway: Incarnation) {
-        let silent = self.neighbours.get(&gateway);
-        if silent.is_some_and(|silent| self.is_replaced(silent)) {
-            self.end(gateway);
+    /// Lets go of the agents of gateways that cannot be written to at present, if another directory
+    /// knows them: it may know them at another gateway already.
+    pub fn leave_to_others(&mut self, knows: impl Fn(&Entry) -> bool) {
+        for (incarnation, neighbour) in &mut self.neighbours {
+            if neighbour.gone.is_some() && self.directory.leave_to_others(*incarnation, &knows) {
+                // Everything is told again when the gateway is back.
+                neighbour.held = None;
+            }
         }
+    }
+
+    /// The gateway of this location did not answer there. If another gateway takes letters there and has
+    /// told its agents, the silent one has ended, even if a connection with it seems to be open: over
+    /// datagrams a connection outlives a gateway that was killed. Returns whether it has ended. One that
+    /// is there nevertheless is asked for its agents.
+    pub fn handle_silence(&mut self, now: Instant, location: &Location) -> bool {
+        let gateway = location.incarnation();
+        if !self.is_replaced(gateway, std::slice::from_ref(location)) {
+            return false;
+        }
+        match self.neighbours.get_mut(&gateway) {
+            Some(silent) if silent.gone.is_none() => {
+                self.directory.forget(gateway);
+                (silent.held, silent.staged) = (None, None);
+                silent.ask_again(now);
+            }
+            _ => self.end(gateway),
+        }
+        true
     }
 
     /// Ends gateways that another incarnation has replaced: a gateway that was killed and started again
@@ -231,19 +256,20 @@ impl Exchange {
     /// it answers, its entries stay: two gateways behind one address translator show the same location.
     fn end_replaced(&mut self) {
         let gone = self.neighbours.iter().filter(|(_, old)| old.gone.is_some());
-        let replaced = gone.filter(|(_, old)| self.is_replaced(old));
+        let replaced = gone.filter(|(gateway, old)| self.is_replaced(**gateway, &old.locations));
         let replaced: Vec<Incarnation> = replaced.map(|(incarnation, _)| *incarnation).collect();
         for incarnation in replaced {
             self.end(incarnation);
         }
     }
 
-    /// Whether another gateway takes letters at a location of this one, and has told its agents.
-    fn is_replaced(&self, old: &Neighbour) -> bool {
-        let mut others = self.neighbours.values();
-        others.any(|new| {
-            let is_other = new.mts.incarnation != old.mts.incarnation;
-            is_other && new.gone.is_none() && new.held.is_some() && new.is_at_a_location_of(old)
+    /// Whether another gateway takes letters at one of these locations of this one, and has told its
+    /// agents.
+    fn is_replaced(&self, gateway: Incarnation, locations: &[Location]) -> bool {
+        let mut others = self.neighbours.iter();
+        others.any(|(other, new)| {
+            let tells = new.gone.is_none() && new.held.is_some();
+            *other != gateway && tells && new.is_at_one_of(locations)
         })
     }
 
@@ -557,13 +583,13 @@ impl Neighbour {
         }
     }
 
-    /// Whether it takes letters where the other one does or did, under another incarnation.
-    fn is_at_a_location_of(&self, other: &Self) -> bool {
+    /// Whether it takes letters at one of these locations, of whichever incarnation.
+    fn is_at_one_of(&self, locations: &[Location]) -> bool {
         let same = |one: &Location, two: &Location| {
             one.kind() == two.kind() && one.address() == two.address()
         };
         let mut own = self.locations.iter();
-        own.any(|one| other.locations.iter().any(|two| same(one, two)))
+        own.any(|one| locations.iter().any(|two| same(one, two)))
     }
 
     /// When the next letter to it may go.

@@ -356,6 +356,16 @@ impl Browser {
         self.confirmed.insert(gateway, now);
     }
 
+    /// These records are of a gateway that has ended. They are gone, unless that is said again.
+    pub(super) fn end(&mut self, now: Instant, fullnames: &[Arc<str>]) {
+        for fullname in fullnames {
+            if let Some(known) = self.records.get_mut(label_of(fullname)) {
+                known.ends_at(now);
+                self.wake(now);
+            }
+        }
+    }
+
     /// Asks whether these records are still there. Who does not answer is gone.
     pub(super) fn doubt(&mut self, now: Instant, fullnames: &[Arc<str>]) {
         for fullname in fullnames {

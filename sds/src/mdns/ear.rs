@@ -80,7 +80,11 @@ impl Ear {
             }
         }
         self.send(shared.moved());
-        let doubtful = shared.held.lock().due(now);
+        let (ended, doubtful) = {
+            let mut held = shared.held.lock();
+            (held.take_ended(), held.due(now))
+        };
+        self.browser.end(now, &ended);
         self.browser.doubt(now, &doubtful);
         let due = self.browser.handle_timeout(now, fastrand::f64());
         self.send(due.packets);

@@ -25,6 +25,8 @@ pub(super) struct Holdings {
     queue: VecDeque<Arc<str>>,
     /// Those in the queue that are of no gateway.
     peers: HashSet<Arc<str>>,
+    /// Those of gateways that have ended.
+    ended: Vec<Arc<str>>,
     next: Option<Instant>,
 }
 
@@ -98,6 +100,20 @@ impl Holdings {
         known.doubted = Some((now, Arc::clone(fullname)));
         self.queue.push_front(Arc::clone(fullname));
         true
+    }
+
+    /// This gateway has ended without a goodbye: all its records end.
+    pub(super) fn end(&mut self, gateway: Incarnation) {
+        if let Some(known) = self.gateways.get(&gateway)
+            && self.ended.len() <= self.records.len()
+        {
+            self.ended.extend(known.records.iter().cloned());
+        }
+    }
+
+    /// The full names of records that end now.
+    pub(super) fn take_ended(&mut self) -> Vec<Arc<str>> {
+        std::mem::take(&mut self.ended)
     }
 
     /// A record of an old peer, which has no gateway, is verified.

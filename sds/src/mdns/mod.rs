@@ -201,6 +201,13 @@ impl MdnsDirectory {
         }
     }
 
+    /// This gateway has ended without a goodbye, and another one has its place: all that it announced is
+    /// forgotten at once.
+    pub fn gateway_has_ended(&self, gateway: Incarnation) {
+        self.shared.held.lock().end(gateway);
+        self.shared.postponed.notify_one();
+    }
+
     /// The interfaces of this host have changed: speaks and listens on the new ones at once, rather
     /// than when it looks next.
     pub fn interfaces_changed(&self) {

@@ -243,7 +243,7 @@ impl Lane {
             return;
         }
         if error.fault != WayFault::TooLarge {
-            desk.way_failed(now, location);
+            desk.way_failed(now, location, error.fault);
         }
         self.letters[index].failed_at(location, error);
     }

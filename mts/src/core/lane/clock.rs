@@ -43,7 +43,10 @@ impl Lane {
                         desk.abandon(location.kind(), *attempt, error);
                     }
                 }
-                State::Custody { .. } if expired || abandoned => {
+                State::Custody { location, .. } if expired || abandoned => {
+                    let location = location.clone();
+                    let text = "the gateway that has the letter in custody has not reported";
+                    delivery.failed_at(&location, WayError::new(WayFault::TimedOut, text));
                     self.fail(now, index, FailureReason::Unconfirmed, desk);
                     continue;
                 }
