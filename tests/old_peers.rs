@@ -9,7 +9,8 @@ use std::time::Duration;
 
 use fipa::config::Sources;
 use fipa::{
-    Agent, AgentId, Config, Domain, Envelope, Gateway, Kind, Letter, Message, Outcome, Performative,
+    Agent, AgentId, Config, Domain, Envelope, FailureReason, Gateway, Kind, Letter, Message,
+    Outcome, Performative,
 };
 use fipa_acl::{Dialect, Representation};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -156,6 +157,41 @@ async fn what_fipa_services_wrote_is_taken_and_answered_in_its_hand() {
             assert_eq!(letter.envelope(), theirs.unwrap(), "{file}");
         }
     }
+    host.gateway.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_letter_that_fipa_services_cannot_read_fails_at_once_with_its_reason() {
+    let host = Host::new("alice", "fipa-services").await;
+    let [rover, my_arm] = ["rover", "my arm"].map(|it| host.domain.register(it).unwrap());
+    let letter = |from: &Agent| {
+        from.message(Performative::Request)
+            .receiver(AgentId::new("alice").unwrap())
+    };
+    let elsewhere = AgentId::new("a b").unwrap();
+    let letters = [
+        (&rover, letter(&rover).reply_to(elsewhere).build().unwrap()),
+        (&my_arm, letter(&my_arm).build().unwrap()),
+    ];
+    for (from, message) in letters {
+        // The test ends long before this deadline, or fails.
+        let sent = from.send_within(message, 10 * PATIENCE);
+        let deliveries = timeout(PATIENCE, sent).await.unwrap().unwrap();
+        match &deliveries.0[0].outcome {
+            Outcome::Failed { reason, attempts } => {
+                assert_eq!(*reason, FailureReason::Inexpressible, "{deliveries}");
+                assert_eq!(attempts.len(), 1, "{deliveries}");
+                let detail = &attempts[0].error.detail;
+                assert!(detail.contains("is not a FIPA00070 word"), "{detail}");
+            }
+            other => panic!("{other}"),
+        }
+    }
+    // Nothing was opened for them: the next connection carries the next letter.
+    let plain = letter(&rover).content("plain").build().unwrap();
+    let (delivered, read_by_peer) = tokio::join!(rover.send(plain), host.read_by_peer());
+    assert!(delivered.unwrap().all_succeeded());
+    assert_eq!(read(&read_by_peer).2.content().unwrap(), "plain");
     host.gateway.close().await;
 }
 

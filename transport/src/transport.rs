@@ -355,11 +355,13 @@ pub enum WayFault {
     Closed,
     /// This end has run out of memory, descriptors or disk for this way.
     Exhausted,
+    /// The dialect of the peer has no form for something in the letter. No byte was sent.
+    Inexpressible,
 }
 
 impl WayFault {
     /// Every fault, for encoding: the position is the code on the wire, so new ones go last.
-    pub(crate) const CODES: [Self; 10] = [
+    pub(crate) const CODES: [Self; 11] = [
         Self::Unreachable,
         Self::WrongIncarnation,
         Self::TooLarge,
@@ -370,6 +372,7 @@ impl WayFault {
         Self::Refused,
         Self::Closed,
         Self::Exhausted,
+        Self::Inexpressible,
     ];
 
     fn description(self) -> &'static str {
@@ -384,6 +387,7 @@ impl WayFault {
             Self::Refused => "refused",
             Self::Closed => "closed",
             Self::Exhausted => "no room at this end",
+            Self::Inexpressible => "the peer's dialect cannot express it",
         }
     }
 }

@@ -72,6 +72,11 @@ fn advice(reason: FailureReason, config: &Config) -> String {
              bytes) in the configuration of both sides",
             config.transport.shm.max_letter
         ),
+        FailureReason::Inexpressible => {
+            "see above which parameter the peer's dialect has no form for: change or leave out that \
+             parameter"
+                .to_owned()
+        }
         FailureReason::TimedOut => {
             "give it more time with --deadline; see above what was tried".to_owned()
         }

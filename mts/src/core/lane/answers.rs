@@ -242,7 +242,7 @@ impl Lane {
             self.pause_until(now + CONGESTED_PAUSE);
             return;
         }
-        if error.fault != WayFault::TooLarge {
+        if !matches!(error.fault, WayFault::TooLarge | WayFault::Inexpressible) {
             desk.way_failed(now, location);
         }
         self.letters[index].failed_at(location, error);

@@ -161,11 +161,20 @@ impl Delivery {
         self.progress.handed.contains(&service)
     }
 
-    /// Whether every attempt failed because the letter is too large.
-    pub(super) fn only_too_large(&self) -> bool {
-        let attempts = &self.progress.attempts;
-        let mut faults = attempts.iter().map(|attempt| attempt.error.fault);
-        !attempts.is_empty() && faults.all(|fault| fault == WayFault::TooLarge)
+    /// The reason when every attempt failed because of the letter itself: it is too large, or the
+    /// peer's dialect cannot express it.
+    pub(super) fn unfit(&self) -> Option<FailureReason> {
+        let mut reason = None;
+        for attempt in &self.progress.attempts {
+            match attempt.error.fault {
+                WayFault::Inexpressible => reason = Some(FailureReason::Inexpressible),
+                WayFault::TooLarge => {
+                    reason = reason.or(Some(FailureReason::TooLarge));
+                }
+                _ => return None,
+            }
+        }
+        reason
     }
 
     /// The reason when its deadline has passed. `behind_full_queue` is whether a letter before it
@@ -178,10 +187,8 @@ impl Delivery {
             FailureReason::QueueFull
         } else if progress.attempts.is_empty() {
             FailureReason::TimedOut
-        } else if self.only_too_large() {
-            FailureReason::TooLarge
         } else {
-            FailureReason::Unreachable
+            self.unfit().unwrap_or(FailureReason::Unreachable)
         }
     }
 

@@ -412,25 +412,29 @@ impl Lane {
             return true;
         }
         progress.tried.clear();
-        if self.is_too_large(index, desk) {
-            self.fail(now, index, FailureReason::TooLarge, desk);
+        if let Some(reason) = self.never_fits(index, desk) {
+            self.fail(now, index, reason, desk);
             return true;
         }
         self.pause(now);
         false
     }
 
-    /// Whether the letter is larger than every kind of way takes that may lead to the receiver. A
-    /// kind that the directory does not show at present may come back. Shared memory is left out,
-    /// because it does not lead to other hosts.
-    fn is_too_large(&self, index: usize, desk: &Desk) -> bool {
+    /// The reason why no repetition can succeed, after all routes of the receiver were tried.
+    ///
+    /// A letter that is too large for all of them waits for a kind that the directory does not show
+    /// at present and that may return. Shared memory is left out, because it does not lead to other
+    /// hosts. A letter that a legacy peer's dialect cannot express waits for nothing.
+    fn never_fits(&self, index: usize, desk: &Desk) -> Option<FailureReason> {
         let delivery = &self.letters[index];
+        let reason = delivery.unfit()?;
         let attempts = &delivery.progress.attempts;
         let mut order = desk.config.order_for(&self.receiver).iter();
-        delivery.only_too_large()
-            && order.all(|kind| {
+        let waits = reason == FailureReason::TooLarge
+            && !order.all(|kind| {
                 *kind == Kind::Shm || attempts.iter().any(|attempt| attempt.via == *kind)
-            })
+            });
+        (!waits).then_some(reason)
     }
 
     fn pause(&mut self, now: Instant) {

@@ -1,0 +1,145 @@
+//! Letters to and from agents of legacy peers: failures that are certain at once, and their reasons.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use fipa_acl::{AgentId, Message, Performative};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
+use fipa_mts::letter_for;
+use fipa_sds::{Directory, StaticDirectory};
+use fipa_transport::{
+    AttemptId, Conclusion, FailureReason, Incarnation, Kind, Location, Outcome, WayError, WayFault,
+};
+
+const ROVER: Incarnation = Incarnation::from_u64(0xb);
+const DEADLINE: Duration = Duration::from_secs(5);
+
+/// The core of the process of the agent `rover`, on virtual time. The agent `arm` belongs to a
+/// legacy peer.
+struct Bench {
+    core: Core,
+    start: Instant,
+}
+
+impl Bench {
+    fn new(locations: &[&str]) -> Self {
+        let locations: Vec<Location> = locations.iter().map(|it| it.parse().unwrap()).collect();
+        let directory: Arc<dyn Directory> =
+            Arc::new(StaticDirectory::new([("arm", locations)]).unwrap());
+        let order = vec![Kind::Shm, Kind::Tcp, Kind::Udp];
+        let config = CoreConfig::new("mts", Incarnation::from_u64(1), order);
+        let mut core = Core::new(config, directory);
+        core.register("rover".into(), ROVER);
+        Self {
+            core,
+            start: Instant::now(),
+        }
+    }
+
+    fn at(&self, ms: u64) -> Now {
+        Now {
+            instant: self.start + Duration::from_millis(ms),
+            utc: SystemTime::UNIX_EPOCH,
+        }
+    }
+
+    fn send(&mut self, ms: u64) {
+        let message = Message::builder(Performative::Inform)
+            .sender(AgentId::new("rover").unwrap())
+            .receiver(AgentId::new("arm").unwrap())
+            .build()
+            .unwrap();
+        let submission = Submission {
+            sender: ROVER,
+            letter: letter_for(&message, SystemTime::UNIX_EPOCH).unwrap(),
+            receivers: vec!["arm".into()],
+            deadline: DEADLINE,
+        };
+        self.core.send(self.at(ms), submission);
+    }
+
+    /// The next letter that the core dispatches, and the location.
+    fn dispatched(&mut self) -> (AttemptId, String) {
+        let mut actions = std::iter::from_fn(|| self.core.poll_action());
+        let next = actions.find(|action| !matches!(action, Action::Deliverable { .. }));
+        match next {
+            Some(Action::Dispatch {
+                attempt, location, ..
+            }) => (attempt, location.to_string()),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    fn not_sent(&mut self, ms: u64, attempt: AttemptId, fault: WayFault) {
+        let conclusion = Conclusion::NotSent(WayError::new(fault, "for a test"));
+        self.core
+            .handle_conclusion(self.at(ms), attempt, conclusion);
+    }
+
+    fn outcome(&mut self) -> Option<Outcome> {
+        std::iter::from_fn(|| self.core.poll_action()).find_map(|action| match action {
+            Action::Outcome { outcome, .. } => Some(outcome),
+            _ => None,
+        })
+    }
+}
+
+fn reason(outcome: &Outcome) -> FailureReason {
+    match outcome {
+        Outcome::Failed { reason, .. } => *reason,
+        other => panic!("{other}"),
+    }
+}
+
+#[test]
+fn a_letter_that_the_dialect_cannot_express_fails_at_once() {
+    let mut bench = Bench::new(&["tcp://10.0.0.3:6789;fipa-services"]);
+    bench.send(0);
+    let (attempt, _) = bench.dispatched();
+    bench.not_sent(1, attempt, WayFault::Inexpressible);
+    let outcome = bench.outcome().unwrap();
+    assert_eq!(reason(&outcome), FailureReason::Inexpressible);
+    assert_eq!(outcome.attempts().len(), 1);
+    assert!(!bench.core.has_open_letters());
+
+    // The route is not at fault: the next letter goes there at once.
+    bench.send(2);
+    assert_eq!(bench.dispatched().1, "tcp://10.0.0.3:6789;fipa-services");
+}
+
+#[test]
+fn a_letter_that_one_dialect_cannot_express_goes_by_another() {
+    let mut bench = Bench::new(&[
+        "tcp://10.0.0.3:6789;fipa-services",
+        "tcp://10.0.0.3:6790;jade",
+    ]);
+    bench.send(0);
+    let (attempt, _) = bench.dispatched();
+    bench.not_sent(1, attempt, WayFault::Inexpressible);
+    let (attempt, location) = bench.dispatched();
+    assert_eq!(location, "tcp://10.0.0.3:6790;jade");
+    bench
+        .core
+        .handle_conclusion(bench.at(2), attempt, Conclusion::Handed);
+    let outcome = bench.outcome().unwrap();
+    assert!(outcome.is_success(), "{outcome}");
+}
+
+#[test]
+fn a_letter_that_another_location_may_carry_later_is_repeated() {
+    let mut bench = Bench::new(&[
+        "tcp://10.0.0.3:6789;fipa-services",
+        "tcp://10.0.0.3:6790;jade",
+    ]);
+    bench.send(0);
+    let (attempt, _) = bench.dispatched();
+    bench.not_sent(1, attempt, WayFault::Inexpressible);
+    let (attempt, _) = bench.dispatched();
+    bench.not_sent(2, attempt, WayFault::Unreachable);
+    assert_eq!(bench.outcome(), None);
+    bench.core.handle_timeout(bench.at(5001));
+    let outcome = bench.outcome().unwrap();
+    assert_eq!(reason(&outcome), FailureReason::Unreachable);
+}
