@@ -143,3 +143,22 @@ fn a_letter_that_another_location_may_carry_later_is_repeated() {
     let outcome = bench.outcome().unwrap();
     assert_eq!(reason(&outcome), FailureReason::Unreachable);
 }
+
+#[test]
+fn a_letter_to_an_agent_that_has_unsupported_transports_only_fails_at_once() {
+    let mut bench = Bench::new(&["udt://10.0.0.3:6790;fipa-services"]);
+    bench.send(0);
+    let outcome = bench.outcome().unwrap();
+    assert_eq!(reason(&outcome), FailureReason::Unsupported);
+    assert_eq!(
+        outcome.to_string(),
+        "failed: unsupported transport; tried udt://10.0.0.3:6790;fipa-services: unsupported \
+         transport: udt"
+    );
+    assert!(!bench.core.has_open_letters());
+
+    // A supported location is used.
+    let mut bench = Bench::new(&["udt://10.0.0.3:6790", "tcp://10.0.0.3:6789;fipa-services"]);
+    bench.send(0);
+    assert_eq!(bench.dispatched().1, "tcp://10.0.0.3:6789;fipa-services");
+}

@@ -135,11 +135,14 @@ pub enum FailureReason {
     /// The dialect of the legacy peer that the receiver belongs to has no form for something in the
     /// letter.
     Inexpressible,
+    /// The receiver is reached only by transports that this project does not have. The attempts
+    /// name them.
+    Unsupported,
 }
 
 impl FailureReason {
     /// Every reason, for encoding: the position is the code on the wire, so new ones go last.
-    pub(crate) const CODES: [Self; 10] = [
+    pub(crate) const CODES: [Self; 11] = [
         Self::NoSuchAgent,
         Self::QueueFull,
         Self::Unreachable,
@@ -150,6 +153,7 @@ impl FailureReason {
         Self::Loop,
         Self::Closed,
         Self::Inexpressible,
+        Self::Unsupported,
     ];
 }
 
@@ -166,6 +170,7 @@ impl fmt::Display for FailureReason {
             Self::Loop => "loop",
             Self::Closed => "closed",
             Self::Inexpressible => "not expressible in the peer's dialect",
+            Self::Unsupported => "unsupported transport",
         })
     }
 }

@@ -357,11 +357,13 @@ pub enum WayFault {
     Exhausted,
     /// The dialect of the peer has no form for something in the letter. No byte was sent.
     Inexpressible,
+    /// There is no transport of this kind.
+    Unsupported,
 }
 
 impl WayFault {
     /// Every fault, for encoding: the position is the code on the wire, so new ones go last.
-    pub(crate) const CODES: [Self; 11] = [
+    pub(crate) const CODES: [Self; 12] = [
         Self::Unreachable,
         Self::WrongIncarnation,
         Self::TooLarge,
@@ -373,6 +375,7 @@ impl WayFault {
         Self::Closed,
         Self::Exhausted,
         Self::Inexpressible,
+        Self::Unsupported,
     ];
 
     fn description(self) -> &'static str {
@@ -388,6 +391,7 @@ impl WayFault {
             Self::Closed => "closed",
             Self::Exhausted => "no room at this end",
             Self::Inexpressible => "the peer's dialect cannot express it",
+            Self::Unsupported => "unsupported transport",
         }
     }
 }

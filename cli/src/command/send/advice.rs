@@ -77,6 +77,11 @@ fn advice(reason: FailureReason, config: &Config) -> String {
              parameter"
                 .to_owned()
         }
+        FailureReason::Unsupported => {
+            "see above the transports of the peer, which this program does not have: have the peer \
+             listen on TCP, too"
+                .to_owned()
+        }
         FailureReason::TimedOut => {
             "give it more time with --deadline; see above what was tried".to_owned()
         }

@@ -312,7 +312,7 @@ impl Lane {
                 Some(_) => break,
                 None if self.under_way > 0 => break,
                 None => {
-                    if !self.end_of_round(now, index, desk) {
+                    if !self.end_of_round(now, index, &entry, desk) {
                         break;
                     }
                 }
@@ -405,13 +405,23 @@ impl Lane {
     }
 
     /// Every way was tried. Says whether the letter was settled.
-    fn end_of_round(&mut self, now: Instant, index: usize, desk: &mut Desk) -> bool {
-        let progress = &mut self.letters[index].progress;
-        if progress.tried.is_empty() {
-            self.fail(now, index, FailureReason::Unreachable, desk);
+    fn end_of_round(&mut self, now: Instant, index: usize, entry: &Entry, desk: &mut Desk) -> bool {
+        let delivery = &mut self.letters[index];
+        if delivery.progress.tried.is_empty() {
+            let reason = match entry.is_unsupported() {
+                true => {
+                    for location in &entry.locations {
+                        let error = WayError::new(WayFault::Unsupported, location.kind());
+                        delivery.failed_at(location, error);
+                    }
+                    FailureReason::Unsupported
+                }
+                false => FailureReason::Unreachable,
+            };
+            self.fail(now, index, reason, desk);
             return true;
         }
-        progress.tried.clear();
+        delivery.progress.tried.clear();
         if let Some(reason) = self.never_fits(index, desk) {
             self.fail(now, index, reason, desk);
             return true;
