@@ -196,6 +196,28 @@ async fn a_letter_that_fipa_services_cannot_read_fails_at_once_with_its_reason()
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn fipa_services_is_told_that_its_letter_cannot_be_decoded() {
+    let host = Host::new("alice", "fipa-services").await;
+    let bob = host.domain.register("bob").unwrap();
+    let [(_, recorded)] = recorded!["e01_simple.be"];
+    throw(&recorded[..recorded.len() - 3], &host.address()).await;
+    let (_, letter, failure) = read(&host.read_by_peer().await);
+    assert_eq!(*failure.performative(), Performative::Failure);
+    assert_eq!(failure.receivers()[0].name(), "alice");
+    let theirs = failure.encode(Representation::BitEfficient, Dialect::FipaServices);
+    assert_eq!(letter.payload().to_bytes(), theirs.unwrap());
+    let told = String::from_utf8_lossy(failure.content().unwrap()).into_owned();
+    assert!(
+        told.contains("cannot be decoded") && told.contains("bob"),
+        "{told}"
+    );
+    // A whole letter comes afterwards, and is the first that the agent gets.
+    throw(recorded, &host.address()).await;
+    assert_eq!(receive(&bob).await, read(recorded).2);
+    host.gateway.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn jades_proxy_is_asked_and_answers_where_the_letter_says() {
     let host = Host::new("echo@jadetest", "jade").await;
     let rusty = host.domain.register("rusty@rustap").unwrap();

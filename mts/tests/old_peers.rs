@@ -9,7 +9,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
 use fipa_acl::{AgentId, Dialect, Letter, Message, Payload, Performative, Representation};
-use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Received, Submission, Unframed};
 use fipa_mts::{Gate, letter_for};
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration, StaticDirectory};
 use fipa_transport::{
@@ -97,9 +97,7 @@ fn who_sent_a_recorded_letter_to_nobody_is_told_in_its_own_words() {
     core.handle_unframed(
         now(),
         Duration::from_secs(5),
-        recorded(LETTER),
-        Kind::Tcp,
-        HERE,
+        Unframed::read(recorded(LETTER), Kind::Tcp, HERE),
     );
     let (attempt, location, parcel) = dispatched(&mut core).unwrap();
     assert_eq!(location.to_string(), "tcp://127.0.0.1:45615;fipa-services");
@@ -158,9 +156,7 @@ fn each_receiver_is_told_of_once_and_failures_never() {
     core.handle_unframed(
         now(),
         deadline,
-        letter(Performative::Request),
-        Kind::Tcp,
-        HERE,
+        Unframed::read(letter(Performative::Request), Kind::Tcp, HERE),
     );
     let mut told = Vec::new();
     while let Some((_, location, parcel)) = dispatched(&mut core) {
@@ -172,9 +168,7 @@ fn each_receiver_is_told_of_once_and_failures_never() {
     core.handle_unframed(
         now(),
         deadline,
-        letter(Performative::Failure),
-        Kind::Tcp,
-        HERE,
+        Unframed::read(letter(Performative::Failure), Kind::Tcp, HERE),
     );
     assert!(core.poll_action().is_none());
 }
@@ -184,7 +178,11 @@ fn nobody_is_told_where_somebody_elses_letter_says_it_is() {
     let mut core = core(true, &[]);
     let elsewhere = IpAddr::from([10, 0, 0, 66]);
     let deadline = Duration::from_secs(5);
-    core.handle_unframed(now(), deadline, recorded(LETTER), Kind::Tcp, elsewhere);
+    core.handle_unframed(
+        now(),
+        deadline,
+        Unframed::read(recorded(LETTER), Kind::Tcp, elsewhere),
+    );
     assert!(core.poll_action().is_none(), "it came from {elsewhere}");
 }
 
@@ -218,7 +216,11 @@ fn who_is_refused_is_told_in_its_own_words_and_not_without_end() {
     let mut core = Core::new(config, Arc::new(directory)).gated(Arc::new(Refusing("echo")));
     let (then, deadline) = (now(), Duration::from_secs(5));
     for _ in 0..200 {
-        core.handle_unframed(then, deadline, recorded(LETTER), Kind::Tcp, HERE);
+        core.handle_unframed(
+            then,
+            deadline,
+            Unframed::read(recorded(LETTER), Kind::Tcp, HERE),
+        );
     }
     let mut told = 0;
     while let Some((attempt, location, parcel)) = dispatched(&mut core) {
@@ -235,6 +237,83 @@ fn who_is_refused_is_told_in_its_own_words_and_not_without_end() {
         core.handle_conclusion(then, attempt, Conclusion::Handed);
     }
     assert_eq!(told, 20, "as many as a second has");
+}
+
+/// A letter whose message has lost its end.
+fn without_end(letter: &Letter) -> Letter {
+    let payload = letter.payload().to_bytes();
+    Letter::new(letter.envelope(), payload.slice(..payload.len() - 3))
+}
+
+#[test]
+fn the_sender_of_a_recorded_letter_that_cannot_be_decoded_is_told() {
+    let config = CoreConfig {
+        forwards: true,
+        ..CoreConfig::new(
+            "gateway",
+            Incarnation::from_u64(7),
+            vec![Kind::Shm, Kind::Tcp],
+        )
+    };
+    let mut core = Core::new(config, host_of("echo"));
+    let letter = without_end(&recorded(LETTER));
+    let deadline = Duration::from_secs(5);
+    let unframed = Unframed::read(letter.clone(), Kind::Tcp, HERE);
+    core.handle_unframed(now(), deadline, unframed);
+    let (_, location, parcel) = dispatched(&mut core).unwrap();
+    // The envelope says where the sender is, as the message of another letter does.
+    assert_eq!(location.to_string(), "tcp://127.0.0.1:45615;fipa-services");
+    let failure = message_of(&parcel);
+    assert_eq!(*failure.performative(), Performative::Failure);
+    assert_eq!(failure.receivers()[0].name(), "cpp-sender");
+    let told = nested(failure.content().unwrap());
+    assert_eq!(told.receivers()[0].name(), "echo");
+    let text = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
+    let expected = "description: message delivery failed: refused: the message cannot be decoded: ";
+    assert!(text.starts_with(expected), "{text}");
+    assert_eq!(text.lines().count(), 2, "{text}");
+    // The agent does not get it.
+    assert!(core.poll_action().is_none());
+
+    // An address of another host is not believed.
+    let unframed = Unframed::read(letter, Kind::Tcp, IpAddr::from([10, 0, 0, 66]));
+    core.handle_unframed(now(), deadline, unframed);
+    assert!(core.poll_action().is_none());
+}
+
+#[test]
+fn the_sender_of_a_framed_letter_that_cannot_be_decoded_is_told() {
+    let mut core = Core::new(
+        CoreConfig::new("process", Incarnation::from_u64(7), vec![Kind::Shm]),
+        host_of("rover"),
+    );
+    let rover = Incarnation::from_u64(5);
+    let arm: Arc<str> = "arm".into();
+    core.register(Arc::clone(&arm), Incarnation::from_u64(6));
+    let message = Message::builder(Performative::Inform)
+        .sender(AgentId::new("rover").unwrap())
+        .receiver(AgentId::new("arm").unwrap())
+        .content("x")
+        .build()
+        .unwrap();
+    let received = |sender| Received {
+        letter: without_end(&letter_for(&message, now().utc).unwrap()),
+        sender,
+        via: Some(Kind::Shm),
+    };
+    core.handle_undecodable(now(), &arm, &received(rover), "for a test".to_owned());
+    let (_, location, parcel) = dispatched(&mut core).unwrap();
+    assert_eq!(location.kind(), Kind::Shm);
+    assert_eq!(&*parcel.receiver, "rover");
+    let failure = message_of(&parcel);
+    assert_eq!(*failure.performative(), Performative::Failure);
+    let told = String::from_utf8(failure.content().unwrap().to_vec()).unwrap();
+    assert!(told.contains("refused: the message cannot be decoded: for a test"));
+
+    // Another agent that writes under this name is not believed, and the agent is not told.
+    let other = received(Incarnation::from_u64(66));
+    core.handle_undecodable(now(), &arm, &other, "for a test".to_owned());
+    assert!(core.poll_action().is_none());
 }
 
 /// The directory of a host on which one agent is registered.
@@ -264,7 +343,11 @@ fn a_name_with_a_dot_is_reached_as_legacy_peers_write_it() {
     };
     let mut core = Core::new(config, host_of("arm.left"));
     let deadline = Duration::from_secs(5);
-    core.handle_unframed(now(), deadline, recorded_to("arm?left"), Kind::Tcp, HERE);
+    core.handle_unframed(
+        now(),
+        deadline,
+        Unframed::read(recorded_to("arm?left"), Kind::Tcp, HERE),
+    );
     let (_, location, parcel) = dispatched(&mut core).unwrap();
     assert_eq!(location.kind(), Kind::Shm);
     assert_eq!(&*parcel.receiver, "arm.left");
@@ -278,7 +361,11 @@ fn failure_messages_that_nobody_takes_are_bounded() {
     // All at one moment, however long it takes: nothing may time out.
     let (then, deadline) = (now(), Duration::from_secs(5));
     for _ in 0..2 * most {
-        core.handle_unframed(then, deadline, recorded(LETTER), Kind::Tcp, HERE);
+        core.handle_unframed(
+            then,
+            deadline,
+            Unframed::read(recorded(LETTER), Kind::Tcp, HERE),
+        );
     }
     let mut told = 0;
     while let Some((attempt, _, _)) = dispatched(&mut core) {

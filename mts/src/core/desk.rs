@@ -126,8 +126,8 @@ pub(crate) enum Settlement {
 pub(crate) enum Author {
     /// This agent of this process.
     Ours(Incarnation),
-    /// An old peer's agent, whose letter came from this address.
-    OldPeer { from: IpAddr },
+    /// An agent of another service. A legacy peer's letter came from this address.
+    Remote { from: Option<IpAddr> },
 }
 
 /// A delivery that did not succeed, for the failure message.

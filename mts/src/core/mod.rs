@@ -9,6 +9,7 @@
 //! * `lane`: letters of one stream on their way, in order, one way at a time.
 //! * `inbox`: the receiving end, where letters are taken once and in order.
 //! * `forward`: letters for agents of other processes.
+//! * `failures`: which senders are told of which failures, by messages.
 //! * `departed`: registrations that have left this host a moment ago.
 //! * `peers`: services that the configuration names, and how it stands with them.
 //! * `routes`: which way letters would go and what happened on each way, for people.
@@ -22,6 +23,7 @@
 mod config;
 mod departed;
 mod desk;
+mod failures;
 mod forward;
 mod inbox;
 mod lane;
@@ -46,6 +48,7 @@ use fipa_transport::{
 pub use config::{CoreConfig, MAX_DEADLINE};
 pub use desk::Action;
 use desk::{Author, Desk, Note, Origin, Purpose, Undelivered};
+pub use forward::Unframed;
 use inbox::Inbox;
 pub use inbox::Received;
 use lane::{Delivery, Lane, LaneId, LaneKey};

@@ -550,7 +550,7 @@ impl Lane {
         let attempts = std::mem::take(&mut delivery.progress.attempts);
         let sender = match delivery.origin {
             Origin::Local { .. } => Some(Author::Ours(self.sender)),
-            Origin::OldPeer { from } => Some(Author::OldPeer { from }),
+            Origin::OldPeer { from } => Some(Author::Remote { from: Some(from) }),
             Origin::Forwarded { .. } | Origin::Nobody => None,
         };
         if let Some(sender) = sender {

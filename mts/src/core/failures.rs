@@ -1,0 +1,214 @@
+//! Failure messages: which senders are told of which failures, and how often.
+
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use fipa_acl::{Dialect, Representation};
+use fipa_sds::{Entry, Mts, Reach, Role, Source};
+use fipa_transport::{Allowance, FailureReason, Incarnation, Location, Signature, Stream};
+
+use super::desk::{Action, Author, Origin, Undelivered, life_of};
+use super::inbox::Received;
+use super::lane::Delivery;
+use super::{Core, News, Now, own_lane};
+use crate::failure::Failure;
+use crate::stamp;
+
+/// Letters of old peers a second that they are told were refused. What they may send is not limited
+/// by how fast answers go out, and nobody is to be made to write to them without end.
+const REFUSALS_TOLD: f64 = 20.0;
+/// How long a failure message to an old peer's agent may take.
+const FAILURE_DEADLINE: Duration = Duration::from_secs(5);
+
+impl Core {
+    /// Whether an old peer is told of one more letter that was refused.
+    pub(super) fn tells_of_refusal(&mut self, now: Now) -> bool {
+        let full = || Allowance::new(REFUSALS_TOLD, now.instant);
+        let refusals = self.refusals.get_or_insert_with(full);
+        refusals.take(1.0, REFUSALS_TOLD, now.instant)
+    }
+
+    /// An agent of this process has taken a letter whose message cannot be decoded. The sender is told
+    /// if it is an agent of this process, or one that the directory has under the name that the
+    /// envelope gives. Nothing else proves a name in an envelope.
+    pub fn handle_undecodable(
+        &mut self,
+        now: Now,
+        receiver: &Arc<str>,
+        received: &Received,
+        why: String,
+    ) {
+        let life = received.sender;
+        if received.via.is_none() || !life.is_known() {
+            return;
+        }
+        let sender = if self.agents.contains_key(&life) {
+            Author::Ours(life)
+        } else {
+            let named = stamp::sender(&received.letter);
+            let known = self.desk.directory.known_incarnation(life);
+            match known {
+                Some(entry) if named.as_deref() == Some(&*entry.name) => {
+                    Author::Remote { from: None }
+                }
+                _ => return,
+            }
+        };
+        if self.tells_of_refusal(now) {
+            self.desk.undelivered.push_back(Undelivered {
+                sender,
+                receiver: Arc::clone(receiver),
+                letter: received.letter.clone(),
+                reason: FailureReason::Refused,
+                detail: cannot_be_decoded(&why),
+            });
+            self.tell_failures(now);
+        }
+    }
+
+    /// Tells senders of what failed, in the form of FIPA `failure` messages.
+    pub(super) fn tell_failures(&mut self, now: Now) {
+        while let Some(undelivered) = self.desk.undelivered.pop_front() {
+            let Undelivered {
+                sender,
+                receiver,
+                letter,
+                reason,
+                detail,
+            } = undelivered;
+            let name = Arc::clone(&self.desk.config.name);
+            let name = &*name;
+            let Some(report) = Failure::of(&letter, &receiver, reason, &detail) else {
+                continue;
+            };
+            let own = self.desk.config.incarnation;
+            let sequence = self.sequence_of(own);
+            let from = match sender {
+                Author::Remote { from } => from,
+                Author::Ours(_) => None,
+            };
+            if let Author::Ours(agent) = sender {
+                let Some(inbox) = self.agents.get_mut(&agent) else {
+                    continue;
+                };
+                let letter = match report.written_for(name, Dialect::Standard, now.utc) {
+                    Ok(letter) => letter,
+                    Err(error) => {
+                        tracing::warn!(%error, %receiver, "a failure message could not be written");
+                        continue;
+                    }
+                };
+                if inbox.push_failure(letter.clone()) {
+                    let stream = Stream {
+                        sender: own,
+                        receiver: agent,
+                    };
+                    let name = Arc::clone(&inbox.name);
+                    self.desk.notice(stream, sequence, &name, || News::Taken {
+                        via: None,
+                        letter,
+                    });
+                    self.desk.actions.push_back(Action::Deliverable { agent });
+                }
+                continue;
+            }
+            // Its sender is known by name, or a legacy peer's letter gives its address.
+            let known = self.desk.directory.lookup(report.sender.name());
+            let said = match known {
+                Some(_) => None,
+                None => from.and_then(|from| said_of_itself(&report, from)),
+            };
+            let Some(entry) = known.or_else(|| said.clone()) else {
+                tracing::info!(to = %report.sender, %reason, "nobody to send a failure message to");
+                continue;
+            };
+            if entry.role == Role::Gateway {
+                continue;
+            }
+            let letter = match report.written_for(name, dialect_of(&entry), now.utc) {
+                Ok(letter) => letter,
+                Err(error) => {
+                    tracing::warn!(%error, receiver = %report.receiver, "a failure message could not be written");
+                    continue;
+                }
+            };
+            let stream = Stream {
+                sender: self.desk.config.incarnation,
+                receiver: life_of(&entry),
+            };
+            let id = self.lane(now, own_lane(stream.sender, &entry), &entry.name);
+            if !self.has_room_for_stranger(id, letter.len()) {
+                tracing::info!(to = %report.sender, %reason, "no room for a failure message");
+                continue;
+            }
+            let deadline = now.instant + FAILURE_DEADLINE;
+            let letter_of = (stream.receiver, sequence);
+            let origin = Origin::Nobody;
+            let delivery = Delivery::new(now.instant, origin, letter, letter_of, deadline);
+            self.desk
+                .notice(stream, sequence, &entry.name, || News::Sent {
+                    send: None,
+                    letter: delivery.letter.clone(),
+                });
+            if said.is_some()
+                && let Some(lane) = self.lanes.get_mut(&id)
+            {
+                lane.said(Arc::clone(&entry));
+            }
+            self.put(now, id, delivery);
+        }
+    }
+}
+
+/// The detail of a failure.
+pub(super) fn cannot_be_decoded(why: &dyn std::fmt::Display) -> String {
+    format!("the message cannot be decoded: {why}")
+}
+
+/// An agent that the directory does not know, as it said itself where it can be reached: the
+/// numeric addresses of an old peer's agent, of the host that its letter came from. Others anybody
+/// could claim, and have this service send to them what they never asked for.
+fn said_of_itself(report: &Failure<'_>, from: IpAddr) -> Option<Arc<Entry>> {
+    let agent = &report.sender;
+    let signature = match report.representation {
+        Some(Representation::String) => Signature::JadeProxy,
+        _ => Signature::FipaServices,
+    };
+    let locations = agent.addresses().iter().filter_map(|address| {
+        let location: Location = address.parse().ok()?;
+        let claimed: SocketAddr = location.address().parse().ok()?;
+        if claimed.ip().to_canonical() != from {
+            return None;
+        }
+        location.with_signature(signature).ok()
+    });
+    let locations: Vec<Location> = locations.take(Entry::MAX_LOCATIONS).collect();
+    if locations.is_empty() {
+        return None;
+    }
+    let entry = Entry {
+        name: agent.name().into(),
+        agent_type: String::new(),
+        incarnation: Incarnation::UNKNOWN,
+        locations,
+        mts: Mts::new(agent.name(), Incarnation::UNKNOWN),
+        description: String::new(),
+        registered: SystemTime::UNIX_EPOCH,
+        source: Source::Contact,
+        reach: Reach::Remote {
+            gateway: Incarnation::UNKNOWN,
+        },
+        role: Role::Agent,
+    };
+    entry.check().is_ok().then(|| Arc::new(entry))
+}
+
+/// What an agent understands, by what is understood where it can be reached.
+fn dialect_of(entry: &Entry) -> Dialect {
+    match entry.locations.first().map(Location::signature) {
+        Some(Signature::FipaServices) => Dialect::FipaServices,
+        Some(Signature::JadeProxy) => Dialect::Jade,
+        _ => Dialect::Standard,
+    }
+}
