@@ -12,6 +12,8 @@
 //! * agents of fipa_services: an `inform` in the string encoding, from the sender to the intended
 //!   receiver, in the language `internal-error`, that tells the services which the letter passed.
 
+mod read;
+
 use std::error::Error;
 use std::time::SystemTime;
 
@@ -22,6 +24,7 @@ use fipa_acl::{
 use fipa_transport::FailureReason;
 use fipa_transport::wire::truncated;
 
+pub use self::read::DeliveryFailure;
 use crate::letter_for;
 
 /// What there is to tell about a letter that was not delivered to one receiver.
