@@ -2,17 +2,18 @@
 
 use std::net::IpAddr;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use fipa_acl::{Letter, MessageView};
-use fipa_sds::{Entry, Reach, Resolution, Role};
+use fipa_sds::{Entry, Reach, Resolution, Role, Source};
 use fipa_transport::{
-    Answer, FailureReason, Hop, Incarnation, Kind, Outcome, Parcel, Stream, Ticket, Verdict,
+    Answer, FailureReason, Hop, Incarnation, Kind, Location, Outcome, Parcel, Signature, Stream,
+    Ticket, Verdict,
 };
 
 use super::desk::{Action, Author, Origin, Undelivered, Upstream};
 use super::failures::cannot_be_decoded;
-use super::lane::{Delivery, LaneId, LaneKey};
+use super::lane::{Delivery, Lane, LaneId, LaneKey};
 use super::{Core, MAX_DEADLINE, News, Now, own_lane};
 use smallvec::smallvec;
 
@@ -20,6 +21,12 @@ use crate::stamp;
 
 /// When the sender of a letter is told that it is in custody, if its outcome takes longer.
 const CUSTODY_AFTER: Duration = Duration::from_millis(200);
+
+/// Time from the registration of an agent until legacy peers have found it by mDNS. Avahi takes 1.2 s
+/// to resolve a new agent; a peer that gets a letter earlier cannot answer it.
+const FOUND_AFTER: Duration = Duration::from_millis(1500);
+/// Time that is left for the delivery of a letter that waits for its sender to be found.
+const LEFT_FOR_DELIVERY: Duration = Duration::from_millis(250);
 
 /// A letter of a legacy peer, read as far as the core needs it. Reading takes time in proportion to
 /// the bytes of the letter, so it comes before the core is locked.
@@ -117,8 +124,41 @@ impl Core {
         let mut delivery = Delivery::new(now.instant, origin, stamped, letter_of, deadline);
         delivery.after = parcel.after;
         delivery.custody_due = unanswered.map(|_| now.instant + CUSTODY_AFTER);
+        delivery.not_before = self.found_by_peer(now, stream.sender, &entry, parcel.remaining);
+        if let Some(until) = delivery.not_before
+            && self.lanes.get(&id).is_some_and(Lane::is_empty)
+        {
+            let wait = until.saturating_duration_since(now.instant);
+            tracing::info!(
+                receiver = %entry.name,
+                ?wait,
+                "letters wait until the legacy peer has found their sender by mDNS"
+            );
+        }
         self.put(now, id, delivery);
         taken
+    }
+
+    /// When the legacy peer of the receiver, which was found by mDNS, has found the sender, if it has
+    /// not yet. Early enough for a letter that has this much time left.
+    fn found_by_peer(
+        &self,
+        now: Now,
+        sender: Incarnation,
+        receiver: &Entry,
+        remaining: Duration,
+    ) -> Option<Instant> {
+        let is_legacy = |location: &Location| location.signature() != Signature::Frames;
+        if receiver.source != Source::Mdns || !receiver.locations.iter().any(is_legacy) {
+            return None;
+        }
+        let sender = self.desk.directory.known_incarnation(sender)?;
+        // A registration in the future shows that the calendar was set back.
+        let ago = now.utc.duration_since(sender.registered);
+        let wait = FOUND_AFTER.checked_sub(ago.unwrap_or_default())?;
+        let latest = remaining - LEFT_FOR_DELIVERY.min(remaining / 2);
+        let wait = wait.min(latest);
+        (!wait.is_zero()).then(|| now.instant + wait)
     }
 
     /// What the gate says, if there is one.

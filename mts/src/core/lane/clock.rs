@@ -82,7 +82,8 @@ impl Lane {
                 Some(Holding::Until(until)) => Some(until),
                 _ => None,
             };
-            [deadline, delivery.custody_due, times_out, held]
+            let not_before = delivery.not_before.filter(|until| *until > now);
+            [deadline, delivery.custody_due, times_out, held, not_before]
         });
         let paused = self.paused_until.filter(|until| *until > now);
         let moving = self

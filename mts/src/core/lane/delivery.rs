@@ -35,6 +35,8 @@ pub(crate) struct Delivery {
     /// When the service that handed the letter over is told that it is in custody, unless its
     /// outcome is known before.
     pub(crate) custody_due: Option<Instant>,
+    /// Not dispatched before this time.
+    pub(crate) not_before: Option<Instant>,
     pub(super) progress: Progress,
 }
 
@@ -123,6 +125,7 @@ impl Delivery {
             deadline,
             since: now,
             custody_due: None,
+            not_before: None,
             progress,
         }
     }

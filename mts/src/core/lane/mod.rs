@@ -297,6 +297,12 @@ impl Lane {
                 index += 1;
                 continue;
             }
+            if let Some(until) = self.letters[index].not_before
+                && now < until
+            {
+                self.due_at(until);
+                break;
+            }
             let Some(entry) = self.entry(registration, desk) else {
                 if self.receiver_left(now, index, desk) {
                     continue;
