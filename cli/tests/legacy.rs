@@ -12,6 +12,8 @@ use common::{Host, Running};
 use fipa::{AgentId, Envelope, EnvelopeParams, Message, Performative};
 use serde_json::{Value, json};
 
+/// A letter that a fipa_services agent, `cpp-sender`, sent to an agent `echo`.
+const LETTER: &[u8] = include_bytes!("../../acl/tests/vectors/tcp_letter.bin");
 /// The failure message that the message transport service of fipa_services sent to `cpp-sender`.
 const FAILURE: &[u8] = include_bytes!("../../acl/tests/vectors/failure_letter.bin");
 
@@ -139,4 +141,15 @@ fn a_failure_message_about_the_letter_is_no_reply() {
     let json = host.run(&send).done_json();
     assert_eq!(json["reply"]["performative"], "failure");
     assert_eq!(json.get("failures"), None, "{json}");
+}
+
+#[test]
+fn failure_messages_that_are_left_out_are_counted_in_the_log() {
+    let host = Host::new();
+    let mut gateway = host.start(&["up", "--json"]);
+    let to = address(&gateway);
+    for _ in 0..200 {
+        TcpStream::connect(&to).unwrap().write_all(LETTER).unwrap();
+    }
+    gateway.tells(&["left out failure messages", "count="]);
 }

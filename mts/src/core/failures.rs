@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime};
 
 use fipa_acl::{Dialect, Representation};
 use fipa_sds::{Entry, Mts, Reach, Role, Source};
-use fipa_transport::{Allowance, FailureReason, Incarnation, Location, Signature, Stream};
+use fipa_transport::{FailureReason, Incarnation, Location, Signature, Stream};
 
 use super::desk::{Action, Author, Origin, Undelivered, life_of};
 use super::inbox::Received;
@@ -15,20 +15,10 @@ use super::{Core, News, Now, own_lane};
 use crate::failure::Failure;
 use crate::stamp;
 
-/// Letters of old peers a second that they are told were refused. What they may send is not limited
-/// by how fast answers go out, and nobody is to be made to write to them without end.
-const REFUSALS_TOLD: f64 = 20.0;
 /// How long a failure message to an old peer's agent may take.
 const FAILURE_DEADLINE: Duration = Duration::from_secs(5);
 
 impl Core {
-    /// Whether an old peer is told of one more letter that was refused.
-    pub(super) fn tells_of_refusal(&mut self, now: Now) -> bool {
-        let full = || Allowance::new(REFUSALS_TOLD, now.instant);
-        let refusals = self.refusals.get_or_insert_with(full);
-        refusals.take(1.0, REFUSALS_TOLD, now.instant)
-    }
-
     /// An agent of this process has taken a letter whose message cannot be decoded. The sender is told
     /// if it is an agent of this process, or one that the directory has under the name that the
     /// envelope gives. Nothing else proves a name in an envelope.
@@ -55,16 +45,14 @@ impl Core {
                 _ => return,
             }
         };
-        if self.tells_of_refusal(now) {
-            self.desk.undelivered.push_back(Undelivered {
-                sender,
-                receiver: Arc::clone(receiver),
-                letter: received.letter.clone(),
-                reason: FailureReason::Refused,
-                detail: cannot_be_decoded(&why),
-            });
-            self.tell_failures(now);
-        }
+        self.desk.undelivered.push_back(Undelivered {
+            sender,
+            receiver: Arc::clone(receiver),
+            letter: received.letter.clone(),
+            reason: FailureReason::Refused,
+            detail: cannot_be_decoded(&why),
+        });
+        self.tell_failures(now);
     }
 
     /// Tells senders of what failed, in the form of FIPA `failure` messages.
@@ -79,15 +67,22 @@ impl Core {
             } = undelivered;
             let name = Arc::clone(&self.desk.config.name);
             let name = &*name;
+            let from = match sender {
+                Author::Ours(_) => None,
+                Author::Remote { from } => {
+                    // Before the message is decoded, by the name that the envelope gives.
+                    let named = stamp::sender(&letter).unwrap_or_default();
+                    if !self.failure_limit.allows(now.instant, from, &named) {
+                        continue;
+                    }
+                    from
+                }
+            };
             let Some(report) = Failure::of(&letter, &receiver, reason, &detail) else {
                 continue;
             };
             let own = self.desk.config.incarnation;
             let sequence = self.sequence_of(own);
-            let from = match sender {
-                Author::Remote { from } => from,
-                Author::Ours(_) => None,
-            };
             if let Author::Ours(agent) = sender {
                 let Some(inbox) = self.agents.get_mut(&agent) else {
                     continue;
@@ -110,6 +105,8 @@ impl Core {
                         letter,
                     });
                     self.desk.actions.push_back(Action::Deliverable { agent });
+                } else {
+                    self.failure_limit.leave_out(now.instant);
                 }
                 continue;
             }
@@ -139,7 +136,7 @@ impl Core {
             };
             let id = self.lane(now, own_lane(stream.sender, &entry), &entry.name);
             if !self.has_room_for_stranger(id, letter.len()) {
-                tracing::info!(to = %report.sender, %reason, "no room for a failure message");
+                self.failure_limit.leave_out(now.instant);
                 continue;
             }
             let deadline = now.instant + FAILURE_DEADLINE;

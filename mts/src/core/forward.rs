@@ -264,10 +264,8 @@ impl Core {
         if let Some(fault) = fault {
             tracing::info!(%from, "refused a letter of a legacy peer: {fault}");
             for receiver in receivers {
-                if self.tells_of_refusal(now) {
-                    let why = (FailureReason::Refused, fault.clone());
-                    self.unframed_failed(&receiver.into(), &letter, (via, from), why);
-                }
+                let why = (FailureReason::Refused, fault.clone());
+                self.unframed_failed(&receiver.into(), &letter, (via, from), why);
             }
             self.tell_failures(now);
             return;
@@ -301,10 +299,8 @@ impl Core {
             }
             for entry in here {
                 if let Err(why) = self.admits(now, &entry.name, &letter) {
-                    if self.tells_of_refusal(now) {
-                        let why = (FailureReason::Refused, why);
-                        self.unframed_failed(&entry.name, &letter, (via, from), why);
-                    }
+                    let why = (FailureReason::Refused, why);
+                    self.unframed_failed(&entry.name, &letter, (via, from), why);
                     continue;
                 }
                 let stream = Stream {

@@ -10,6 +10,7 @@
 //! * `inbox`: the receiving end, where letters are taken once and in order.
 //! * `forward`: letters for agents of other processes.
 //! * `failures`: which senders are told of which failures, by messages.
+//! * `failure_limit`: how many of these messages leave.
 //! * `departed`: registrations that have left this host a moment ago.
 //! * `peers`: services that the configuration names, and how it stands with them.
 //! * `routes`: which way letters would go and what happened on each way, for people.
@@ -23,6 +24,7 @@
 mod config;
 mod departed;
 mod desk;
+mod failure_limit;
 mod failures;
 mod forward;
 mod inbox;
@@ -41,13 +43,14 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::Letter;
 use fipa_sds::{Directory, Entry, Pattern, Resolution, Role};
 use fipa_transport::{
-    Allowance, Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind,
-    Location, Outcome, Parcel, Report, Stream, Verdict, WayError, WayFault,
+    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
+    Outcome, Parcel, Report, Stream, Verdict, WayError, WayFault,
 };
 
 pub use config::{CoreConfig, MAX_DEADLINE};
 pub use desk::Action;
 use desk::{Author, Desk, Note, Origin, Purpose, Undelivered};
+use failure_limit::FailureLimit;
 pub use forward::Unframed;
 use inbox::Inbox;
 pub use inbox::Received;
@@ -111,8 +114,7 @@ pub struct Core {
     notes: BinaryHeap<Reverse<LateNote>>,
     peers: Peers,
     gate: Option<Arc<dyn Gate>>,
-    /// How many old peers' letters that were refused may still be told of.
-    refusals: Option<Allowance>,
+    failure_limit: FailureLimit,
     /// No more letters of others are taken.
     ending: bool,
     /// The service has ended: nothing is sent any more.
@@ -173,7 +175,7 @@ impl Core {
             notes: BinaryHeap::new(),
             peers: Peers::default(),
             gate: None,
-            refusals: None,
+            failure_limit: FailureLimit::default(),
             ending: false,
             closed: false,
             next_lane: 1,
@@ -675,6 +677,7 @@ impl Core {
             self.handle_late_note(now, late);
         }
         self.peers.handle_timeout(now.instant, &mut self.desk);
+        self.failure_limit.handle_timeout(now.instant);
         self.tell_failures(now);
         self.forget_idle_lanes(now);
     }
@@ -773,7 +776,8 @@ impl Core {
     pub fn poll_timeout(&self) -> Option<Instant> {
         let lanes = self.timers.peek().map(|Reverse((due, _))| *due);
         let notes = self.notes.peek().map(|Reverse(late)| late.0);
-        [lanes, notes, self.peers.due()].into_iter().flatten().min()
+        let others = [self.peers.due(), self.failure_limit.due()];
+        others.into_iter().chain([lanes, notes]).flatten().min()
     }
 
     /// The next thing to be done.

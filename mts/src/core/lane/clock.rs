@@ -48,7 +48,7 @@ impl Lane {
                     continue;
                 }
                 State::Waiting if expired => {
-                    let reason = delivery.reason_at_deadline(self.busy);
+                    let reason = self.reason_while_waiting(index);
                     self.fail(now, index, reason, desk);
                     continue;
                 }

@@ -139,15 +139,20 @@ impl Delivery {
         self.progress.uncertain = rules::stays_uncertain(self.progress.uncertain, end);
     }
 
+    /// Remembers a failed attempt. Of many, the first ones and the last one at each location stay.
     pub(super) fn failed_at(&mut self, location: &Location, error: WayError) {
-        if self.progress.attempts.len() < MAX_ATTEMPTS {
-            let location = location.clone();
-            self.progress.attempts.push(Attempt {
-                via: location.kind(),
-                location,
-                error,
-            });
+        let attempts = &mut self.progress.attempts;
+        if attempts.len() >= MAX_ATTEMPTS {
+            let mut known = attempts.iter().rev();
+            let same = known.position(|attempt| attempt.location == *location);
+            // Without one at this location, the newest gives way.
+            attempts.remove(attempts.len() - 1 - same.unwrap_or(0));
         }
+        attempts.push(Attempt {
+            via: location.kind(),
+            location: location.clone(),
+            error,
+        });
     }
 
     /// Remembers that reports of the service at this location are believed.

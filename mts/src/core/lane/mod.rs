@@ -9,7 +9,8 @@
 //! that waits.
 //!
 //! Here is what moves letters on; [`answers`] is what comes back, [`clock`] what time does,
-//! [`custody`] what custodians do about predecessors, [`delivery`] a single letter.
+//! [`custody`] what custodians do about predecessors, [`delivery`] a single letter, [`tried`] what
+//! letters tell that were never dispatched.
 //!
 //! [`rules`]: super::rules
 
@@ -17,6 +18,7 @@ mod answers;
 mod clock;
 mod custody;
 mod delivery;
+mod tried;
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -24,7 +26,8 @@ use std::time::{Duration, Instant};
 
 use fipa_sds::Entry;
 use fipa_transport::{
-    Body, FailureReason, Incarnation, Kind, Location, Outcome, Parcel, Stream, WayError, WayFault,
+    Attempt, Body, FailureReason, Incarnation, Kind, Location, Outcome, Parcel, Stream, WayError,
+    WayFault,
 };
 
 pub(crate) use self::delivery::Delivery;
@@ -84,6 +87,9 @@ pub(crate) struct Lane {
     way: Option<Location>,
     /// Where it is counted what happens on that way, also when it was the last one.
     tally: Option<(Location, Arc<Tally>)>,
+    /// The last error of each route that has failed since the lane was empty, and has not worked since.
+    /// Letters that never had an attempt of their own tell them.
+    failed: Vec<Attempt>,
     /// Something came back: nothing is dispatched until all that is under way has been heard of.
     recovering: bool,
     paused_until: Option<Instant>,
@@ -130,6 +136,7 @@ impl Lane {
             under_way: 0,
             way: None,
             tally: None,
+            failed: Vec::new(),
             recovering: false,
             paused_until: None,
             paused_for_lower: false,
@@ -586,6 +593,7 @@ impl Lane {
             self.busy = false;
             self.ended = None;
             self.moving = None;
+            self.failed.clear();
         }
         if self.paused_for_lower {
             self.paused_until = None;
