@@ -55,7 +55,7 @@ impl<'a> Failure<'a> {
         let detected = Representation::detect(&letter.payload().head);
         let (sender, representation, message) = match Message::decode(letter.payload()) {
             Ok(message) if *message.performative() == Performative::Failure => return None,
-            Ok(message) => (message.sender()?.clone(), detected, Some(message)),
+            Ok(message) => (sender_of(&message, letter)?, detected, Some(message)),
             Err(_) => {
                 let envelope = letter.parse_envelope().ok()?.effective();
                 let announced = match envelope.acl_representation {
@@ -147,6 +147,20 @@ impl<'a> Failure<'a> {
         let told = told.encode(Representation::String, Dialect::FipaServices)?;
         Ok(told.to_vec())
     }
+}
+
+/// The sender of a message, with the addresses that the message gives, else with those that the
+/// envelope gives.
+pub(crate) fn sender_of(message: &Message, letter: &Letter) -> Option<AgentId> {
+    let sender = message.sender()?;
+    if sender.addresses().is_empty()
+        && let Ok(envelope) = letter.parse_envelope()
+        && let Some(from) = envelope.effective().from
+        && from.name() == sender.name()
+    {
+        return Some(from);
+    }
+    Some(sender.clone())
 }
 
 fn path(letter: &Letter) -> Vec<String> {

@@ -11,7 +11,10 @@ use bytes::Bytes;
 use fipa_acl::{AgentId, Dialect, Letter, Message, Payload, Performative, Representation};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Received, Submission, Unframed};
 use fipa_mts::{Gate, letter_for};
-use fipa_sds::{Directory, MemoryDirectory, Mts, Registration, StaticDirectory};
+use fipa_sds::{
+    ContactDirectory, Directory, MemoryDirectory, MergedDirectory, Mts, Registration,
+    StaticDirectory,
+};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
     Outcome, Parcel, Ticket, Verdict, WayError, WayFault,
@@ -52,7 +55,8 @@ fn now() -> Now {
 
 /// The next letter that the core wants sent.
 fn dispatched(core: &mut Core) -> Option<(AttemptId, Location, Parcel)> {
-    match core.poll_action()? {
+    let mut actions = std::iter::from_fn(|| core.poll_action());
+    match actions.find(|action| !matches!(action, Action::Heard { .. }))? {
         Action::Dispatch {
             attempt,
             location,
@@ -237,6 +241,130 @@ fn who_is_refused_is_told_in_its_own_words_and_not_without_end() {
         core.handle_conclusion(then, attempt, Conclusion::Handed);
     }
     assert_eq!(told, 20, "as many as a second has");
+}
+
+/// The agents that became known, and where.
+fn heard(core: &mut Core) -> Vec<(String, String)> {
+    let actions = std::iter::from_fn(|| core.poll_action());
+    let heard = actions.filter_map(|action| match action {
+        Action::Heard {
+            name,
+            agent,
+            location,
+        } => {
+            assert!(!agent.is_known());
+            Some((name, location.to_string()))
+        }
+        _ => None,
+    });
+    heard.collect()
+}
+
+#[test]
+fn the_sender_of_a_recorded_letter_becomes_known_at_the_address_that_it_gives() {
+    let host = || {
+        let config = CoreConfig {
+            forwards: true,
+            ..CoreConfig::new("gateway", Incarnation::from_u64(7), vec![Kind::Shm])
+        };
+        Core::new(config, host_of("echo"))
+    };
+    let arrives = |core: &mut Core, letter, from| {
+        let unframed = Unframed::read(letter, Kind::Tcp, from);
+        core.handle_unframed(now(), Duration::from_secs(5), unframed);
+    };
+    let known = |at: &str| vec![("cpp-sender".to_owned(), at.to_owned())];
+    let mut core = host();
+    arrives(&mut core, recorded(LETTER), HERE);
+    let at = "tcp://127.0.0.1:45615;fipa-services";
+    assert_eq!(heard(&mut core), known(at));
+
+    // An address of another host is not believed.
+    let mut core = host();
+    arrives(&mut core, recorded(LETTER), IpAddr::from([10, 0, 0, 66]));
+    assert_eq!(heard(&mut core), []);
+
+    // Without addresses in the message, those in the envelope count.
+    let plain = Message::builder(Performative::Inform)
+        .sender(AgentId::new("cpp-sender").unwrap())
+        .receiver(AgentId::new("echo").unwrap())
+        .build()
+        .unwrap();
+    let letter = Letter::new(recorded(LETTER).envelope(), plain.to_payload());
+    arrives(&mut core, letter, HERE);
+    assert_eq!(heard(&mut core), known(at));
+}
+
+#[test]
+fn agents_become_known_by_letters_at_a_limited_rate() {
+    let config = CoreConfig {
+        forwards: true,
+        ..CoreConfig::new("gateway", Incarnation::from_u64(7), vec![Kind::Shm])
+    };
+    let mut core = Core::new(config, host_of("echo"));
+    let then = now();
+    for number in 0..200 {
+        let name = format!("agent-{number}");
+        let sender = AgentId::new(name).unwrap();
+        let sender = sender.with_address("tcp://127.0.0.1:9").unwrap();
+        let message = Message::builder(Performative::Inform)
+            .sender(sender)
+            .receiver(AgentId::new("echo").unwrap())
+            .build()
+            .unwrap();
+        let letter = letter_for(&message, then.utc).unwrap();
+        let unframed = Unframed::read(letter, Kind::Tcp, HERE);
+        core.handle_unframed(then, Duration::from_secs(5), unframed);
+    }
+    assert_eq!(heard(&mut core).len(), 20);
+}
+
+#[test]
+fn an_agent_that_became_known_by_a_letter_keeps_its_name_while_it_writes() {
+    let contacts = Arc::new(ContactDirectory::new());
+    let both = vec![host_of("echo"), Arc::clone(&contacts) as Arc<dyn Directory>];
+    let config = CoreConfig {
+        forwards: true,
+        ..CoreConfig::new("gateway", Incarnation::from_u64(7), vec![Kind::Shm])
+    };
+    let mut core = Core::new(config, Arc::new(MergedDirectory::new(both)));
+    let start = Now {
+        instant: Instant::now(),
+        utc: SystemTime::now(),
+    };
+    let elsewhere = IpAddr::from([10, 0, 0, 66]);
+    let mut writes = |seconds, from: IpAddr, port: u16| {
+        let sender = AgentId::new("cpp-sender").unwrap();
+        let at = format!("tcp://{from}:{port}");
+        let message = Message::builder(Performative::Inform)
+            .sender(sender.with_address(&at).unwrap())
+            .receiver(AgentId::new("echo").unwrap())
+            .build()
+            .unwrap();
+        let letter = letter_for(&message, start.utc).unwrap();
+        let since = Duration::from_secs(seconds);
+        let then = Now {
+            instant: start.instant + since,
+            utc: start.utc + since,
+        };
+        let unframed = Unframed::read(letter, Kind::Tcp, from);
+        core.handle_unframed(then, Duration::from_secs(5), unframed);
+        let heard = heard(&mut core);
+        for (name, at) in &heard {
+            let at = at.parse().unwrap();
+            let unknown = Incarnation::UNKNOWN;
+            contacts.heard(then.instant, name, unknown, at).unwrap();
+        }
+        heard.len()
+    };
+    assert_eq!(writes(0, HERE, 1000), 1);
+    assert_eq!(writes(1, HERE, 1000), 0, "it is known");
+    assert_eq!(writes(2, elsewhere, 1000), 0, "the name has an owner");
+    assert_eq!(writes(3, HERE, 2000), 1, "it listens elsewhere now");
+    assert_eq!(writes(20, HERE, 2000), 1, "it is remembered for longer");
+    assert_eq!(writes(21, elsewhere, 1000), 0);
+    let at = contacts.lookup("cpp-sender").unwrap().locations[0].to_string();
+    assert_eq!(at, "tcp://127.0.0.1:2000;fipa-services");
 }
 
 /// A letter whose message has lost its end.

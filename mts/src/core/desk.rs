@@ -62,11 +62,11 @@ pub enum Action {
         outcome: Outcome,
     },
     /// An agent of another host that the directory does not know has written; letters for it can
-    /// be sent to where this one came from. Comes before the letter is passed on.
+    /// be sent to where this one came from, or where it says that a legacy peer takes them. Comes before the letter is passed on.
     Heard {
         /// The name it writes under.
         name: String,
-        /// This life of it.
+        /// This life of it; unknown for an agent of a legacy peer.
         agent: Incarnation,
         /// Where its message transport service can be reached.
         location: Location,

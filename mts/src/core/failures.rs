@@ -163,24 +163,34 @@ pub(super) fn cannot_be_decoded(why: &dyn std::fmt::Display) -> String {
     format!("the message cannot be decoded: {why}")
 }
 
-/// An agent that the directory does not know, as it said itself where it can be reached: the
-/// numeric addresses of an old peer's agent, of the host that its letter came from. Others anybody
-/// could claim, and have this service send to them what they never asked for.
-fn said_of_itself(report: &Failure<'_>, from: IpAddr) -> Option<Arc<Entry>> {
-    let agent = &report.sender;
-    let signature = match report.representation {
+/// The locations that an agent of a legacy peer gives as its own: of its addresses, the numeric ones
+/// of the host that its letter came from. Any others could be claimed to have this service send to
+/// a third party.
+pub(super) fn locations_given<'a>(
+    addresses: impl IntoIterator<Item = &'a str>,
+    representation: Option<Representation>,
+    from: IpAddr,
+) -> Vec<Location> {
+    let signature = match representation {
         Some(Representation::String) => Signature::JadeProxy,
         _ => Signature::FipaServices,
     };
-    let locations = agent.addresses().iter().filter_map(|address| {
+    let locations = addresses.into_iter().filter_map(|address| {
         let location: Location = address.parse().ok()?;
         let claimed: SocketAddr = location.address().parse().ok()?;
-        if claimed.ip().to_canonical() != from {
+        if claimed.ip().to_canonical() != from || !location.kind().is_supported() {
             return None;
         }
         location.with_signature(signature).ok()
     });
-    let locations: Vec<Location> = locations.take(Entry::MAX_LOCATIONS).collect();
+    locations.take(Entry::MAX_LOCATIONS).collect()
+}
+
+/// An agent that the directory does not know, with the locations that it gives as its own.
+fn said_of_itself(report: &Failure<'_>, from: IpAddr) -> Option<Arc<Entry>> {
+    let agent = &report.sender;
+    let addresses = agent.addresses().iter().map(|address| &**address);
+    let locations = locations_given(addresses, report.representation, from);
     if locations.is_empty() {
         return None;
     }

@@ -1,10 +1,10 @@
 //! Letters for agents of other processes: the gateway's role, and letters of legacy peers.
 
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_acl::{Letter, MessageView};
+use fipa_acl::{Letter, Message, Representation};
 use fipa_sds::{Entry, Reach, Resolution, Role, Source};
 use fipa_transport::{
     Answer, FailureReason, Hop, Incarnation, Kind, Location, Outcome, Parcel, Signature, Stream,
@@ -12,11 +12,13 @@ use fipa_transport::{
 };
 
 use super::desk::{Action, Author, Origin, Undelivered, Upstream};
-use super::failures::cannot_be_decoded;
+use super::failures::{cannot_be_decoded, locations_given};
 use super::lane::{Delivery, Lane, LaneId, LaneKey};
+use super::limits::SenderLimit;
 use super::{Core, MAX_DEADLINE, News, Now, own_lane};
 use smallvec::smallvec;
 
+use crate::failure::sender_of;
 use crate::stamp;
 
 /// When the sender of a letter is told that it is in custody, if its outcome takes longer.
@@ -28,6 +30,10 @@ const FOUND_AFTER: Duration = Duration::from_millis(1500);
 /// Time that is left for the delivery of a letter that waits for its sender to be found.
 const LEFT_FOR_DELIVERY: Duration = Duration::from_millis(250);
 
+/// How long an agent of a legacy peer stays known by a letter before another letter renews that. Less
+/// than the time after which it is forgotten.
+const HEARD_AGAIN_AFTER: Duration = Duration::from_secs(15);
+
 /// A letter of a legacy peer, read as far as the core needs it. Reading takes time in proportion to
 /// the bytes of the letter, so it comes before the core is locked.
 #[derive(Debug)]
@@ -35,6 +41,8 @@ pub struct Unframed {
     letter: Letter,
     via: Kind,
     from: IpAddr,
+    /// The name of the sender, and a location that it gives as its own.
+    sender: Option<(String, Location)>,
     /// Why the message cannot be decoded, if it cannot.
     fault: Option<String>,
 }
@@ -43,15 +51,33 @@ impl Unframed {
     /// Reads the letter, which came from this address.
     #[must_use]
     pub fn read(letter: Letter, via: Kind, from: IpAddr) -> Self {
-        let message = MessageView::parse_payload(letter.payload());
-        let fault = message.err().map(|error| cannot_be_decoded(&error));
+        let (sender, fault) = match Message::decode(letter.payload()) {
+            Ok(message) => (locate(&message, &letter, from), None),
+            Err(error) => (None, Some(cannot_be_decoded(&error))),
+        };
         Self {
             letter,
             via,
             from,
+            sender,
             fault,
         }
     }
+}
+
+/// The name of the sender, and the first location that it gives as its own.
+fn locate(message: &Message, letter: &Letter, from: IpAddr) -> Option<(String, Location)> {
+    let sender = sender_of(message, letter)?;
+    let addresses = sender.addresses().iter().map(|address| &**address);
+    let representation = Representation::detect(&letter.payload().head);
+    let mut locations = locations_given(addresses, representation, from).into_iter();
+    Some((sender.name().to_owned(), locations.next()?))
+}
+
+/// Agents of legacy peers a second that become known by their letters: each one is published to the
+/// processes of the host.
+pub(super) fn contact_limit() -> SenderLimit {
+    SenderLimit::new(2.0, 20.0, 50.0)
 }
 
 impl Core {
@@ -233,6 +259,35 @@ impl Core {
         }
     }
 
+    /// Makes an agent of a legacy peer known, which can then be answered, at the location that it gives
+    /// as its own. Only an agent that nothing else is known of, and one that became known in this way
+    /// and writes from the same host.
+    fn hear_unframed(&mut self, now: Now, (name, location): (String, Location), from: IpAddr) {
+        if !self.desk.config.forwards {
+            return;
+        }
+        if let Some(known) = self.desk.directory.known(&name) {
+            let at = known.locations.first();
+            let address = at.and_then(|at| at.address().parse::<SocketAddr>().ok());
+            let same = address.is_some_and(|address| address.ip().to_canonical() == from);
+            let age = now.utc.duration_since(known.registered);
+            let is_due = at != Some(&location) || age.is_ok_and(|age| age >= HEARD_AGAIN_AFTER);
+            let is_contact = known.source == Source::Contact && !known.incarnation.is_known();
+            if !(is_contact && same && is_due) {
+                return;
+            }
+        }
+        if !self.contact_limit.take(now.instant, Some(from), &name) {
+            tracing::debug!(%from, "too many new agents of legacy peers; this one cannot be answered");
+            return;
+        }
+        self.desk.actions.push_back(Action::Heard {
+            name,
+            agent: Incarnation::UNKNOWN,
+            location,
+        });
+    }
+
     /// Whether there is room for another letter in this lane.
     pub(super) fn has_room(&self, lane: LaneId, len: usize) -> bool {
         let lane = self.lanes.get(&lane);
@@ -252,6 +307,7 @@ impl Core {
             letter,
             via,
             from,
+            sender: mut located,
             fault,
         } = unframed;
         let receivers = match stamp::receivers(&letter) {
@@ -302,6 +358,9 @@ impl Core {
                     let why = (FailureReason::Refused, why);
                     self.unframed_failed(&entry.name, &letter, (via, from), why);
                     continue;
+                }
+                if let Some(located) = located.take() {
+                    self.hear_unframed(now, located, from);
                 }
                 let stream = Stream {
                     sender: stream_sender,

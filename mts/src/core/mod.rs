@@ -10,7 +10,7 @@
 //! * `inbox`: the receiving end, where letters are taken once and in order.
 //! * `forward`: letters for agents of other processes.
 //! * `failures`: which senders are told of which failures, by messages.
-//! * `failure_limit`: how many of these messages leave.
+//! * `limits`: how many of these messages leave.
 //! * `departed`: registrations that have left this host a moment ago.
 //! * `peers`: services that the configuration names, and how it stands with them.
 //! * `routes`: which way letters would go and what happened on each way, for people.
@@ -24,11 +24,11 @@
 mod config;
 mod departed;
 mod desk;
-mod failure_limit;
 mod failures;
 mod forward;
 mod inbox;
 mod lane;
+mod limits;
 mod notice;
 mod peers;
 mod routes;
@@ -50,11 +50,11 @@ use fipa_transport::{
 pub use config::{CoreConfig, MAX_DEADLINE};
 pub use desk::Action;
 use desk::{Author, Desk, Note, Origin, Purpose, Undelivered};
-use failure_limit::FailureLimit;
 pub use forward::Unframed;
 use inbox::Inbox;
 pub use inbox::Received;
 use lane::{Delivery, Lane, LaneId, LaneKey};
+use limits::{FailureLimit, SenderLimit};
 pub use notice::{News, Notice};
 
 use crate::{Gate, Map};
@@ -115,6 +115,8 @@ pub struct Core {
     peers: Peers,
     gate: Option<Arc<dyn Gate>>,
     failure_limit: FailureLimit,
+    /// Limits how many agents of legacy peers become known by their letters.
+    contact_limit: SenderLimit,
     /// No more letters of others are taken.
     ending: bool,
     /// The service has ended: nothing is sent any more.
@@ -176,6 +178,7 @@ impl Core {
             peers: Peers::default(),
             gate: None,
             failure_limit: FailureLimit::default(),
+            contact_limit: forward::contact_limit(),
             ending: false,
             closed: false,
             next_lane: 1,

@@ -1,8 +1,8 @@
-//! How many failure messages leave for agents of other services, and what is left out.
+//! Limits of what a gateway does because of legacy peers' letters: failure messages, and agents that
+//! become known by a letter.
 //!
-//! A legacy peer may send letters that fail as fast as it likes, under any name. Three rates bound the
-//! failure messages about them: of one sender, of one address, and of all. One sender that exceeds
-//! its rate takes nothing from the others.
+//! A legacy peer may send letters as fast as it likes, under any name. Three rates bound what is done
+//! about them: for one sender, for one address, and for all.
 
 use std::net::IpAddr;
 use std::time::{Duration, Instant};
@@ -25,32 +25,37 @@ const LOG_EVERY: Duration = Duration::from_secs(1);
 /// The address that a letter came from, if that is known, and the name of its sender.
 type Sender = (Option<IpAddr>, String);
 
-/// Counts failure messages. Sans-I/O, but for the log.
-#[derive(Debug, Default)]
-pub(super) struct FailureLimit {
+/// Limits what is done for senders: for one, for those of one address, and for all. What exceeds one
+/// rate takes nothing from others.
+#[derive(Debug)]
+pub(super) struct SenderLimit {
+    per_sender: f64,
+    per_address: f64,
+    in_all: f64,
     all: Option<Allowance>,
     addresses: Map<IpAddr, Allowance>,
     senders: Map<Sender, Allowance>,
-    left_out: u64,
-    /// When it is logged how many were left out.
-    log_at: Option<Instant>,
 }
 
-impl FailureLimit {
-    /// Senders that are remembered, at most, and addresses. Only failure messages that leave make
-    /// entries: at most 800 within the memory.
+impl SenderLimit {
+    /// Senders that are remembered, at most, and addresses. Only what is allowed makes entries: twice
+    /// `in_all` within the memory.
     const MAX_ENTRIES: usize = 1024;
 
-    /// Whether one more failure message may leave for this sender. If not, it is counted.
-    pub(super) fn allows(&mut self, now: Instant, from: Option<IpAddr>, sender: &str) -> bool {
-        let allowed = self.take(now, (from.map(host), sender.to_owned()));
-        if !allowed {
-            self.leave_out(now);
+    /// So much a second, each.
+    pub(super) fn new(per_sender: f64, per_address: f64, in_all: f64) -> Self {
+        Self {
+            per_sender,
+            per_address,
+            in_all,
+            all: None,
+            addresses: Map::default(),
+            senders: Map::default(),
         }
-        allowed
     }
 
-    fn take(&mut self, now: Instant, sender: Sender) -> bool {
+    /// Whether it is allowed once more.
+    pub(super) fn take(&mut self, now: Instant, from: Option<IpAddr>, sender: &str) -> bool {
         if self.senders.len().max(self.addresses.len()) >= Self::MAX_ENTRIES {
             let is_recent = |it: &Allowance| now.saturating_duration_since(it.asked()) < MEMORY;
             self.senders.retain(|_, allowance| is_recent(allowance));
@@ -59,32 +64,62 @@ impl FailureLimit {
                 return false;
             }
         }
+        let address = from.map(host);
+        let sender = (address, sender.to_owned());
         // The narrowest first: what it refuses takes nothing from the others. Refused by the
         // widest, nothing is remembered.
-        let address = sender.0;
         if let Some(known) = self.senders.get_mut(&sender)
-            && !known.take(1.0, PER_SENDER, now)
+            && !known.take(1.0, self.per_sender, now)
         {
             return false;
         }
         if let Some(known) = address.and_then(|address| self.addresses.get_mut(&address))
-            && !known.take(1.0, PER_ADDRESS, now)
+            && !known.take(1.0, self.per_address, now)
         {
             return false;
         }
-        let all = self.all.get_or_insert_with(|| Allowance::new(IN_ALL, now));
-        if !all.take(1.0, IN_ALL, now) {
+        let in_all = self.in_all;
+        let all = self.all.get_or_insert_with(|| Allowance::new(in_all, now));
+        if !all.take(1.0, in_all, now) {
             return false;
         }
-        self.senders
-            .entry(sender)
-            .or_insert_with(|| less_one(PER_SENDER, now));
+        let per_sender = || less_one(self.per_sender, now);
+        self.senders.entry(sender).or_insert_with(per_sender);
         if let Some(address) = address {
-            self.addresses
-                .entry(address)
-                .or_insert_with(|| less_one(PER_ADDRESS, now));
+            let per_address = || less_one(self.per_address, now);
+            self.addresses.entry(address).or_insert_with(per_address);
         }
         true
+    }
+}
+
+/// Limits failure messages, and counts those that are left out. Sans-I/O, but for the log.
+#[derive(Debug)]
+pub(super) struct FailureLimit {
+    limit: SenderLimit,
+    left_out: u64,
+    /// When it is logged how many were left out.
+    log_at: Option<Instant>,
+}
+
+impl Default for FailureLimit {
+    fn default() -> Self {
+        Self {
+            limit: SenderLimit::new(PER_SENDER, PER_ADDRESS, IN_ALL),
+            left_out: 0,
+            log_at: None,
+        }
+    }
+}
+
+impl FailureLimit {
+    /// Whether one more failure message may leave for this sender. If not, it is counted.
+    pub(super) fn allows(&mut self, now: Instant, from: Option<IpAddr>, sender: &str) -> bool {
+        let allowed = self.limit.take(now, from, sender);
+        if !allowed {
+            self.leave_out(now);
+        }
+        allowed
     }
 
     /// Counts a failure message that does not leave.
@@ -175,8 +210,8 @@ mod tests {
             let now = start + Duration::from_micros(u64::from(number) * 200);
             let from = Some(Ipv4Addr::from(number).into());
             allowed += u32::from(limit.allows(now, from, &format!("name {number}")));
-            assert!(limit.senders.len() <= FailureLimit::MAX_ENTRIES);
-            assert!(limit.addresses.len() <= FailureLimit::MAX_ENTRIES);
+            assert!(limit.limit.senders.len() <= SenderLimit::MAX_ENTRIES);
+            assert!(limit.limit.addresses.len() <= SenderLimit::MAX_ENTRIES);
         }
         // Ten seconds, and what may leave at once.
         assert!((4000..=4400).contains(&allowed), "{allowed}");
