@@ -280,7 +280,21 @@ impl Agent {
     }
 
     fn taken(&self, received: fipa_mts::core::Received) -> Result<Incoming, ReceiveError> {
-        let incoming = Incoming::decode(received)?;
+        let message = Message::decode(received.letter.payload()).map_err(|source| {
+            let mts = &self.domain.inner.service.mts;
+            mts.handle_undecodable(&self.name, &received, source.to_string());
+            ReceiveError::Malformed {
+                source,
+                letter: Box::new(received.letter.clone()),
+            }
+        })?;
+        let incoming = Incoming {
+            message,
+            letter: received.letter,
+            via: received.via,
+            #[cfg(feature = "monitor")]
+            violation: None,
+        };
         #[cfg(feature = "monitor")]
         if let Some(checks) = &self.checks {
             return checks.arrived(self, incoming);
@@ -403,25 +417,6 @@ pub struct Incoming {
     pub violation: Option<Box<fipa_monitor::Violation>>,
 }
 
-impl Incoming {
-    fn decode(received: fipa_mts::core::Received) -> Result<Self, ReceiveError> {
-        let fipa_mts::core::Received { letter, via, .. } = received;
-        match Message::decode(letter.payload()) {
-            Ok(message) => Ok(Self {
-                message,
-                letter,
-                via,
-                #[cfg(feature = "monitor")]
-                violation: None,
-            }),
-            Err(source) => Err(ReceiveError::Malformed {
-                source,
-                letter: Box::new(letter),
-            }),
-        }
-    }
-}
-
 /// Why a message was not sent.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -462,7 +457,7 @@ pub enum ReceiveError {
     /// This process is a forked child of the one that registered the agent.
     #[error(transparent)]
     Forked(#[from] Forked),
-    /// A letter came whose message cannot be decoded.
+    /// A letter came whose message cannot be decoded. Its sender gets a failure message.
     #[error("a letter with a message that cannot be decoded: {source}")]
     Malformed {
         /// Why not.

@@ -73,6 +73,7 @@ pub use fipa_acl::{
 };
 #[cfg(feature = "monitor")]
 pub use fipa_monitor as monitor;
+pub use fipa_mts::DeliveryFailure;
 pub use fipa_sds::{
     Change, Directory, Entry, Matcher, Members, MembersError, Pattern, PatternError, Query, Reach,
     RegisterError, Role, Source, Watch, is_pattern,

@@ -9,9 +9,10 @@ use std::time::Duration;
 
 use fipa::config::Sources;
 use fipa::{
-    Agent, AgentId, Config, Domain, Envelope, Gateway, Kind, Letter, Message, Outcome, Performative,
+    Agent, AgentId, Config, Domain, Envelope, EnvelopeParams, FailureReason, Gateway, Kind, Letter,
+    Message, Outcome, Performative,
 };
-use fipa_acl::{Dialect, Representation};
+use fipa_acl::{AclRepresentation, Dialect, Representation};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::timeout;
@@ -155,6 +156,132 @@ async fn what_fipa_services_wrote_is_taken_and_answered_in_its_hand() {
             let theirs = envelope.encode(Representation::BitEfficient, Dialect::FipaServices);
             assert_eq!(letter.envelope(), theirs.unwrap(), "{file}");
         }
+    }
+    host.gateway.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_letter_that_fipa_services_cannot_read_fails_at_once_with_its_reason() {
+    let host = Host::new("alice", "fipa-services").await;
+    let [rover, my_arm] = ["rover", "my arm"].map(|it| host.domain.register(it).unwrap());
+    let letter = |from: &Agent| {
+        from.message(Performative::Request)
+            .receiver(AgentId::new("alice").unwrap())
+    };
+    let elsewhere = AgentId::new("a b").unwrap();
+    let letters = [
+        (&rover, letter(&rover).reply_to(elsewhere).build().unwrap()),
+        (&my_arm, letter(&my_arm).build().unwrap()),
+    ];
+    for (from, message) in letters {
+        // The test ends long before this deadline, or fails.
+        let sent = from.send_within(message, 10 * PATIENCE);
+        let deliveries = timeout(PATIENCE, sent).await.unwrap().unwrap();
+        match &deliveries.0[0].outcome {
+            Outcome::Failed { reason, attempts } => {
+                assert_eq!(*reason, FailureReason::Inexpressible, "{deliveries}");
+                assert_eq!(attempts.len(), 1, "{deliveries}");
+                let detail = &attempts[0].error.detail;
+                assert!(detail.contains("is not a FIPA00070 word"), "{detail}");
+            }
+            other => panic!("{other}"),
+        }
+    }
+    // Nothing was opened for them: the next connection carries the next letter.
+    let plain = letter(&rover).content("plain").build().unwrap();
+    let (delivered, read_by_peer) = tokio::join!(rover.send(plain), host.read_by_peer());
+    assert!(delivered.unwrap().all_succeeded());
+    assert_eq!(read(&read_by_peer).2.content().unwrap(), "plain");
+    host.gateway.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn fipa_services_is_told_that_its_letter_cannot_be_decoded() {
+    let host = Host::new("alice", "fipa-services").await;
+    let bob = host.domain.register("bob").unwrap();
+    let [(_, recorded)] = recorded!["e01_simple.be"];
+    throw(&recorded[..recorded.len() - 3], &host.address()).await;
+    let (_, letter, failure) = read(&host.read_by_peer().await);
+    assert_eq!(*failure.performative(), Performative::Failure);
+    assert_eq!(failure.receivers()[0].name(), "alice");
+    let theirs = failure.encode(Representation::BitEfficient, Dialect::FipaServices);
+    assert_eq!(letter.payload().to_bytes(), theirs.unwrap());
+    let told = String::from_utf8_lossy(failure.content().unwrap()).into_owned();
+    assert!(
+        told.contains("cannot be decoded") && told.contains("bob"),
+        "{told}"
+    );
+    // A whole letter comes afterwards, and is the first that the agent gets.
+    throw(recorded, &host.address()).await;
+    assert_eq!(receive(&bob).await, read(recorded).2);
+    host.gateway.close().await;
+}
+
+/// A letter of an agent of fipa_services to bob, which gives this address as its own.
+fn letter_from(name: &str, address: &str) -> Vec<u8> {
+    let sender = AgentId::new(name).unwrap().with_address(address).unwrap();
+    let bob = AgentId::new("bob").unwrap();
+    let (representation, dialect) = (Representation::BitEfficient, Dialect::FipaServices);
+    let message = Message::builder(Performative::Request)
+        .sender(sender.clone())
+        .receiver(bob.clone())
+        .conversation_id("c-1")
+        .content("lift")
+        .build()
+        .unwrap();
+    let base = EnvelopeParams {
+        to: vec![bob.clone()],
+        from: Some(sender),
+        acl_representation: Some(AclRepresentation::BitEfficient),
+        date: Some("20261120T112644481".parse().unwrap()),
+        intended_receivers: vec![bob],
+        ..EnvelopeParams::default()
+    };
+    let envelope = Envelope {
+        base,
+        extensions: Vec::new(),
+    };
+    let mut letter = envelope.encode(representation, dialect).unwrap().to_vec();
+    letter.extend_from_slice(&message.encode(representation, dialect).unwrap());
+    letter
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_agent_that_nothing_announces_is_answered_where_its_letter_says() {
+    // The directory knows another agent at the peer only.
+    let host = Host::new("alice", "fipa-services").await;
+    let bob = host.domain.register("bob").unwrap();
+    let at = format!("tcp://{}", host.peer.local_addr().unwrap());
+    throw(&letter_from("carol", &at), &host.address()).await;
+    let asked = receive(&bob).await;
+    assert_eq!(asked.content().unwrap(), "lift");
+    let answer = bob.reply(&asked, Performative::Agree).content("done");
+    let (delivered, answer) = tokio::join!(
+        bob.send(answer.build().unwrap()),
+        timeout(PATIENCE, host.read_by_peer())
+    );
+    let delivered = delivered.unwrap();
+    let handed = matches!(delivered.0[0].outcome, Outcome::Sent { via: Kind::Tcp, .. });
+    assert!(handed, "{delivered}");
+    let (envelope, letter, message) = read(&answer.unwrap());
+    assert_eq!(envelope.effective().intended_receivers[0].name(), "carol");
+    assert_eq!(message.content().unwrap(), "done");
+    assert_eq!(message.conversation_id(), Some("c-1"));
+    let theirs = message.encode(Representation::BitEfficient, Dialect::FipaServices);
+    assert_eq!(letter.payload().to_bytes(), theirs.unwrap());
+
+    // The address of another host is never dialled.
+    throw(
+        &letter_from("mallory", "tcp://192.0.2.66:6789"),
+        &host.address(),
+    )
+    .await;
+    let asked = receive(&bob).await;
+    let answer = bob.reply(&asked, Performative::Agree).build().unwrap();
+    let delivered = bob.send(answer).await.unwrap();
+    match &delivered.0[0].outcome {
+        Outcome::Failed { reason, .. } => assert_eq!(*reason, FailureReason::NoSuchAgent),
+        other => panic!("{other}"),
     }
     host.gateway.close().await;
 }

@@ -9,6 +9,8 @@
 mod common;
 
 use std::collections::BTreeMap;
+use std::io::Read;
+use std::net::TcpListener;
 use std::time::{Duration, Instant};
 
 use common::{Host, Running};
@@ -77,6 +79,65 @@ fn agents_come_and_go(avahi: &Avahi<'_>) {
     // The agent is there still, but nobody on the network could reach it.
     ends(gateway);
     wait_for(&[]);
+}
+
+#[test]
+fn a_letter_to_a_legacy_peer_waits_for_its_sender_to_be_found() {
+    isolated("in_the_namespace_with_a_legacy_peer", &Avahi::TOOLS);
+}
+
+#[test]
+#[ignore = "is run by the other test in a network namespace"]
+fn in_the_namespace_with_a_legacy_peer() {
+    enter();
+    fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
+    let network = Network::new(2);
+    let avahi = Avahi::start(network.host(1));
+    let peer = network
+        .host(1)
+        .enter(|| TcpListener::bind("10.99.0.2:0").unwrap());
+    let signature = "fipa::services::transports::MessageTransport";
+    let locator = format!("LOCATOR=tcp://{} {signature};", peer.local_addr().unwrap());
+    let _cpp = avahi.publish(
+        "cpp",
+        "_fipa_service_directory._udp",
+        0,
+        &["TYPE=cpp", &locator, "DESCRIPTION="],
+    );
+    network.host(0).enter(|| a_letter_waits(&peer));
+}
+
+fn a_letter_waits(peer: &TcpListener) {
+    let host = Host::new();
+    let mut gateway = host.start(&[
+        "up",
+        "-v",
+        "--set",
+        "discovery.mdns=true",
+        "--set",
+        "transport.tcp.listen=[\"10.99.0.1:0\"]",
+        "--set",
+        "security.insecure=true",
+    ]);
+    let begun = Instant::now();
+    while !host.run(&["agents"]).done().contains("cpp") {
+        assert!(begun.elapsed() < WATCHDOG, "the legacy peer is not found");
+    }
+    let before = Instant::now();
+    let mut command = host.command(&["send", "--to", "cpp", "--content", "hello"]);
+    let mut sending = command.spawn().unwrap();
+    let (mut stream, _) = peer.accept().unwrap();
+    let waited = before.elapsed();
+    let mut letter = Vec::new();
+    stream.read_to_end(&mut letter).unwrap();
+    drop(stream);
+    assert!(sending.wait().unwrap().success());
+    assert!(letter.windows(5).any(|bytes| bytes == b"hello"));
+    assert!(waited >= Duration::from_millis(1500), "{waited:?}");
+    gateway.tells(&[
+        "letters wait until the legacy peer has found their sender",
+        "cpp",
+    ]);
 }
 
 fn start_first(host: &Host) -> Running {

@@ -2,8 +2,9 @@
 //!
 //! The message is a `failure` with the ontology `fipa-agent-management` (FIPA00067) from the message
 //! transport service to the sender of the letter; `in-reply-to`, `conversation-id` and `protocol`
-//! are taken from the message. There is none about a message that is a failure itself. Its content
-//! is what the sender understands:
+//! are taken from the message. There is none about a message that is a failure itself. If the message
+//! cannot be decoded, the sender is the one that the envelope names. The content is what the sender
+//! understands:
 //!
 //! * our own agents and JADE's: language `fipa-sl`, content `((action (agent-identifier :name
 //!   SENDER) (ACLMessage)) (MTS-error (agent-identifier :name RECEIVER) (internal-error "REASON:
@@ -11,12 +12,19 @@
 //! * agents of fipa_services: an `inform` in the string encoding, from the sender to the intended
 //!   receiver, in the language `internal-error`, that tells the services which the letter passed.
 
+mod read;
+
 use std::error::Error;
 use std::time::SystemTime;
 
-use fipa_acl::{AgentId, Dialect, EnvelopeView, Letter, Message, Performative, Representation};
+use fipa_acl::{
+    AclRepresentation, AgentId, Dialect, EnvelopeView, Letter, Message, Performative,
+    Representation,
+};
 use fipa_transport::FailureReason;
+use fipa_transport::wire::truncated;
 
+pub use self::read::DeliveryFailure;
 use crate::letter_for;
 
 /// What there is to tell about a letter that was not delivered to one receiver.
@@ -27,7 +35,8 @@ pub(crate) struct Failure<'a> {
     pub(crate) receiver: &'a str,
     /// How its message was encoded, which the sender understands.
     pub(crate) representation: Option<Representation>,
-    message: Message,
+    /// The message, unless it cannot be decoded.
+    message: Option<Message>,
     reason: FailureReason,
     detail: &'a str,
     /// The services that the letter passed, the first one first.
@@ -35,29 +44,31 @@ pub(crate) struct Failure<'a> {
 }
 
 impl<'a> Failure<'a> {
-    /// What there is to tell, unless there is nobody to tell, or the letter is a failure message
-    /// itself. What cannot be decoded is logged: nobody else could be told.
+    /// The failure of this letter. None if neither its message nor its envelope names a sender, or
+    /// the message is a failure message itself.
     pub(crate) fn of(
         letter: &Letter,
         receiver: &'a str,
         reason: FailureReason,
         detail: &'a str,
     ) -> Option<Self> {
-        let message = match Message::decode(letter.payload()) {
-            Ok(message) => message,
-            Err(error) => {
-                tracing::info!(%error, receiver, "no failure message about what cannot be decoded");
-                return None;
+        let detected = Representation::detect(&letter.payload().head);
+        let (sender, representation, message) = match Message::decode(letter.payload()) {
+            Ok(message) if *message.performative() == Performative::Failure => return None,
+            Ok(message) => (sender_of(&message, letter)?, detected, Some(message)),
+            Err(_) => {
+                let envelope = letter.parse_envelope().ok()?.effective();
+                let announced = match envelope.acl_representation {
+                    Some(AclRepresentation::String) => Some(Representation::String),
+                    _ => detected,
+                };
+                (envelope.from?, announced, None)
             }
         };
-        let sender = message.sender()?.clone();
-        if *message.performative() == Performative::Failure {
-            return None;
-        }
         Some(Self {
             sender,
             receiver,
-            representation: Representation::detect(&letter.payload().head),
+            representation,
             message,
             reason,
             detail,
@@ -87,24 +98,22 @@ impl<'a> Failure<'a> {
             },
             _ => failure.language("fipa-sl").content(self.told_in_sl()),
         };
-        if let Some(protocol) = self.message.protocol() {
-            failure = failure.protocol(protocol);
-        }
-        if let Some(conversation) = self.message.conversation_id() {
-            failure = failure.conversation_id(conversation);
-        }
-        if let Some(reply_with) = self.message.reply_with() {
-            failure = failure.in_reply_to(reply_with);
+        if let Some(message) = &self.message {
+            if let Some(protocol) = message.protocol() {
+                failure = failure.protocol(protocol);
+            }
+            if let Some(conversation) = message.conversation_id() {
+                failure = failure.conversation_id(conversation);
+            }
+            if let Some(reply_with) = message.reply_with() {
+                failure = failure.in_reply_to(reply_with);
+            }
         }
         Ok(letter_for(&failure.build()?, utc)?)
     }
 
     fn told_in_sl(&self) -> String {
-        let text = if self.detail.is_empty() {
-            self.reason.to_string()
-        } else {
-            format!("{}: {}", self.reason, self.detail)
-        };
+        let text = self.text();
         format!(
             "((action (agent-identifier :name {}) (ACLMessage)) \
              (MTS-error (agent-identifier :name {}) (internal-error {})))",
@@ -112,6 +121,14 @@ impl<'a> Failure<'a> {
             sl_string(self.receiver),
             sl_string(&text),
         )
+    }
+
+    /// The reason, and its detail if there is one.
+    fn text(&self) -> String {
+        match self.detail {
+            "" => self.reason.to_string(),
+            detail => format!("{}: {detail}", self.reason),
+        }
     }
 
     fn told_by_path(&self, mts: &str) -> Result<Vec<u8>, Box<dyn Error>> {
@@ -123,13 +140,27 @@ impl<'a> Failure<'a> {
             .language("internal-error")
             .content(format!(
                 "description: message delivery failed: {}\ndelivery path: {}",
-                self.reason,
+                one_line(&self.text()),
                 path.join(",")
             ))
             .build()?;
         let told = told.encode(Representation::String, Dialect::FipaServices)?;
         Ok(told.to_vec())
     }
+}
+
+/// The sender of a message, with the addresses that the message gives, else with those that the
+/// envelope gives.
+pub(crate) fn sender_of(message: &Message, letter: &Letter) -> Option<AgentId> {
+    let sender = message.sender()?;
+    if sender.addresses().is_empty()
+        && let Ok(envelope) = letter.parse_envelope()
+        && let Some(from) = envelope.effective().from
+        && from.name() == sender.name()
+    {
+        return Some(from);
+    }
+    Some(sender.clone())
 }
 
 fn path(letter: &Letter) -> Vec<String> {
@@ -146,6 +177,12 @@ fn path(letter: &Letter) -> Vec<String> {
     // The newest stamp stands in front.
     path.reverse();
     path
+}
+
+/// The beginning of a text, without control characters: fipa_services reads line by line.
+fn one_line(text: &str) -> String {
+    let plain = |c: char| if c.is_control() { ' ' } else { c };
+    truncated(text, 400).chars().map(plain).collect()
 }
 
 /// A string literal of FIPA SL (FIPA00008): `\"` is its only escape.

@@ -434,6 +434,16 @@ impl Mts {
         Some(received)
     }
 
+    /// An agent has taken a letter whose message cannot be decoded; see
+    /// [`Core::handle_undecodable`].
+    pub fn handle_undecodable(&self, receiver: &Arc<str>, received: &Received, why: String) {
+        let mut state = self.shared.state.lock();
+        state
+            .core
+            .handle_undecodable(Now::read(), receiver, received, why);
+        self.shared.carry_out(state);
+    }
+
     /// Does what can be done now on the calling thread; see [`Transport::drive`].
     pub fn drive(&self) -> bool {
         self.shared.drive()

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, Letter, Message, Performative};
-use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission, Unframed};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
@@ -336,9 +336,11 @@ fn a_lane_that_is_full_holds_back_and_gives_credit() {
 fn an_old_peers_letter_is_for_whom_its_envelope_names() {
     let mut gateway = Gateway::new(true);
     let now = gateway.at(0);
-    gateway
-        .core
-        .handle_unframed(now, Duration::from_secs(2), letter(), Kind::Tcp, HERE);
+    gateway.core.handle_unframed(
+        now,
+        Duration::from_secs(2),
+        Unframed::read(letter(), Kind::Tcp, HERE),
+    );
     let (attempt, location, parcel) = gateway.dispatched();
     assert_eq!(location, shm(0x9));
     assert_eq!(&*parcel.receiver, "arm");

@@ -9,9 +9,12 @@ use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
 use fipa_acl::{AgentId, Dialect, Letter, Message, Payload, Performative, Representation};
-use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Received, Submission, Unframed};
 use fipa_mts::{Gate, letter_for};
-use fipa_sds::{Directory, MemoryDirectory, Mts, Registration, StaticDirectory};
+use fipa_sds::{
+    ContactDirectory, Directory, MemoryDirectory, MergedDirectory, Mts, Registration,
+    StaticDirectory,
+};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
     Outcome, Parcel, Ticket, Verdict, WayError, WayFault,
@@ -52,7 +55,8 @@ fn now() -> Now {
 
 /// The next letter that the core wants sent.
 fn dispatched(core: &mut Core) -> Option<(AttemptId, Location, Parcel)> {
-    match core.poll_action()? {
+    let mut actions = std::iter::from_fn(|| core.poll_action());
+    match actions.find(|action| !matches!(action, Action::Heard { .. }))? {
         Action::Dispatch {
             attempt,
             location,
@@ -97,9 +101,7 @@ fn who_sent_a_recorded_letter_to_nobody_is_told_in_its_own_words() {
     core.handle_unframed(
         now(),
         Duration::from_secs(5),
-        recorded(LETTER),
-        Kind::Tcp,
-        HERE,
+        Unframed::read(recorded(LETTER), Kind::Tcp, HERE),
     );
     let (attempt, location, parcel) = dispatched(&mut core).unwrap();
     assert_eq!(location.to_string(), "tcp://127.0.0.1:45615;fipa-services");
@@ -158,9 +160,7 @@ fn each_receiver_is_told_of_once_and_failures_never() {
     core.handle_unframed(
         now(),
         deadline,
-        letter(Performative::Request),
-        Kind::Tcp,
-        HERE,
+        Unframed::read(letter(Performative::Request), Kind::Tcp, HERE),
     );
     let mut told = Vec::new();
     while let Some((_, location, parcel)) = dispatched(&mut core) {
@@ -172,9 +172,7 @@ fn each_receiver_is_told_of_once_and_failures_never() {
     core.handle_unframed(
         now(),
         deadline,
-        letter(Performative::Failure),
-        Kind::Tcp,
-        HERE,
+        Unframed::read(letter(Performative::Failure), Kind::Tcp, HERE),
     );
     assert!(core.poll_action().is_none());
 }
@@ -184,7 +182,11 @@ fn nobody_is_told_where_somebody_elses_letter_says_it_is() {
     let mut core = core(true, &[]);
     let elsewhere = IpAddr::from([10, 0, 0, 66]);
     let deadline = Duration::from_secs(5);
-    core.handle_unframed(now(), deadline, recorded(LETTER), Kind::Tcp, elsewhere);
+    core.handle_unframed(
+        now(),
+        deadline,
+        Unframed::read(recorded(LETTER), Kind::Tcp, elsewhere),
+    );
     assert!(core.poll_action().is_none(), "it came from {elsewhere}");
 }
 
@@ -218,7 +220,11 @@ fn who_is_refused_is_told_in_its_own_words_and_not_without_end() {
     let mut core = Core::new(config, Arc::new(directory)).gated(Arc::new(Refusing("echo")));
     let (then, deadline) = (now(), Duration::from_secs(5));
     for _ in 0..200 {
-        core.handle_unframed(then, deadline, recorded(LETTER), Kind::Tcp, HERE);
+        core.handle_unframed(
+            then,
+            deadline,
+            Unframed::read(recorded(LETTER), Kind::Tcp, HERE),
+        );
     }
     let mut told = 0;
     while let Some((attempt, location, parcel)) = dispatched(&mut core) {
@@ -235,6 +241,207 @@ fn who_is_refused_is_told_in_its_own_words_and_not_without_end() {
         core.handle_conclusion(then, attempt, Conclusion::Handed);
     }
     assert_eq!(told, 20, "as many as a second has");
+}
+
+/// The agents that became known, and where.
+fn heard(core: &mut Core) -> Vec<(String, String)> {
+    let actions = std::iter::from_fn(|| core.poll_action());
+    let heard = actions.filter_map(|action| match action {
+        Action::Heard {
+            name,
+            agent,
+            location,
+        } => {
+            assert!(!agent.is_known());
+            Some((name, location.to_string()))
+        }
+        _ => None,
+    });
+    heard.collect()
+}
+
+#[test]
+fn the_sender_of_a_recorded_letter_becomes_known_at_the_address_that_it_gives() {
+    let host = || {
+        let config = CoreConfig {
+            forwards: true,
+            ..CoreConfig::new("gateway", Incarnation::from_u64(7), vec![Kind::Shm])
+        };
+        Core::new(config, host_of("echo"))
+    };
+    let arrives = |core: &mut Core, letter, from| {
+        let unframed = Unframed::read(letter, Kind::Tcp, from);
+        core.handle_unframed(now(), Duration::from_secs(5), unframed);
+    };
+    let known = |at: &str| vec![("cpp-sender".to_owned(), at.to_owned())];
+    let mut core = host();
+    arrives(&mut core, recorded(LETTER), HERE);
+    let at = "tcp://127.0.0.1:45615;fipa-services";
+    assert_eq!(heard(&mut core), known(at));
+
+    // An address of another host is not believed.
+    let mut core = host();
+    arrives(&mut core, recorded(LETTER), IpAddr::from([10, 0, 0, 66]));
+    assert_eq!(heard(&mut core), []);
+
+    // Without addresses in the message, those in the envelope count.
+    let plain = Message::builder(Performative::Inform)
+        .sender(AgentId::new("cpp-sender").unwrap())
+        .receiver(AgentId::new("echo").unwrap())
+        .build()
+        .unwrap();
+    let letter = Letter::new(recorded(LETTER).envelope(), plain.to_payload());
+    arrives(&mut core, letter, HERE);
+    assert_eq!(heard(&mut core), known(at));
+}
+
+#[test]
+fn agents_become_known_by_letters_at_a_limited_rate() {
+    let config = CoreConfig {
+        forwards: true,
+        ..CoreConfig::new("gateway", Incarnation::from_u64(7), vec![Kind::Shm])
+    };
+    let mut core = Core::new(config, host_of("echo"));
+    let then = now();
+    for number in 0..200 {
+        let name = format!("agent-{number}");
+        let sender = AgentId::new(name).unwrap();
+        let sender = sender.with_address("tcp://127.0.0.1:9").unwrap();
+        let message = Message::builder(Performative::Inform)
+            .sender(sender)
+            .receiver(AgentId::new("echo").unwrap())
+            .build()
+            .unwrap();
+        let letter = letter_for(&message, then.utc).unwrap();
+        let unframed = Unframed::read(letter, Kind::Tcp, HERE);
+        core.handle_unframed(then, Duration::from_secs(5), unframed);
+    }
+    assert_eq!(heard(&mut core).len(), 20);
+}
+
+#[test]
+fn an_agent_that_became_known_by_a_letter_keeps_its_name_while_it_writes() {
+    let contacts = Arc::new(ContactDirectory::new());
+    let both = vec![host_of("echo"), Arc::clone(&contacts) as Arc<dyn Directory>];
+    let config = CoreConfig {
+        forwards: true,
+        ..CoreConfig::new("gateway", Incarnation::from_u64(7), vec![Kind::Shm])
+    };
+    let mut core = Core::new(config, Arc::new(MergedDirectory::new(both)));
+    let start = Now {
+        instant: Instant::now(),
+        utc: SystemTime::now(),
+    };
+    let elsewhere = IpAddr::from([10, 0, 0, 66]);
+    let mut writes = |seconds, from: IpAddr, port: u16| {
+        let sender = AgentId::new("cpp-sender").unwrap();
+        let at = format!("tcp://{from}:{port}");
+        let message = Message::builder(Performative::Inform)
+            .sender(sender.with_address(&at).unwrap())
+            .receiver(AgentId::new("echo").unwrap())
+            .build()
+            .unwrap();
+        let letter = letter_for(&message, start.utc).unwrap();
+        let since = Duration::from_secs(seconds);
+        let then = Now {
+            instant: start.instant + since,
+            utc: start.utc + since,
+        };
+        let unframed = Unframed::read(letter, Kind::Tcp, from);
+        core.handle_unframed(then, Duration::from_secs(5), unframed);
+        let heard = heard(&mut core);
+        for (name, at) in &heard {
+            let at = at.parse().unwrap();
+            let unknown = Incarnation::UNKNOWN;
+            contacts.heard(then.instant, name, unknown, at).unwrap();
+        }
+        heard.len()
+    };
+    assert_eq!(writes(0, HERE, 1000), 1);
+    assert_eq!(writes(1, HERE, 1000), 0, "it is known");
+    assert_eq!(writes(2, elsewhere, 1000), 0, "the name has an owner");
+    assert_eq!(writes(3, HERE, 2000), 1, "it listens elsewhere now");
+    assert_eq!(writes(20, HERE, 2000), 1, "it is remembered for longer");
+    assert_eq!(writes(21, elsewhere, 1000), 0);
+    let at = contacts.lookup("cpp-sender").unwrap().locations[0].to_string();
+    assert_eq!(at, "tcp://127.0.0.1:2000;fipa-services");
+}
+
+/// A letter whose message has lost its end.
+fn without_end(letter: &Letter) -> Letter {
+    let payload = letter.payload().to_bytes();
+    Letter::new(letter.envelope(), payload.slice(..payload.len() - 3))
+}
+
+#[test]
+fn the_sender_of_a_recorded_letter_that_cannot_be_decoded_is_told() {
+    let config = CoreConfig {
+        forwards: true,
+        ..CoreConfig::new(
+            "gateway",
+            Incarnation::from_u64(7),
+            vec![Kind::Shm, Kind::Tcp],
+        )
+    };
+    let mut core = Core::new(config, host_of("echo"));
+    let letter = without_end(&recorded(LETTER));
+    let deadline = Duration::from_secs(5);
+    let unframed = Unframed::read(letter.clone(), Kind::Tcp, HERE);
+    core.handle_unframed(now(), deadline, unframed);
+    let (_, location, parcel) = dispatched(&mut core).unwrap();
+    // The envelope says where the sender is, as the message of another letter does.
+    assert_eq!(location.to_string(), "tcp://127.0.0.1:45615;fipa-services");
+    let failure = message_of(&parcel);
+    assert_eq!(*failure.performative(), Performative::Failure);
+    assert_eq!(failure.receivers()[0].name(), "cpp-sender");
+    let told = nested(failure.content().unwrap());
+    assert_eq!(told.receivers()[0].name(), "echo");
+    let text = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
+    let expected = "description: message delivery failed: refused: the message cannot be decoded: ";
+    assert!(text.starts_with(expected), "{text}");
+    assert_eq!(text.lines().count(), 2, "{text}");
+    // The agent does not get it.
+    assert!(core.poll_action().is_none());
+
+    // An address of another host is not believed.
+    let unframed = Unframed::read(letter, Kind::Tcp, IpAddr::from([10, 0, 0, 66]));
+    core.handle_unframed(now(), deadline, unframed);
+    assert!(core.poll_action().is_none());
+}
+
+#[test]
+fn the_sender_of_a_framed_letter_that_cannot_be_decoded_is_told() {
+    let mut core = Core::new(
+        CoreConfig::new("process", Incarnation::from_u64(7), vec![Kind::Shm]),
+        host_of("rover"),
+    );
+    let rover = Incarnation::from_u64(5);
+    let arm: Arc<str> = "arm".into();
+    core.register(Arc::clone(&arm), Incarnation::from_u64(6));
+    let message = Message::builder(Performative::Inform)
+        .sender(AgentId::new("rover").unwrap())
+        .receiver(AgentId::new("arm").unwrap())
+        .content("x")
+        .build()
+        .unwrap();
+    let received = |sender| Received {
+        letter: without_end(&letter_for(&message, now().utc).unwrap()),
+        sender,
+        via: Some(Kind::Shm),
+    };
+    core.handle_undecodable(now(), &arm, &received(rover), "for a test".to_owned());
+    let (_, location, parcel) = dispatched(&mut core).unwrap();
+    assert_eq!(location.kind(), Kind::Shm);
+    assert_eq!(&*parcel.receiver, "rover");
+    let failure = message_of(&parcel);
+    assert_eq!(*failure.performative(), Performative::Failure);
+    let told = String::from_utf8(failure.content().unwrap().to_vec()).unwrap();
+    assert!(told.contains("refused: the message cannot be decoded: for a test"));
+
+    // Another agent that writes under this name is not believed, and the agent is not told.
+    let other = received(Incarnation::from_u64(66));
+    core.handle_undecodable(now(), &arm, &other, "for a test".to_owned());
+    assert!(core.poll_action().is_none());
 }
 
 /// The directory of a host on which one agent is registered.
@@ -264,7 +471,11 @@ fn a_name_with_a_dot_is_reached_as_legacy_peers_write_it() {
     };
     let mut core = Core::new(config, host_of("arm.left"));
     let deadline = Duration::from_secs(5);
-    core.handle_unframed(now(), deadline, recorded_to("arm?left"), Kind::Tcp, HERE);
+    core.handle_unframed(
+        now(),
+        deadline,
+        Unframed::read(recorded_to("arm?left"), Kind::Tcp, HERE),
+    );
     let (_, location, parcel) = dispatched(&mut core).unwrap();
     assert_eq!(location.kind(), Kind::Shm);
     assert_eq!(&*parcel.receiver, "arm.left");
@@ -272,20 +483,32 @@ fn a_name_with_a_dot_is_reached_as_legacy_peers_write_it() {
 }
 
 #[test]
-fn failure_messages_that_nobody_takes_are_bounded() {
+fn a_sender_whose_letters_all_fail_keeps_no_failure_message_from_another() {
     let mut core = core(true, &[]);
-    let most = core.config().lane;
-    // All at one moment, however long it takes: nothing may time out.
-    let (then, deadline) = (now(), Duration::from_secs(5));
-    for _ in 0..2 * most {
-        core.handle_unframed(then, deadline, recorded(LETTER), Kind::Tcp, HERE);
-    }
-    let mut told = 0;
-    while let Some((attempt, _, _)) = dispatched(&mut core) {
-        told += 1;
-        core.handle_conclusion(then, attempt, Conclusion::Handed);
-    }
-    assert_eq!(told, most);
+    let deadline = Duration::from_secs(5);
+    let letter_of = |name: &str| {
+        let at = format!("tcp://127.0.0.1:{}", 1000 + name.len());
+        let sender = AgentId::new(name).unwrap().with_address(&at).unwrap();
+        let message = Message::builder(Performative::Inform)
+            .sender(sender)
+            .receiver(AgentId::new("nobody").unwrap())
+            .build()
+            .unwrap();
+        letter_for(&message, now().utc).unwrap()
+    };
+    let then = now();
+    let told = |core: &mut Core, name: &str| {
+        let unframed = Unframed::read(letter_of(name), Kind::Tcp, HERE);
+        core.handle_unframed(then, deadline, unframed);
+        dispatched(core).is_some_and(|(attempt, _, parcel)| {
+            assert_eq!(&*parcel.receiver, name);
+            core.handle_conclusion(then, attempt, Conclusion::Handed);
+            true
+        })
+    };
+    let loud = (0..200).filter(|_| told(&mut core, "loud")).count();
+    assert_eq!(loud, 20);
+    assert!(told(&mut core, "quiet"));
 }
 
 #[test]

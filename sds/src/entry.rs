@@ -58,6 +58,13 @@ impl Entry {
         rank(self) < rank(other)
     }
 
+    /// Whether it has locations, but only of transports that this project does not have.
+    #[must_use]
+    pub fn is_unsupported(&self) -> bool {
+        let supported = |location: &Location| location.kind().is_supported();
+        !self.locations.is_empty() && !self.locations.iter().any(supported)
+    }
+
     /// Whether the entry keeps to the limits that every back end relies on.
     ///
     /// # Errors

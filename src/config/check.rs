@@ -277,14 +277,10 @@ impl Findings {
     fn kinds(&mut self, path: &[&str], kinds: &[Kind]) -> bool {
         let before = self.0.len();
         if kinds.is_empty() {
-            self.add(
-                path,
-                "is empty",
-                format!(
-                    "list at least one of {}",
-                    Kind::ALL.map(Kind::name).join(", ")
-                ),
-            );
+            let supported = Kind::ALL.into_iter().filter(|kind| kind.is_supported());
+            let names: Vec<&str> = supported.map(Kind::name).collect();
+            let help = format!("list at least one of {}", names.join(", "));
+            self.add(path, "is empty", help);
         }
         if let Some(kind) = repeated(kinds) {
             self.add(

@@ -8,7 +8,7 @@ use std::ops::Range;
 use std::time::Duration;
 
 use bytesize::ByteSize;
-use fipa_transport::{Kind, Location};
+use fipa_transport::{Kind, Location, LocationError};
 use toml_edit::Value as Toml;
 
 use super::effective::Value;
@@ -399,7 +399,13 @@ fn items<T>(value: &Toml, one: fn(&Toml) -> Result<T, Wrong>) -> Result<Vec<T>, 
 fn kinds(value: &Toml) -> Result<Vec<Kind>, Wrong> {
     items(value, |value| {
         let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
-        text.parse().map_err(|error| Wrong::new(value, error))
+        match text.parse() {
+            Ok(kind) if !Kind::is_supported(kind) => {
+                let error = LocationError::UnknownKind(text.to_owned());
+                Err(Wrong::new(value, error))
+            }
+            parsed => parsed.map_err(|error| Wrong::new(value, error)),
+        }
     })
 }
 

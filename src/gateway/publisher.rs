@@ -47,9 +47,13 @@ impl Publisher {
         let all = heard.iter().chain(known.iter());
         let through_here = all
             .filter(|entry| entry.role != Role::Gateway)
-            .map(|entry| Entry {
-                locations: locations.clone(),
-                ..Entry::clone(entry)
+            .map(|entry| match entry.is_unsupported() {
+                // Its own locations say why no letter reaches it, by this gateway neither.
+                true => Entry::clone(entry),
+                false => Entry {
+                    locations: locations.clone(),
+                    ..Entry::clone(entry)
+                },
             });
         if let Err(error) = self.host.publish_remote(through_here.collect()) {
             tracing::warn!(%error, "the processes of this host are not told of all other hosts");

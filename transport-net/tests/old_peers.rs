@@ -204,7 +204,7 @@ fn what_the_peer_could_not_read_is_not_sent() {
         .send(1, &peer.location, common::parcel(1, "not even an envelope"))
         .unwrap();
     match party.conclusion(1) {
-        Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Incompatible, "{error}"),
+        Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Inexpressible, "{error}"),
         other => panic!("{other:?}"),
     }
 }

@@ -21,11 +21,21 @@ pub enum Kind {
     Udp,
     /// Letters over QUIC, encrypted.
     Quic,
+    /// UDT, one of the transports of fipa_services. Not [supported](Kind::is_supported).
+    Udt,
 }
 
 impl Kind {
     /// Every kind, in no particular order.
-    pub const ALL: [Self; 4] = [Self::Shm, Self::Tcp, Self::Udp, Self::Quic];
+    pub const ALL: [Self; 5] = [Self::Shm, Self::Tcp, Self::Udp, Self::Quic, Self::Udt];
+
+    /// Whether this project has a transport of this kind. Locations of other kinds occur in the
+    /// directory, and letters to them fail as
+    /// [unsupported](crate::FailureReason::Unsupported).
+    #[must_use]
+    pub const fn is_supported(self) -> bool {
+        !matches!(self, Self::Udt)
+    }
 
     /// The name of this kind, which is also the scheme of its addresses.
     #[must_use]
@@ -35,6 +45,7 @@ impl Kind {
             Self::Tcp => "tcp",
             Self::Udp => "udp",
             Self::Quic => "quic",
+            Self::Udt => "udt",
         }
     }
 }
@@ -125,7 +136,8 @@ impl FromStr for Signature {
 /// An address at which a message transport service can be reached, what is understood there, and
 /// the incarnation of the service that listened there.
 ///
-/// Written `kind://address`, then `;signature` unless our own frames are understood there, then
+/// Written `kind://address`, then `;signature` unless our own frames are understood there (behind
+/// an address of `udt` it may be left out, because only fipa_services is spoken there), then
 /// `#incarnation` when it is known: `tcp://10.0.0.2:7788#00abcdef01234567`,
 /// `tcp://10.0.0.3:6789;fipa-services`, `tcp://10.0.0.4:6789;jade`. What `address` means is up to
 /// the transport. A transport that connects to a location with a known incarnation and finds
@@ -144,7 +156,8 @@ impl Location {
     /// Longest address accepted, in bytes.
     pub const MAX_ADDRESS: usize = 512;
 
-    /// A location of a service that understands our frames and whose incarnation is not known.
+    /// A location of a service that understands our frames (over UDT: fipa_services) and whose
+    /// incarnation is not known.
     ///
     /// # Errors
     /// When the address is empty, too long, or has characters that an address cannot have
@@ -164,7 +177,10 @@ impl Location {
         Ok(Self {
             kind,
             address: address.into(),
-            signature: Signature::Frames,
+            signature: match kind {
+                Kind::Udt => Signature::FipaServices,
+                _ => Signature::Frames,
+            },
             incarnation: Incarnation::UNKNOWN,
         })
     }
@@ -179,10 +195,15 @@ impl Location {
     /// The same location, where this is understood.
     ///
     /// # Errors
-    /// When the kind of transport is not TCP, over which alone the old peers are reached, and
-    /// something else than frames is to be spoken.
+    /// When it is not spoken over this kind of transport: over TCP every signature is, over UDT
+    /// that of fipa_services only, and over all others frames only.
     pub fn with_signature(mut self, signature: Signature) -> Result<Self, LocationError> {
-        if signature != Signature::Frames && self.kind != Kind::Tcp {
+        let is_spoken = match self.kind {
+            Kind::Tcp => true,
+            Kind::Udt => signature == Signature::FipaServices,
+            _ => signature == Signature::Frames,
+        };
+        if !is_spoken {
             return Err(LocationError::NotOverKind(signature, self.kind));
         }
         self.signature = signature;
@@ -252,8 +273,8 @@ pub enum LocationError {
     /// What stands behind `;` is no signature.
     #[error("unknown signature behind ';' (known: fipa-services, jade, fipa): {0:?}")]
     UnknownSignature(String),
-    /// The transport does not reach those who speak so.
-    #[error("{0} is spoken over tcp only, not over {1}")]
+    /// This signature is not spoken over this kind of transport.
+    #[error("{0} is not spoken over {1}")]
     NotOverKind(Signature, Kind),
     /// What stands behind `#` is not an incarnation.
     #[error("not an incarnation behind '#' (16 hexadecimal digits expected): {0:?}")]
@@ -280,12 +301,14 @@ impl FromStr for Location {
             None => (rest, Incarnation::UNKNOWN),
         };
         let (address, signature) = match rest.split_once(';') {
-            Some((address, signature)) => (address, signature.parse()?),
-            None => (rest, Signature::Frames),
+            Some((address, signature)) => (address, Some(signature.parse()?)),
+            None => (rest, None),
         };
-        Self::new(kind, address)?
-            .with_incarnation(incarnation)
-            .with_signature(signature)
+        let location = Self::new(kind, address)?.with_incarnation(incarnation);
+        match signature {
+            Some(signature) => location.with_signature(signature),
+            None => Ok(location),
+        }
     }
 }
 
@@ -315,6 +338,7 @@ mod tests {
             "shm://0000000000000001#0000000000000001",
             "tcp://10.0.0.3:6789;fipa-services",
             "tcp://[fe80::1%eth0]:6789;jade#00abcdef01234567",
+            "udt://10.0.0.3:6790;fipa-services",
         ] {
             assert_eq!(text.parse::<Location>().unwrap().to_string(), text);
         }
@@ -327,6 +351,17 @@ mod tests {
         assert_eq!("tcp://10.0.0.2:7788;fipa".parse(), Ok(plain.clone()));
         let old = plain.clone().with_signature(Signature::FipaServices);
         assert_ne!(old, Ok(plain));
+    }
+
+    #[test]
+    fn only_fipa_services_is_spoken_over_udt() {
+        let udt: Location = "udt://10.0.0.3:6790".parse().unwrap();
+        assert_eq!(udt.signature(), Signature::FipaServices);
+        assert!(!udt.kind().is_supported());
+        for refused in [Signature::Frames, Signature::JadeProxy] {
+            let refused = udt.clone().with_signature(refused);
+            assert!(matches!(refused, Err(LocationError::NotOverKind(..))));
+        }
     }
 
     #[test]

@@ -132,11 +132,17 @@ pub enum FailureReason {
     Loop,
     /// The sender's own service is closed.
     Closed,
+    /// The dialect of the legacy peer that the receiver belongs to has no form for something in the
+    /// letter.
+    Inexpressible,
+    /// The receiver is reached only by transports that this project does not have. The attempts
+    /// name them.
+    Unsupported,
 }
 
 impl FailureReason {
     /// Every reason, for encoding: the position is the code on the wire, so new ones go last.
-    pub(crate) const CODES: [Self; 9] = [
+    pub(crate) const CODES: [Self; 11] = [
         Self::NoSuchAgent,
         Self::QueueFull,
         Self::Unreachable,
@@ -146,6 +152,8 @@ impl FailureReason {
         Self::Unconfirmed,
         Self::Loop,
         Self::Closed,
+        Self::Inexpressible,
+        Self::Unsupported,
     ];
 }
 
@@ -161,6 +169,8 @@ impl fmt::Display for FailureReason {
             Self::Unconfirmed => "unconfirmed",
             Self::Loop => "loop",
             Self::Closed => "closed",
+            Self::Inexpressible => "not expressible in the peer's dialect",
+            Self::Unsupported => "unsupported transport",
         })
     }
 }

@@ -355,11 +355,15 @@ pub enum WayFault {
     Closed,
     /// This end has run out of memory, descriptors or disk for this way.
     Exhausted,
+    /// The dialect of the peer has no form for something in the letter. No byte was sent.
+    Inexpressible,
+    /// There is no transport of this kind.
+    Unsupported,
 }
 
 impl WayFault {
     /// Every fault, for encoding: the position is the code on the wire, so new ones go last.
-    pub(crate) const CODES: [Self; 10] = [
+    pub(crate) const CODES: [Self; 12] = [
         Self::Unreachable,
         Self::WrongIncarnation,
         Self::TooLarge,
@@ -370,6 +374,8 @@ impl WayFault {
         Self::Refused,
         Self::Closed,
         Self::Exhausted,
+        Self::Inexpressible,
+        Self::Unsupported,
     ];
 
     fn description(self) -> &'static str {
@@ -384,6 +390,8 @@ impl WayFault {
             Self::Refused => "refused",
             Self::Closed => "closed",
             Self::Exhausted => "no room at this end",
+            Self::Inexpressible => "the peer's dialect cannot express it",
+            Self::Unsupported => "unsupported transport",
         }
     }
 }

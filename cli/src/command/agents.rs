@@ -2,12 +2,13 @@
 
 mod watch;
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
 use comfy_table::{Table, presets};
-use fipa::{Directory, Entry, Matcher, Query, Reach, Role, Source, Time};
+use fipa::{Directory, Entry, Kind, Location, Matcher, Query, Reach, Role, Source, Time};
 use serde_json::{Value, json};
 
 use crate::membership;
@@ -44,7 +45,8 @@ JSON:
     \"agents\": [ { \"name\", \"type\", \"description\", \"role\": \"agent\", \"gateway\" or \"coalition\",
                   \"members\": [ name ] and \"leader\": name or null, of a coalition,
                   \"reach\": \"local\" or \"remote\", \"gateway\": name, when it is remote,
-                  \"locations\": [ text ], \"mts\": { \"name\", \"incarnation\" },
+                  \"locations\": [ text ], \"unsupported_transports\": [ transport ], when it has
+                  no location of another transport, \"mts\": { \"name\", \"incarnation\" },
                   \"incarnation\", \"registered\": time, \"source\": how it was learnt } ] }
 
 With --watch, one object on each line, the first for those who are there already:
@@ -214,7 +216,12 @@ impl Row {
         if let Some(gateway) = &through {
             json["gateway"] = gateway.as_str().into();
         }
-        let places = match &entry.role {
+        if entry.is_unsupported() {
+            let kinds = entry.locations.iter().map(|location| location.kind());
+            let kinds: BTreeSet<Kind> = kinds.collect();
+            json["unsupported_transports"] = json!(kinds);
+        }
+        let places: Vec<String> = match &entry.role {
             Role::Coalition(members) => {
                 json["members"] = json!(members.names());
                 json["leader"] = json!(members.leader());
@@ -226,7 +233,7 @@ impl Row {
                 };
                 names.map(line).collect()
             }
-            _ => locations,
+            _ => entry.locations.iter().map(place).collect(),
         };
         let reach = match through {
             None => "this host".to_owned(),
@@ -242,6 +249,15 @@ impl Row {
             age(entry),
         ];
         Self { cells, json }
+    }
+}
+
+/// A location, for people.
+fn place(location: &Location) -> String {
+    let kind = location.kind();
+    match kind.is_supported() {
+        true => location.to_string(),
+        false => format!("{location} (unsupported transport {kind})"),
     }
 }
 

@@ -35,7 +35,7 @@ JSON:
     \"routes\": [ { \"receiver\", \"incarnation\", \"gateway\": incarnation or null,
                   \"exception\": the pattern of [routes] that decides, or null,
                   \"ways\": [ { \"location\", \"standing\": { \"standing\": \"ready\", \"failing\"
-                              or \"not_in_order\", with \"milliseconds\", \"failures\" and
+                              \"not_in_order\" or \"unsupported\", with \"milliseconds\", \"failures\" and
                               \"error\" when it is failing } } ] } ],
     \"ways\": [ { \"location\", \"standing\", \"in_flight\", \"tried\", \"taken\", \"turned_back\",
                 \"failed\", \"last_error\", \"last_error_seconds\" } ],
@@ -213,7 +213,7 @@ fn rows_of(table: &mut Table, route: &Route, from: &str) {
         let to = if first { receiver.as_str() } else { "" };
         let from = if first { from } else { "" };
         let mut standing = standing(&way.standing);
-        if way.standing != Standing::NotInOrder {
+        if !matches!(way.standing, Standing::NotInOrder | Standing::Unsupported) {
             standing = format!("{}, {standing}", if first { "first" } else { "then" });
         }
         table.add_row([to, from, &way.location.to_string(), &standing]);
@@ -233,6 +233,7 @@ fn standing(standing: &Standing) -> String {
             format!("failed {failures} times, put back for {left}: {error}")
         }
         Standing::NotInOrder => "not used: not in the order of transports".to_owned(),
+        Standing::Unsupported => "not used: unsupported transport".to_owned(),
         other => format!("{other:?}"),
     }
 }

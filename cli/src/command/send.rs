@@ -7,11 +7,11 @@ use std::time::{Duration, SystemTime};
 
 use clap::Args;
 use fipa::{
-    Agent, AgentId, Config, Deliveries, Incarnation, Incoming, Message, Performative, ReceiveError,
-    RegisterOptions, Time,
+    Agent, AgentId, Config, Deliveries, DeliveryFailure, Incarnation, Incoming, Message,
+    Performative, ReceiveError, RegisterOptions, Time,
 };
 use fipa_acl::json::message_to_json;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use crate::options::{self, Global};
 use crate::report::{self, Failure};
@@ -25,7 +25,8 @@ use crate::{input, membership, output};
 ///
 /// Works with and without a gateway; agents of other hosts are reached when one is running
 /// (`fipa up`). The exit code is 0 only if every receiver has got the message and, with --wait, a
-/// reply came.
+/// reply came. A failure message about the letter itself, from the message transport service of
+/// either host, is no reply.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
@@ -39,7 +40,9 @@ JSON:
   { \"deliveries\": [ { \"receiver\": name, \"outcome\": \"delivered\", \"sent\" or \"failed\",
                       \"via\": transport, unless it failed, \"reason\": text, if it failed,
                       \"attempts\": [ { \"via\", \"location\", \"error\" } ] } ],
-    \"reply\": the message, as `fipa decode` prints it, if one came }")]
+    \"reply\": the message, as `fipa decode` prints it, if one came,
+    \"failures\": [ { \"from\": name, \"receiver\": name or null, \"reason\": text } ], if with --wait
+                failure messages about the letter came }")]
 pub(crate) struct Arguments {
     /// Name of the receiver, or a pattern of names such as 'arm_.*'; may be repeated
     #[arg(long, required = true, value_name = "NAME")]
@@ -170,26 +173,69 @@ async fn converse(
         output::text(&format!("{deliveries}\n"))?;
     }
     let anybody_got_it = deliveries.0.iter().any(|one| one.outcome.is_success());
-    let reply = if arguments.wait && anybody_got_it {
-        reply(agent, &message, arguments.timeout).await?
-    } else {
-        None
-    };
-    match &reply {
+    let mut answers = Answers::default();
+    if arguments.wait && anybody_got_it {
+        let sent = deliveries.0.iter().filter(|one| one.outcome.is_success());
+        answers = wait(agent, &message, sent.count(), arguments.timeout).await?;
+    }
+    match &answers.reply {
         _ if arguments.json => {
             let mut json = json!({ "deliveries": output::deliveries(&deliveries) });
-            if let Some(reply) = &reply {
+            if let Some(reply) = &answers.reply {
                 json["reply"] = message_to_json(&reply.message);
+            }
+            if !answers.failures.is_empty() {
+                let failures = answers.failures.iter().map(FailureMessage::json);
+                json["failures"] = failures.collect();
             }
             output::json(&json)?;
         }
         Some(reply) => output::text(&format!("reply: {}\n", reply.message))?,
         None => {}
     }
-    let silent = arguments.wait && anybody_got_it && reply.is_none();
+    let silent = arguments.wait && anybody_got_it && answers.timed_out;
     let silent = silent.then(|| no_reply(&deliveries, arguments.timeout));
     let failures = advice::failures(&deliveries, agent, config);
-    Failure::all(failures.into_iter().chain(silent))
+    let told = answers.failures.iter().map(FailureMessage::failure);
+    Failure::all(failures.into_iter().chain(told).chain(silent))
+}
+
+/// What came while the command waited for a reply.
+#[derive(Debug, Default)]
+struct Answers {
+    reply: Option<Incoming>,
+    failures: Vec<FailureMessage>,
+    timed_out: bool,
+}
+
+/// A message that says that the letter was not delivered.
+#[derive(Debug)]
+struct FailureMessage {
+    from: String,
+    failure: DeliveryFailure,
+}
+
+impl FailureMessage {
+    fn of(message: &Message) -> Option<Self> {
+        let from = message.sender().map_or("", AgentId::name).to_owned();
+        let failure = DeliveryFailure::read(message)?;
+        Some(Self { from, failure })
+    }
+
+    fn json(&self) -> Value {
+        let DeliveryFailure { receiver, reason } = &self.failure;
+        json!({ "from": self.from, "receiver": receiver, "reason": reason })
+    }
+
+    fn failure(&self) -> Failure {
+        let DeliveryFailure { receiver, reason } = &self.failure;
+        let receiver = receiver.as_deref().unwrap_or("a receiver");
+        Failure::failed(
+            format!("not delivered: {reason}"),
+            format!("{receiver:?}, as {:?} says in a failure message", self.from),
+            "see `fipa agents`, and the log of that message transport service",
+        )
+    }
 }
 
 fn message(
@@ -241,18 +287,29 @@ fn message(
     })
 }
 
-/// The first reply, if one comes in time.
-async fn reply(
+/// Waits for the first reply. Failure messages about the letter are collected meanwhile; when there
+/// is one for each of the receivers that it was `sent` to, no reply is waited for.
+async fn wait(
     agent: &Agent,
     message: &Message,
+    sent: usize,
     patience: Duration,
-) -> Result<Option<Incoming>, Failure> {
+) -> Result<Answers, Failure> {
+    let mut answers = Answers::default();
     let first = async {
-        loop {
+        while answers.failures.len() < sent {
             match agent.receive().await {
                 // What this process tells the agent itself is in the outcomes already.
                 Ok(incoming) if incoming.via.is_none() => {}
-                Ok(incoming) if incoming.message.is_reply_to(message) => return Ok(incoming),
+                Ok(incoming) if incoming.message.is_reply_to(message) => {
+                    match FailureMessage::of(&incoming.message) {
+                        Some(failure) => answers.failures.push(failure),
+                        None => {
+                            answers.reply = Some(incoming);
+                            break;
+                        }
+                    }
+                }
                 Ok(other) => report::warn(&format!("not a reply: {}", other.message)),
                 Err(error @ ReceiveError::Malformed { .. }) => report::warn(&error.to_string()),
                 Err(error) => {
@@ -264,11 +321,13 @@ async fn reply(
                 }
             }
         }
+        Ok(())
     };
     match tokio::time::timeout(patience, first).await {
-        Ok(first) => first.map(Some),
-        Err(_) => Ok(None),
+        Ok(ended) => ended?,
+        Err(_) => answers.timed_out = true,
     }
+    Ok(answers)
 }
 
 fn no_reply(deliveries: &Deliveries, patience: Duration) -> Failure {

@@ -62,11 +62,11 @@ pub enum Action {
         outcome: Outcome,
     },
     /// An agent of another host that the directory does not know has written; letters for it can
-    /// be sent to where this one came from. Comes before the letter is passed on.
+    /// be sent to where this one came from, or where it says that a legacy peer takes them. Comes before the letter is passed on.
     Heard {
         /// The name it writes under.
         name: String,
-        /// This life of it.
+        /// This life of it; unknown for an agent of a legacy peer.
         agent: Incarnation,
         /// Where its message transport service can be reached.
         location: Location,
@@ -128,8 +128,8 @@ pub(crate) enum Settlement {
 pub(crate) enum Author {
     /// This agent of this process.
     Ours(Incarnation),
-    /// An old peer's agent, whose letter came from this address.
-    OldPeer { from: IpAddr },
+    /// An agent of another service. A legacy peer's letter came from this address.
+    Remote { from: Option<IpAddr> },
 }
 
 /// A delivery that did not succeed, for the failure message.

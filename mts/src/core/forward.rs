@@ -1,31 +1,84 @@
-//! Letters for somebody else: the gateway's role, old peers' letters, and failure messages.
+//! Letters for agents of other processes: the gateway's role, and letters of legacy peers.
 
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant};
 
-use fipa_acl::{Dialect, Letter, Representation};
-use fipa_sds::{Entry, Mts, Reach, Resolution, Role, Source};
+use fipa_acl::{Letter, Message, Representation};
+use fipa_sds::{Entry, Reach, Resolution, Role, Source};
 use fipa_transport::{
-    Allowance, Answer, FailureReason, Hop, Incarnation, Kind, Location, Outcome, Parcel, Signature,
-    Stream, Ticket, Verdict,
+    Answer, FailureReason, Hop, Incarnation, Kind, Location, Outcome, Parcel, Signature, Stream,
+    Ticket, Verdict,
 };
 
-use super::desk::{Action, Author, Origin, Undelivered, Upstream, life_of};
-use super::lane::{Delivery, LaneId, LaneKey};
+use super::desk::{Action, Author, Origin, Undelivered, Upstream};
+use super::failures::{cannot_be_decoded, locations_given};
+use super::lane::{Delivery, Lane, LaneId, LaneKey};
+use super::limits::SenderLimit;
 use super::{Core, MAX_DEADLINE, News, Now, own_lane};
 use smallvec::smallvec;
 
-use crate::failure::Failure;
+use crate::failure::sender_of;
 use crate::stamp;
 
 /// When the sender of a letter is told that it is in custody, if its outcome takes longer.
 const CUSTODY_AFTER: Duration = Duration::from_millis(200);
-/// Letters of old peers a second that they are told were refused. What they may send is not limited
-/// by how fast answers go out, and nobody is to be made to write to them without end.
-const REFUSALS_TOLD: f64 = 20.0;
-/// How long a failure message to an old peer's agent may take.
-const FAILURE_DEADLINE: Duration = Duration::from_secs(5);
+
+/// Time from the registration of an agent until legacy peers have found it by mDNS. Avahi takes 1.2 s
+/// to resolve a new agent; a peer that gets a letter earlier cannot answer it.
+const FOUND_AFTER: Duration = Duration::from_millis(1500);
+/// Time that is left for the delivery of a letter that waits for its sender to be found.
+const LEFT_FOR_DELIVERY: Duration = Duration::from_millis(250);
+
+/// How long an agent of a legacy peer stays known by a letter before another letter renews that. Less
+/// than the time after which it is forgotten.
+const HEARD_AGAIN_AFTER: Duration = Duration::from_secs(15);
+
+/// A letter of a legacy peer, read as far as the core needs it. Reading takes time in proportion to
+/// the bytes of the letter, so it comes before the core is locked.
+#[derive(Debug)]
+pub struct Unframed {
+    letter: Letter,
+    via: Kind,
+    from: IpAddr,
+    /// The name of the sender, and a location that it gives as its own.
+    sender: Option<(String, Location)>,
+    /// Why the message cannot be decoded, if it cannot.
+    fault: Option<String>,
+}
+
+impl Unframed {
+    /// Reads the letter, which came from this address.
+    #[must_use]
+    pub fn read(letter: Letter, via: Kind, from: IpAddr) -> Self {
+        let (sender, fault) = match Message::decode(letter.payload()) {
+            Ok(message) => (locate(&message, &letter, from), None),
+            Err(error) => (None, Some(cannot_be_decoded(&error))),
+        };
+        Self {
+            letter,
+            via,
+            from,
+            sender,
+            fault,
+        }
+    }
+}
+
+/// The name of the sender, and the first location that it gives as its own.
+fn locate(message: &Message, letter: &Letter, from: IpAddr) -> Option<(String, Location)> {
+    let sender = sender_of(message, letter)?;
+    let addresses = sender.addresses().iter().map(|address| &**address);
+    let representation = Representation::detect(&letter.payload().head);
+    let mut locations = locations_given(addresses, representation, from).into_iter();
+    Some((sender.name().to_owned(), locations.next()?))
+}
+
+/// Agents of legacy peers a second that become known by their letters: each one is published to the
+/// processes of the host.
+pub(super) fn contact_limit() -> SenderLimit {
+    SenderLimit::new(2.0, 20.0, 50.0)
+}
 
 impl Core {
     /// Takes a letter for somebody else into custody, or says why not. `unanswered` is the arrival
@@ -97,8 +150,41 @@ impl Core {
         let mut delivery = Delivery::new(now.instant, origin, stamped, letter_of, deadline);
         delivery.after = parcel.after;
         delivery.custody_due = unanswered.map(|_| now.instant + CUSTODY_AFTER);
+        delivery.not_before = self.found_by_peer(now, stream.sender, &entry, parcel.remaining);
+        if let Some(until) = delivery.not_before
+            && self.lanes.get(&id).is_some_and(Lane::is_empty)
+        {
+            let wait = until.saturating_duration_since(now.instant);
+            tracing::info!(
+                receiver = %entry.name,
+                ?wait,
+                "letters wait until the legacy peer has found their sender by mDNS"
+            );
+        }
         self.put(now, id, delivery);
         taken
+    }
+
+    /// When the legacy peer of the receiver, which was found by mDNS, has found the sender, if it has
+    /// not yet. Early enough for a letter that has this much time left.
+    fn found_by_peer(
+        &self,
+        now: Now,
+        sender: Incarnation,
+        receiver: &Entry,
+        remaining: Duration,
+    ) -> Option<Instant> {
+        let is_legacy = |location: &Location| location.signature() != Signature::Frames;
+        if receiver.source != Source::Mdns || !receiver.locations.iter().any(is_legacy) {
+            return None;
+        }
+        let sender = self.desk.directory.known_incarnation(sender)?;
+        // A registration in the future shows that the calendar was set back.
+        let ago = now.utc.duration_since(sender.registered);
+        let wait = FOUND_AFTER.checked_sub(ago.unwrap_or_default())?;
+        let latest = remaining - LEFT_FOR_DELIVERY.min(remaining / 2);
+        let wait = wait.min(latest);
+        (!wait.is_zero()).then(|| now.instant + wait)
     }
 
     /// What the gate says, if there is one.
@@ -173,6 +259,35 @@ impl Core {
         }
     }
 
+    /// Makes an agent of a legacy peer known, which can then be answered, at the location that it gives
+    /// as its own. Only an agent that nothing else is known of, and one that became known in this way
+    /// and writes from the same host.
+    fn hear_unframed(&mut self, now: Now, (name, location): (String, Location), from: IpAddr) {
+        if !self.desk.config.forwards {
+            return;
+        }
+        if let Some(known) = self.desk.directory.known(&name) {
+            let at = known.locations.first();
+            let address = at.and_then(|at| at.address().parse::<SocketAddr>().ok());
+            let same = address.is_some_and(|address| address.ip().to_canonical() == from);
+            let age = now.utc.duration_since(known.registered);
+            let is_due = at != Some(&location) || age.is_ok_and(|age| age >= HEARD_AGAIN_AFTER);
+            let is_contact = known.source == Source::Contact && !known.incarnation.is_known();
+            if !(is_contact && same && is_due) {
+                return;
+            }
+        }
+        if !self.contact_limit.take(now.instant, Some(from), &name) {
+            tracing::debug!(%from, "too many new agents of legacy peers; this one cannot be answered");
+            return;
+        }
+        self.desk.actions.push_back(Action::Heard {
+            name,
+            agent: Incarnation::UNKNOWN,
+            location,
+        });
+    }
+
     /// Whether there is room for another letter in this lane.
     pub(super) fn has_room(&self, lane: LaneId, len: usize) -> bool {
         let lane = self.lanes.get(&lane);
@@ -180,21 +295,21 @@ impl Core {
     }
 
     /// Whether there is room for a letter whose sender cannot be held back.
-    fn has_room_for_stranger(&self, lane: LaneId, len: usize) -> bool {
+    pub(super) fn has_room_for_stranger(&self, lane: LaneId, len: usize) -> bool {
         let bytes = self.desk.held.saturating_add(len);
         bytes <= self.desk.config.custody_bytes && self.has_room(lane, len)
     }
 
-    /// An old peer's letter arrived from this address, for the agents of this host that its
-    /// envelope names.
-    pub fn handle_unframed(
-        &mut self,
-        now: Now,
-        deadline: Duration,
-        letter: Letter,
-        via: Kind,
-        from: IpAddr,
-    ) {
+    /// A legacy peer's letter arrived, for the agents of this host that its envelope names. If its
+    /// message cannot be decoded, it is refused, and its sender is told.
+    pub fn handle_unframed(&mut self, now: Now, deadline: Duration, unframed: Unframed) {
+        let Unframed {
+            letter,
+            via,
+            from,
+            sender: mut located,
+            fault,
+        } = unframed;
         let receivers = match stamp::receivers(&letter) {
             Ok(receivers) => receivers,
             Err(error) => {
@@ -202,6 +317,15 @@ impl Core {
                 return;
             }
         };
+        if let Some(fault) = fault {
+            tracing::info!(%from, "refused a letter of a legacy peer: {fault}");
+            for receiver in receivers {
+                let why = (FailureReason::Refused, fault.clone());
+                self.unframed_failed(&receiver.into(), &letter, (via, from), why);
+            }
+            self.tell_failures(now);
+            return;
+        }
         let directory = Arc::clone(&self.desk.directory);
         let sender = stamp::sender(&letter).unwrap_or_default();
         let stream_sender = self.desk.config.incarnation;
@@ -231,11 +355,12 @@ impl Core {
             }
             for entry in here {
                 if let Err(why) = self.admits(now, &entry.name, &letter) {
-                    if self.tells_of_refusal(now) {
-                        let why = (FailureReason::Refused, why);
-                        self.unframed_failed(&entry.name, &letter, (via, from), why);
-                    }
+                    let why = (FailureReason::Refused, why);
+                    self.unframed_failed(&entry.name, &letter, (via, from), why);
                     continue;
+                }
+                if let Some(located) = located.take() {
+                    self.hear_unframed(now, located, from);
                 }
                 let stream = Stream {
                     sender: stream_sender,
@@ -263,7 +388,7 @@ impl Core {
                 let lane = self.lane(now, own_lane(stream_sender, entry), &entry.name);
                 if !self.has_room_for_stranger(lane, letter.len()) {
                     self.desk.undelivered.push_back(Undelivered {
-                        sender: Author::OldPeer { from },
+                        sender: Author::Remote { from: Some(from) },
                         receiver: Arc::clone(&entry.name),
                         letter: letter.clone(),
                         reason: FailureReason::QueueFull,
@@ -285,13 +410,6 @@ impl Core {
             }
         }
         self.tell_failures(now);
-    }
-
-    /// Whether an old peer is told of one more letter that was refused.
-    fn tells_of_refusal(&mut self, now: Now) -> bool {
-        let full = || Allowance::new(REFUSALS_TOLD, now.instant);
-        let refusals = self.refusals.get_or_insert_with(full);
-        refusals.take(1.0, REFUSALS_TOLD, now.instant)
     }
 
     /// An old peer's letter does not get to this receiver.
@@ -320,152 +438,12 @@ impl Core {
                 sender: true,
             });
         self.desk.undelivered.push_back(Undelivered {
-            sender: Author::OldPeer { from },
+            sender: Author::Remote { from: Some(from) },
             receiver: Arc::clone(receiver),
             letter: letter.clone(),
             reason,
             detail,
         });
-    }
-
-    /// Tells senders of what failed, in the form of FIPA `failure` messages.
-    pub(super) fn tell_failures(&mut self, now: Now) {
-        while let Some(undelivered) = self.desk.undelivered.pop_front() {
-            let Undelivered {
-                sender,
-                receiver,
-                letter,
-                reason,
-                detail,
-            } = undelivered;
-            let name = Arc::clone(&self.desk.config.name);
-            let name = &*name;
-            let Some(report) = Failure::of(&letter, &receiver, reason, &detail) else {
-                continue;
-            };
-            let own = self.desk.config.incarnation;
-            let sequence = self.sequence_of(own);
-            let from = match sender {
-                Author::OldPeer { from } => Some(from),
-                Author::Ours(_) => None,
-            };
-            if let Author::Ours(agent) = sender {
-                let Some(inbox) = self.agents.get_mut(&agent) else {
-                    continue;
-                };
-                let letter = match report.written_for(name, Dialect::Standard, now.utc) {
-                    Ok(letter) => letter,
-                    Err(error) => {
-                        tracing::warn!(%error, %receiver, "a failure message could not be written");
-                        continue;
-                    }
-                };
-                if inbox.push_failure(letter.clone()) {
-                    let stream = Stream {
-                        sender: own,
-                        receiver: agent,
-                    };
-                    let name = Arc::clone(&inbox.name);
-                    self.desk.notice(stream, sequence, &name, || News::Taken {
-                        via: None,
-                        letter,
-                    });
-                    self.desk.actions.push_back(Action::Deliverable { agent });
-                }
-                continue;
-            }
-            // An old peer's letter: its sender is known by name, or has said where it is.
-            let known = self.desk.directory.lookup(report.sender.name());
-            let said = match known {
-                Some(_) => None,
-                None => from.and_then(|from| said_of_itself(&report, from)),
-            };
-            let Some(entry) = known.or_else(|| said.clone()) else {
-                tracing::info!(to = %report.sender, %reason, "nobody to send a failure message to");
-                continue;
-            };
-            if entry.role == Role::Gateway {
-                continue;
-            }
-            let letter = match report.written_for(name, dialect_of(&entry), now.utc) {
-                Ok(letter) => letter,
-                Err(error) => {
-                    tracing::warn!(%error, receiver = %report.receiver, "a failure message could not be written");
-                    continue;
-                }
-            };
-            let stream = Stream {
-                sender: self.desk.config.incarnation,
-                receiver: life_of(&entry),
-            };
-            let id = self.lane(now, own_lane(stream.sender, &entry), &entry.name);
-            if !self.has_room_for_stranger(id, letter.len()) {
-                tracing::info!(to = %report.sender, %reason, "no room for a failure message");
-                continue;
-            }
-            let deadline = now.instant + FAILURE_DEADLINE;
-            let letter_of = (stream.receiver, sequence);
-            let origin = Origin::Nobody;
-            let delivery = Delivery::new(now.instant, origin, letter, letter_of, deadline);
-            self.desk
-                .notice(stream, sequence, &entry.name, || News::Sent {
-                    send: None,
-                    letter: delivery.letter.clone(),
-                });
-            if said.is_some()
-                && let Some(lane) = self.lanes.get_mut(&id)
-            {
-                lane.said(Arc::clone(&entry));
-            }
-            self.put(now, id, delivery);
-        }
-    }
-}
-
-/// An agent that the directory does not know, as it said itself where it can be reached: the
-/// numeric addresses of an old peer's agent, of the host that its letter came from. Others anybody
-/// could claim, and have this service send to them what they never asked for.
-fn said_of_itself(report: &Failure<'_>, from: IpAddr) -> Option<Arc<Entry>> {
-    let agent = &report.sender;
-    let signature = match report.representation {
-        Some(Representation::String) => Signature::JadeProxy,
-        _ => Signature::FipaServices,
-    };
-    let locations = agent.addresses().iter().filter_map(|address| {
-        let location: Location = address.parse().ok()?;
-        let claimed: SocketAddr = location.address().parse().ok()?;
-        if claimed.ip().to_canonical() != from {
-            return None;
-        }
-        location.with_signature(signature).ok()
-    });
-    let locations: Vec<Location> = locations.take(Entry::MAX_LOCATIONS).collect();
-    if locations.is_empty() {
-        return None;
-    }
-    let entry = Entry {
-        name: agent.name().into(),
-        agent_type: String::new(),
-        incarnation: Incarnation::UNKNOWN,
-        locations,
-        mts: Mts::new(agent.name(), Incarnation::UNKNOWN),
-        description: String::new(),
-        registered: SystemTime::UNIX_EPOCH,
-        source: Source::Contact,
-        reach: Reach::Remote {
-            gateway: Incarnation::UNKNOWN,
-        },
-        role: Role::Agent,
-    };
-    entry.check().is_ok().then(|| Arc::new(entry))
-}
-
-/// What an agent understands, by what is understood where it can be reached.
-fn dialect_of(entry: &Entry) -> Dialect {
-    match entry.locations.first().map(Location::signature) {
-        Some(Signature::FipaServices) => Dialect::FipaServices,
-        Some(Signature::JadeProxy) => Dialect::Jade,
-        _ => Dialect::Standard,
     }
 }
 

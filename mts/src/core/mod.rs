@@ -9,6 +9,8 @@
 //! * `lane`: letters of one stream on their way, in order, one way at a time.
 //! * `inbox`: the receiving end, where letters are taken once and in order.
 //! * `forward`: letters for agents of other processes.
+//! * `failures`: which senders are told of which failures, by messages.
+//! * `limits`: how many of these messages leave.
 //! * `departed`: registrations that have left this host a moment ago.
 //! * `peers`: services that the configuration names, and how it stands with them.
 //! * `routes`: which way letters would go and what happened on each way, for people.
@@ -22,9 +24,11 @@
 mod config;
 mod departed;
 mod desk;
+mod failures;
 mod forward;
 mod inbox;
 mod lane;
+mod limits;
 mod notice;
 mod peers;
 mod routes;
@@ -39,16 +43,18 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::Letter;
 use fipa_sds::{Directory, Entry, Pattern, Resolution, Role};
 use fipa_transport::{
-    Allowance, Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind,
-    Location, Outcome, Parcel, Report, Stream, Verdict, WayError, WayFault,
+    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
+    Outcome, Parcel, Report, Stream, Verdict, WayError, WayFault,
 };
 
 pub use config::{CoreConfig, MAX_DEADLINE};
 pub use desk::Action;
 use desk::{Author, Desk, Note, Origin, Purpose, Undelivered};
+pub use forward::Unframed;
 use inbox::Inbox;
 pub use inbox::Received;
 use lane::{Delivery, Lane, LaneId, LaneKey};
+use limits::{FailureLimit, SenderLimit};
 pub use notice::{News, Notice};
 
 use crate::{Gate, Map};
@@ -108,8 +114,9 @@ pub struct Core {
     notes: BinaryHeap<Reverse<LateNote>>,
     peers: Peers,
     gate: Option<Arc<dyn Gate>>,
-    /// How many old peers' letters that were refused may still be told of.
-    refusals: Option<Allowance>,
+    failure_limit: FailureLimit,
+    /// Limits how many agents of legacy peers become known by their letters.
+    contact_limit: SenderLimit,
     /// No more letters of others are taken.
     ending: bool,
     /// The service has ended: nothing is sent any more.
@@ -170,7 +177,8 @@ impl Core {
             notes: BinaryHeap::new(),
             peers: Peers::default(),
             gate: None,
-            refusals: None,
+            failure_limit: FailureLimit::default(),
+            contact_limit: forward::contact_limit(),
             ending: false,
             closed: false,
             next_lane: 1,
@@ -672,6 +680,7 @@ impl Core {
             self.handle_late_note(now, late);
         }
         self.peers.handle_timeout(now.instant, &mut self.desk);
+        self.failure_limit.handle_timeout(now.instant);
         self.tell_failures(now);
         self.forget_idle_lanes(now);
     }
@@ -770,7 +779,8 @@ impl Core {
     pub fn poll_timeout(&self) -> Option<Instant> {
         let lanes = self.timers.peek().map(|Reverse((due, _))| *due);
         let notes = self.notes.peek().map(|Reverse(late)| late.0);
-        [lanes, notes, self.peers.due()].into_iter().flatten().min()
+        let others = [self.peers.due(), self.failure_limit.due()];
+        others.into_iter().chain([lanes, notes]).flatten().min()
     }
 
     /// The next thing to be done.

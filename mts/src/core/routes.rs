@@ -58,6 +58,8 @@ pub enum Standing {
     },
     /// Its transport is not in the order for this receiver.
     NotInOrder,
+    /// This project has no transport of its kind.
+    Unsupported,
 }
 
 /// What has happened on one way since the service started, or since the way was last forgotten:
@@ -152,7 +154,10 @@ impl Desk {
         debug_assert!(rest.clone().all(|it| !order.contains(&it.kind())));
         ways.extend(rest.map(|location| Way {
             location: location.clone(),
-            standing: Standing::NotInOrder,
+            standing: match location.kind().is_supported() {
+                true => Standing::NotInOrder,
+                false => Standing::Unsupported,
+            },
         }));
         Route {
             receiver: entry.name.to_string(),

@@ -11,7 +11,7 @@ use fipa_transport::{
 };
 
 use super::Shared;
-use crate::core::Now;
+use crate::core::{Now, Unframed};
 
 /// What a transport sees of the service.
 pub(super) struct Receiving {
@@ -41,11 +41,10 @@ impl Sink for Receiving {
         let Some(shared) = self.shared.upgrade() else {
             return;
         };
+        let unframed = Unframed::read(letter, via, from);
         let mut state = shared.state.lock();
         let deadline = state.unframed_deadline;
-        state
-            .core
-            .handle_unframed(Now::read(), deadline, letter, via, from);
+        state.core.handle_unframed(Now::read(), deadline, unframed);
         shared.carry_out(state);
     }
 

@@ -293,9 +293,9 @@ fn locator(locations: &[Location]) -> String {
     locator
 }
 
-/// `address signature[ service-signature];`, repeated. Schemes that we do not have are left out,
-/// and so are signatures of what we cannot speak, rather than sending there what nobody
-/// understands.
+/// `address signature[ service-signature];`, repeated. Unknown schemes and signatures are left out.
+/// Locations without a supported transport are left out when there is another one; else they show
+/// why letters to the agent fail.
 fn locations_of_locator(locator: &str) -> Vec<Location> {
     let location = |one: &str| {
         let mut words = one.split_ascii_whitespace();
@@ -306,8 +306,13 @@ fn locations_of_locator(locator: &str) -> Vec<Location> {
         };
         address.with_signature(signature).ok()
     };
-    let locations = locator.split(';').filter_map(location);
-    locations.take(Entry::MAX_LOCATIONS).collect()
+    let locations = || locator.split(';').filter_map(location);
+    let supported = locations().filter(|location| location.kind().is_supported());
+    let supported: Vec<Location> = supported.take(Entry::MAX_LOCATIONS).collect();
+    match supported.is_empty() {
+        true => locations().take(Entry::MAX_LOCATIONS).collect(),
+        false => supported,
+    }
 }
 
 const TIMESTAMP: &str = "%Y%m%d-%H:%M:%S";
@@ -441,6 +446,17 @@ mod tests {
         let bare = decode("bare", &said(&[]), now).unwrap();
         assert_eq!(bare.registered, now);
         assert!(decode("", &said(&[]), now).is_err());
+    }
+
+    #[test]
+    fn an_agent_that_has_udt_only_is_shown_with_it() {
+        let locator = format!("udt://10.0.0.2:1 {SIGNATURE};http://10.0.0.2:2 {SIGNATURE};");
+        let entry = read("cpp", &said(&[("LOCATOR", locator.as_bytes())])).unwrap();
+        assert_eq!(
+            entry.locations,
+            ["udt://10.0.0.2:1;fipa-services".parse().unwrap()]
+        );
+        assert!(entry.is_unsupported());
     }
 
     /// As fipa_services splits it: at 200 bytes, wherever that is.

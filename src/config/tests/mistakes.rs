@@ -71,6 +71,11 @@ fn mistakes_are_named_with_line_and_key() {
              (known: shm, tcp, udp, quic); expected a list of transports such as [\"shm\", \"tcp\"]",
         ),
         (
+            "[mts]\ntransports = [\"udt\"]\n",
+            "fipa.toml:2: `mts.transports` is wrong: \"udt\": unknown transport \"udt\" \
+             (known: shm, tcp, udp, quic); expected a list of transports such as [\"shm\", \"tcp\"]",
+        ),
+        (
             "[mts]\nname = true\n",
             "fipa.toml:2: `mts.name` is wrong: true: a boolean cannot stand here; \
              expected a name of 1 to 255 bytes",

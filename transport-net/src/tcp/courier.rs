@@ -270,7 +270,7 @@ async fn deliver(round: &Round, errand: &Errand, begun: &Mutex<bool>) -> Conclus
     let (endpoint, to) = (&round.endpoint, &round.to);
     let in_dialect = |here: Option<&str>| {
         translate(&errand.letter, &errand.receiver, to.signature(), here)
-            .map_err(|error| Conclusion::NotSent(WayError::new(WayFault::Incompatible, error)))
+            .map_err(|error| Conclusion::NotSent(WayError::new(error.fault(), error)))
     };
     // Before anything is opened: a connection without a letter costs fipa_services a descriptor.
     let mut letter = match in_dialect(None) {

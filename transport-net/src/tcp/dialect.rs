@@ -9,7 +9,7 @@ use fipa_acl::{
     AclRepresentation, AgentId, DecodeError, Dialect, EncodeError, Envelope, EnvelopeParams,
     Letter, Message, Representation,
 };
-use fipa_transport::Signature;
+use fipa_transport::{Signature, WayFault};
 
 /// Why a letter cannot be said to an old peer.
 #[derive(Debug, thiserror::Error)]
@@ -17,12 +17,22 @@ use fipa_transport::Signature;
 pub(crate) enum TranslateError {
     #[error("the letter cannot be read: {0}")]
     Read(#[from] DecodeError),
-    #[error("the peer's dialect cannot say it: {0}")]
+    #[error("{0}")]
     Write(#[from] EncodeError),
     #[error("the receiver's name cannot be written: {0:?}")]
     Receiver(String),
     #[error("{0} is not the dialect of an old peer")]
     NoDialect(Signature),
+}
+
+impl TranslateError {
+    /// The fault of an attempt that ends with this error.
+    pub(crate) fn fault(&self) -> WayFault {
+        match self {
+            Self::Read(_) | Self::Write(_) | Self::Receiver(_) => WayFault::Inexpressible,
+            Self::NoDialect(_) => WayFault::Incompatible,
+        }
+    }
 }
 
 /// The letter for one receiver as a peer with that signature reads it: envelope and message.

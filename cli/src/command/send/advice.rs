@@ -72,6 +72,16 @@ fn advice(reason: FailureReason, config: &Config) -> String {
              bytes) in the configuration of both sides",
             config.transport.shm.max_letter
         ),
+        FailureReason::Inexpressible => {
+            "see above which parameter the peer's dialect has no form for: change or leave out that \
+             parameter"
+                .to_owned()
+        }
+        FailureReason::Unsupported => {
+            "see above the transports of the peer, which this program does not have: have the peer \
+             listen on TCP, too"
+                .to_owned()
+        }
         FailureReason::TimedOut => {
             "give it more time with --deadline; see above what was tried".to_owned()
         }

@@ -51,6 +51,7 @@ impl Lane {
                     });
                 }
                 desk.way_worked(&location);
+                self.route_worked(&location);
                 self.answered(now, index, (attempt, location), answer, desk);
             }
             Conclusion::Handed => {
@@ -58,6 +59,7 @@ impl Lane {
                     Tally::add(&tally.taken);
                 }
                 desk.way_worked(&location);
+                self.route_worked(&location);
                 let attempts = std::mem::take(&mut self.letters[index].progress.attempts);
                 let via = location.kind();
                 let outcome = Outcome::Sent { via, attempts };
@@ -242,9 +244,10 @@ impl Lane {
             self.pause_until(now + CONGESTED_PAUSE);
             return;
         }
-        if error.fault != WayFault::TooLarge {
+        if !matches!(error.fault, WayFault::TooLarge | WayFault::Inexpressible) {
             desk.way_failed(now, location, error.fault);
         }
+        self.route_failed(location, &error);
         self.letters[index].failed_at(location, error);
     }
 

@@ -51,7 +51,7 @@ impl Lane {
                     continue;
                 }
                 State::Waiting if expired => {
-                    let reason = delivery.reason_at_deadline(self.busy);
+                    let reason = self.reason_while_waiting(index);
                     self.fail(now, index, reason, desk);
                     continue;
                 }
@@ -85,7 +85,8 @@ impl Lane {
                 Some(Holding::Until(until)) => Some(until),
                 _ => None,
             };
-            [deadline, delivery.custody_due, times_out, held]
+            let not_before = delivery.not_before.filter(|until| *until > now);
+            [deadline, delivery.custody_due, times_out, held, not_before]
         });
         let paused = self.paused_until.filter(|until| *until > now);
         let moving = self

@@ -35,6 +35,8 @@ pub(crate) struct Delivery {
     /// When the service that handed the letter over is told that it is in custody, unless its
     /// outcome is known before.
     pub(crate) custody_due: Option<Instant>,
+    /// Not dispatched before this time.
+    pub(crate) not_before: Option<Instant>,
     pub(super) progress: Progress,
 }
 
@@ -123,6 +125,7 @@ impl Delivery {
             deadline,
             since: now,
             custody_due: None,
+            not_before: None,
             progress,
         }
     }
@@ -136,15 +139,20 @@ impl Delivery {
         self.progress.uncertain = rules::stays_uncertain(self.progress.uncertain, end);
     }
 
+    /// Remembers a failed attempt. Of many, the first ones and the last one at each location stay.
     pub(super) fn failed_at(&mut self, location: &Location, error: WayError) {
-        if self.progress.attempts.len() < MAX_ATTEMPTS {
-            let location = location.clone();
-            self.progress.attempts.push(Attempt {
-                via: location.kind(),
-                location,
-                error,
-            });
+        let attempts = &mut self.progress.attempts;
+        if attempts.len() >= MAX_ATTEMPTS {
+            let mut known = attempts.iter().rev();
+            let same = known.position(|attempt| attempt.location == *location);
+            // Without one at this location, the newest gives way.
+            attempts.remove(attempts.len() - 1 - same.unwrap_or(0));
         }
+        attempts.push(Attempt {
+            via: location.kind(),
+            location: location.clone(),
+            error,
+        });
     }
 
     /// Remembers that reports of the service at this location are believed.
@@ -161,11 +169,20 @@ impl Delivery {
         self.progress.handed.contains(&service)
     }
 
-    /// Whether every attempt failed because the letter is too large.
-    pub(super) fn only_too_large(&self) -> bool {
-        let attempts = &self.progress.attempts;
-        let mut faults = attempts.iter().map(|attempt| attempt.error.fault);
-        !attempts.is_empty() && faults.all(|fault| fault == WayFault::TooLarge)
+    /// The reason when every attempt failed because of the letter itself: it is too large, or the
+    /// peer's dialect cannot express it.
+    pub(super) fn unfit(&self) -> Option<FailureReason> {
+        let mut reason = None;
+        for attempt in &self.progress.attempts {
+            match attempt.error.fault {
+                WayFault::Inexpressible => reason = Some(FailureReason::Inexpressible),
+                WayFault::TooLarge => {
+                    reason = reason.or(Some(FailureReason::TooLarge));
+                }
+                _ => return None,
+            }
+        }
+        reason
     }
 
     /// The reason when its deadline has passed. `behind_full_queue` is whether a letter before it
@@ -178,10 +195,8 @@ impl Delivery {
             FailureReason::QueueFull
         } else if progress.attempts.is_empty() {
             FailureReason::TimedOut
-        } else if self.only_too_large() {
-            FailureReason::TooLarge
         } else {
-            FailureReason::Unreachable
+            self.unfit().unwrap_or(FailureReason::Unreachable)
         }
     }
 

@@ -9,7 +9,8 @@
 //! that waits.
 //!
 //! Here is what moves letters on; [`answers`] is what comes back, [`clock`] what time does,
-//! [`custody`] what custodians do about predecessors, [`delivery`] a single letter.
+//! [`custody`] what custodians do about predecessors, [`delivery`] a single letter, [`tried`] what
+//! letters tell that were never dispatched.
 //!
 //! [`rules`]: super::rules
 
@@ -17,6 +18,7 @@ mod answers;
 mod clock;
 mod custody;
 mod delivery;
+mod tried;
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -24,7 +26,8 @@ use std::time::{Duration, Instant};
 
 use fipa_sds::Entry;
 use fipa_transport::{
-    Body, FailureReason, Incarnation, Kind, Location, Outcome, Parcel, Stream, WayError, WayFault,
+    Attempt, Body, FailureReason, Incarnation, Kind, Location, Outcome, Parcel, Stream, WayError,
+    WayFault,
 };
 
 pub(crate) use self::delivery::Delivery;
@@ -84,6 +87,9 @@ pub(crate) struct Lane {
     way: Option<Location>,
     /// Where it is counted what happens on that way, also when it was the last one.
     tally: Option<(Location, Arc<Tally>)>,
+    /// The last error of each route that has failed since the lane was empty, and has not worked since.
+    /// Letters that never had an attempt of their own tell them.
+    failed: Vec<Attempt>,
     /// Something came back: nothing is dispatched until all that is under way has been heard of.
     recovering: bool,
     paused_until: Option<Instant>,
@@ -130,6 +136,7 @@ impl Lane {
             under_way: 0,
             way: None,
             tally: None,
+            failed: Vec::new(),
             recovering: false,
             paused_until: None,
             paused_for_lower: false,
@@ -297,6 +304,12 @@ impl Lane {
                 index += 1;
                 continue;
             }
+            if let Some(until) = self.letters[index].not_before
+                && now < until
+            {
+                self.due_at(until);
+                break;
+            }
             let Some(entry) = self.entry(registration, desk) else {
                 if self.receiver_left(now, index, desk) {
                     continue;
@@ -312,7 +325,7 @@ impl Lane {
                 Some(_) => break,
                 None if self.under_way > 0 => break,
                 None => {
-                    if !self.end_of_round(now, index, desk) {
+                    if !self.end_of_round(now, index, &entry, desk) {
                         break;
                     }
                 }
@@ -405,32 +418,46 @@ impl Lane {
     }
 
     /// Every way was tried. Says whether the letter was settled.
-    fn end_of_round(&mut self, now: Instant, index: usize, desk: &mut Desk) -> bool {
-        let progress = &mut self.letters[index].progress;
-        if progress.tried.is_empty() {
-            self.fail(now, index, FailureReason::Unreachable, desk);
+    fn end_of_round(&mut self, now: Instant, index: usize, entry: &Entry, desk: &mut Desk) -> bool {
+        let delivery = &mut self.letters[index];
+        if delivery.progress.tried.is_empty() {
+            let reason = match entry.is_unsupported() {
+                true => {
+                    for location in &entry.locations {
+                        let error = WayError::new(WayFault::Unsupported, location.kind());
+                        delivery.failed_at(location, error);
+                    }
+                    FailureReason::Unsupported
+                }
+                false => FailureReason::Unreachable,
+            };
+            self.fail(now, index, reason, desk);
             return true;
         }
-        progress.tried.clear();
-        if self.is_too_large(index, desk) {
-            self.fail(now, index, FailureReason::TooLarge, desk);
+        delivery.progress.tried.clear();
+        if let Some(reason) = self.never_fits(index, desk) {
+            self.fail(now, index, reason, desk);
             return true;
         }
         self.pause(now);
         false
     }
 
-    /// Whether the letter is larger than every kind of way takes that may lead to the receiver. A
-    /// kind that the directory does not show at present may come back. Shared memory is left out,
-    /// because it does not lead to other hosts.
-    fn is_too_large(&self, index: usize, desk: &Desk) -> bool {
+    /// The reason why no repetition can succeed, after all routes of the receiver were tried.
+    ///
+    /// A letter that is too large for all of them waits for a kind that the directory does not show
+    /// at present and that may return. Shared memory is left out, because it does not lead to other
+    /// hosts. A letter that a legacy peer's dialect cannot express waits for nothing.
+    fn never_fits(&self, index: usize, desk: &Desk) -> Option<FailureReason> {
         let delivery = &self.letters[index];
+        let reason = delivery.unfit()?;
         let attempts = &delivery.progress.attempts;
         let mut order = desk.config.order_for(&self.receiver).iter();
-        delivery.only_too_large()
-            && order.all(|kind| {
+        let waits = reason == FailureReason::TooLarge
+            && !order.all(|kind| {
                 *kind == Kind::Shm || attempts.iter().any(|attempt| attempt.via == *kind)
-            })
+            });
+        (!waits).then_some(reason)
     }
 
     fn pause(&mut self, now: Instant) {
@@ -536,7 +563,7 @@ impl Lane {
         let attempts = std::mem::take(&mut delivery.progress.attempts);
         let sender = match delivery.origin {
             Origin::Local { .. } => Some(Author::Ours(self.sender)),
-            Origin::OldPeer { from } => Some(Author::OldPeer { from }),
+            Origin::OldPeer { from } => Some(Author::Remote { from: Some(from) }),
             Origin::Forwarded { .. } | Origin::Nobody => None,
         };
         if let Some(sender) = sender {
@@ -566,6 +593,7 @@ impl Lane {
             self.busy = false;
             self.ended = None;
             self.moving = None;
+            self.failed.clear();
         }
         if self.paused_for_lower {
             self.paused_until = None;

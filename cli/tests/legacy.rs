@@ -1,0 +1,155 @@
+//! The commands with agents of legacy peers, in processes of their own.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+
+mod common;
+
+use std::io::{Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::thread;
+
+use common::{Host, Running};
+use fipa::{AgentId, Envelope, EnvelopeParams, Message, Performative};
+use serde_json::{Value, json};
+
+/// A letter that a fipa_services agent, `cpp-sender`, sent to an agent `echo`.
+const LETTER: &[u8] = include_bytes!("../../acl/tests/vectors/tcp_letter.bin");
+/// The failure message that the message transport service of fipa_services sent to `cpp-sender`.
+const FAILURE: &[u8] = include_bytes!("../../acl/tests/vectors/failure_letter.bin");
+
+/// The address at which the gateway takes letters of legacy peers.
+fn address(gateway: &Running) -> String {
+    let ready: Value = serde_json::from_str(&gateway.ready).unwrap();
+    let locations = ready["locations"].as_array().unwrap();
+    let mut locations = locations.iter().filter_map(Value::as_str);
+    let tcp = locations.find_map(|it| it.strip_prefix("tcp://")).unwrap();
+    tcp.split('#').next().unwrap().to_owned()
+}
+
+/// A legacy peer that takes one letter, then sends this one on a connection of its own.
+fn answers_with(listener: &TcpListener, letter: Vec<u8>, to: String) {
+    let listener = listener.try_clone().unwrap();
+    thread::spawn(move || {
+        let (mut stream, _) = listener.accept().unwrap();
+        let mut asked = Vec::new();
+        stream.read_to_end(&mut asked).unwrap();
+        drop(stream);
+        TcpStream::connect(to).unwrap().write_all(&letter).unwrap();
+    });
+}
+
+/// Waits until the processes of the host are told of the agent, and returns what `fipa agents` says.
+#[track_caller]
+fn known(host: &Host, name: &str) -> Value {
+    let until = std::time::Instant::now() + std::time::Duration::from_secs(60);
+    loop {
+        let all = host.run(&["agents", name, "--json"]).done_json();
+        match &all["agents"][0] {
+            Value::Null => assert!(std::time::Instant::now() < until, "{all}"),
+            agent => return agent.clone(),
+        }
+    }
+}
+
+#[test]
+fn an_agent_that_has_udt_only_is_shown_as_unsupported_and_letters_to_it_fail_at_once() {
+    let host = Host::new();
+    let peer = "discovery.static={ cpp = [\"udt://127.0.0.1:9\"] }";
+    let _gateway = host.start(&["up", "--set", peer]);
+    let agent = known(&host, "cpp");
+    assert_eq!(
+        agent["locations"],
+        json!(["udt://127.0.0.1:9;fipa-services"])
+    );
+    assert_eq!(agent["unsupported_transports"], json!(["udt"]));
+    let table = host.run(&["agents", "cpp"]).done();
+    let shown = "udt://127.0.0.1:9;fipa-services (unsupported transport udt)";
+    assert!(table.contains(shown), "{table}");
+    let routes = host.run(&["routes", "cpp"]).done();
+    let shown = "not used: unsupported transport";
+    assert!(routes.contains(shown), "{routes}");
+
+    // The watchdog ends the command long before this deadline.
+    let send = ["send", "--to", "cpp", "--deadline", "30m", "--json"];
+    let (json, told) = host.run(&send).failed_json();
+    let delivery = &json["deliveries"][0];
+    assert_eq!(delivery["reason"], "unsupported transport");
+    assert_eq!(delivery["attempts"][0]["via"], "udt");
+    assert!(
+        told.starts_with("error: not delivered: unsupported transport\nwhere: \"cpp\"\n"),
+        "{told}"
+    );
+}
+
+#[test]
+fn a_failure_message_about_the_letter_is_no_reply() {
+    let host = Host::new();
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let at = listener.local_addr().unwrap();
+    let peer = format!("discovery.static={{ cpp = [\"tcp://{at};fipa-services\"] }}");
+    let gateway = host.start(&["up", "--json", "--set", &peer]);
+    known(&host, "cpp");
+    let send = [
+        "send",
+        "--to",
+        "cpp",
+        "--from",
+        "cpp-sender",
+        "--conversation-id",
+        "conv-1",
+        "--reply-with",
+        "rw-1",
+        "--wait",
+        "--timeout",
+        "30s",
+        "--json",
+    ];
+    answers_with(&listener, FAILURE.to_vec(), address(&gateway));
+    let (json, told) = host.run(&send).failed_json();
+    assert_eq!(json["deliveries"][0]["outcome"], "sent");
+    assert_eq!(json.get("reply"), None, "{json}");
+    let failure = json!({ "from": "echo-mts", "receiver": "nobo",
+                          "reason": "message delivery failed" });
+    assert_eq!(json["failures"], json!([failure]));
+    let expected =
+        "error: not delivered: message delivery failed\nwhere: \"nobo\", as \"echo-mts\" ";
+    assert!(told.starts_with(expected), "{told}");
+
+    // A failure that the receiver itself tells, of something else, is a reply.
+    let to = AgentId::new("cpp-sender").unwrap();
+    let reply = Message::builder(Performative::Failure)
+        .sender(AgentId::new("cpp").unwrap())
+        .receiver(to.clone())
+        .conversation_id("conv-1")
+        .in_reply_to("rw-1")
+        .content("(lift sample-3) (too-heavy)")
+        .build()
+        .unwrap();
+    let envelope = Envelope {
+        base: EnvelopeParams {
+            to: vec![to],
+            from: reply.sender().cloned(),
+            acl_representation: Some(fipa_acl::AclRepresentation::BitEfficient),
+            date: Some("20261120T112644481Z".parse().unwrap()),
+            ..EnvelopeParams::default()
+        },
+        extensions: Vec::new(),
+    };
+    let mut letter = envelope.encode_standard().unwrap().to_vec();
+    letter.extend_from_slice(&reply.to_payload().to_bytes());
+    answers_with(&listener, letter, address(&gateway));
+    let json = host.run(&send).done_json();
+    assert_eq!(json["reply"]["performative"], "failure");
+    assert_eq!(json.get("failures"), None, "{json}");
+}
+
+#[test]
+fn failure_messages_that_are_left_out_are_counted_in_the_log() {
+    let host = Host::new();
+    let mut gateway = host.start(&["up", "--json"]);
+    let to = address(&gateway);
+    for _ in 0..200 {
+        TcpStream::connect(&to).unwrap().write_all(LETTER).unwrap();
+    }
+    gateway.tells(&["left out failure messages", "count="]);
+}

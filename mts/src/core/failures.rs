@@ -1,0 +1,221 @@
+//! Failure messages: which senders are told of which failures, and how often.
+
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use fipa_acl::{Dialect, Representation};
+use fipa_sds::{Entry, Mts, Reach, Role, Source};
+use fipa_transport::{FailureReason, Incarnation, Location, Signature, Stream};
+
+use super::desk::{Action, Author, Origin, Undelivered, life_of};
+use super::inbox::Received;
+use super::lane::Delivery;
+use super::{Core, News, Now, own_lane};
+use crate::failure::Failure;
+use crate::stamp;
+
+/// How long a failure message to an old peer's agent may take.
+const FAILURE_DEADLINE: Duration = Duration::from_secs(5);
+
+impl Core {
+    /// An agent of this process has taken a letter whose message cannot be decoded. The sender is told
+    /// if it is an agent of this process, or one that the directory has under the name that the
+    /// envelope gives. Nothing else proves a name in an envelope.
+    pub fn handle_undecodable(
+        &mut self,
+        now: Now,
+        receiver: &Arc<str>,
+        received: &Received,
+        why: String,
+    ) {
+        let life = received.sender;
+        if received.via.is_none() || !life.is_known() {
+            return;
+        }
+        let sender = if self.agents.contains_key(&life) {
+            Author::Ours(life)
+        } else {
+            let named = stamp::sender(&received.letter);
+            let known = self.desk.directory.known_incarnation(life);
+            match known {
+                Some(entry) if named.as_deref() == Some(&*entry.name) => {
+                    Author::Remote { from: None }
+                }
+                _ => return,
+            }
+        };
+        self.desk.undelivered.push_back(Undelivered {
+            sender,
+            receiver: Arc::clone(receiver),
+            letter: received.letter.clone(),
+            reason: FailureReason::Refused,
+            detail: cannot_be_decoded(&why),
+        });
+        self.tell_failures(now);
+    }
+
+    /// Tells senders of what failed, in the form of FIPA `failure` messages.
+    pub(super) fn tell_failures(&mut self, now: Now) {
+        while let Some(undelivered) = self.desk.undelivered.pop_front() {
+            let Undelivered {
+                sender,
+                receiver,
+                letter,
+                reason,
+                detail,
+            } = undelivered;
+            let name = Arc::clone(&self.desk.config.name);
+            let name = &*name;
+            let from = match sender {
+                Author::Ours(_) => None,
+                Author::Remote { from } => {
+                    // Before the message is decoded, by the name that the envelope gives.
+                    let named = stamp::sender(&letter).unwrap_or_default();
+                    if !self.failure_limit.allows(now.instant, from, &named) {
+                        continue;
+                    }
+                    from
+                }
+            };
+            let Some(report) = Failure::of(&letter, &receiver, reason, &detail) else {
+                continue;
+            };
+            let own = self.desk.config.incarnation;
+            let sequence = self.sequence_of(own);
+            if let Author::Ours(agent) = sender {
+                let Some(inbox) = self.agents.get_mut(&agent) else {
+                    continue;
+                };
+                let letter = match report.written_for(name, Dialect::Standard, now.utc) {
+                    Ok(letter) => letter,
+                    Err(error) => {
+                        tracing::warn!(%error, %receiver, "a failure message could not be written");
+                        continue;
+                    }
+                };
+                if inbox.push_failure(letter.clone()) {
+                    let stream = Stream {
+                        sender: own,
+                        receiver: agent,
+                    };
+                    let name = Arc::clone(&inbox.name);
+                    self.desk.notice(stream, sequence, &name, || News::Taken {
+                        via: None,
+                        letter,
+                    });
+                    self.desk.actions.push_back(Action::Deliverable { agent });
+                } else {
+                    self.failure_limit.leave_out(now.instant);
+                }
+                continue;
+            }
+            // Its sender is known by name, or a legacy peer's letter gives its address.
+            let known = self.desk.directory.lookup(report.sender.name());
+            let said = match known {
+                Some(_) => None,
+                None => from.and_then(|from| said_of_itself(&report, from)),
+            };
+            let Some(entry) = known.or_else(|| said.clone()) else {
+                tracing::info!(to = %report.sender, %reason, "nobody to send a failure message to");
+                continue;
+            };
+            if entry.role == Role::Gateway {
+                continue;
+            }
+            let letter = match report.written_for(name, dialect_of(&entry), now.utc) {
+                Ok(letter) => letter,
+                Err(error) => {
+                    tracing::warn!(%error, receiver = %report.receiver, "a failure message could not be written");
+                    continue;
+                }
+            };
+            let stream = Stream {
+                sender: self.desk.config.incarnation,
+                receiver: life_of(&entry),
+            };
+            let id = self.lane(now, own_lane(stream.sender, &entry), &entry.name);
+            if !self.has_room_for_stranger(id, letter.len()) {
+                self.failure_limit.leave_out(now.instant);
+                continue;
+            }
+            let deadline = now.instant + FAILURE_DEADLINE;
+            let letter_of = (stream.receiver, sequence);
+            let origin = Origin::Nobody;
+            let delivery = Delivery::new(now.instant, origin, letter, letter_of, deadline);
+            self.desk
+                .notice(stream, sequence, &entry.name, || News::Sent {
+                    send: None,
+                    letter: delivery.letter.clone(),
+                });
+            if said.is_some()
+                && let Some(lane) = self.lanes.get_mut(&id)
+            {
+                lane.said(Arc::clone(&entry));
+            }
+            self.put(now, id, delivery);
+        }
+    }
+}
+
+/// The detail of a failure.
+pub(super) fn cannot_be_decoded(why: &dyn std::fmt::Display) -> String {
+    format!("the message cannot be decoded: {why}")
+}
+
+/// The locations that an agent of a legacy peer gives as its own: of its addresses, the numeric ones
+/// of the host that its letter came from. Any others could be claimed to have this service send to
+/// a third party.
+pub(super) fn locations_given<'a>(
+    addresses: impl IntoIterator<Item = &'a str>,
+    representation: Option<Representation>,
+    from: IpAddr,
+) -> Vec<Location> {
+    let signature = match representation {
+        Some(Representation::String) => Signature::JadeProxy,
+        _ => Signature::FipaServices,
+    };
+    let locations = addresses.into_iter().filter_map(|address| {
+        let location: Location = address.parse().ok()?;
+        let claimed: SocketAddr = location.address().parse().ok()?;
+        if claimed.ip().to_canonical() != from || !location.kind().is_supported() {
+            return None;
+        }
+        location.with_signature(signature).ok()
+    });
+    locations.take(Entry::MAX_LOCATIONS).collect()
+}
+
+/// An agent that the directory does not know, with the locations that it gives as its own.
+fn said_of_itself(report: &Failure<'_>, from: IpAddr) -> Option<Arc<Entry>> {
+    let agent = &report.sender;
+    let addresses = agent.addresses().iter().map(|address| &**address);
+    let locations = locations_given(addresses, report.representation, from);
+    if locations.is_empty() {
+        return None;
+    }
+    let entry = Entry {
+        name: agent.name().into(),
+        agent_type: String::new(),
+        incarnation: Incarnation::UNKNOWN,
+        locations,
+        mts: Mts::new(agent.name(), Incarnation::UNKNOWN),
+        description: String::new(),
+        registered: SystemTime::UNIX_EPOCH,
+        source: Source::Contact,
+        reach: Reach::Remote {
+            gateway: Incarnation::UNKNOWN,
+        },
+        role: Role::Agent,
+    };
+    entry.check().is_ok().then(|| Arc::new(entry))
+}
+
+/// What an agent understands, by what is understood where it can be reached.
+fn dialect_of(entry: &Entry) -> Dialect {
+    match entry.locations.first().map(Location::signature) {
+        Some(Signature::FipaServices) => Dialect::FipaServices,
+        Some(Signature::JadeProxy) => Dialect::Jade,
+        _ => Dialect::Standard,
+    }
+}

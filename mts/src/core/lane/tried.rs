@@ -1,0 +1,59 @@
+//! What is told of letters whose deadline passed before they were dispatched: what was tried with the
+//! letters before them.
+
+use fipa_sds::Entry;
+use fipa_transport::{Attempt, FailureReason, Location, WayError, WayFault};
+
+use super::Lane;
+
+impl Lane {
+    /// Notes an error of a route, unless it is about one letter only.
+    pub(super) fn route_failed(&mut self, location: &Location, error: &WayError) {
+        if matches!(error.fault, WayFault::TooLarge | WayFault::Inexpressible) {
+            return;
+        }
+        self.route_worked(location);
+        if self.failed.len() >= Entry::MAX_LOCATIONS {
+            self.failed.remove(0);
+        }
+        self.failed.push(Attempt {
+            via: location.kind(),
+            location: location.clone(),
+            error: error.clone(),
+        });
+    }
+
+    /// Notes that a route works.
+    pub(super) fn route_worked(&mut self, location: &Location) {
+        if !self.failed.is_empty() {
+            self.failed.retain(|attempt| attempt.location != *location);
+        }
+    }
+
+    /// The reason for the letter at `index`, which waits and whose deadline has passed. A letter
+    /// without attempts of its own gets those of the letters before it.
+    pub(super) fn reason_while_waiting(&mut self, index: usize) -> FailureReason {
+        let busy = self.busy;
+        let waits_behind = self.waits_behind();
+        let delivery = &mut self.letters[index];
+        if delivery.progress.attempts.is_empty() && !delivery.progress.busy && !busy {
+            delivery.progress.attempts.clone_from(&self.failed);
+        }
+        let reason = delivery.reason_at_deadline(busy);
+        if reason == FailureReason::TimedOut {
+            delivery.progress.attempts.extend(waits_behind);
+        }
+        reason
+    }
+
+    /// The route on which letters have no answer yet.
+    fn waits_behind(&self) -> Option<Attempt> {
+        let location = self.way.as_ref().filter(|_| self.under_way > 0)?;
+        let detail = format!("letters before it have no answer ({})", self.under_way);
+        Some(Attempt {
+            via: location.kind(),
+            location: location.clone(),
+            error: WayError::new(WayFault::TimedOut, detail),
+        })
+    }
+}

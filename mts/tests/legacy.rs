@@ -1,0 +1,261 @@
+//! Letters to and from agents of legacy peers: failures that are certain at once, and their reasons.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use fipa_acl::{AgentId, Message, Performative};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
+use fipa_mts::letter_for;
+use fipa_sds::{Directory, StaticDirectory};
+use fipa_transport::{
+    AttemptId, Conclusion, FailureReason, Incarnation, Kind, Location, Outcome, WayError, WayFault,
+};
+
+const ROVER: Incarnation = Incarnation::from_u64(0xb);
+const DEADLINE: Duration = Duration::from_secs(5);
+
+/// The core of the process of the agent `rover`, on virtual time. The agent `arm` belongs to a
+/// legacy peer.
+struct Bench {
+    core: Core,
+    start: Instant,
+}
+
+impl Bench {
+    fn new(locations: &[&str]) -> Self {
+        Self::with_window(locations, 16)
+    }
+
+    /// The same, with so many letters under way at a time.
+    fn with_window(locations: &[&str], window: usize) -> Self {
+        let locations: Vec<Location> = locations.iter().map(|it| it.parse().unwrap()).collect();
+        let directory: Arc<dyn Directory> =
+            Arc::new(StaticDirectory::new([("arm", locations)]).unwrap());
+        let order = vec![Kind::Shm, Kind::Tcp, Kind::Udp];
+        let config = CoreConfig {
+            window,
+            ..CoreConfig::new("mts", Incarnation::from_u64(1), order)
+        };
+        let mut core = Core::new(config, directory);
+        core.register("rover".into(), ROVER);
+        Self {
+            core,
+            start: Instant::now(),
+        }
+    }
+
+    fn at(&self, ms: u64) -> Now {
+        Now {
+            instant: self.start + Duration::from_millis(ms),
+            utc: SystemTime::UNIX_EPOCH,
+        }
+    }
+
+    fn send(&mut self, ms: u64) {
+        self.send_within(ms, DEADLINE);
+    }
+
+    fn send_within(&mut self, ms: u64, deadline: Duration) {
+        let message = Message::builder(Performative::Inform)
+            .sender(AgentId::new("rover").unwrap())
+            .receiver(AgentId::new("arm").unwrap())
+            .build()
+            .unwrap();
+        let submission = Submission {
+            sender: ROVER,
+            letter: letter_for(&message, SystemTime::UNIX_EPOCH).unwrap(),
+            receivers: vec!["arm".into()],
+            deadline,
+        };
+        self.core.send(self.at(ms), submission);
+    }
+
+    /// The next letter that the core dispatches, and the location.
+    fn dispatched(&mut self) -> (AttemptId, String) {
+        let mut actions = std::iter::from_fn(|| self.core.poll_action());
+        let next = actions.find(|action| !matches!(action, Action::Deliverable { .. }));
+        match next {
+            Some(Action::Dispatch {
+                attempt, location, ..
+            }) => (attempt, location.to_string()),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    fn not_sent(&mut self, ms: u64, attempt: AttemptId, fault: WayFault) {
+        let conclusion = Conclusion::NotSent(WayError::new(fault, "for a test"));
+        self.core
+            .handle_conclusion(self.at(ms), attempt, conclusion);
+    }
+
+    fn outcome(&mut self) -> Option<Outcome> {
+        std::iter::from_fn(|| self.core.poll_action()).find_map(|action| match action {
+            Action::Outcome { outcome, .. } => Some(outcome),
+            _ => None,
+        })
+    }
+}
+
+fn reason(outcome: &Outcome) -> FailureReason {
+    match outcome {
+        Outcome::Failed { reason, .. } => *reason,
+        other => panic!("{other}"),
+    }
+}
+
+#[test]
+fn a_letter_that_the_dialect_cannot_express_fails_at_once() {
+    let mut bench = Bench::new(&["tcp://10.0.0.3:6789;fipa-services"]);
+    bench.send(0);
+    let (attempt, _) = bench.dispatched();
+    bench.not_sent(1, attempt, WayFault::Inexpressible);
+    let outcome = bench.outcome().unwrap();
+    assert_eq!(reason(&outcome), FailureReason::Inexpressible);
+    assert_eq!(outcome.attempts().len(), 1);
+    assert!(!bench.core.has_open_letters());
+
+    // The route is not at fault: the next letter goes there at once.
+    bench.send(2);
+    assert_eq!(bench.dispatched().1, "tcp://10.0.0.3:6789;fipa-services");
+}
+
+#[test]
+fn a_letter_that_one_dialect_cannot_express_goes_by_another() {
+    let mut bench = Bench::new(&[
+        "tcp://10.0.0.3:6789;fipa-services",
+        "tcp://10.0.0.3:6790;jade",
+    ]);
+    bench.send(0);
+    let (attempt, _) = bench.dispatched();
+    bench.not_sent(1, attempt, WayFault::Inexpressible);
+    let (attempt, location) = bench.dispatched();
+    assert_eq!(location, "tcp://10.0.0.3:6790;jade");
+    bench
+        .core
+        .handle_conclusion(bench.at(2), attempt, Conclusion::Handed);
+    let outcome = bench.outcome().unwrap();
+    assert!(outcome.is_success(), "{outcome}");
+}
+
+#[test]
+fn a_letter_that_another_location_may_carry_later_is_repeated() {
+    let mut bench = Bench::new(&[
+        "tcp://10.0.0.3:6789;fipa-services",
+        "tcp://10.0.0.3:6790;jade",
+    ]);
+    bench.send(0);
+    let (attempt, _) = bench.dispatched();
+    bench.not_sent(1, attempt, WayFault::Inexpressible);
+    let (attempt, _) = bench.dispatched();
+    bench.not_sent(2, attempt, WayFault::Unreachable);
+    assert_eq!(bench.outcome(), None);
+    bench.core.handle_timeout(bench.at(5001));
+    let outcome = bench.outcome().unwrap();
+    assert_eq!(reason(&outcome), FailureReason::Unreachable);
+}
+
+#[test]
+fn a_letter_to_an_agent_that_has_unsupported_transports_only_fails_at_once() {
+    let mut bench = Bench::new(&["udt://10.0.0.3:6790;fipa-services"]);
+    bench.send(0);
+    let outcome = bench.outcome().unwrap();
+    assert_eq!(reason(&outcome), FailureReason::Unsupported);
+    assert_eq!(
+        outcome.to_string(),
+        "failed: unsupported transport; tried udt://10.0.0.3:6790;fipa-services: unsupported \
+         transport: udt"
+    );
+    assert!(!bench.core.has_open_letters());
+
+    // A supported location is used.
+    let mut bench = Bench::new(&["udt://10.0.0.3:6790", "tcp://10.0.0.3:6789;fipa-services"]);
+    bench.send(0);
+    assert_eq!(bench.dispatched().1, "tcp://10.0.0.3:6789;fipa-services");
+}
+
+const LEGACY: &str = "tcp://10.0.0.3:6789;fipa-services";
+
+/// What became of all letters, in order.
+fn outcomes(bench: &mut Bench) -> Vec<Outcome> {
+    std::iter::from_fn(|| bench.outcome()).collect()
+}
+
+#[test]
+fn letters_that_waited_for_a_dead_peer_tell_what_was_tried() {
+    let mut bench = Bench::with_window(&[LEGACY], 1);
+    for _ in 0..3 {
+        bench.send(0);
+    }
+    let (attempt, _) = bench.dispatched();
+    bench.not_sent(1, attempt, WayFault::Unreachable);
+    bench.core.handle_timeout(bench.at(5001));
+    let outcomes = outcomes(&mut bench);
+    assert_eq!(outcomes.len(), 3);
+    for outcome in outcomes {
+        assert_eq!(reason(&outcome), FailureReason::Unreachable);
+        let tried = outcome.attempts();
+        assert_eq!(tried.len(), 1, "{outcome}");
+        assert_eq!(tried[0].location.to_string(), LEGACY);
+        assert_eq!(tried[0].error.fault, WayFault::Unreachable);
+    }
+    // Each failure message tells it, too.
+    for _ in 0..3 {
+        let told = bench.core.take(ROVER).unwrap();
+        let told = Message::decode(told.letter.payload()).unwrap();
+        let text = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
+        assert!(text.contains("unreachable: tcp://10.0.0.3:6789"), "{text}");
+    }
+    // The next letter does not tell what earlier ones met.
+    bench.send(5002);
+    bench.dispatched();
+    bench.core.handle_timeout(bench.at(10_003));
+    assert_eq!(bench.outcome(), None);
+}
+
+#[test]
+fn letters_that_waited_behind_a_silent_peer_tell_where() {
+    let mut bench = Bench::with_window(&[LEGACY], 1);
+    for _ in 0..2 {
+        bench.send(0);
+    }
+    let (_, _) = bench.dispatched();
+    bench.core.handle_timeout(bench.at(5001));
+    let outcome = bench.outcome().unwrap();
+    assert_eq!(reason(&outcome), FailureReason::TimedOut);
+    assert_eq!(outcome.attempts().len(), 1, "{outcome}");
+    assert_eq!(outcome.attempts()[0].location.to_string(), LEGACY);
+}
+
+#[test]
+fn the_last_error_of_each_location_is_told() {
+    const FAR: Duration = Duration::from_secs(600);
+    let mut bench = Bench::new(&[LEGACY, "tcp://10.0.0.3:6790;jade"]);
+    bench.send_within(0, FAR);
+    let mut now = bench.start;
+    for number in 0..30 {
+        let attempt = loop {
+            match bench.core.poll_action() {
+                Some(Action::Dispatch { attempt, .. }) => break attempt,
+                Some(other) => panic!("{other:?}"),
+                None => now = bench.core.poll_timeout().unwrap(),
+            }
+            let utc = SystemTime::UNIX_EPOCH;
+            bench.core.handle_timeout(Now { instant: now, utc });
+        };
+        let fault = match number {
+            28.. => WayFault::Refused,
+            _ => WayFault::Unreachable,
+        };
+        let ms = now.duration_since(bench.start).as_millis();
+        bench.not_sent(u64::try_from(ms).unwrap(), attempt, fault);
+    }
+    bench.core.handle_timeout(bench.at(600_001));
+    let outcome = bench.outcome().unwrap();
+    for location in [LEGACY, "tcp://10.0.0.3:6790;jade"] {
+        let mut tried = outcome.attempts().iter().rev();
+        let last = tried.find(|attempt| attempt.location.to_string() == location);
+        assert_eq!(last.unwrap().error.fault, WayFault::Refused, "{outcome}");
+    }
+}
