@@ -257,6 +257,7 @@ impl Place {
         let remove = |path: PathBuf| drop(fs::remove_dir(path));
         remove(self.part("directory"));
         remove(self.part("shm"));
+        remove(self.part("unix"));
         if self.is_empty_but_for_host() {
             let _ = fs::remove_file(self.path().join(HOST));
         }

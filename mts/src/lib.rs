@@ -17,6 +17,6 @@ pub mod watch;
 /// somebody who finds out, by how long things take, which keys collide.
 type Map<K, V> = std::collections::HashMap<K, V, foldhash::fast::RandomState>;
 
-pub use gate::Gate;
+pub use gate::{Gate, Link};
 pub use post::{PostError, letter_around, letter_for};
 pub use runtime::{Contacts, Mts, RuntimeConfig, Sending, Started, Tap};

@@ -12,8 +12,10 @@ use fipa_transport::{
 };
 
 use super::desk::{Action, Author, Origin, Undelivered, Upstream, life_of};
+use super::inbox::link_of;
 use super::lane::{Delivery, LaneId, LaneKey};
 use super::{Core, MAX_DEADLINE, News, Now, own_lane};
+use crate::gate::Link;
 use smallvec::smallvec;
 
 use crate::failure::Failure;
@@ -77,7 +79,7 @@ impl Core {
             lane.wait_for_credit(from.location);
             return Verdict::Now(Answer::Busy);
         }
-        if let Err(why) = self.admits(now, &entry.name, &stamped) {
+        if let Err(why) = self.admits(now, &entry.name, &stamped, link_of(via, &from.location)) {
             return Verdict::Now(Answer::failed(FailureReason::Refused, why));
         }
         if from.remote {
@@ -102,9 +104,9 @@ impl Core {
     }
 
     /// What the gate says, if there is one.
-    fn admits(&self, now: Now, receiver: &str, letter: &Letter) -> Result<(), String> {
+    fn admits(&self, now: Now, receiver: &str, letter: &Letter, link: Link) -> Result<(), String> {
         match &self.gate {
-            Some(gate) => gate.admits(now.instant, receiver, letter),
+            Some(gate) => gate.admits(now.instant, receiver, letter, link),
             None => Ok(()),
         }
     }
@@ -205,6 +207,10 @@ impl Core {
         let directory = Arc::clone(&self.desk.directory);
         let sender = stamp::sender(&letter).unwrap_or_default();
         let stream_sender = self.desk.config.incarnation;
+        let unproved = Link {
+            via,
+            service: Incarnation::UNKNOWN,
+        };
         for receiver in receivers {
             let (entries, missing) = match fipa_sds::resolve_legacy(&*directory, &receiver, &sender)
             {
@@ -230,7 +236,7 @@ impl Core {
                 self.unframed_failed(&name, &letter, (via, from), why);
             }
             for entry in here {
-                if let Err(why) = self.admits(now, &entry.name, &letter) {
+                if let Err(why) = self.admits(now, &entry.name, &letter, unproved) {
                     if self.tells_of_refusal(now) {
                         let why = (FailureReason::Refused, why);
                         self.unframed_failed(&entry.name, &letter, (via, from), why);

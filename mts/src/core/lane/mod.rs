@@ -24,7 +24,7 @@ use std::time::{Duration, Instant};
 
 use fipa_sds::Entry;
 use fipa_transport::{
-    Body, FailureReason, Incarnation, Kind, Location, Outcome, Parcel, Stream, WayError, WayFault,
+    Body, FailureReason, Incarnation, Location, Outcome, Parcel, Stream, WayError, WayFault,
 };
 
 pub(crate) use self::delivery::Delivery;
@@ -421,15 +421,15 @@ impl Lane {
     }
 
     /// Whether the letter is larger than every kind of way takes that may lead to the receiver. A
-    /// kind that the directory does not show at present may come back. Shared memory is left out,
-    /// because it does not lead to other hosts.
+    /// kind that the directory does not show at present may come back. Those within a host are left
+    /// out, because they do not lead to other hosts.
     fn is_too_large(&self, index: usize, desk: &Desk) -> bool {
         let delivery = &self.letters[index];
         let attempts = &delivery.progress.attempts;
         let mut order = desk.config.order_for(&self.receiver).iter();
         delivery.only_too_large()
             && order.all(|kind| {
-                *kind == Kind::Shm || attempts.iter().any(|attempt| attempt.via == *kind)
+                kind.is_host_local() || attempts.iter().any(|attempt| attempt.via == *kind)
             })
     }
 
