@@ -184,7 +184,6 @@ impl Place {
     }
 
     /// Whether it is there; as private as it has to be, as far as it is.
-    #[cfg_attr(not(feature = "shm"), expect(dead_code, reason = "nobody asks"))]
     pub(crate) fn look(&self) -> Result<bool, PlaceError> {
         for path in [&self.base, &self.path()] {
             match check_private(path) {

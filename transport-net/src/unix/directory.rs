@@ -29,7 +29,7 @@ const BACKLOG: i32 = 1024;
 /// Time before a socket whose backlog is full is tried again.
 const RETRY_AFTER: Duration = Duration::from_millis(2);
 
-/// Time to wait for the lock of the directory, which is held for less than a millisecond.
+/// Time to wait for the lock of the directory, which is held for some milliseconds at most.
 const LOCKING: Duration = Duration::from_secs(1);
 
 /// Why the sockets of a domain cannot be used.
@@ -137,7 +137,7 @@ impl Directory {
             // The file is there a moment before the kernel finds the socket by it; a sweep must not
             // come in between. Without the lock, because a process that sweeps was stopped, the
             // worst is that the file is removed, and made again.
-            let _lock = self.lock(FlockOperation::NonBlockingLockShared);
+            let _lock = self.lock(FlockOperation::NonBlockingLockShared, LOCKING);
             self.remove_file(name)?;
             let socket = new_socket(SocketType::STREAM)?;
             let path = format!("/proc/self/fd/{}/{name}", self.dir.as_raw_fd());
@@ -184,9 +184,11 @@ impl Directory {
         Ok((stream, number))
     }
 
-    /// Removes the sockets that dead processes have left.
+    /// Removes the sockets that dead processes have left, unless another process is at it, or makes
+    /// its own.
     pub(super) fn sweep(&self) {
-        let Some(_lock) = self.lock(FlockOperation::NonBlockingLockExclusive) else {
+        let exclusive = FlockOperation::NonBlockingLockExclusive;
+        let Some(_lock) = self.lock(exclusive, Duration::ZERO) else {
             return;
         };
         let entries = Dir::read_from(&self.dir).into_iter().flatten().flatten();
@@ -242,8 +244,8 @@ impl Directory {
         }
     }
 
-    /// Locks the directory, if that is possible within a second.
-    fn lock(&self, operation: FlockOperation) -> Option<Locked> {
+    /// Locks the directory, if that is possible within this time.
+    fn lock(&self, operation: FlockOperation, patience: Duration) -> Option<Locked> {
         // Opened again: a lock belongs to the open file, which the threads of a process share.
         let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
         let dir = rustix::fs::openat(&self.dir, ".", flags, Mode::empty()).ok()?;
@@ -251,7 +253,7 @@ impl Directory {
         loop {
             match rustix::fs::flock(&dir, operation) {
                 Ok(()) => return Some(Locked(dir)),
-                Err(Errno::WOULDBLOCK) if began.elapsed() < LOCKING => {
+                Err(Errno::WOULDBLOCK) if began.elapsed() < patience => {
                     std::thread::sleep(Duration::from_millis(1));
                 }
                 Err(Errno::INTR) => {}

@@ -14,6 +14,7 @@ use std::os::unix::net::UnixListener as StdListener;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Kind, ListenError, Location, OwnerProcess, Parcel, Sink, Ticket,
@@ -22,6 +23,8 @@ use fipa_transport::{
 use parking_lot::Mutex;
 use tokio::net::UnixListener;
 use tokio::runtime::Handle;
+use tokio::task::spawn_blocking;
+use tokio::time::sleep;
 
 pub use self::directory::UnixError;
 use self::directory::{Directory, FileId};
@@ -29,6 +32,10 @@ use crate::Identity;
 use crate::stream::config::{Limits, StreamConfig};
 use crate::stream::counters::Counters;
 use crate::stream::endpoint::Endpoint;
+
+/// Time between the end of a process and the look for its socket, in which the kernel closes it, and
+/// further processes may end.
+const TIDY_AFTER: Duration = Duration::from_millis(100);
 
 /// How often the directory is opened again when a process that leaves has just removed it.
 const RETRIES: u32 = 20;
@@ -60,6 +67,8 @@ pub struct UnixTransport {
     /// The socket, while the endpoint listens.
     bound: Arc<Mutex<Option<Bound>>>,
     closed: AtomicBool,
+    /// Whether a look for sockets of dead processes is due.
+    tidying: Arc<AtomicBool>,
     owner: OwnerProcess,
 }
 
@@ -91,6 +100,7 @@ impl UnixTransport {
             endpoint: Endpoint::new(Kind::Unix, config, runtime),
             bound: Arc::default(),
             closed: AtomicBool::new(false),
+            tidying: Arc::default(),
             owner: OwnerProcess::this(),
         }
     }
@@ -104,12 +114,19 @@ impl UnixTransport {
     /// Processes of this domain have ended: removes the sockets that dead ones have left, in the
     /// background.
     pub fn tidy(&self) {
-        let directory = self.bound.lock().as_ref().map(|it| it.directory.clone());
-        if let Some(directory) = directory {
-            self.endpoint
-                .runtime
-                .spawn_blocking(move || directory.sweep());
+        if self.tidying.swap(true, Ordering::AcqRel) {
+            return;
         }
+        let (tidying, bound) = (self.tidying.clone(), self.bound.clone());
+        self.endpoint.runtime.spawn(async move {
+            sleep(TIDY_AFTER).await;
+            tidying.store(false, Ordering::Release);
+            let directory = bound.lock().as_ref().map(|it| it.directory.clone());
+            if let Some(directory) = directory {
+                // An error is that the runtime ends.
+                let _ = spawn_blocking(move || directory.sweep()).await;
+            }
+        });
     }
 
     /// Whether other processes find the socket. False when another program has removed it, or the
