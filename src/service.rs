@@ -107,7 +107,8 @@ impl Service {
             place,
         };
         for (kind, error) in failed {
-            if role.gateway {
+            // Without a route within the host there may be another one.
+            if role.gateway && !kind.is_host_local() {
                 service.abort();
                 return Err(OpenError::Listen {
                     kind,

@@ -588,3 +588,25 @@ fn members_may_come_and_go_all_at_once() {
         }
     });
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_process_does_not_take_to_the_network_and_says_what_to_list_instead() {
+    let config = config(&["mts.transports=tcp"]);
+    let error = Domain::open(&config).await.err().unwrap().to_string();
+    assert!(error.contains("list shm or unix"), "{error}");
+    assert!(error.contains("transport.tcp.processes"), "{error}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn routes_between_hosts_leave_those_within_a_host_alone() {
+    // Of the gateway, which passes on by TCP what processes hand it by the usual order.
+    let config = config(&["routes={ \"arm\" = [\"tcp\"], \"leg\" = [\"unix\"] }"]);
+    let (here, there) = two(&config).await;
+    let rover = here.register("rover").unwrap();
+    for (name, via) in [("arm", Kind::Shm), ("leg", Kind::Unix)] {
+        let agent = there.register(name).unwrap();
+        let sent = rover.send(inform(&rover, name, "x")).await.unwrap();
+        assert_eq!(only(&sent).via(), Some(via), "{sent}");
+        drop(agent);
+    }
+}
