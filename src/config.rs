@@ -13,7 +13,7 @@
 //! domain = "default"                  # processes of one domain on one host see each other
 //! [mts]
 //! name = "sherpa-mts"                 # default: <host name>-mts
-//! transports = ["shm", "tcp"]         # order of preference; what is not listed is off
+//! transports = ["shm", "unix", "tcp"] # order of preference; what is not listed is off
 //! deadline = "5s"                     # per letter, unless the letter says otherwise
 //! queue = 256                         # letters waiting per agent before senders are held back
 //! queue_bytes = "64MiB"               # the same in bytes; also per sender and receiver at gateways
@@ -24,7 +24,8 @@
 //! max_letter = "64MiB"
 //! spin = "50us"                       # before blocking; 0 on battery
 //! [transport.tcp]
-//! listen = ["127.0.0.1:0"]            # loopback unless the owner opens it
+//! listen = ["127.0.0.1:0"]            # of the gateway; loopback unless the owner opens it
+//! processes = false                   # true: other processes of the host use TCP, too
 //! [transport.udp]
 //! listen = ["127.0.0.1:0"]            # as for tcp; letters that fit one datagram
 //! [transport.quic]
@@ -138,7 +139,7 @@ pub struct Transports {
     /// `[transport.shm]`.
     pub shm: Shm,
     /// `[transport.tcp]`.
-    pub tcp: Listen,
+    pub tcp: Tcp,
     /// `[transport.udp]`.
     pub udp: Listen,
     /// `[transport.quic]`; needs [`Security::keys`].
@@ -158,7 +159,19 @@ pub struct Shm {
     pub spin: Duration,
 }
 
-/// `[transport.tcp]`, `[transport.udp]` and `[transport.quic]`: where a network transport listens.
+/// `[transport.tcp]`: letters over TCP.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Tcp {
+    /// `listen`: where the gateway listens; see [`Listen::listen`].
+    pub listen: Vec<String>,
+    /// `processes`: whether processes that are not the gateway use TCP among each other, too. They
+    /// listen on a port of 127.0.0.1 that the system chooses, where every user of the host can
+    /// connect.
+    pub processes: bool,
+}
+
+/// `[transport.udp]` and `[transport.quic]`: where a network transport of the gateway listens.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Listen {
@@ -321,7 +334,7 @@ impl Config {
             domain: "default".to_owned(),
             mts: Mts {
                 name: keys::default_mts_name(host_name),
-                transports: vec![Kind::Shm, Kind::Tcp],
+                transports: vec![Kind::Shm, Kind::Unix, Kind::Tcp],
                 deadline: Duration::from_secs(5),
                 queue: 256,
                 queue_bytes: 64 << 20,
@@ -333,7 +346,10 @@ impl Config {
                     max_letter: 64 << 20,
                     spin: Duration::from_micros(50),
                 },
-                tcp: loopback.clone(),
+                tcp: Tcp {
+                    listen: loopback.listen.clone(),
+                    processes: false,
+                },
                 udp: loopback.clone(),
                 quic: loopback,
             },

@@ -7,8 +7,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use fipa_acl::{EnvelopeView, Letter, MessageView};
-use fipa_mts::Gate;
-use fipa_sds::{Directory, HostDirectory, Role as EntryRole};
+use fipa_mts::{Gate, Link};
+use fipa_sds::{Directory, Entry, HostDirectory, Role as EntryRole};
 use parking_lot::Mutex;
 
 use crate::access::{Access, Claim, Refusal};
@@ -27,7 +27,7 @@ pub(crate) enum Of {
     /// The gateway's, with its name. Everybody may write to it: so gateways and their clerks talk.
     Gateway(Arc<str>),
     /// A process's on this host. The gateway there may write to everybody, as it answers only, and
-    /// has counted what it passes on.
+    /// has counted what it passes on. It is recognized by its link.
     Process(Arc<HostDirectory>),
 }
 
@@ -46,6 +46,7 @@ impl Door {
         letter: &Letter,
         view: &EnvelopeView<'_>,
         sender: &str,
+        link: Link,
     ) -> Result<(), Refused> {
         let message = MessageView::parse_payload(letter.payload());
         let message = message
@@ -65,31 +66,51 @@ impl Door {
             performative: &performative.as_str(),
             protocol: protocol.as_deref(),
         };
-        // A gateway has stamped what it has passed on, and counted it.
-        let is_passed_on = matches!(self.of, Of::Process(_)) && view.stamps().next().is_some();
-        let judged = {
-            let mut access = self.access.lock();
-            let judged = access.judge(&claim);
-            match is_passed_on {
-                true => judged,
-                false => judged.and_then(|()| access.count(sender, now)),
+        let is_stamped = view.stamps().next().is_some();
+        let judge = |gateway: Option<Arc<Entry>>| match gateway {
+            // The gateway has stamped what it has passed on, and counted it.
+            Some(_) if is_stamped => self.access.lock().judge(&claim),
+            Some(gateway) if *gateway.name == *sender => Ok(()),
+            _ => {
+                let mut access = self.access.lock();
+                access
+                    .judge(&claim)
+                    .and_then(|()| access.count(sender, now))
             }
         };
-        // Asked only now: hardly any letter is the gateway's own. Somebody else who calls himself so
-        // has been passed on.
-        judged.or_else(|refusal| match !is_passed_on && self.is_gateway(sender) {
-            true => Ok(()),
-            false => Err(refusal.into()),
+        let gateway = self.gateway_on(link);
+        let is_known = gateway.is_some();
+        judge(gateway).or_else(|refusal| {
+            // The gateway may have registered a moment ago. Looking is for what is refused only.
+            match self.looked_for_gateway_on(link).filter(|_| !is_known) {
+                Some(gateway) => Ok(judge(Some(gateway))?),
+                None => Err(refusal.into()),
+            }
         })
     }
 
-    /// Whether this is the name of the gateway of this host, which writes to a process of it.
-    fn is_gateway(&self, sender: &str) -> bool {
+    /// The entry of the gateway of this host, if it is at the other end of this link as far as is
+    /// known. The kernel proves that the other end is a process of this user only when the link is
+    /// within the host.
+    fn gateway_on(&self, link: Link) -> Option<Arc<Entry>> {
         let Of::Process(host) = &self.of else {
-            return false;
+            return None;
         };
-        let entry = host.lookup(sender);
-        entry.is_some_and(|entry| entry.role == EntryRole::Gateway)
+        if !link.via.is_host_local() {
+            return None;
+        }
+        let entry = host.known_incarnation(link.service)?;
+        (entry.role == EntryRole::Gateway).then_some(entry)
+    }
+
+    /// The same, with what others have registered until now.
+    fn looked_for_gateway_on(&self, link: Link) -> Option<Arc<Entry>> {
+        if let Of::Process(host) = &self.of
+            && link.via.is_host_local()
+        {
+            host.refresh();
+        }
+        self.gateway_on(link)
     }
 }
 
@@ -103,7 +124,13 @@ enum Refused {
 }
 
 impl Gate for Door {
-    fn admits(&self, now: Instant, receiver: &str, letter: &Letter) -> Result<(), String> {
+    fn admits(
+        &self,
+        now: Instant,
+        receiver: &str,
+        letter: &Letter,
+        link: Link,
+    ) -> Result<(), String> {
         if let Of::Gateway(own) = &self.of
             && receiver == &**own
         {
@@ -113,7 +140,9 @@ impl Gate for Door {
         let view = EnvelopeView::parse(&envelope).ok();
         let sender = view.as_ref().and_then(EnvelopeView::from_name);
         let judged = match (&view, sender) {
-            (Some(view), Some(sender)) => self.judge(now, receiver, letter, view, &sender.as_str()),
+            (Some(view), Some(sender)) => {
+                self.judge(now, receiver, letter, view, &sender.as_str(), link)
+            }
             _ => Err(Refused::Other("its envelope names no sender".to_owned())),
         };
         judged.map_err(|why| {
@@ -133,7 +162,7 @@ mod tests {
         AclRepresentation, AgentId, Envelope, EnvelopeParams, Message, Performative, Received, Time,
     };
     use fipa_sds::{HostConfig, Mts, Registration};
-    use fipa_transport::Incarnation;
+    use fipa_transport::{Incarnation, Kind};
 
     use super::*;
     use crate::config;
@@ -187,43 +216,93 @@ mod tests {
         (door, open(true), place)
     }
 
-    #[tokio::test]
-    async fn what_a_gateway_has_counted_is_not_counted_again() {
-        let (door, _gateway, _place) = door(&[]);
-        let now = Instant::now();
-        let taken = |is_stamped| {
-            let letter = letter("rover", "rover", is_stamped);
-            door.admits(now, "arm", &letter).is_ok()
+    const GATEWAY: Incarnation = Incarnation::from_u64(0x6a7e);
+
+    /// A link with the gateway.
+    fn gateway_by(via: Kind) -> Link {
+        Link {
+            via,
+            service: GATEWAY,
+        }
+    }
+
+    /// A link with a process that is not the gateway.
+    fn process_by(via: Kind) -> Link {
+        Link {
+            via,
+            service: Incarnation::from_u64(0x9),
+        }
+    }
+
+    /// The gateway registers itself, and the process of this door notices.
+    fn register(gateway: &HostDirectory, door: &Door) {
+        let at = "shm://0000000000006a7e#0000000000006a7e".parse().unwrap();
+        let registration = Registration {
+            role: EntryRole::Gateway,
+            ..Registration::new("mts", GATEWAY, vec![at])
         };
+        gateway.register(registration).unwrap();
+        if let Of::Process(host) = &door.of {
+            host.refresh();
+        }
+    }
+
+    #[tokio::test]
+    async fn what_the_gateway_has_counted_is_not_counted_again() {
+        let (door, gateway, _place) = door(&[]);
+        register(&gateway, &door);
+        let now = Instant::now();
+        let taken = |is_stamped, link| {
+            let letter = letter("rover", "rover", is_stamped);
+            door.admits(now, "arm", &letter, link).is_ok()
+        };
+        let link = gateway_by(Kind::Unix);
         // Held up on the way, they come closer together than they were sent.
-        assert!(taken(true) && taken(true) && taken(true));
-        assert!(taken(false));
-        assert!(!taken(false), "one a second");
+        assert!(taken(true, link) && taken(true, link) && taken(true, link));
+        assert!(taken(false, link));
+        assert!(!taken(false, link), "one a second");
+    }
+
+    #[tokio::test]
+    async fn a_stamp_evades_the_rate_on_no_link_but_the_gateways() {
+        for link in [
+            process_by(Kind::Shm),
+            process_by(Kind::Unix),
+            // The incarnation is what the peer claims there.
+            gateway_by(Kind::Tcp),
+        ] {
+            let (door, gateway, _place) = door(&[]);
+            register(&gateway, &door);
+            let now = Instant::now();
+            let stamped = letter("rover", "rover", true);
+            assert!(door.admits(now, "arm", &stamped, link).is_ok());
+            assert!(door.admits(now, "arm", &stamped, link).is_err(), "{link:?}");
+        }
     }
 
     #[tokio::test]
     async fn envelope_and_message_name_one_sender() {
         let (door, _gateway, _place) = door(&[]);
-        let judged = door.admits(Instant::now(), "arm", &letter("rover", "crex", false));
+        let letter = letter("rover", "crex", false);
+        let judged = door.admits(Instant::now(), "arm", &letter, process_by(Kind::Shm));
         let told = judged.unwrap_err();
         assert!(told.contains("rover") && told.contains("crex"), "{told}");
     }
 
     #[tokio::test]
-    async fn the_gateway_of_the_host_is_heard_and_nobody_else_by_its_name() {
+    async fn the_gateway_of_the_host_is_taken_by_its_link_and_nothing_else_by_its_name() {
         let (door, gateway, _place) = door(&["mts", "rover"]);
-        let at = "shm://1#0000000000000001".parse().unwrap();
-        let registration = Registration {
-            role: EntryRole::Gateway,
-            ..Registration::new("mts", Incarnation::random(), vec![at])
-        };
-        gateway.register(registration).unwrap();
-        let taken = |sender, is_passed_on| {
+        register(&gateway, &door);
+        let taken = |sender, is_passed_on, link| {
             let letter = letter(sender, sender, is_passed_on);
-            door.admits(Instant::now(), "arm", &letter).is_ok()
+            door.admits(Instant::now(), "arm", &letter, link).is_ok()
         };
-        assert!(taken("mts", false));
-        assert!(!taken("mts", true), "from another host");
-        assert!(!taken("rover", false));
+        for local in [Kind::Shm, Kind::Unix] {
+            assert!(taken("mts", false, gateway_by(local)));
+            assert!(!taken("mts", true, gateway_by(local)), "from another host");
+            assert!(!taken("rover", false, gateway_by(local)));
+            assert!(!taken("mts", false, process_by(local)), "by its name");
+        }
+        assert!(!taken("mts", false, gateway_by(Kind::Tcp)), "unproved");
     }
 }

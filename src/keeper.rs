@@ -1,12 +1,11 @@
 //! Keeps a process in its domain when another program removes the runtime directory, as cleaners of
 //! `/tmp` do.
 
-use std::sync::Arc;
-#[cfg(feature = "shm")]
-use std::sync::Weak;
+use std::sync::{Arc, Weak};
 use std::time::Duration;
 
 use fipa_sds::{HostDirectory, HostError};
+use fipa_transport_net::{UnixError, UnixTransport};
 #[cfg(feature = "shm")]
 use fipa_transport_shm::{ShmError, ShmTransport};
 use tokio::time::{Instant, sleep, sleep_until};
@@ -29,6 +28,7 @@ pub(crate) struct Keeper {
     pub(crate) host: Arc<HostDirectory>,
     #[cfg(feature = "shm")]
     pub(crate) shm: Option<Weak<ShmTransport>>,
+    pub(crate) unix: Option<Weak<UnixTransport>>,
 }
 
 /// Why a domain could not be joined again.
@@ -41,6 +41,8 @@ enum RejoinError {
     #[cfg(feature = "shm")]
     #[error(transparent)]
     Shm(#[from] ShmError),
+    #[error(transparent)]
+    Unix(#[from] UnixError),
 }
 
 impl Keeper {
@@ -50,6 +52,7 @@ impl Keeper {
             host,
             #[cfg(feature = "shm")]
             shm: None,
+            unix: None,
         }
     }
 
@@ -115,7 +118,8 @@ impl Keeper {
         let shm = self.shm().is_none_or(|shm| shm.is_there());
         #[cfg(not(feature = "shm"))]
         let shm = true;
-        self.place.is_there() && host && shm
+        let unix = self.unix().is_none_or(|unix| unix.is_there());
+        self.place.is_there() && host && shm && unix
     }
 
     fn rejoin(&mut self) -> Result<(), RejoinError> {
@@ -125,7 +129,14 @@ impl Keeper {
         if let Some(shm) = self.shm() {
             shm.rejoin()?;
         }
+        if let Some(unix) = self.unix() {
+            unix.rejoin()?;
+        }
         Ok(())
+    }
+
+    fn unix(&self) -> Option<Arc<UnixTransport>> {
+        self.unix.as_ref()?.upgrade()
     }
 
     #[cfg(feature = "shm")]

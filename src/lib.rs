@@ -1,8 +1,8 @@
 //! Agent communication for robots, to the FIPA standards: what a robot process embeds.
 //!
 //! A process joins a [`Domain`], registers [`Agent`]s in it, and these exchange FIPA messages with
-//! all agents of the domain: through shared memory on one host, and through the host's gateway
-//! with those of other hosts.
+//! all agents of the domain: through shared memory or Unix domain sockets on one host, and through
+//! the host's gateway with those of other hosts.
 //!
 //! ```no_run
 //! use fipa::{AgentId, Config, Domain, Performative};
@@ -34,9 +34,6 @@
 //! * [`Gateway`] (feature `net`) is what `fipa up` runs; robot processes do not need it.
 //!
 //! What must not live here: delivery (that is `fipa-mts`), transports, terminals.
-
-#[cfg(not(any(feature = "shm", feature = "net")))]
-compile_error!("fipa needs a transport: enable the feature \"shm\" or \"net\"");
 
 mod access;
 mod agent;

@@ -184,7 +184,6 @@ impl Place {
     }
 
     /// Whether it is there; as private as it has to be, as far as it is.
-    #[cfg_attr(not(feature = "shm"), expect(dead_code, reason = "nobody asks"))]
     pub(crate) fn look(&self) -> Result<bool, PlaceError> {
         for path in [&self.base, &self.path()] {
             match check_private(path) {
@@ -257,6 +256,7 @@ impl Place {
         let remove = |path: PathBuf| drop(fs::remove_dir(path));
         remove(self.part("directory"));
         remove(self.part("shm"));
+        remove(self.part("unix"));
         if self.is_empty_but_for_host() {
             let _ = fs::remove_file(self.path().join(HOST));
         }

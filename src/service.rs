@@ -24,7 +24,6 @@ use crate::watch::Taps;
 /// How often the other end of a quiet connection is asked for a sign of life. One that leads
 /// nowhere any more, because an address has changed, is found out after twice this long, which
 /// has to be less than the usual deadline of a letter.
-#[cfg(feature = "net")]
 const KEEP_ALIVE: Duration = Duration::from_secs(2);
 
 /// How long a service that ends waits for what is under way.
@@ -108,7 +107,8 @@ impl Service {
             place,
         };
         for (kind, error) in failed {
-            if role.gateway {
+            // Without a route within the host there may be another one.
+            if role.gateway && !kind.is_host_local() {
                 service.abort();
                 return Err(OpenError::Listen {
                     kind,
@@ -119,7 +119,7 @@ impl Service {
         }
         if service.locations().is_empty() {
             service.abort();
-            return Err(OpenError::NoTransport(told(&refused)));
+            return Err(OpenError::NoTransport(told(config, &refused)));
         }
         for (kind, error) in &refused {
             tracing::warn!(%kind, error, "a transport cannot be used; going on without it");
@@ -156,13 +156,13 @@ impl Service {
         }
     }
 
-    /// Uses the orders and the deadline of this configuration from now on.
+    /// Uses the orders and the deadline of this configuration from now on. Of the gateway.
     #[cfg(feature = "net")]
     pub(crate) fn reorder(&self, config: &Config) {
         let mut order = config.mts.transports.clone();
         let open: Vec<Kind> = self.mts.kinds().collect();
         order.retain(|kind| open.contains(kind));
-        let routes = routes(config, &order);
+        let routes = routes(config, &order, true);
         self.mts.reorder(order, routes, config.mts.deadline);
     }
 
@@ -239,19 +239,24 @@ fn was_removed(error: &HostError) -> bool {
     }
 }
 
-fn told(refused: &[(Kind, String)]) -> String {
-    let texts: Vec<String> = refused
-        .iter()
+fn told(config: &Config, refused: &[(Kind, String)]) -> String {
+    let refused = refused.iter();
+    let mut texts: Vec<String> = refused
         .map(|(kind, error)| format!("{kind}: {error}"))
         .collect();
+    if !config.mts.transports.iter().any(|it| it.is_host_local()) {
+        let unused = "within a host, list shm or unix in mts.transports, or set \
+                      transport.tcp.processes for tcp";
+        texts.push(unused.to_owned());
+    }
     texts.join("; ")
 }
 
 fn core_config(config: &Config, role: &Role<'_>, incarnation: Incarnation) -> CoreConfig {
-    let order = config.mts.transports.clone();
+    let order: Vec<Kind> = used(config, role).collect();
     CoreConfig {
         forwards: role.gateway,
-        routes: routes(config, &order),
+        routes: routes(config, &order, role.gateway),
         queue: config.mts.queue,
         queue_bytes: usize::try_from(config.mts.queue_bytes).unwrap_or(usize::MAX),
         lane_bytes: usize::try_from(config.mts.queue_bytes).unwrap_or(usize::MAX),
@@ -259,24 +264,35 @@ fn core_config(config: &Config, role: &Role<'_>, incarnation: Incarnation) -> Co
     }
 }
 
-/// The exceptions of the configuration, cut to the transports that are used.
-fn routes(config: &Config, order: &[Kind]) -> Vec<(Pattern, Vec<Kind>)> {
+/// The exceptions of the configuration, cut to the transports that are used. Those that list
+/// transports between hosts only are for the gateway.
+fn routes(config: &Config, order: &[Kind], gateway: bool) -> Vec<(Pattern, Vec<Kind>)> {
     let routes = config.routes.iter().filter_map(|route| {
         // Checked when the configuration was: what does not compile cannot be here.
         let pattern = Pattern::new(&route.receiver).ok()?;
-        let used = route.transports.iter().filter(|kind| order.contains(kind));
-        Some((pattern, used.copied().collect()))
+        let used = route.transports.iter().copied();
+        let used: Vec<Kind> = used.filter(|kind| order.contains(kind)).collect();
+        let names_local = route.transports.iter().any(|kind| kind.is_host_local());
+        (gateway || names_local || !used.is_empty()).then_some((pattern, used))
     });
     routes.collect()
+}
+
+/// The kinds of transport that are wanted in this role, in order of preference. One configuration
+/// serves the gateway and all other processes of a host; only the gateway uses the network, unless
+/// the owner wants TCP within the host, too.
+fn used<'a>(config: &'a Config, role: &Role<'_>) -> impl Iterator<Item = Kind> + use<'a> {
+    let gateway = role.gateway;
+    let kinds = config.mts.transports.iter().copied();
+    kinds.filter(move |kind| {
+        let tcp = *kind == Kind::Tcp && config.transport.tcp.processes;
+        gateway || kind.is_host_local() || tcp
+    })
 }
 
 /// The transports that are wanted, built in, and work here.
 fn transports(
     config: &Config,
-    #[cfg_attr(
-        not(feature = "net"),
-        expect(unused_variables, reason = "nothing listens")
-    )]
     role: &Role<'_>,
     keeper: &mut Keeper,
     incarnation: Incarnation,
@@ -284,10 +300,11 @@ fn transports(
     refused: &mut Vec<(Kind, String)>,
 ) -> Vec<Arc<dyn Transport>> {
     let mut transports: Vec<Arc<dyn Transport>> = Vec::new();
-    for kind in &config.mts.transports {
+    for kind in used(config, role) {
         let made = match kind {
             #[cfg(feature = "shm")]
             Kind::Shm => shm(config, keeper, incarnation, handle),
+            Kind::Unix => unix(config, role, keeper, incarnation, handle),
             #[cfg(feature = "net")]
             Kind::Tcp => tcp(config, role, &keeper.place, incarnation, handle),
             #[cfg(feature = "net")]
@@ -295,7 +312,7 @@ fn transports(
             #[cfg(feature = "quic")]
             Kind::Quic => match &role.security {
                 Some(security) => quic(config, role, security, &keeper.place, incarnation, handle),
-                // On this host other processes have no keys, and no need for them.
+                // The check of the configuration does not let this happen.
                 None => continue,
             },
             // One configuration serves all processes of a robot, whatever they were built with.
@@ -306,7 +323,7 @@ fn transports(
         };
         match made {
             Ok(transport) => transports.push(transport),
-            Err(error) => refused.push((*kind, error)),
+            Err(error) => refused.push((kind, error)),
         }
     }
     transports
@@ -329,17 +346,46 @@ fn shm(
     let transport = ShmTransport::new(config, handle.clone()).map_err(|error| error.to_string())?;
     let transport = Arc::new(transport);
     keeper.shm = Some(Arc::downgrade(&transport));
-    let (mut departures, there) = (keeper.host.departures(), Arc::downgrade(&transport));
-    // The directory notices the end of every process, the transport only of those it talks to.
+    tidy(handle, keeper, &transport, ShmTransport::tidy);
+    Ok(transport)
+}
+
+fn unix(
+    config: &Config,
+    role: &Role<'_>,
+    keeper: &mut Keeper,
+    incarnation: Incarnation,
+    handle: &Handle,
+) -> Result<Arc<dyn Transport>, String> {
+    use fipa_transport_net::{UnixConfig, UnixTransport};
+    let config = UnixConfig {
+        directory: keeper.place.part("unix"),
+        identity: identity(config, role, &keeper.place, incarnation)?,
+        limits: stream_limits(config),
+    };
+    let transport = Arc::new(UnixTransport::new(config, handle.clone()));
+    keeper.unix = Some(Arc::downgrade(&transport));
+    tidy(handle, keeper, &transport, UnixTransport::tidy);
+    Ok(transport)
+}
+
+/// Has a transport remove what processes have left that ended. The directory notices the end of
+/// every process, a transport only of those that it talks to.
+fn tidy<T: Transport>(
+    handle: &Handle,
+    keeper: &Keeper,
+    transport: &Arc<T>,
+    tidy: impl Fn(&T) + Send + 'static,
+) {
+    let (mut departures, there) = (keeper.host.departures(), Arc::downgrade(transport));
     handle.spawn(async move {
         while departures.next().await {
             match there.upgrade() {
-                Some(transport) => transport.tidy(),
+                Some(transport) => tidy(&transport),
                 None => return,
             }
         }
     });
-    Ok(transport)
 }
 
 #[cfg(feature = "net")]
@@ -352,7 +398,7 @@ fn tcp(
 ) -> Result<Arc<dyn Transport>, String> {
     use fipa_transport_net::{TcpConfig, TcpTransport};
     let config = TcpConfig {
-        listen: listen(&config.transport.tcp, role),
+        listen: listen(&config.transport.tcp.listen, role),
         identity: identity(config, role, place, incarnation)?,
         limits: stream_limits(config),
         #[cfg(feature = "secure")]
@@ -371,7 +417,7 @@ fn udp(
 ) -> Result<Arc<dyn Transport>, String> {
     use fipa_transport_net::{UdpConfig, UdpTransport};
     let config = UdpConfig {
-        listen: listen(&config.transport.udp, role),
+        listen: config.transport.udp.listen.clone(),
         identity: identity(config, role, place, incarnation)?,
         limits: datagram_limits(config),
     };
@@ -389,7 +435,7 @@ fn quic(
 ) -> Result<Arc<dyn Transport>, String> {
     use fipa_transport_net::{QuicConfig, QuicTransport};
     let config = QuicConfig {
-        listen: listen(&config.transport.quic, role),
+        listen: config.transport.quic.listen.clone(),
         identity: identity(config, role, place, incarnation)?,
         limits: stream_limits(config),
         security: security.clone(),
@@ -398,7 +444,6 @@ fn quic(
 }
 
 /// The limits of transports that carry letters of any size.
-#[cfg(feature = "net")]
 fn stream_limits(config: &Config) -> fipa_transport_net::Limits {
     fipa_transport_net::Limits {
         max_letter: usize::try_from(config.transport.shm.max_letter).unwrap_or(usize::MAX),
@@ -423,15 +468,14 @@ fn datagram_limits(config: &Config) -> fipa_transport_net::UdpLimits {
 
 /// A gateway listens where its owner wants it, other processes for their own host.
 #[cfg(feature = "net")]
-fn listen(settings: &crate::config::Listen, role: &Role<'_>) -> Vec<String> {
+fn listen(addresses: &[String], role: &Role<'_>) -> Vec<String> {
     if role.gateway {
-        settings.listen.clone()
+        addresses.to_vec()
     } else {
         vec!["127.0.0.1:0".to_owned()]
     }
 }
 
-#[cfg(feature = "net")]
 fn identity(
     config: &Config,
     role: &Role<'_>,

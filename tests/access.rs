@@ -3,13 +3,21 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
+use std::net::IpAddr;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use fipa::config::Sources;
 use fipa::{
-    Agent, AgentId, Config, Domain, FailureReason, Kind, Message, Outcome, Performative, WayFault,
+    Agent, AgentId, Config, Domain, Entry, FailureReason, Gateway, Kind, Message, Outcome,
+    Performative, WayFault,
 };
+use fipa_mts::letter_for;
+use fipa_transport::{
+    Answer, Arrival, AttemptId, Body, Conclusion, Parcel, Sink, Stream, Transport as _, Verdict,
+};
+use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport};
 
 /// Two processes' memberships in a domain of their own: one without rules, and one with these.
 async fn host(kind: Kind, rules: &str) -> (Domain, Domain) {
@@ -19,6 +27,7 @@ async fn host(kind: Kind, rules: &str) -> (Domain, Domain) {
         let mut set = vec![
             format!("domain=acc-{}-{number}", std::process::id()),
             format!("mts.transports={kind}"),
+            "transport.tcp.processes=true".to_owned(),
         ];
         set.extend(more.iter().map(|it| (*it).to_owned()));
         let sources = Sources {
@@ -106,6 +115,11 @@ async fn rules_are_kept_in_shared_memory() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn rules_are_kept_over_unix_domain_sockets() {
+    rules_are_kept(Kind::Unix).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn rules_are_kept_over_tcp() {
     rules_are_kept(Kind::Tcp).await;
 }
@@ -134,4 +148,108 @@ async fn who_sends_too_much_is_refused_and_others_are_not() {
     drop((rover, crex, arm));
     lax.close().await;
     strict.close().await;
+}
+
+/// What the sink of a peer that lies is told.
+#[derive(Default)]
+struct Told(parking_lot::Mutex<Option<Conclusion>>);
+
+impl Sink for Told {
+    fn arrived(&self, _: Arrival) -> Verdict {
+        Verdict::Now(Answer::Accepted)
+    }
+
+    fn arrived_unframed(&self, _: fipa::Letter, _: Kind, _: IpAddr) {}
+
+    fn concluded(&self, _: AttemptId, conclusion: Conclusion) {
+        *self.0.lock() = Some(conclusion);
+    }
+}
+
+/// Hands a letter in the gateway's name, over TCP and with the gateway's incarnation, to an agent of
+/// a process, and returns what that process says.
+async fn hand_over(gateway: &Gateway, to: &Entry) -> Conclusion {
+    let config = TcpConfig {
+        listen: Vec::new(),
+        identity: Identity {
+            name: gateway.name().to_owned(),
+            incarnation: gateway.incarnation(),
+            domain: "any".to_owned(),
+            host: "any".to_owned(),
+        },
+        limits: Limits::default(),
+        #[cfg(feature = "secure")]
+        security: None,
+    };
+    let transport = TcpTransport::new(config, tokio::runtime::Handle::current());
+    let told = Arc::new(Told::default());
+    transport.listen(told.clone()).unwrap();
+    let message = Message::builder(Performative::Request)
+        .sender(AgentId::new(gateway.name()).unwrap())
+        .receiver(AgentId::new(&*to.name).unwrap())
+        .build()
+        .unwrap();
+    let parcel = Parcel {
+        receiver: Arc::clone(&to.name),
+        stream: Stream {
+            sender: gateway.incarnation(),
+            receiver: to.incarnation,
+        },
+        sequence: 1,
+        after: 0,
+        remaining: Duration::from_secs(5),
+        transfer: 0,
+        body: Body::Letter(letter_for(&message, SystemTime::now()).unwrap()),
+    };
+    let at = to.locations.iter().find(|it| it.kind() == Kind::Tcp);
+    transport
+        .dispatch(AttemptId(1), at.unwrap(), parcel)
+        .unwrap();
+    let began = Instant::now();
+    loop {
+        if let Some(conclusion) = told.0.lock().take() {
+            return conclusion;
+        }
+        assert!(began.elapsed() < Duration::from_secs(60));
+        tokio::time::sleep(Duration::from_millis(2)).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_name_of_the_gateway_opens_no_door_over_tcp() {
+    let domain = format!("domain=acc-{}-gateway", std::process::id());
+    let config = |more: &[&str]| {
+        let set = [&*domain, "discovery.mdns=false", "mts.name=door-mts"];
+        let set = set.iter().chain(more).map(|it| (*it).to_owned());
+        let sources = Sources {
+            set: set.collect(),
+            ..Sources::default()
+        };
+        Config::load(&sources).unwrap()
+    };
+    let gateway = Gateway::open(&config(&[])).await.unwrap();
+    let rules = config(&[
+        "transport.tcp.processes=true",
+        "access.deny={ \".*\" = [\"arm\"] }",
+    ]);
+    let strict = Domain::open(&rules).await.unwrap();
+    let arm = strict.register("arm").unwrap();
+    let entry = gateway.directory().lookup("arm").unwrap();
+    let refused = hand_over(&gateway, &entry).await;
+    let Conclusion::Answered(Answer::Failed { reason, detail }) = &refused else {
+        panic!("{refused:?}")
+    };
+    assert_eq!(*reason, FailureReason::Refused);
+    assert!(detail.contains("access.deny"), "{detail}");
+    assert!(arm.try_receive().unwrap().is_none());
+    // Without the owner's leave a process is not there at all.
+    let quiet = Domain::open(&config(&[])).await.unwrap();
+    let leg = quiet.register("leg").unwrap();
+    let entry = gateway.directory().lookup("leg").unwrap();
+    let kinds: Vec<Kind> = entry.locations.iter().map(|it| it.kind()).collect();
+    assert_eq!(kinds, [Kind::Shm, Kind::Unix]);
+    drop((arm, leg));
+    quiet.close().await;
+    strict.close().await;
+    gateway.close().await;
 }

@@ -79,7 +79,7 @@ fn agents_are_reachable_again_after_their_directory_was_removed() {
 #[ignore = "is run by the other test in a process of its own"]
 fn inside_a_directory_that_is_removed() {
     let run = runtime_dir();
-    for transports in ["shm", "shm,tcp"] {
+    for transports in ["shm", "unix", "shm,unix"] {
         let config = config(transports);
         let domains = [(); 2].map(|()| Domain::open(&config).unwrap());
         let (arm, leg) = (
@@ -132,7 +132,7 @@ fn systemd_tmpfiles_passes_over_a_directory_in_use() {
 fn inside_a_cleaned_directory() {
     let run = runtime_dir();
     let cleaned = run.parent().unwrap();
-    let config = config("shm,tcp");
+    let config = config("shm,unix");
     let domain = Domain::open(&config).unwrap();
     let (arm, leg) = (
         domain.register("arm").unwrap(),

@@ -36,7 +36,7 @@ fn config(name: u64, transports: &str) -> Config {
 }
 
 async fn large_contents() {
-    let config = config(fastrand::u64(..), "shm,tcp");
+    let config = config(fastrand::u64(..), "shm,unix");
     let here = Domain::open(&config).await.unwrap();
     let there = Domain::open(&config).await.unwrap();
     let rover = here.register("rover").unwrap();
@@ -82,7 +82,7 @@ async fn large_contents() {
         }
     }
     assert!(ways.contains(&Kind::Shm), "{ways:?}");
-    assert!(ways.contains(&Kind::Tcp), "{ways:?}");
+    assert!(ways.contains(&Kind::Unix), "{ways:?}");
     // Small letters still go.
     held.clear();
     let message = rover
@@ -124,8 +124,8 @@ fn leave(free: Option<u64>) {
 
 async fn full() {
     let name = fastrand::u64(..);
-    let here = Domain::open(&config(name, "shm,tcp")).await.unwrap();
-    let there = Domain::open(&config(name, "shm,tcp")).await.unwrap();
+    let here = Domain::open(&config(name, "shm,unix")).await.unwrap();
+    let there = Domain::open(&config(name, "shm,unix")).await.unwrap();
     let rover = here.register("rover").unwrap();
     let arm = there.register("arm").unwrap();
     let letter = async || {
@@ -147,10 +147,10 @@ async fn full() {
     // First contact, for which there is no room at all.
     leave(Some(0));
     let (via, attempts) = letter().await;
-    assert_eq!(via, Kind::Tcp);
+    assert_eq!(via, Kind::Unix);
     assert!(attempts.contains("/dev/shm"), "{attempts}");
     // A process starts without shared memory, if it has another transport.
-    let late = Domain::open(&config(name, "shm,tcp")).await.unwrap();
+    let late = Domain::open(&config(name, "shm,unix")).await.unwrap();
     drop(late);
     let error = Domain::open(&config(name, "shm")).await.err().unwrap();
     assert!(error.to_string().contains("/dev/shm"), "{error}");

@@ -14,7 +14,7 @@ use tokio::time::timeout;
 
 use services::{ARM, Place, host, letter, number};
 
-const ORDER: [Kind; 2] = [Kind::Shm, Kind::Tcp];
+const ORDER: [Kind; 2] = [Kind::Shm, Kind::Unix];
 
 /// Processes that can have the mailbox open.
 const CLIENTS: usize = 3;
@@ -40,11 +40,11 @@ async fn beyond_max_clients_letters_take_the_next_route() {
             };
             let expected = match sender < CLIENTS {
                 true => Kind::Shm,
-                false => Kind::Tcp,
+                false => Kind::Unix,
             };
             assert_eq!(via, expected, "sender {sender}");
             // The route says why it was not taken, at least the first time.
-            if letter == 0 && expected == Kind::Tcp {
+            if letter == 0 && expected == Kind::Unix {
                 let reasons: Vec<String> = attempts.iter().map(ToString::to_string).collect();
                 let reasons = reasons.join("; ");
                 assert!(reasons.contains("max_clients"), "{reasons}");

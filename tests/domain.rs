@@ -58,9 +58,11 @@ fn reason(deliveries: &Deliveries) -> FailureReason {
 #[tokio::test(flavor = "multi_thread")]
 async fn letters_go_both_ways_and_say_by_which_way() {
     for (transports, via) in [
-        ("shm,tcp", Kind::Shm),
-        ("tcp", Kind::Tcp),
-        ("tcp,shm", Kind::Tcp),
+        ("shm,unix,tcp", Kind::Shm),
+        ("unix", Kind::Unix),
+        ("unix,shm", Kind::Unix),
+        // Not without the owner's leave.
+        ("tcp,unix", Kind::Unix),
     ] {
         let config = config(&[&format!("mts.transports={transports}")]);
         let (here, there) = two(&config).await;
@@ -375,13 +377,13 @@ async fn large_content_for_several_receivers_is_in_memory_once() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn large_content_for_several_receivers_goes_to_those_without_shared_memory_too() {
-    let config = config(&["mts.transports=shm,tcp"]);
+    let config = config(&["mts.transports=shm,unix"]);
     let domain = format!("domain={}", config.domain);
     let plain = Config::load(&Sources {
         set: vec![
             domain,
             "discovery.mdns=false".into(),
-            "mts.transports=tcp".into(),
+            "mts.transports=unix".into(),
         ],
         ..Sources::default()
     });
@@ -402,7 +404,7 @@ async fn large_content_for_several_receivers_goes_to_those_without_shared_memory
         .await
         .unwrap();
     assert!(sent.all_succeeded(), "{sent}");
-    for (arm, via) in arms.iter().zip([Kind::Shm, Kind::Shm, Kind::Tcp]) {
+    for (arm, via) in arms.iter().zip([Kind::Shm, Kind::Shm, Kind::Unix]) {
         let incoming = arm.receive().await.unwrap();
         assert_eq!(incoming.via, Some(via));
         assert_eq!(incoming.message.content().unwrap(), &vec![9; 1 << 20]);
@@ -585,4 +587,26 @@ fn members_may_come_and_go_all_at_once() {
             });
         }
     });
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_process_does_not_take_to_the_network_and_says_what_to_list_instead() {
+    let config = config(&["mts.transports=tcp"]);
+    let error = Domain::open(&config).await.err().unwrap().to_string();
+    assert!(error.contains("list shm or unix"), "{error}");
+    assert!(error.contains("transport.tcp.processes"), "{error}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn routes_between_hosts_leave_those_within_a_host_alone() {
+    // Of the gateway, which passes on by TCP what processes hand it by the usual order.
+    let config = config(&["routes={ \"arm\" = [\"tcp\"], \"leg\" = [\"unix\"] }"]);
+    let (here, there) = two(&config).await;
+    let rover = here.register("rover").unwrap();
+    for (name, via) in [("arm", Kind::Shm), ("leg", Kind::Unix)] {
+        let agent = there.register(name).unwrap();
+        let sent = rover.send(inform(&rover, name, "x")).await.unwrap();
+        assert_eq!(only(&sent).via(), Some(via), "{sent}");
+        drop(agent);
+    }
 }

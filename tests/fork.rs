@@ -26,7 +26,7 @@ const PASSED: i32 = 7;
 fn config(domain: &str) -> Config {
     let set = vec![
         format!("domain={domain}"),
-        "mts.transports=shm,tcp".to_owned(),
+        "mts.transports=shm,unix,tcp".to_owned(),
         "mts.deadline=20s".to_owned(),
     ];
     Config::load(&Sources {

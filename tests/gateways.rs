@@ -315,7 +315,7 @@ async fn a_newcomer_that_writes_can_be_answered_at_once() {
 async fn the_gateway_tells_which_way_letters_go_and_what_became_of_them() {
     let here = Host::new(&[
         "mts.deadline=1s",
-        "routes={ \"arm.*\" = [\"tcp\", \"shm\"] }",
+        "routes={ \"arm.*\" = [\"tcp\", \"unix\"] }",
     ]);
     let there = Host::new(&[]);
     let (near, at_home) = here.occupied().await;
@@ -353,7 +353,8 @@ async fn the_gateway_tells_which_way_letters_go_and_what_became_of_them() {
     let mut routes = own.routes.iter();
     let to_arm = routes.find(|it| it.receiver == arm.name()).unwrap();
     assert_eq!(to_arm.gateway, Some(near.incarnation()));
-    assert_eq!(to_arm.ways[0].location.kind(), Kind::Tcp);
+    assert_eq!(to_arm.exception.as_deref(), Some("arm.*"));
+    assert_eq!(to_arm.ways[0].location.kind(), Kind::Unix);
 
     // A gateway that is killed says no goodbye: what is tried fails, and that is told.
     let mut killed = Some(far);
@@ -414,7 +415,7 @@ async fn another_configuration_loses_no_letter() {
     let changing = async {
         let mut config = here.config.clone();
         for round in 0_u16.. {
-            let order = ["shm,tcp", "tcp,shm"][usize::from(round % 2)];
+            let order = ["shm,unix,tcp", "tcp,unix,shm"][usize::from(round % 2)];
             config = here.configured(&[
                 &format!("mts.transports={order}"),
                 &format!("mts.deadline={}s", 5 + round % 3),

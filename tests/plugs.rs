@@ -103,13 +103,16 @@ async fn pull_plugs(order: [Kind; 3]) -> Vec<(Kind, Kind, Duration)> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_plug_that_is_pulled_loses_doubles_and_disorders_nothing() {
-    let [shm, tcp, udp] = [Kind::Shm, Kind::Tcp, Kind::Udp];
+    let [shm, unix, tcp, udp] = [Kind::Shm, Kind::Unix, Kind::Tcp, Kind::Udp];
     for order in [
+        [shm, unix, tcp],
+        [unix, shm, tcp],
+        [unix, tcp, shm],
         [shm, tcp, udp],
         [shm, udp, tcp],
         [tcp, shm, udp],
-        [tcp, udp, shm],
-        [udp, shm, tcp],
+        [tcp, udp, unix],
+        [udp, unix, tcp],
         [udp, tcp, shm],
     ] {
         for (broken, next, took) in pull_plugs(order).await {

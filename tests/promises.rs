@@ -34,7 +34,7 @@ use tokio::runtime::Handle;
 use tokio::task::spawn_blocking;
 use tokio::time::{sleep, timeout};
 
-const ORDER: [Kind; 3] = [Kind::Shm, Kind::Quic, Kind::Tcp];
+const ORDER: [Kind; 4] = [Kind::Shm, Kind::Unix, Kind::Quic, Kind::Tcp];
 /// Between the gateways.
 const OUTSIDE: [Kind; 2] = [Kind::Quic, Kind::Tcp];
 /// The agents that send, each a stream of its own to the arm.
@@ -98,7 +98,13 @@ impl Draft {
 struct NoCancel;
 
 impl Gate for NoCancel {
-    fn admits(&self, _: Instant, _: &str, letter: &Letter) -> Result<(), String> {
+    fn admits(
+        &self,
+        _: Instant,
+        _: &str,
+        letter: &Letter,
+        _: fipa_mts::Link,
+    ) -> Result<(), String> {
         let message = Message::decode(letter.payload()).map_err(|error| error.to_string())?;
         match *message.performative() == Performative::Cancel {
             true => Err("cancel is not allowed here".to_owned()),
@@ -248,17 +254,16 @@ async fn outcome(sending: Sending) -> Outcome {
 async fn through(seed: u64) -> String {
     let mut random = Rng::with_seed(seed);
     let (here, there) = (host(), host());
-    let [_, near_keys, far_keys, arm_keys] =
-        friends(here.path(), ["rovers", "near", "far", "arms"]);
+    let [near_keys, far_keys] = friends(here.path(), ["near", "far"]);
     let rovers = Place::start(here.path(), "rovers", &[Kind::Shm], false);
     let near = Place::with_keys(here.path(), "near", &ORDER, true, Some(near_keys));
     let far = Place::with_gate(there.path(), "far", &ORDER, far_keys, Arc::new(NoCancel));
-    let arms = Place::with_keys(there.path(), "arms", &ORDER, false, Some(arm_keys));
+    let arms = Place::start(there.path(), "arms", &[Kind::Shm, Kind::Unix], false);
     let quic = Link::before(&far.at(Kind::Quic)).await;
     let tcp = Link::before(&far.at(Kind::Tcp)).await;
     rovers.knows_arm_at(vec![near.at(Kind::Shm)]);
     near.knows_arm_at(vec![quic.location.clone(), tcp.location.clone()]);
-    far.knows_arm_at(vec![arms.at(Kind::Shm), arms.at(Kind::Tcp)]);
+    far.knows_arm_at(arms.everywhere());
     arms.knows_arm_at(arms.everywhere());
     for (name, sender) in SENDERS {
         rovers.mts.register(name.into(), sender);

@@ -98,7 +98,7 @@ fn every_way_is_measured_beside_its_limit() {
             assert!(measured("shm", "block", size, fill), "{report:#}");
             assert!(measured("shm, encoded", "spin", size, fill), "{report:#}");
         }
-        assert!(measured("tcp", "block", size, "copied"), "{report:#}");
+        assert!(measured("unix", "block", size, "copied"), "{report:#}");
         for gateways in ["gateways tcp", "gateways tcp, tls", "gateways quic"] {
             assert!(measured(gateways, "block", size, "copied"), "{report:#}");
         }

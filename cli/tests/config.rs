@@ -89,7 +89,7 @@ domain = \"lab\"                       # fipa.toml:1
 
 [mts]
 name = \"sherpa\"                      # fipa.toml:3
-transports = [\"shm\", \"tcp\"]          # default
+transports = [\"shm\", \"unix\", \"tcp\"]  # default
 deadline = \"9s\"                      # --set
 queue = 256                          # default
 queue_bytes = \"64MiB\"                # default
@@ -101,6 +101,7 @@ spin = \"50us\"                        # default
 
 [transport.tcp]
 listen = [\"127.0.0.1:0\"]             # default
+processes = false                    # default
 
 [transport.udp]
 listen = [\"127.0.0.1:0\"]             # default
@@ -160,7 +161,7 @@ fn show_as_json_tells_the_origin_of_every_value() {
                 "origin": { "from": "file", "path": "fipa.toml", "line": 2 } }),
         json!({ "path": ["discovery", "mdns"], "value": false,
                 "origin": { "from": "set", "assignment": "discovery.mdns=false" } }),
-        json!({ "path": ["mts", "transports"], "value": ["shm", "tcp"],
+        json!({ "path": ["mts", "transports"], "value": ["shm", "unix", "tcp"],
                 "origin": { "from": "default" } }),
     ] {
         assert!(settings.contains(&expected), "{expected} in {settings:#?}");

@@ -55,7 +55,10 @@ fn every_step_does_what_it_says() {
     assert_eq!(steps.len(), 11);
     let via: Vec<&Value> = steps.iter().map(|step| &step["via"]).collect();
     assert_eq!((via[1], via[2]), (&"shm".into(), &"tcp".into()));
-    assert_eq!(steps[6]["attempts"][0]["via"], "shm");
+    assert_eq!(
+        (via[6], &steps[6]["attempts"][0]["via"]),
+        (&"unix".into(), &"shm".into())
+    );
     assert_eq!(steps[8]["sender"], "arm_3");
     let itself = steps[8]["caught_itself"].as_str().unwrap();
     assert!(itself.contains("from arm_6"), "{itself}");

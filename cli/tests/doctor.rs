@@ -47,7 +47,9 @@ fn a_machine_in_order_is_found_so_and_left_so() {
     let table = host.run(&["doctor"]).done();
     assert!(table.starts_with("VERDICT"), "{table}");
     assert!(table.contains("limit of open files"), "{table}");
-    let none = host.run(&["doctor", "--set", "mts.transports=tcp"]).done();
+    let none = host
+        .run(&["doctor", "--set", "mts.transports=unix,tcp"])
+        .done();
     assert!(!none.contains("/dev/shm"), "{none}");
 }
 

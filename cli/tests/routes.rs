@@ -26,7 +26,7 @@ fn which_way_letters_would_go() {
     assert!(first.starts_with("shm://"), "{first}");
 
     // An exception, as a process that starts now has it, and as the gateway has it.
-    let exception = "routes={ \"arm_.*\" = [\"tcp\"] }";
+    let exception = "routes={ \"arm_.*\" = [\"unix\"] }";
     let peer = "discovery.static={ crex = [\"tcp://127.0.0.1:9\"] }";
     let _gateway = host.start(&["up", "--set", "mts.name=sherpa", "--set", peer]);
     let told = host.run(&["routes", "arm_1", "--json", "--set", exception]);
@@ -35,7 +35,7 @@ fn which_way_letters_would_go() {
     assert_eq!(route["exception"], "arm_.*");
     let ways = route["ways"].as_array().unwrap();
     let location = |way: &Value| way["location"].as_str().unwrap().to_owned();
-    assert!(location(&ways[0]).starts_with("tcp://"), "{ways:?}");
+    assert!(location(&ways[0]).starts_with("unix://"), "{ways:?}");
     let standing = |way: &Value| way["standing"]["standing"].clone();
     assert_eq!(standing(ways.last().unwrap()), "not_in_order");
     let gateway = &told["gateway"];

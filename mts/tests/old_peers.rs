@@ -10,7 +10,7 @@ use std::time::{Duration, Instant, SystemTime};
 use bytes::Bytes;
 use fipa_acl::{AgentId, Dialect, Letter, Message, Payload, Performative, Representation};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Received, Submission, Unframed};
-use fipa_mts::{Gate, letter_for};
+use fipa_mts::{Gate, Link, letter_for};
 use fipa_sds::{
     ContactDirectory, Directory, MemoryDirectory, MergedDirectory, Mts, Registration,
     StaticDirectory,
@@ -194,7 +194,7 @@ fn nobody_is_told_where_somebody_elses_letter_says_it_is() {
 struct Refusing(&'static str);
 
 impl Gate for Refusing {
-    fn admits(&self, _: Instant, receiver: &str, _: &Letter) -> Result<(), String> {
+    fn admits(&self, _: Instant, receiver: &str, _: &Letter, _: Link) -> Result<(), String> {
         match receiver.starts_with(self.0) {
             true => Err("a rule denies it".to_owned()),
             false => Ok(()),

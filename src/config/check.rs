@@ -439,7 +439,7 @@ impl Findings {
 
     fn location(&mut self, path: &[&str], location: &Location) {
         let kind = location.kind();
-        if kind == Kind::Shm {
+        if kind.is_host_local() {
             self.add(
                 path,
                 format_args!("lists {location}, which leads to no other host"),

@@ -52,7 +52,7 @@ pub(super) struct Wrong {
     pub(super) reason: String,
 }
 
-const KINDS: &str = r#"a list of transports such as ["shm", "tcp"]"#;
+const KINDS: &str = r#"a list of transports such as ["shm", "unix", "tcp"]"#;
 const SIZE: &str = r#"a size such as "64MiB""#;
 const ACCESS: &str = r#"a list of receivers such as ["arm_.* performative=request,cancel"]"#;
 const ADDRESSES: &str = r#"a list of numeric addresses with port such as ["127.0.0.1:0"]"#;
@@ -128,6 +128,13 @@ pub(super) const KEYS: &[Key] = &[
         expected: ADDRESSES,
         write: |config, value| addresses(value).map(|all| config.transport.tcp.listen = all),
         read: |config| Value::list(&config.transport.tcp.listen),
+    },
+    Key {
+        path: &["transport", "tcp", "processes"],
+        shape: Shape::Plain,
+        expected: "true or false",
+        write: |config, value| truth(value).map(|on| config.transport.tcp.processes = on),
+        read: |config| Value::Truth(config.transport.tcp.processes),
     },
     Key {
         path: &["transport", "udp", "listen"],

@@ -42,7 +42,10 @@ fn nothing_said_gives_the_defaults() {
     assert_eq!(effective.file(), None);
     assert_eq!(effective.config(), &Config::for_host("sherpa"));
     assert_eq!(effective.config().mts.name, "sherpa-mts");
-    assert_eq!(effective.config().mts.transports, [Kind::Shm, Kind::Tcp]);
+    assert_eq!(
+        effective.config().mts.transports,
+        [Kind::Shm, Kind::Unix, Kind::Tcp]
+    );
     assert!(Config::load(&Sources::default()).unwrap().mts.name == "localhost-mts");
 }
 
@@ -291,6 +294,7 @@ spin = "50us"                        # default
 
 [transport.tcp]
 listen = ["127.0.0.1:0"]             # default
+processes = false                    # default
 
 [transport.udp]
 listen = ["127.0.0.1:0"]             # default

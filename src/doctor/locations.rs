@@ -1,7 +1,6 @@
 //! Where other hosts reach the gateway at present.
 
 use super::{Area, Check, Verdict};
-use crate::config::Listen;
 use crate::{Config, Kind};
 
 const AREA: Area = Area("network");
@@ -9,10 +8,10 @@ const LOCATIONS: &str = "locations";
 
 pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     let transport = &config.transport;
-    let listens: [(Kind, &Listen); 3] = [
-        (Kind::Tcp, &transport.tcp),
-        (Kind::Udp, &transport.udp),
-        (Kind::Quic, &transport.quic),
+    let listens: [(Kind, &[String]); 3] = [
+        (Kind::Tcp, &transport.tcp.listen),
+        (Kind::Udp, &transport.udp.listen),
+        (Kind::Quic, &transport.quic.listen),
     ];
     let used = |kind| config.mts.transports.contains(&kind);
     let built = |kind| kind != Kind::Quic || cfg!(feature = "quic");
@@ -21,7 +20,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         if !used(kind) || !built(kind) {
             continue;
         }
-        match fipa_transport_net::reachable_at(&listen.listen) {
+        match fipa_transport_net::reachable_at(listen) {
             Ok(addresses) => found.extend(addresses.into_iter().map(|it| (kind, it))),
             Err(error) => {
                 checks.push(AREA.wrong(
@@ -40,7 +39,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     let open = listens
         .iter()
         .filter(|(kind, _)| used(*kind))
-        .flat_map(|(_, listen)| &listen.listen)
+        .flat_map(|(_, listen)| *listen)
         .any(|text| !crate::config::is_on_loopback(text));
     let leads_here = found
         .iter()

@@ -8,6 +8,7 @@
 mod locations;
 #[cfg(feature = "mdns")]
 mod network;
+mod place;
 mod queues;
 #[cfg(feature = "net")]
 mod security;
@@ -53,6 +54,7 @@ pub enum Verdict {
 #[must_use]
 pub fn examine(config: &Config) -> Vec<Check> {
     let mut checks = Vec::new();
+    place::examine(config, &mut checks);
     #[cfg(feature = "shm")]
     if config.mts.transports.contains(&crate::Kind::Shm) {
         shm::examine(config, &mut checks);

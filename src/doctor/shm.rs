@@ -32,7 +32,6 @@ const FIRST_PERSON: u32 = 1000;
 
 pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     let place = Place::of(&config.domain);
-    checks.push(directory(&place));
     let settings = ShmConfig {
         capacity: config.transport.shm.capacity,
         ..ShmConfig::new(place.part("shm"), place.prefix(), Incarnation::random())
@@ -53,24 +52,6 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     checks.push(descriptors());
     checks.extend(instances());
     checks.extend(remove_ipc(Path::new("/"), geteuid().as_raw()));
-}
-
-fn directory(place: &Place) -> Check {
-    const CHECK: &str = "directory of the domain";
-    let path = place.path();
-    match place.look() {
-        Ok(true) => AREA.fine(CHECK, format!("{} is private", path.display())),
-        Ok(false) => {
-            let found = format!("{} is made when the first process starts", path.display());
-            AREA.fine(CHECK, found)
-        }
-        Err(error) => AREA.wrong(
-            CHECK,
-            Verdict::Bad,
-            error.to_string(),
-            "no process can join the domain until that is so",
-        ),
-    }
 }
 
 fn size(found: &Inspection, capacity: u64) -> Check {

@@ -8,7 +8,7 @@ use std::time::Instant;
 use fipa_sds::{
     ContactDirectory, Directory, Entry, HostDirectory, MergedDirectory, Reach, Registration, Role,
 };
-use fipa_transport::{Incarnation, Kind, Location};
+use fipa_transport::{Incarnation, Location};
 
 use super::Network;
 use crate::config::is_on_loopback;
@@ -34,7 +34,7 @@ impl Publisher {
     fn announced_locations(&self) -> Vec<Location> {
         let mut locations = self.service.locations();
         locations.retain(|location| {
-            let stays_here = location.kind() == Kind::Shm;
+            let stays_here = location.kind().is_host_local();
             !stays_here && (self.only_loopback || !is_on_loopback(location.address()))
         });
         locations

@@ -180,7 +180,7 @@ impl Stage {
         let settings = [
             &format!("domain={domain}"),
             "discovery.mdns=false",
-            "mts.transports=shm,tcp",
+            "mts.transports=shm,unix,tcp",
             "mts.deadline=10s",
             "mts.queue=24",
         ];

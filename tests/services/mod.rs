@@ -16,6 +16,7 @@ use fipa_transport::{Incarnation, Location, Transport};
 pub(crate) use fipa_transport_net::secure::Security;
 use fipa_transport_net::{
     Counters, Identity, Limits, TcpConfig, TcpTransport, UdpConfig, UdpLimits, UdpTransport,
+    UnixConfig, UnixTransport,
 };
 #[cfg(feature = "quic")]
 use fipa_transport_net::{QuicConfig, QuicTransport};
@@ -54,6 +55,7 @@ pub(crate) struct Place {
     pub(crate) mts: Mts,
     directory: Arc<MemoryDirectory>,
     shm: Option<Arc<ShmTransport>>,
+    unix: Option<Arc<UnixTransport>>,
     tcp: Option<Arc<TcpTransport>>,
     udp: Option<Arc<UdpTransport>>,
     #[cfg(feature = "quic")]
@@ -143,6 +145,14 @@ impl Place {
             config.max_clients = bounds.clients.unwrap_or(config.max_clients);
             Arc::new(ShmTransport::new(config, handle.clone()).unwrap())
         });
+        let unix = has(Kind::Unix).then(|| {
+            let config = UnixConfig {
+                directory: host.join("unix"),
+                identity: identity.clone(),
+                limits: limits.clone(),
+            };
+            Arc::new(UnixTransport::new(config, handle.clone()))
+        });
         let tcp = has(Kind::Tcp).then(|| {
             let config = TcpConfig {
                 listen: listen.clone(),
@@ -173,6 +183,7 @@ impl Place {
         });
         let transports = [
             shm.clone().map(|it| it as Arc<dyn Transport>),
+            unix.clone().map(|it| it as Arc<dyn Transport>),
             tcp.clone().map(|it| it as Arc<dyn Transport>),
             udp.clone().map(|it| it as Arc<dyn Transport>),
             #[cfg(feature = "quic")]
@@ -201,6 +212,7 @@ impl Place {
             mts,
             directory,
             shm,
+            unix,
             tcp,
             udp,
             #[cfg(feature = "quic")]
@@ -230,6 +242,7 @@ impl Place {
     pub(crate) fn transport(&self, kind: Kind) -> Arc<dyn Transport> {
         let found = match kind {
             Kind::Shm => self.shm.clone().map(|it| it as Arc<dyn Transport>),
+            Kind::Unix => self.unix.clone().map(|it| it as Arc<dyn Transport>),
             Kind::Tcp => self.tcp.clone().map(|it| it as Arc<dyn Transport>),
             #[cfg(feature = "quic")]
             Kind::Quic => self.quic.clone().map(|it| it as Arc<dyn Transport>),

@@ -1,6 +1,6 @@
 //! Why a connection ends, and what that means for the parcels on it.
 
-use fipa_transport::{Incarnation, WayError, WayFault};
+use fipa_transport::{Incarnation, Location, WayError, WayFault};
 
 /// Why a connection ends.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -37,6 +37,12 @@ pub(crate) enum End {
 }
 
 impl End {
+    /// No connection could be opened to a location.
+    pub(crate) fn unreachable(to: &Location, what: &dyn std::fmt::Display) -> Self {
+        let detail = format!("{}: {what}", to.address());
+        Self::NotOpened(WayError::new(WayFault::Unreachable, detail))
+    }
+
     /// Whether this side ends the connection in good order, with a goodbye.
     pub(crate) fn is_orderly(&self) -> bool {
         matches!(

@@ -41,6 +41,7 @@ impl Identity {
 
     /// Whether somebody with the other identity is on another host, or in another domain, which
     /// stands for one.
+    #[cfg(feature = "ip")]
     pub(crate) fn is_remote(&self, other: &Self) -> bool {
         self.host != other.host || self.domain != other.domain
     }
@@ -74,6 +75,7 @@ mod tests {
         assert!(long.fault().unwrap().contains("domain"));
     }
 
+    #[cfg(feature = "ip")]
     #[test]
     fn another_host_or_another_domain_is_remote() {
         let other_host = Identity {

@@ -1,37 +1,59 @@
-//! Letters between hosts.
+//! Letters over sockets.
 //!
-//! * [`TcpTransport`] carries parcels in frames over one persistent connection per peer, and takes
-//!   the unframed letters of old peers on the same port.
-//! * [`UdpTransport`] carries parcels that fit one datagram, acknowledged.
-//! * [`QuicTransport`] (feature `quic`) carries parcels in the same frames over QUIC, each in a
+//! * [`UnixTransport`] carries parcels in frames over Unix domain sockets, between the processes of
+//!   one domain on one host.
+//! * `TcpTransport` (feature `ip`) carries them in the same frames over one persistent connection
+//!   per peer, and takes the unframed letters of old peers on the same port.
+//! * `UdpTransport` (feature `ip`) carries parcels that fit one datagram, acknowledged.
+//! * `QuicTransport` (feature `quic`) carries parcels in the same frames over QUIC, each in a
 //!   stream of its own.
 //!
-//! Each has a module tree of its own. Beside them stands what they share: who is there
-//! ([`Identity`]) and how they introduce themselves (`hello`), addresses as text (`address`), how
-//! answers are written (`answer`), how much a peer may send (`ration`), and why a connection ends
-//! (`end`).
+//! Each has a module tree of its own. Beside them stands what they share: frames and connections
+//! (`stream`), how endpoints introduce themselves ([`Identity`], `hello`), addresses as text
+//! (`address`), how answers are written (`answer`), how much a peer may send (`ration`), and why a
+//! connection ends (`end`).
 //!
 //! What must not live here: routes, retries, order across transports, directories. A transport
 //! tries once and reports.
 
+#[cfg(feature = "ip")]
 mod address;
 mod answer;
 mod end;
 mod hello;
 mod identity;
+#[cfg(feature = "ip")]
 mod interfaces;
 #[cfg(feature = "quic")]
 mod quic;
+#[cfg_attr(
+    not(any(feature = "ip", test)),
+    expect(dead_code, reason = "the processes of this host may send any number")
+)]
 mod ration;
 #[cfg(feature = "secure")]
 pub mod secure;
+#[cfg_attr(
+    not(any(feature = "ip", test)),
+    expect(dead_code, reason = "only TCP resets connections")
+)]
 mod seldom;
+mod stream;
+#[cfg(feature = "ip")]
 mod tcp;
+#[cfg(feature = "ip")]
 mod udp;
+mod unix;
 
+#[cfg(feature = "ip")]
 pub use address::{AddressError, reachable_at};
 pub use identity::Identity;
 #[cfg(feature = "quic")]
 pub use quic::{QuicConfig, QuicTransport};
-pub use tcp::{Counters, Limits, TcpConfig, TcpTransport};
+pub use stream::config::Limits;
+pub use stream::counters::Counters;
+#[cfg(feature = "ip")]
+pub use tcp::{TcpConfig, TcpTransport};
+#[cfg(feature = "ip")]
 pub use udp::{UdpConfig, UdpCounters, UdpLimits, UdpTransport};
+pub use unix::{UnixConfig, UnixError, UnixTransport};

@@ -109,6 +109,7 @@ impl Ration {
 }
 
 /// Whether an address is that of one peer: the processes of this host are many at one address.
+#[cfg(feature = "ip")]
 pub(crate) fn is_one_peer(ip: IpAddr) -> bool {
     !ip.to_canonical().is_loopback()
 }

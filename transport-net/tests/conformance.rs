@@ -1,4 +1,5 @@
-//! The rules of every transport, kept by TCP, UDP and QUIC on loopback, over IPv4 and IPv6.
+//! The rules of every transport, kept by Unix domain sockets, and by TCP, UDP and QUIC on loopback,
+//! over IPv4 and IPv6.
 #![allow(
     clippy::unwrap_used,
     reason = "a test or bench that cannot go on may panic"
@@ -11,7 +12,7 @@ use std::sync::Arc;
 
 use fipa_transport::conformance::Fixture;
 use fipa_transport::{Faulty, Kind, Location, Transport};
-use fipa_transport_net::{TcpTransport, UdpTransport};
+use fipa_transport_net::{TcpTransport, UdpTransport, UnixTransport};
 use tokio::net::TcpSocket;
 
 struct Tcp {
@@ -94,6 +95,36 @@ impl Fixture for Udp {
         let address = self.nowhere.local_addr().unwrap().to_string();
         Location::new(Kind::Udp, &address).unwrap()
     }
+}
+
+struct Unix {
+    runtime: common::Threads,
+    directory: tempfile::TempDir,
+}
+
+impl Unix {
+    fn new() -> Self {
+        Self {
+            runtime: common::runtime(),
+            directory: tempfile::tempdir().unwrap(),
+        }
+    }
+}
+
+impl Fixture for Unix {
+    fn endpoint(&self) -> Arc<dyn Transport> {
+        let config = common::unix_config(&self.directory.path().join("unix"));
+        Arc::new(UnixTransport::new(config, self.runtime.handle().clone()))
+    }
+
+    fn nowhere(&self) -> Location {
+        Location::new(Kind::Unix, "0000000000000001").unwrap()
+    }
+}
+
+mod unix {
+    use super::Unix;
+    fipa_transport::conformance_tests!(Unix::new());
 }
 
 mod tcp_ipv4 {

@@ -21,13 +21,22 @@ pub enum Kind {
     Udp,
     /// Letters over QUIC, encrypted.
     Quic,
+    /// Framed, acknowledged letters over Unix domain sockets between processes of one host.
+    Unix,
     /// UDT, one of the transports of fipa_services. Not [supported](Kind::is_supported).
     Udt,
 }
 
 impl Kind {
-    /// Every kind, in no particular order.
-    pub const ALL: [Self; 5] = [Self::Shm, Self::Tcp, Self::Udp, Self::Quic, Self::Udt];
+    /// Every kind, for encoding: the position is the code on the wire, so new ones go last.
+    pub const ALL: [Self; 6] = [
+        Self::Shm,
+        Self::Tcp,
+        Self::Udp,
+        Self::Quic,
+        Self::Unix,
+        Self::Udt,
+    ];
 
     /// Whether this project has a transport of this kind. Locations of other kinds occur in the
     /// directory, and letters to them fail as
@@ -45,8 +54,16 @@ impl Kind {
             Self::Tcp => "tcp",
             Self::Udp => "udp",
             Self::Quic => "quic",
+            Self::Unix => "unix",
             Self::Udt => "udt",
         }
+    }
+
+    /// Whether locations of this kind lead to processes of this host only. They mean nothing on
+    /// other hosts, and are neither told to them nor taken from them.
+    #[must_use]
+    pub const fn is_host_local(self) -> bool {
+        matches!(self, Self::Shm | Self::Unix)
     }
 }
 
@@ -262,7 +279,7 @@ pub enum LocationError {
     #[error("not a location (expected for example tcp://10.0.0.2:7788): {0:?}")]
     NoScheme(String),
     /// No transport has this name.
-    #[error("unknown transport {0:?} (known: shm, tcp, udp, quic)")]
+    #[error("unknown transport {0:?} (known: shm, unix, tcp, udp, quic)")]
     UnknownKind(String),
     /// The address is empty or too long.
     #[error("address of {0} bytes (1 to {max} allowed)", max = Location::MAX_ADDRESS)]
@@ -336,6 +353,7 @@ mod tests {
             "tcp://10.0.0.2:7788",
             "tcp://[fe80::1%eth0]:7788#00abcdef01234567",
             "shm://0000000000000001#0000000000000001",
+            "unix://0000000000000001#0000000000000001",
             "tcp://10.0.0.3:6789;fipa-services",
             "tcp://[fe80::1%eth0]:6789;jade#00abcdef01234567",
             "udt://10.0.0.3:6790;fipa-services",

@@ -49,7 +49,7 @@ pub(crate) struct Plan {
 impl Default for Plan {
     fn default() -> Self {
         Self {
-            transports: &["shm", "tcp"],
+            transports: &["shm", "unix", "tcp"],
             deadline: Duration::from_secs(3),
             dials: None,
             is_dialled: None,
@@ -391,13 +391,18 @@ impl Account {
     }
 }
 
+/// Whether a transport leads to other hosts.
+fn is_beyond(kind: &str) -> bool {
+    !["shm", "unix"].contains(&kind)
+}
+
 impl Party {
     fn new(network: &Network, at: usize, plan: &Plan) -> Self {
         let host = network.host(at);
         let known = (0..3).filter(|other| plan.tells(at, *other));
         let peers = known.map(|other| {
             let addresses = plan.addresses(network, other);
-            let kinds = plan.transports.iter().filter(|kind| **kind != "shm");
+            let kinds = plan.transports.iter().filter(|kind| is_beyond(kind));
             let ways: Vec<String> = kinds
                 .flat_map(|kind| addresses.iter().map(move |it| (kind, it)))
                 .map(|(kind, address)| format!("\"{kind}://{address}:{PORT}\""))
@@ -418,7 +423,7 @@ impl Party {
             format!("mts.deadline={}ms", plan.deadline.as_millis()),
             format!("discovery.static={{ {} }}", peers.join(", ")),
         ];
-        for kind in plan.transports.iter().filter(|kind| **kind != "shm") {
+        for kind in plan.transports.iter().filter(|kind| is_beyond(kind)) {
             settings.push(format!("transport.{kind}.listen=[\"0.0.0.0:{PORT}\"]"));
         }
         let gateway = start_gateway(host, &settings);

@@ -702,7 +702,7 @@ fn settings(at: usize, order: &[&str], mdns: bool) -> Vec<String> {
     let mut settings = vec![
         format!("domain=host{at}"),
         format!("mts.name=gateway{at}"),
-        format!("mts.transports=shm,{}", order.join(",")),
+        format!("mts.transports=shm,unix,{}", order.join(",")),
         format!("discovery.mdns={mdns}"),
         "access.deny={ \".*\" = [\".* performative=cancel\"] }".to_owned(),
     ];

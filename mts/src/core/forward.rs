@@ -13,9 +13,11 @@ use fipa_transport::{
 
 use super::desk::{Action, Author, Origin, Undelivered, Upstream};
 use super::failures::{cannot_be_decoded, locations_given};
+use super::inbox::link_of;
 use super::lane::{Delivery, Lane, LaneId, LaneKey};
 use super::limits::SenderLimit;
 use super::{Core, MAX_DEADLINE, News, Now, own_lane};
+use crate::gate::Link;
 use smallvec::smallvec;
 
 use crate::failure::sender_of;
@@ -130,7 +132,7 @@ impl Core {
             lane.wait_for_credit(from.location);
             return Verdict::Now(Answer::Busy);
         }
-        if let Err(why) = self.admits(now, &entry.name, &stamped) {
+        if let Err(why) = self.admits(now, &entry.name, &stamped, link_of(via, &from.location)) {
             return Verdict::Now(Answer::failed(FailureReason::Refused, why));
         }
         if from.remote {
@@ -188,9 +190,9 @@ impl Core {
     }
 
     /// What the gate says, if there is one.
-    fn admits(&self, now: Now, receiver: &str, letter: &Letter) -> Result<(), String> {
+    fn admits(&self, now: Now, receiver: &str, letter: &Letter, link: Link) -> Result<(), String> {
         match &self.gate {
-            Some(gate) => gate.admits(now.instant, receiver, letter),
+            Some(gate) => gate.admits(now.instant, receiver, letter, link),
             None => Ok(()),
         }
     }
@@ -329,6 +331,10 @@ impl Core {
         let directory = Arc::clone(&self.desk.directory);
         let sender = stamp::sender(&letter).unwrap_or_default();
         let stream_sender = self.desk.config.incarnation;
+        let unproved = Link {
+            via,
+            service: Incarnation::UNKNOWN,
+        };
         for receiver in receivers {
             let (entries, missing) = match fipa_sds::resolve_legacy(&*directory, &receiver, &sender)
             {
@@ -354,7 +360,7 @@ impl Core {
                 self.unframed_failed(&name, &letter, (via, from), why);
             }
             for entry in here {
-                if let Err(why) = self.admits(now, &entry.name, &letter) {
+                if let Err(why) = self.admits(now, &entry.name, &letter, unproved) {
                     let why = (FailureReason::Refused, why);
                     self.unframed_failed(&entry.name, &letter, (via, from), why);
                     continue;

@@ -11,6 +11,7 @@ use fipa_transport::{Answer, FailureReason, Incarnation, Kind, Location, Parcel,
 use super::rules::{self, Offer};
 use super::{CoreConfig, MAX_DEADLINE};
 use crate::Gate;
+use crate::gate::Link;
 
 /// A letter taken from an agent's queue.
 #[derive(Debug, Clone)]
@@ -109,7 +110,7 @@ impl Inbox {
             return Answer::Busy;
         }
         if let Some(gate) = gate
-            && let Err(why) = gate.admits(now, &self.name, &letter)
+            && let Err(why) = gate.admits(now, &self.name, &letter, link_of(via, back))
         {
             return Answer::failed(FailureReason::Refused, why);
         }
@@ -233,6 +234,14 @@ impl Inbox {
         self.senders
             .retain(|_, taken| now.saturating_duration_since(taken.seen) < memory);
         self.next_sweep = Some(now + Duration::from_secs(60));
+    }
+}
+
+/// The link of a letter that came by this kind from the service at this location.
+pub(super) fn link_of(via: Kind, back: &Location) -> Link {
+    Link {
+        via,
+        service: back.incarnation(),
     }
 }
 

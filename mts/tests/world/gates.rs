@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use fipa_acl::Letter;
-use fipa_mts::Gate;
+use fipa_mts::{Gate, Link};
 use fipa_transport::Allowance;
 use parking_lot::Mutex;
 
@@ -53,7 +53,7 @@ impl Rules {
 }
 
 impl Gate for Rules {
-    fn admits(&self, now: Instant, receiver: &str, letter: &Letter) -> Result<(), String> {
+    fn admits(&self, now: Instant, receiver: &str, letter: &Letter, _: Link) -> Result<(), String> {
         let Some(number) = number_of(letter) else {
             return Ok(());
         };

@@ -17,7 +17,7 @@
 //! | `fipa-members` | names of the members of a coalition, with a line feed between two |
 //! | `fipa-leader` | the name of its leader, if it has one |
 //! | `fipa-time` | when it was registered, in milliseconds since 1970, UTC |
-//! | `fipa-locations` | all locations, in order, with a space between two |
+//! | `fipa-locations` | all locations that lead to this host, in order, with a space between two |
 //! | `fipa-type`, `fipa-description` | in full, when the peers' key has only the beginning |
 //!
 //! What the peers read keeps to what they can take: at most 200 bytes in a value, no scheme but
@@ -90,7 +90,9 @@ pub(super) fn encode(entry: &Entry) -> Properties {
         }
     }
     own("fipa-time", &time.to_string());
-    let locations: Vec<String> = entry.locations.iter().map(Location::to_string).collect();
+    let locations = entry.locations.iter();
+    let locations = locations.filter(|location| !location.kind().is_host_local());
+    let locations: Vec<String> = locations.map(Location::to_string).collect();
     own("fipa-locations", &locations.join(" "));
     for (key, whole) in [
         ("fipa-type", &entry.agent_type),
@@ -209,6 +211,9 @@ fn ours(record: &Record<'_>) -> Result<Entry, RecordError> {
     let mut known = Vec::new();
     for location in locations.split(' ').filter(|location| !location.is_empty()) {
         match location.parse() {
+            // Another host's shared memory and sockets are not reached from here, and this host's
+            // own are not told by others.
+            Ok(location) if Location::kind(&location).is_host_local() => {}
             Ok(location) => known.push(location),
             // What a later version has is no reason not to use the others.
             Err(LocationError::UnknownKind(_) | LocationError::UnknownSignature(_)) => {}
@@ -417,6 +422,23 @@ mod tests {
     }
 
     #[test]
+    fn what_leads_to_processes_of_a_host_is_neither_announced_nor_believed() {
+        let mut entry = example();
+        let locations = entry.locations.clone();
+        for local in ["shm://00000000000000ab", "unix://00000000000000ab"] {
+            entry.locations.insert(1, local.parse().unwrap());
+        }
+        let mut properties = encode(&entry);
+        let locations_key = |(key, _): &&mut (String, Vec<u8>)| key.starts_with("fipa-locations");
+        let (_, announced) = properties.iter_mut().find(locations_key).unwrap();
+        let text = String::from_utf8(announced.clone()).unwrap();
+        assert!(!text.contains("shm") && !text.contains("unix"), "{text}");
+        announced.extend(b" unix://00000000000000ab shm://00000000000000ab");
+        let read = read("arm?left@crex", &properties).unwrap();
+        assert_eq!(read.locations, locations);
+    }
+
+    #[test]
     fn what_peers_announce_is_read() {
         let properties = said(&[
             ("timestamp", b"20261120-11:00:00:123456"),
@@ -555,7 +577,8 @@ mod tests {
     }
 
     fn any_location() -> impl Strategy<Value = Location> {
-        let kind = prop::sample::select(Kind::ALL.to_vec());
+        let kinds = Kind::ALL.into_iter().filter(|kind| !kind.is_host_local());
+        let kind = prop::sample::select(kinds.collect::<Vec<_>>());
         let address = "[!-\"$-:<-~é]{1,200}";
         let signature = prop::sample::select(Signature::ALL.to_vec());
         let parts = (kind, address, signature, any::<u64>());

@@ -42,7 +42,7 @@ fn mistakes_are_named_with_line_and_key() {
         (
             "[routes]\ncamera.left = [\"shm\"]\n",
             "fipa.toml:2: `routes.camera` is wrong: a table cannot stand here (a name with dots \
-             needs quotes); expected a list of transports such as [\"shm\", \"tcp\"]",
+             needs quotes); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
         ),
         (
             "\nmts = 5\n",
@@ -63,12 +63,12 @@ fn mistakes_are_named_with_line_and_key() {
         (
             "[mts]\ntransports = \"shm\"\n",
             "fipa.toml:2: `mts.transports` is wrong: \"shm\": a string cannot stand here; \
-             expected a list of transports such as [\"shm\", \"tcp\"]",
+             expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
         ),
         (
             "[mts]\ntransports = [\n  \"shm\",\n  \"tpc\",\n]\n",
             "fipa.toml:4: `mts.transports` is wrong: \"tpc\": unknown transport \"tpc\" \
-             (known: shm, tcp, udp, quic); expected a list of transports such as [\"shm\", \"tcp\"]",
+             (known: shm, unix, tcp, udp, quic); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
         ),
         (
             "[mts]\ntransports = [\"udt\"]\n",
@@ -167,7 +167,7 @@ fn mistakes_are_named_with_line_and_key() {
         ),
         (
             "[mts]\ntransports = []\n",
-            "fipa.toml:2: `mts.transports` is empty; list at least one of shm, tcp, udp, quic",
+            "fipa.toml:2: `mts.transports` is empty; list at least one of shm, tcp, udp, quic, unix",
         ),
         (
             "[mts]\ntransports = [\"tcp\", \"shm\", \"tcp\"]\n",
@@ -217,7 +217,7 @@ fn mistakes_are_named_with_line_and_key() {
         ),
         (
             "[routes]\na = []\n",
-            "fipa.toml:2: `routes.a` is empty; list at least one of shm, tcp, udp, quic",
+            "fipa.toml:2: `routes.a` is empty; list at least one of shm, tcp, udp, quic, unix",
         ),
         (
             "[routes]\na = [\"shm\", \"quic\", \"shm\"]\n",

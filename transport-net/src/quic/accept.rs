@@ -11,10 +11,11 @@ use tokio::time::timeout;
 use super::dial::ends;
 use super::sockets::{Sockets, why_lost};
 use crate::seldom::warn_seldom;
-use crate::tcp::endpoint::{Endpoint, Stranger};
-use crate::tcp::frame::FrameReader;
-use crate::tcp::link::Running;
-use crate::tcp::proof::Proof;
+use crate::stream::endpoint::{Endpoint, Stranger};
+use crate::stream::frame::FrameReader;
+use crate::stream::link::Running;
+use crate::stream::proof::Proof;
+use crate::stream::source::Source;
 
 /// Accepts connections until it is aborted.
 pub(super) async fn accept(
@@ -31,7 +32,8 @@ pub(super) async fn accept(
             }
             continue;
         }
-        let Some(place) = endpoint.receive_stranger(incoming.remote_address().ip()) else {
+        let Some(place) = endpoint.receive_stranger(Source::Address(incoming.remote_address()))
+        else {
             return;
         };
         let number = place.number;
@@ -77,7 +79,7 @@ async fn receive(
     let ends = ends(&connection, send, receive, max_letter);
     drop(connection);
     Running::new(endpoint, link, sink, None)
-        .serve(ends, proof, reader, from, || drop(place))
+        .serve(ends, proof, reader, Source::Address(from), || drop(place))
         .await;
 }
 

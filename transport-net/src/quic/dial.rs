@@ -11,12 +11,14 @@ use quinn::{Connection, ConnectionError, RecvStream, SendStream};
 
 use super::sockets::{Sockets, why_lost};
 use super::streams::{Control, Letters, Outgoing};
-use crate::tcp::dial::{addresses, reach, unreachable};
-use crate::tcp::endpoint::Endpoint;
-use crate::tcp::frame::FrameReader;
-use crate::tcp::link::{Link, Running};
-use crate::tcp::proof::Proof;
-use crate::tcp::wire::{Reading, Writing};
+use crate::end::End;
+use crate::stream::endpoint::Endpoint;
+use crate::stream::frame::FrameReader;
+use crate::stream::link::{Link, Running};
+use crate::stream::proof::Proof;
+use crate::stream::source::Source;
+use crate::stream::wire::{Reading, Writing};
+use crate::tcp::dial::{addresses, reach};
 
 /// Opens the connection of a link that has been made up, and serves it.
 pub(super) async fn dial(
@@ -37,7 +39,7 @@ pub(super) async fn dial(
     };
     let Some(certificate) = sockets.certificate(&connection) else {
         let what = "the peer's certificate is not trusted any more";
-        return running.fail(unreachable(&to, &what));
+        return running.fail(End::unreachable(&to, &what));
     };
     link.connected(Instant::now());
     let from = connection.remote_address();
@@ -45,6 +47,7 @@ pub(super) async fn dial(
     let reader = FrameReader::new(limits.max_letter, BytesMut::new());
     let ends = ends(&connection, send, receive, limits.max_letter);
     drop(connection);
+    let from = Source::Address(from);
     running.serve(ends, proof, reader, from, || {}).await;
 }
 

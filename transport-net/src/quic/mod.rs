@@ -1,7 +1,7 @@
 //! Letters over QUIC (RFC 9000), each in a stream of its own.
 //!
-//! Frames, hello, limits, trust and the account of parcels are those of TCP with TLS ([`crate::tcp`],
-//! [`crate::secure`]); here is what differs: sockets, how connections are made, and which streams
+//! Frames, hello, limits and the account of parcels are those of [`crate::stream`], trust is that of
+//! TCP with TLS ([`crate::secure`]); here is what differs: sockets, how connections are made, and which streams
 //! frames go in.
 //!
 //! * [`streams`]: the streams of one connection.
@@ -29,13 +29,14 @@ use tokio::runtime::Handle;
 
 use self::sockets::Sockets;
 use crate::secure::Security;
-use crate::tcp::endpoint::Endpoint;
-use crate::{Counters, Identity, Limits, TcpConfig};
+use crate::stream::config::StreamConfig;
+use crate::stream::endpoint::Endpoint;
+use crate::{Counters, Identity, Limits};
 
 /// Configuration of a [`QuicTransport`].
 #[derive(Debug, Clone)]
 pub struct QuicConfig {
-    /// Numeric addresses to listen on, as for [`TcpConfig::listen`].
+    /// Numeric addresses to listen on, as for [`TcpConfig::listen`](crate::TcpConfig::listen).
     pub listen: Vec<String>,
     /// How this endpoint introduces itself.
     pub identity: Identity,
@@ -56,6 +57,7 @@ pub struct QuicConfig {
 /// runtime's threads, so the runtime must live on for a moment.
 #[derive(Debug)]
 pub struct QuicTransport {
+    listen: Vec<String>,
     endpoint: Arc<Endpoint>,
     sockets: Arc<Sockets>,
 }
@@ -72,13 +74,13 @@ impl QuicTransport {
             security,
         } = config;
         let sockets = Arc::new(Sockets::new(security.clone(), &limits));
-        let config = TcpConfig {
-            listen,
+        let config = StreamConfig {
             identity,
             limits,
             security: Some(security),
         };
         Self {
+            listen,
             endpoint: Endpoint::new(Kind::Quic, config, runtime),
             sockets,
         }
@@ -106,7 +108,7 @@ impl Transport for QuicTransport {
 
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
         let open = |text: &str| self.sockets.listen(text);
-        self.endpoint.listen(sink, open, |socket| {
+        self.endpoint.listen(sink, &self.listen, open, |socket| {
             let accept = accept::accept(self.endpoint.clone(), self.sockets.clone(), socket);
             self.endpoint.runtime.spawn(accept)
         })

@@ -17,7 +17,7 @@ use parking_lot::Mutex;
 use quinn::{Connection, ConnectionError, ReadError, RecvStream, SendStream, VarInt, WriteError};
 
 use super::sockets::why_lost;
-use crate::tcp::frame::{self, FrameReader, Space};
+use crate::stream::frame::{self, FrameReader, Space};
 
 /// Answers go before letters.
 const URGENT: i32 = 1;

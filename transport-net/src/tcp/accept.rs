@@ -15,25 +15,23 @@ use tokio::task::AbortHandle;
 use tokio::time::{sleep, sleep_until, timeout};
 
 use super::accept_queue::{self, Full, Place, TURN};
-use super::config::Limits;
-use super::counters::count;
-use super::endpoint::{Endpoint, Stranger};
-use super::frame::{FrameReader, MAGIC};
-use super::link::Running;
-use super::proof::Proof;
 #[cfg(feature = "secure")]
 use super::tls;
 use super::unframed::{self, UnframedError};
-use super::wire;
 use crate::address::{self, AddressError};
 use crate::seldom::warn_seldom;
+use crate::stream::config::Limits;
+use crate::stream::counters::count;
+use crate::stream::endpoint::{Endpoint, Stranger};
+use crate::stream::frame::{FrameReader, MAGIC};
+use crate::stream::link::Running;
+use crate::stream::proof::Proof;
+use crate::stream::source::{Home, Source};
+use crate::stream::wire;
 
 /// Connections that the system holds until they are accepted: the letters of a legacy peer wait there
 /// while this process is stopped.
 const BACKLOG: i32 = 1024;
-
-/// How long accepting rests when the system has no descriptors left.
-const REST: Duration = Duration::from_millis(100);
 
 /// Opens a listening socket, and returns the address that it is bound to. To be called within a
 /// runtime.
@@ -81,27 +79,21 @@ pub(crate) async fn accept(endpoint: Arc<Endpoint>, listener: TcpListener) {
         match listener.accept().await {
             Ok((stream, from)) => {
                 let stream = Arc::new(stream);
-                match endpoint.accept_queue.admit(&endpoint, from.ip(), &stream) {
+                match endpoint
+                    .legacy
+                    .accept_queue
+                    .admit(&endpoint, from.ip(), &stream)
+                {
                     Ok(place) => serve(&endpoint, place, stream, from),
                     Err(Full::Closed) => return,
                     Err(full) => reset(&endpoint, stream, from, full),
                 }
-                let (waiting, left) = endpoint.accept_queue.progress();
+                let (waiting, left) = endpoint.legacy.accept_queue.progress();
                 if pace.pauses(waiting, left) {
                     sleep(Pace::PAUSE).await;
                 }
             }
-            Err(error) => {
-                let before = endpoint
-                    .tally()
-                    .accept_failures
-                    .fetch_add(1, Ordering::Relaxed);
-                warn_seldom(
-                    before,
-                    format_args!("cannot accept a connection: {error} (`ulimit -n`?)"),
-                );
-                sleep(REST).await;
-            }
+            Err(error) => endpoint.accept_failed(&error).await,
         }
     }
 }
@@ -149,7 +141,7 @@ fn serve(endpoint: &Arc<Endpoint>, place: Place, stream: Arc<TcpStream>, from: S
 
 fn reset(endpoint: &Arc<Endpoint>, stream: Arc<TcpStream>, from: SocketAddr, full: Full) {
     if let Some(stream) = Arc::into_inner(stream) {
-        endpoint.reset(stream, from, full);
+        endpoint.legacy.reset(endpoint, stream, from, full);
     }
 }
 
@@ -207,9 +199,13 @@ async fn receive(
             };
             let reader = FrameReader::new(endpoint.limits().max_letter, BytesMut::new());
             Running::new(endpoint, link, sink, None)
-                .serve(wire::plain(stream), Proof::default(), reader, from, || {
-                    drop(place);
-                })
+                .serve(
+                    wire::plain(stream),
+                    Proof::default(),
+                    reader,
+                    Source::Address(from),
+                    || drop(place),
+                )
                 .await;
             return;
         }
@@ -275,7 +271,7 @@ async fn first_byte(
 
 /// A place among those that have not introduced themselves.
 fn stranger(endpoint: &Arc<Endpoint>, from: SocketAddr, task: AbortHandle) -> Option<Stranger> {
-    let place = endpoint.receive_stranger(from.ip())?;
+    let place = endpoint.receive_stranger(Source::Address(from))?;
     endpoint.stranger_started(place.number, task);
     Some(place)
 }
@@ -309,7 +305,10 @@ impl Waiting {
             Self::InTurn(place) => Ok(place),
             Self::Late(stranger) => {
                 drop(stranger);
-                let place = endpoint.accept_queue.admit(endpoint, from.ip(), stream)?;
+                let place = endpoint
+                    .legacy
+                    .accept_queue
+                    .admit(endpoint, from.ip(), stream)?;
                 place.has_bytes();
                 if place.started(task) {
                     Ok(place)
@@ -336,7 +335,7 @@ async fn receive_letter(
     let letter = unframed::read(endpoint, &mut stream, || place.stalled()).await?;
     drop(stream);
     place.is_first().await;
-    if let Some(ration) = endpoint.ration(from.ip())
+    if let Some(ration) = endpoint.ration(Home::Address(from.ip()))
         && let Some(until) = ration.spend(1, letter.len(), Instant::now())
     {
         count(&endpoint.tally().held_back);
@@ -370,7 +369,9 @@ async fn prove(
                     let proof = Proof::of(security, secured.certificate);
                     let reader = FrameReader::new(endpoint.limits().max_letter, BytesMut::new());
                     Running::new(endpoint.clone(), link, sink, None)
-                        .serve(secured.ends, proof, reader, from, || drop(place))
+                        .serve(secured.ends, proof, reader, Source::Address(from), || {
+                            drop(place);
+                        })
                         .await;
                     return None;
                 }

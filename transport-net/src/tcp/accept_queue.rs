@@ -24,10 +24,10 @@ use tokio::net::TcpStream;
 use tokio::sync::Notify;
 use tokio::task::AbortHandle;
 
-use super::config::Limits;
-use super::counters::count;
-use super::endpoint::Endpoint;
 use crate::ration::whose;
+use crate::stream::config::Limits;
+use crate::stream::counters::count;
+use crate::stream::endpoint::Endpoint;
 
 /// A connection that has sent nothing for this long loses its turn.
 pub(crate) const TURN: Duration = Duration::from_millis(250);
@@ -397,7 +397,7 @@ impl Place {
     }
 
     fn state(&self) -> parking_lot::MutexGuard<'_, State> {
-        self.endpoint.accept_queue.0.lock()
+        self.endpoint.legacy.accept_queue.0.lock()
     }
 
     fn with_entry<T>(&self, change: impl FnOnce(&mut Entry) -> T) -> Option<T> {

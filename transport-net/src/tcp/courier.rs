@@ -21,11 +21,11 @@ use tokio::sync::watch;
 use tokio::time::timeout;
 
 use super::accept::prepare;
-use super::counters::count;
 use super::dial::{self, Unreachable};
 use super::dialect::translate;
-use super::endpoint::Endpoint;
 use crate::end::End;
+use crate::stream::counters::count;
+use crate::stream::endpoint::Endpoint;
 
 /// How long a peer may take to hang up after it has got its letter, before the next one is begun.
 const FAREWELL: Duration = Duration::from_millis(50);
@@ -201,8 +201,8 @@ pub(crate) async fn run(endpoint: Arc<Endpoint>, sink: Arc<dyn Sink>, to: Locati
         to,
         done: false,
     };
-    let mut closed = round.endpoint.couriers.closed.subscribe();
-    while let Some(errand) = round.endpoint.couriers.next(&round.to) {
+    let mut closed = round.endpoint.legacy.couriers.closed.subscribe();
+    while let Some(errand) = round.endpoint.legacy.couriers.next(&round.to) {
         let progress = Mutex::new(false);
         let conclusion = tokio::select! {
             conclusion = deliver(&round, &errand, &progress) => conclusion,
@@ -221,7 +221,7 @@ pub(crate) async fn run(endpoint: Arc<Endpoint>, sink: Arc<dyn Sink>, to: Locati
         round.conclude(errand.attempt, conclusion);
         if let Some(error) = unreachable {
             // They need not all find out by themselves.
-            for errand in round.endpoint.couriers.drain(&round.to) {
+            for errand in round.endpoint.legacy.couriers.drain(&round.to) {
                 let conclusion = Conclusion::NotSent(error.clone());
                 round.sink.concluded(errand.attempt, conclusion);
             }
@@ -241,7 +241,7 @@ struct Round {
 
 impl Round {
     fn conclude(&self, attempt: AttemptId, conclusion: Conclusion) {
-        if self.endpoint.couriers.ended(&self.to) {
+        if self.endpoint.legacy.couriers.ended(&self.to) {
             self.sink.concluded(attempt, conclusion);
         }
     }
@@ -252,7 +252,7 @@ impl Drop for Round {
         if self.done {
             return;
         }
-        let Some(queue) = self.endpoint.couriers.forget(&self.to) else {
+        let Some(queue) = self.endpoint.legacy.couriers.forget(&self.to) else {
             return;
         };
         if let Some(attempt) = queue.current {
@@ -292,7 +292,7 @@ async fn deliver(round: &Round, errand: &Errand, begun: &Mutex<bool>) -> Conclus
     }
     if to.signature() == Signature::JadeProxy
         && let Some(here) = stream.local_addr().ok()
-        && let Some(here) = endpoint.reachable_at(here)
+        && let Some(here) = listening_at(&endpoint.listening(), here)
     {
         letter = match in_dialect(Some(&here)) {
             Ok(letter) => letter,
@@ -302,7 +302,7 @@ async fn deliver(round: &Round, errand: &Errand, begun: &Mutex<bool>) -> Conclus
     if let Err(error) = prepare(&stream, endpoint.limits()) {
         return Conclusion::NotSent(WayError::new(WayFault::Broken, error));
     }
-    if !endpoint.couriers.begin(to) {
+    if !endpoint.legacy.couriers.begin(to) {
         let detail = "the letter was abandoned";
         return Conclusion::NotSent(WayError::new(WayFault::TimedOut, detail));
     }
@@ -362,7 +362,7 @@ async fn farewell(stream: &mut TcpStream) -> std::io::Result<()> {
 }
 
 /// Where a socket with this address can be reached, when the endpoint listens there.
-pub(crate) fn listening_at(listening: &[String], local: SocketAddr) -> Option<String> {
+fn listening_at(listening: &[String], local: SocketAddr) -> Option<String> {
     listening
         .iter()
         .filter_map(|text| text.parse::<SocketAddr>().ok())

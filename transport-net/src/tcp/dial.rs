@@ -6,22 +6,23 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::BytesMut;
-use fipa_transport::{Location, Sink, WayError, WayFault};
+use fipa_transport::{Location, Sink};
 use tokio::net::{TcpStream, lookup_host};
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
 use super::accept::prepare;
-use super::config::Limits;
-use super::endpoint::Endpoint;
-use super::frame::FrameReader;
-use super::link::{Link, Running};
-use super::proof::Proof;
 #[cfg(feature = "secure")]
 use super::tls;
-use super::wire::{self, Reading, Writing};
 use crate::address::{self, Target};
 use crate::end::End;
+use crate::stream::config::Limits;
+use crate::stream::endpoint::Endpoint;
+use crate::stream::frame::FrameReader;
+use crate::stream::link::{Link, Running};
+use crate::stream::proof::Proof;
+use crate::stream::source::Source;
+use crate::stream::wire::{self, Reading, Writing};
 
 /// How long one address is waited for before the next is tried as well.
 const STAGGER: Duration = Duration::from_millis(250);
@@ -44,18 +45,20 @@ pub(crate) async fn dial(
         Err(end) => return running.fail(end),
     };
     if let Err(error) = prepare(&stream, &limits) {
-        return running.fail(unreachable(&to, &error));
+        return running.fail(End::unreachable(&to, &error));
     }
     let (ends, proof) = tokio::select! {
         proved = prove(&running, stream, peer) => match proved {
             Ok(proved) => proved,
-            Err(why) => return running.fail(unreachable(&to, &why)),
+            Err(why) => return running.fail(End::unreachable(&to, &why)),
         },
         end = link.leaving() => return running.fail(end),
     };
     link.connected(Instant::now());
     let reader = FrameReader::new(limits.max_letter, BytesMut::new());
-    running.serve(ends, proof, reader, peer, || {}).await;
+    running
+        .serve(ends, proof, reader, Source::Address(peer), || {})
+        .await;
 }
 
 /// The address of a location, and those at which the same service is as well. Only where the peer
@@ -89,16 +92,10 @@ where
 {
     tokio::select! {
         connected = first(limits, addresses, connect) => {
-            connected.map_err(|Unreachable(what)| unreachable(to, &what))
+            connected.map_err(|Unreachable(what)| End::unreachable(to, &what))
         }
         end = link.leaving() => Err(end),
     }
-}
-
-/// The end of a link for which no connection could be opened.
-pub(crate) fn unreachable(to: &Location, what: &dyn std::fmt::Display) -> End {
-    let detail = format!("{}: {what}", to.address());
-    End::NotOpened(WayError::new(WayFault::Unreachable, detail))
 }
 
 /// Has the peer prove who it is, where it has to.

@@ -1,31 +1,23 @@
 //! Framed, acknowledged letters over TCP.
 //!
-//! * [`frame`]: the bytes; [`place`]: memory for what arrives, from where it is passed on.
-//! * [`connection`] with its [`outbox`]: the protocol of one connection, without socket or clock.
-//! * [`link`]: a connection with its socket; [`dial`] and [`accept`] make them.
-//! * [`endpoint`]: what the connections share.
+//! Frames, connections and what they share are in [`crate::stream`].
+//!
+//! * [`dial`] and [`accept`] open connections; [`tls`] is for peers that prove who they are.
 //! * [`accept_queue`]: the order in which accepted connections are read.
 //! * [`unframed`]: letters of old peers, on the same port.
 //! * [`courier`]: letters to old peers, in their [`dialect`].
+//! * [`legacy`]: what an endpoint keeps for both.
 
-pub(crate) mod accept;
+mod accept;
 mod accept_queue;
-pub(crate) mod config;
-mod connection;
-pub(crate) mod counters;
+mod config;
 mod courier;
 pub(crate) mod dial;
 mod dialect;
-pub(crate) mod endpoint;
-pub(crate) mod frame;
-pub(crate) mod link;
-mod outbox;
-mod place;
-pub(crate) mod proof;
+mod legacy;
 #[cfg(feature = "secure")]
-mod tls;
+pub(crate) mod tls;
 mod unframed;
-pub(crate) mod wire;
 
 use std::sync::Arc;
 
@@ -35,10 +27,12 @@ use fipa_transport::{
 };
 use tokio::runtime::Handle;
 
-pub use self::config::{Limits, TcpConfig};
-pub use self::counters::Counters;
-use self::endpoint::Endpoint;
+pub use self::config::TcpConfig;
+pub(crate) use self::legacy::Legacy;
 use crate::end::End;
+use crate::stream::config::StreamConfig;
+use crate::stream::counters::Counters;
+use crate::stream::endpoint::Endpoint;
 
 /// Carries parcels over TCP.
 ///
@@ -57,6 +51,7 @@ use crate::end::End;
 /// runtime's threads, so the runtime must live on for a moment.
 #[derive(Debug)]
 pub struct TcpTransport {
+    listen: Vec<String>,
     endpoint: Arc<Endpoint>,
 }
 
@@ -65,7 +60,21 @@ impl TcpTransport {
     /// enabled. Nothing is opened before `listen`.
     #[must_use]
     pub fn new(config: TcpConfig, runtime: Handle) -> Self {
+        let TcpConfig {
+            listen,
+            identity,
+            limits,
+            #[cfg(feature = "secure")]
+            security,
+        } = config;
+        let config = StreamConfig {
+            identity,
+            limits,
+            #[cfg(feature = "secure")]
+            security,
+        };
         Self {
+            listen,
             endpoint: Endpoint::new(Kind::Tcp, config, runtime),
         }
     }
@@ -81,7 +90,7 @@ impl TcpTransport {
         let Some(sink) = self.endpoint.sink() else {
             return Err(End::Closed.after());
         };
-        let couriers = &self.endpoint.couriers;
+        let couriers = &self.endpoint.legacy.couriers;
         if couriers.take(&self.endpoint, attempt, to, parcel)? {
             let run = courier::run(self.endpoint.clone(), sink, to.clone());
             let task = self.endpoint.runtime.spawn(run);
@@ -109,9 +118,10 @@ impl Transport for TcpTransport {
 
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
         let runtime = &self.endpoint.runtime;
-        self.endpoint.listen(sink, accept::listen, |socket| {
-            runtime.spawn(accept::accept(self.endpoint.clone(), socket))
-        })
+        self.endpoint
+            .listen(sink, &self.listen, accept::listen, |socket| {
+                runtime.spawn(accept::accept(self.endpoint.clone(), socket))
+            })
     }
 
     fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {

@@ -17,9 +17,9 @@ use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::time::timeout;
 use tokio_rustls::{TlsAcceptor, TlsConnector};
 
-use super::frame::Space;
-use super::wire::{Reading, Writing};
 use crate::secure::{Certificate, Security, advice};
+use crate::stream::frame::Space;
+use crate::stream::wire::{Reading, Writing};
 
 /// The first byte of a TLS connection: a record with a handshake (RFC 8446 section 5.1).
 pub(crate) const FIRST_BYTE: u8 = 22;

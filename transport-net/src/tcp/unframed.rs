@@ -10,9 +10,9 @@ use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::time::{Instant, timeout_at};
 
 use super::accept_queue::TURN;
-use super::config::Limits;
-use super::counters::count;
-use super::endpoint::Endpoint;
+use crate::stream::config::Limits;
+use crate::stream::counters::count;
+use crate::stream::endpoint::Endpoint;
 
 /// Bytes read at first.
 const FIRST_READ: usize = 4096;

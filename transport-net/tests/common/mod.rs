@@ -10,6 +10,7 @@ pub(crate) mod intruder;
 use std::collections::HashMap;
 use std::net::IpAddr;
 use std::ops::Deref;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -20,7 +21,9 @@ use fipa_transport::{
     Answer, Arrival, Arriving, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, LoanedContent,
     Location, Parcel, Sink, Stream, Ticket, Transport, Verdict, WayError,
 };
-use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport, UdpConfig, UdpLimits};
+use fipa_transport_net::{
+    Identity, Limits, TcpConfig, TcpTransport, UdpConfig, UdpLimits, UnixConfig,
+};
 use parking_lot::Mutex;
 use tokio::runtime::{Handle, Runtime};
 use zerocopy::IntoBytes as _;
@@ -82,6 +85,15 @@ pub(crate) fn udp_config(listen: &[&str]) -> UdpConfig {
             silence: Duration::from_secs(30),
             ..UdpLimits::default()
         },
+    }
+}
+
+/// An endpoint whose socket is in this directory.
+pub(crate) fn unix_config(directory: &Path) -> UnixConfig {
+    UnixConfig {
+        directory: directory.to_owned(),
+        identity: identity(),
+        limits: config(&[]).limits,
     }
 }
 

@@ -226,11 +226,7 @@ async fn cell(
                 continue;
             };
             let is_rate = round > effort.rounds;
-            let window = match way.sort.window(fill) {
-                _ if !is_rate => 1,
-                Some(window) => window,
-                None => continue,
-            };
+            let window = if is_rate { Sort::window(fill) } else { 1 };
             let count = match is_rate {
                 true => (cell.letters * RATE_TURN as usize).max(4 * window),
                 false => cell.letters + WARMING,

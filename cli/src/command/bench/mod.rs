@@ -43,8 +43,8 @@ use crate::{membership, output};
 /// Measure how fast letters go on this machine, beside what the bare mechanisms can do
 ///
 /// Compares every configured transport: latency one way and round trip, throughput and processor
-/// time, for content from 100 bytes to 4 MB, each beside its limit (bare iceoryx2, TCP, UDP, Unix
-/// socket, a bare relay) measured in the same rounds, with the ratio. Gateways also speak TCP with
+/// time, for content from 100 bytes to 4 MB, each beside its limit (bare iceoryx2, Unix
+/// domain socket, a bare relay) measured in the same rounds, with the ratio. Gateways also speak TCP with
 /// TLS, and QUIC, with keys made for the measurement, beside TCP without. All traffic stays on this
 /// machine, and nothing is left behind.
 ///
@@ -97,7 +97,7 @@ pub(crate) struct Arguments {
 enum What {
     /// Two agents on one host, through shared memory
     Shm,
-    /// Over the network: two agents directly, and through a gateway on either side
+    /// Through sockets: two agents directly, and through a gateway on either side
     Net,
     /// Encodings, as in the evaluation of the C++ libraries; writes tables and pictures
     Paper,
@@ -310,9 +310,10 @@ fn wanted(what: Option<What>, transports: &[Kind]) -> Vec<(Sort, Wait)> {
     }
     if net {
         for kind in transports {
-            if matches!(kind, Kind::Tcp | Kind::Udp) {
-                add(Sort::Agents(*kind), Wait::Block);
-                add(Sort::Gateways(*kind), Wait::Block);
+            match kind {
+                Kind::Unix => add(Sort::Agents(Kind::Unix), Wait::Block),
+                Kind::Tcp | Kind::Udp => add(Sort::Gateways(*kind), Wait::Block),
+                _ => {}
             }
         }
         // Whatever is configured: they have keys of their own.

@@ -57,7 +57,6 @@ impl Part {
 pub(super) enum Socket {
     Tcp,
     Unix,
-    Udp,
 }
 
 /// What whoever waits does meanwhile.

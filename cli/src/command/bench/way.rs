@@ -31,8 +31,7 @@ impl Sort {
     pub(super) fn limit(self) -> Option<Self> {
         match self {
             Self::Agents(Kind::Shm) | Self::Letters => Some(Self::Iceoryx),
-            Self::Agents(Kind::Udp) => Some(Self::Socket(Socket::Udp)),
-            Self::Agents(_) => Some(Self::Socket(Socket::Tcp)),
+            Self::Agents(_) => Some(Self::Socket(Socket::Unix)),
             Self::Gateways(_) | Self::Secured(_) => Some(Self::Relay),
             Self::Zenoh {
                 shared_memory: true,
@@ -57,7 +56,6 @@ impl Sort {
             Self::Iceoryx => "raw iceoryx2".to_owned(),
             Self::Socket(Socket::Tcp) => "raw tcp".to_owned(),
             Self::Socket(Socket::Unix) => "raw unix socket".to_owned(),
-            Self::Socket(Socket::Udp) => "raw udp".to_owned(),
             Self::Zenoh {
                 shared_memory: true,
             } => "zenoh shm".to_owned(),
@@ -84,23 +82,12 @@ impl Sort {
         matches!(self, Self::Agents(_) | Self::Gateways(_) | Self::Secured(_))
     }
 
-    /// The largest content, where that is known.
-    fn most(self) -> usize {
-        match self {
-            // A datagram, less headers and number.
-            Self::Socket(Socket::Udp) => 65_507 - 8,
-            _ => usize::MAX,
-        }
-    }
-
-    /// How many letters are under way when throughput is measured; none where that needs a
-    /// protocol.
-    pub(super) fn window(self, fill: Fill) -> Option<usize> {
-        match self {
-            Self::Socket(Socket::Udp) => None,
+    /// How many letters are under way when throughput is measured.
+    pub(super) fn window(fill: Fill) -> usize {
+        match fill {
+            Fill::Copied => 16,
             // As many loans as a process may have.
-            _ if fill != Fill::Copied => Some(8),
-            _ => Some(16),
+            _ => 8,
         }
     }
 }
@@ -233,9 +220,6 @@ impl Way {
 
     /// Whether letters of this size go this way; if not, why.
     pub(super) async fn takes(&self, stage: &mut Stage, size: usize) -> Result<(), String> {
-        if size > self.sort.most() {
-            return Err("too large".to_owned());
-        }
         if !self.sort.is_ours() {
             return Ok(());
         }

@@ -127,7 +127,7 @@ impl Stage {
             // Nothing of the demo leaves this machine.
             .args(["--set", "discovery.interfaces=lo"])
             .args(["--set", "transport.tcp.listen=127.0.0.1:0"])
-            .args(["--set", "mts.transports=shm,tcp"])
+            .args(["--set", "mts.transports=shm,unix,tcp"])
             .args(["--set", set])
             .env("FIPA_RUNTIME_DIR", &self.place)
             .env_remove("FIPA_CONFIG")

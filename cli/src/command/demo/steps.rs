@@ -117,7 +117,7 @@ impl Play {
         let found = self.killed().await;
         self.step("an agent is killed", found);
         let found = self.broken_memory().await;
-        self.step("shared memory breaks, tcp takes over", found);
+        self.step("shared memory breaks, a Unix socket takes over", found);
         let found = self.old_peer().await;
         self.step("a letter of an old peer", found);
         let found = self.broken_protocol().await;
@@ -184,7 +184,7 @@ impl Play {
             let entry = entry.ok_or_else(|| format!("{agent} is not listed"))?;
             let has = |kind: &str| entry.locations.iter().any(|url| url.starts_with(kind));
             ensure!(
-                entry.local && has("shm://") && has("tcp://"),
+                entry.local && has("shm://") && has("unix://") && !has("tcp://"),
                 "{agent}: {entry:?}"
             );
         }
@@ -372,21 +372,22 @@ impl Play {
         };
         let deliveries = self.send("rover", order).await?;
         let went = one_delivery(&deliveries)?;
-        ensure!(went["via"] == "tcp", "the letter went {went}");
+        ensure!(went["via"] == "unix", "the letter went {went}");
         ensure!(
             went["attempts"][0]["via"] == "shm",
             "shared memory was not tried: {went}"
         );
         let seen = self.received_by("arm_5").await?;
         ensure!(
-            seen.via.as_deref() == Some("tcp") && seen.content.as_deref() == Some("by another way"),
+            seen.via.as_deref() == Some("unix")
+                && seen.content.as_deref() == Some("by another way"),
             "arm_5 saw {seen:?}"
         );
         let why = went["attempts"][0]["error"].as_str().unwrap_or_default();
         self.say(&format!(
-            "  shm failed ({why}); arm_5 saw the letter come by tcp"
+            "  shm failed ({why}); arm_5 saw the letter come by unix"
         ));
-        found!("via": "tcp", "attempts": went["attempts"])
+        found!("via": "unix", "attempts": went["attempts"])
     }
 
     async fn old_peer(&mut self) -> Found {

@@ -341,7 +341,8 @@ impl Lane {
     ) {
         // The sender is told the way between the hosts, which only this side may have seen.
         let way = |theirs| match taken_by {
-            None | Some(Kind::Shm) => theirs,
+            None => theirs,
+            Some(ours) if ours.is_host_local() => theirs,
             Some(ours) => ours,
         };
         let delivery = &mut self.letters[index];

@@ -26,8 +26,7 @@ use std::time::{Duration, Instant};
 
 use fipa_sds::Entry;
 use fipa_transport::{
-    Attempt, Body, FailureReason, Incarnation, Kind, Location, Outcome, Parcel, Stream, WayError,
-    WayFault,
+    Attempt, Body, FailureReason, Incarnation, Location, Outcome, Parcel, Stream, WayError, WayFault,
 };
 
 pub(crate) use self::delivery::Delivery;
@@ -446,8 +445,8 @@ impl Lane {
     /// The reason why no repetition can succeed, after all routes of the receiver were tried.
     ///
     /// A letter that is too large for all of them waits for a kind that the directory does not show
-    /// at present and that may return. Shared memory is left out, because it does not lead to other
-    /// hosts. A letter that a legacy peer's dialect cannot express waits for nothing.
+    /// at present and that may return. Kinds within a host are left out, because they do not lead to
+    /// other hosts. A letter that a legacy peer's dialect cannot express waits for nothing.
     fn never_fits(&self, index: usize, desk: &Desk) -> Option<FailureReason> {
         let delivery = &self.letters[index];
         let reason = delivery.unfit()?;
@@ -455,7 +454,7 @@ impl Lane {
         let mut order = desk.config.order_for(&self.receiver).iter();
         let waits = reason == FailureReason::TooLarge
             && !order.all(|kind| {
-                *kind == Kind::Shm || attempts.iter().any(|attempt| attempt.via == *kind)
+                kind.is_host_local() || attempts.iter().any(|attempt| attempt.via == *kind)
             });
         (!waits).then_some(reason)
     }

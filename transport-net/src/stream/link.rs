@@ -5,7 +5,8 @@
 //! the sink.
 
 use std::io::{self, IoSlice};
-use std::net::{IpAddr, SocketAddr};
+#[cfg(feature = "ip")]
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
@@ -24,6 +25,7 @@ use super::endpoint::Endpoint;
 use super::frame::{FrameReader, Placed};
 use super::place::Place;
 use super::proof::Proof;
+use super::source::Source;
 use super::wire::{Beside, Reading, Writing};
 use crate::end::End;
 use crate::ration::Ration;
@@ -152,6 +154,7 @@ impl Link {
     }
 
     /// The address of this host that the connection stays with; see [`Writing::local_ip`].
+    #[cfg(feature = "ip")]
     pub(crate) fn local_ip(&self) -> Option<IpAddr> {
         self.state.lock().writer.as_ref()?.local_ip()
     }
@@ -297,14 +300,14 @@ impl Running {
         (read, writer): (Reading, Writing),
         proof: Proof,
         mut reader: FrameReader,
-        from: SocketAddr,
+        from: Source,
         greeted: impl FnOnce() + Send,
     ) {
         let mut read = read;
         let mut beside = read.take_beside();
         let writer = Arc::new(writer);
         self.link.proved(&proof);
-        self.ration = self.endpoint.ration(from.ip());
+        self.ration = self.endpoint.ration(from.home());
         self.link.state.lock().writer = Some(writer.clone());
         let mut greeted = Some(greeted);
         let exchange = self.exchange(
@@ -335,7 +338,7 @@ impl Running {
         (read, beside): (&mut Reading, &mut Beside),
         writer: &Writing,
         reader: &mut FrameReader,
-        from: SocketAddr,
+        from: Source,
         greeted: &mut Option<impl FnOnce() + Send>,
     ) -> End {
         let timer = sleep_until(Instant::now().into());
@@ -416,7 +419,7 @@ impl Running {
         reader: &mut FrameReader,
         arrived: usize,
         other_partial: bool,
-        from: SocketAddr,
+        from: Source,
         greeted: &mut Option<impl FnOnce() + Send>,
     ) -> Result<(), End> {
         let now = Instant::now();
@@ -480,7 +483,7 @@ impl Running {
     async fn handle_event(
         &mut self,
         event: Event,
-        from: SocketAddr,
+        from: Source,
         greeted: &mut Option<impl FnOnce() + Send>,
     ) -> Result<(), End> {
         match event {

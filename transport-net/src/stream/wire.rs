@@ -4,22 +4,28 @@
 //! to the kernel does: it may arrive.
 
 use std::io::{self, IoSlice};
+#[cfg(feature = "ip")]
 use std::net::IpAddr;
 #[cfg(feature = "secure")]
 use std::sync::Arc;
 
-use tokio::io::AsyncReadExt;
+use tokio::io::{AsyncRead, AsyncReadExt};
+#[cfg(feature = "ip")]
 use tokio::net::TcpStream;
+#[cfg(feature = "ip")]
 use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
+use tokio::net::{UnixStream, unix};
 
 use super::frame::{FrameReader, Space};
-#[cfg(feature = "secure")]
-use super::tls::{Incoming, Session};
 #[cfg(feature = "quic")]
 use crate::quic::streams as quic;
+#[cfg(feature = "secure")]
+use crate::tcp::tls::{Incoming, Session};
 
 /// The end that is read.
 pub(crate) enum Reading {
+    Unix(unix::OwnedReadHalf),
+    #[cfg(feature = "ip")]
     Plain(OwnedReadHalf),
     #[cfg(feature = "secure")]
     Tls(OwnedReadHalf, Incoming),
@@ -31,6 +37,8 @@ pub(crate) enum Reading {
 /// The end that is written.
 #[derive(Debug)]
 pub(crate) enum Writing {
+    Unix(unix::OwnedWriteHalf),
+    #[cfg(feature = "ip")]
     Plain(OwnedWriteHalf),
     #[cfg(feature = "secure")]
     Tls(OwnedWriteHalf, Arc<Session>),
@@ -38,7 +46,14 @@ pub(crate) enum Writing {
     Quic(quic::Outgoing),
 }
 
-/// Both ends of a socket, as it is.
+/// Both ends of a Unix domain socket.
+pub(crate) fn unix(stream: UnixStream) -> (Reading, Writing) {
+    let (read, write) = stream.into_split();
+    (Reading::Unix(read), Writing::Unix(write))
+}
+
+/// Both ends of a TCP socket, as it is.
+#[cfg(feature = "ip")]
 pub(crate) fn plain(stream: TcpStream) -> (Reading, Writing) {
     let (read, write) = stream.into_split();
     (Reading::Plain(read), Writing::Plain(write))
@@ -92,10 +107,9 @@ impl Reading {
     /// Reads what is there, as far as there is space. Nothing is lost when this is dropped.
     pub(crate) async fn read(&mut self, space: &mut Space<'_>) -> io::Result<usize> {
         match self {
-            Self::Plain(socket) => match space {
-                Space::Buffer(buffer) => socket.read_buf(buffer).await,
-                Space::Content(content) => socket.read(content).await,
-            },
+            Self::Unix(socket) => read(socket, space).await,
+            #[cfg(feature = "ip")]
+            Self::Plain(socket) => read(socket, space).await,
             #[cfg(feature = "secure")]
             Self::Tls(socket, incoming) => incoming.read(socket, space).await,
             #[cfg(feature = "quic")]
@@ -105,23 +119,37 @@ impl Reading {
 
     /// Waits until the peer has closed its direction, whatever comes before.
     pub(crate) async fn drain(&mut self) {
-        let mut ignored = [0; 4096];
-        let socket = match self {
-            Self::Plain(socket) => socket,
+        match self {
+            Self::Unix(socket) => drain(socket).await,
+            #[cfg(feature = "ip")]
+            Self::Plain(socket) => drain(socket).await,
             #[cfg(feature = "secure")]
-            Self::Tls(socket, _) => socket,
+            Self::Tls(socket, _) => drain(socket).await,
             #[cfg(feature = "quic")]
-            Self::Quic(control, _) => return control.drain().await,
-        };
-        while matches!(socket.read(&mut ignored).await, Ok(1..)) {}
+            Self::Quic(control, _) => control.drain().await,
+        }
     }
+}
+
+async fn read(socket: &mut (impl AsyncRead + Unpin), space: &mut Space<'_>) -> io::Result<usize> {
+    match space {
+        Space::Buffer(buffer) => socket.read_buf(buffer).await,
+        Space::Content(content) => socket.read(content).await,
+    }
+}
+
+async fn drain(socket: &mut (impl AsyncRead + Unpin)) {
+    let mut ignored = [0; 4096];
+    while matches!(socket.read(&mut ignored).await, Ok(1..)) {}
 }
 
 impl Writing {
     /// The address of this host that the connection stays with. None when the connection can go on
-    /// from another one.
+    /// from another one, or has no address.
+    #[cfg(feature = "ip")]
     pub(crate) fn local_ip(&self) -> Option<IpAddr> {
         match self {
+            Self::Unix(_) => None,
             Self::Plain(socket) => Some(socket.local_addr().ok()?.ip()),
             #[cfg(feature = "secure")]
             Self::Tls(socket, _) => Some(socket.local_addr().ok()?.ip()),
@@ -133,6 +161,8 @@ impl Writing {
     /// Hands over what is taken at once.
     pub(crate) fn try_write(&self, slices: &[IoSlice<'_>]) -> io::Result<usize> {
         match self {
+            Self::Unix(socket) => socket.try_write_vectored(slices),
+            #[cfg(feature = "ip")]
             Self::Plain(socket) => socket.try_write_vectored(slices),
             #[cfg(feature = "secure")]
             Self::Tls(socket, session) => session.write(socket, slices),
@@ -145,6 +175,8 @@ impl Writing {
     /// does not take it now.
     pub(crate) fn try_finish(&self) -> io::Result<()> {
         match self {
+            Self::Unix(_) => Ok(()),
+            #[cfg(feature = "ip")]
             Self::Plain(_) => Ok(()),
             #[cfg(feature = "secure")]
             Self::Tls(socket, session) => session.push(socket),
@@ -156,6 +188,8 @@ impl Writing {
     /// Waits until the kernel takes more.
     pub(crate) async fn writable(&self) -> io::Result<()> {
         match self {
+            Self::Unix(socket) => socket.writable().await,
+            #[cfg(feature = "ip")]
             Self::Plain(socket) => socket.writable().await,
             #[cfg(feature = "secure")]
             Self::Tls(socket, _) => socket.writable().await,

@@ -6,7 +6,7 @@ use proptest::prelude::*;
 
 use super::reader::{APART_FROM, CHUNK, FIRST_STEP};
 use super::*;
-use crate::tcp::place::{Place, Rooms};
+use crate::stream::place::{Place, Rooms};
 
 fn letter_parcel(head: Vec<u8>, content: Vec<u8>) -> Parcel {
     let payload = Payload {

@@ -9,9 +9,13 @@
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap};
-use std::net::{IpAddr, SocketAddr};
+use std::io;
+#[cfg(feature = "ip")]
+use std::net::SocketAddr;
+use std::sync::Arc;
+#[cfg(feature = "ip")]
+use std::sync::Weak;
 use std::sync::atomic::Ordering;
-use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
 use fipa_transport::{
@@ -19,40 +23,44 @@ use fipa_transport::{
     Ticket, WayError, WayFault,
 };
 use parking_lot::Mutex;
-use socket2::SockRef;
-use tokio::net::TcpStream;
 use tokio::runtime::Handle;
 use tokio::task::{AbortHandle, JoinHandle};
 use tokio::time::sleep;
 
-use super::accept_queue::{AcceptQueue, Full};
-use super::config::{Limits, TcpConfig};
+use super::config::{Limits, StreamConfig};
 use super::connection::{Connection, Role, SendError, letter_len};
 use super::counters::{Tally, count};
-use super::courier::{self, Couriers};
 use super::link::{Link, MAX_LINKS, of_ticket};
 use super::place::Rooms;
+use super::source::{Home, Source};
+#[cfg(feature = "ip")]
 use crate::address::{self, Listening};
 use crate::end::End;
 use crate::hello::Hello;
+#[cfg(feature = "ip")]
 use crate::interfaces::Changes;
-use crate::ration::{Ration, Rations, whose};
-use crate::seldom::{PerSecond, warn_seldom};
+use crate::ration::Ration;
+#[cfg(feature = "ip")]
+use crate::ration::Rations;
+use crate::seldom::warn_seldom;
+#[cfg(feature = "ip")]
+use crate::tcp::Legacy;
+
+/// How long accepting rests when the system has no descriptors left.
+const REST: Duration = Duration::from_millis(100);
 
 #[derive(Debug)]
 pub(crate) struct Endpoint {
     kind: Kind,
-    pub(crate) config: TcpConfig,
+    pub(crate) config: StreamConfig,
     pub(crate) runtime: Handle,
-    /// Letters to old peers.
-    pub(crate) couriers: Couriers,
-    /// Accepted connections that may bring a letter of a legacy peer.
-    pub(crate) accept_queue: AcceptQueue,
-    /// Connections that were reset because the accept queue was full.
-    resets: PerSecond,
+    /// Letters of legacy peers, in both directions.
+    #[cfg(feature = "ip")]
+    pub(crate) legacy: Legacy,
     /// What is taken for content that is arriving.
     pub(crate) rooms: Rooms,
     /// What peers may still send.
+    #[cfg(feature = "ip")]
     rations: Rations,
     tally: Tally,
     registry: Mutex<Registry>,
@@ -62,7 +70,7 @@ pub(crate) struct Endpoint {
 struct Registry {
     phase: Phase,
     sink: Option<Arc<dyn Sink>>,
-    listening: Listening,
+    listening: Reached,
     /// The tasks that accept connections, and the one that watches the interfaces.
     listeners: Vec<AbortHandle>,
     /// Connections that were dialled, or whose peer has said hello.
@@ -74,11 +82,11 @@ struct Registry {
     /// The peers' last connections for each of the locations they dialled.
     inbound: HashMap<Inbound, (u64, Arc<Link>)>,
     /// Whose the accepted ones are.
-    homes: HashMap<u32, IpAddr>,
-    /// The address at which the peer of a link was when it introduced itself.
-    places: HashMap<u32, IpAddr>,
+    homes: HashMap<u32, Home>,
+    /// Where the peer of a link was when it introduced itself.
+    places: HashMap<u32, Home>,
     /// Accepted connections that have not introduced themselves, oldest first, and whose they are.
-    strangers: BTreeMap<u64, (IpAddr, Option<AbortHandle>)>,
+    strangers: BTreeMap<u64, (Home, Option<AbortHandle>)>,
     last_stranger: u64,
     last_number: u32,
     last_serial: u64,
@@ -92,12 +100,35 @@ enum Phase {
     Closed,
 }
 
+/// Where an endpoint is reached.
+#[derive(Debug, Default)]
+enum Reached {
+    #[default]
+    Nowhere,
+    /// At the one socket with this address.
+    Socket(String),
+    #[cfg(feature = "ip")]
+    Addresses(Listening),
+}
+
+impl Reached {
+    /// What a hello says of it.
+    fn texts(&self) -> Vec<String> {
+        match self {
+            Self::Nowhere => Vec::new(),
+            Self::Socket(address) => vec![address.clone()],
+            #[cfg(feature = "ip")]
+            Self::Addresses(listening) => listening.texts(),
+        }
+    }
+}
+
 /// What tells a peer's connections for one location from others. With the address, so that a
 /// stranger elsewhere cannot push out somebody's connection by using its incarnation.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Inbound {
     incarnation: Incarnation,
-    ip: IpAddr,
+    home: Home,
     dialled: String,
 }
 
@@ -122,15 +153,15 @@ impl std::fmt::Debug for Registry {
 
 impl Endpoint {
     /// An endpoint of this kind of transport; what has been opened, it does not ask.
-    pub(crate) fn new(kind: Kind, config: TcpConfig, runtime: Handle) -> Arc<Self> {
+    pub(crate) fn new(kind: Kind, config: StreamConfig, runtime: Handle) -> Arc<Self> {
         Arc::new(Self {
             kind,
             config,
             runtime,
-            couriers: Couriers::default(),
-            accept_queue: AcceptQueue::default(),
-            resets: PerSecond::default(),
+            #[cfg(feature = "ip")]
+            legacy: Legacy::default(),
             rooms: Rooms::default(),
+            #[cfg(feature = "ip")]
             rations: Rations::default(),
             tally: Tally::default(),
             registry: Mutex::default(),
@@ -141,10 +172,16 @@ impl Endpoint {
         &self.config.limits
     }
 
-    /// What whoever is at this address may still send, if that is limited.
-    pub(crate) fn ration(&self, ip: IpAddr) -> Option<Arc<Ration>> {
-        let limited = self.config.limits_peer_at(ip);
-        limited.then(|| self.rations.of(ip, self.limits().rates(), Instant::now()))?
+    /// What the peers there may still send, if that is limited.
+    pub(crate) fn ration(&self, home: Home) -> Option<Arc<Ration>> {
+        if !self.config.limits_peer_at(home) {
+            return None;
+        }
+        match home {
+            Home::Process(_) => None,
+            #[cfg(feature = "ip")]
+            Home::Address(ip) => self.rations.of(ip, self.limits().rates(), Instant::now()),
+        }
     }
 
     pub(crate) fn tally(&self) -> &Tally {
@@ -152,32 +189,85 @@ impl Endpoint {
     }
 
     /// Who is told, while the endpoint is open.
+    #[cfg(feature = "ip")]
     pub(crate) fn sink(&self) -> Option<Arc<dyn Sink>> {
         self.registry.lock().sink.clone()
     }
 
-    /// Opens a socket at every address of the configuration with `open`, which returns the address
-    /// that the socket is bound to as well, and has `accept` start the task that serves it. Returns
-    /// where the endpoint is reached at present; the sink is told when that changes.
+    /// Whether the endpoint can be opened.
     ///
     /// # Errors
-    /// When the endpoint was opened before, or a socket cannot be opened.
-    pub(crate) fn listen<S>(
-        self: &Arc<Self>,
-        sink: Arc<dyn Sink>,
-        open: impl Fn(&str) -> Result<(S, SocketAddr), ListenError>,
-        accept: impl Fn(S) -> JoinHandle<()>,
-    ) -> Result<Vec<Location>, ListenError> {
+    /// When it was opened before, or its identity cannot be told.
+    fn may_listen(&self) -> Result<(), ListenError> {
         if self.registry.lock().phase != Phase::New {
             return Err(ListenError::OpenedBefore);
         }
-        let identity = &self.config.identity;
-        if let Some(fault) = identity.fault() {
-            return Err(ListenError::Unavailable(fault));
+        match self.config.identity.fault() {
+            Some(fault) => Err(ListenError::Unavailable(fault)),
+            None => Ok(()),
         }
+    }
+
+    /// Opens the one socket of the endpoint with `open`, which returns its address as well, and has
+    /// `accept` start the task that serves it. Returns where the endpoint is reached.
+    ///
+    /// # Errors
+    /// When the endpoint was opened before, or the socket cannot be opened.
+    pub(crate) fn listen_at<S>(
+        &self,
+        sink: Arc<dyn Sink>,
+        open: impl FnOnce() -> Result<(S, String), ListenError>,
+        accept: impl FnOnce(S) -> JoinHandle<()>,
+    ) -> Result<Vec<Location>, ListenError> {
+        self.may_listen()?;
+        let _inside = self.runtime.enter();
+        let (socket, address) = open()?;
+        let location = Location::new(self.kind, &address)
+            .map_err(|error| ListenError::Unavailable(error.to_string()))?
+            .with_incarnation(self.config.identity.incarnation);
+        let mut registry = self.registry.lock();
+        if registry.phase != Phase::New {
+            return Err(ListenError::OpenedBefore);
+        }
+        registry.phase = Phase::Open;
+        registry.sink = Some(sink);
+        registry.listening = Reached::Socket(address);
+        registry.listeners = vec![accept(socket).abort_handle()];
+        Ok(vec![location])
+    }
+
+    /// Another socket takes the place of the one of [`listen_at`](Self::listen_at), at the same
+    /// address. Does nothing when the endpoint is not open.
+    pub(crate) fn replace_listener(&self, accept: impl FnOnce() -> JoinHandle<()>) {
+        let mut registry = self.registry.lock();
+        if registry.phase != Phase::Open {
+            return;
+        }
+        let before = std::mem::replace(&mut registry.listeners, vec![accept().abort_handle()]);
+        drop(registry);
+        for task in before {
+            task.abort();
+        }
+    }
+
+    /// Opens a socket at each of these addresses with `open`, which returns the address that the
+    /// socket is bound to as well, and has `accept` start the task that serves it. Returns where the
+    /// endpoint is reached at present; the sink is told when that changes.
+    ///
+    /// # Errors
+    /// When the endpoint was opened before, or a socket cannot be opened.
+    #[cfg(feature = "ip")]
+    pub(crate) fn listen<S>(
+        self: &Arc<Self>,
+        sink: Arc<dyn Sink>,
+        listen: &[String],
+        open: impl Fn(&str) -> Result<(S, SocketAddr), ListenError>,
+        accept: impl Fn(S) -> JoinHandle<()>,
+    ) -> Result<Vec<Location>, ListenError> {
+        self.may_listen()?;
         let _inside = self.runtime.enter();
         let (mut sockets, mut bound) = (Vec::new(), Vec::new());
-        for text in &self.config.listen {
+        for text in listen {
             let (socket, address) = open(text)?;
             bound.push(address);
             sockets.push(socket);
@@ -190,7 +280,7 @@ impl Endpoint {
             .any(|bound| !bound.ip().is_loopback())
             .then(Changes::subscribe);
         let listening = Listening::new(bound).map_err(|error| unavailable(&error))?;
-        let locations = listening.locations(self.kind, identity.incarnation);
+        let locations = listening.locations(self.kind, self.config.identity.incarnation);
         let locations = locations.map_err(|error| unavailable(&error))?;
         let mut registry = self.registry.lock();
         if registry.phase != Phase::New {
@@ -198,7 +288,7 @@ impl Endpoint {
         }
         registry.phase = Phase::Open;
         registry.sink = Some(sink);
-        registry.listening = listening;
+        registry.listening = Reached::Addresses(listening);
         let tasks = sockets.into_iter().map(accept);
         let watch = changes.map(|changes| {
             let watch = follow_interfaces(Arc::downgrade(self), changes);
@@ -208,18 +298,23 @@ impl Endpoint {
         Ok(locations)
     }
 
-    /// Where others reach this endpoint at the address that a socket of it has, as a URL.
-    pub(crate) fn reachable_at(&self, local: SocketAddr) -> Option<String> {
-        courier::listening_at(&self.registry.lock().listening.texts(), local)
+    /// What a hello says of where this endpoint is reached.
+    #[cfg(feature = "ip")]
+    pub(crate) fn listening(&self) -> Vec<String> {
+        self.registry.lock().listening.texts()
     }
 
     /// The interfaces of this host have changed: tells the sink where the endpoint is reached now,
     /// and ends the connections of addresses that this host has no more, on which nothing can
     /// arrive.
+    #[cfg(feature = "ip")]
     fn interfaces_changed(&self) {
         let (sink, told, lost, links) = {
             let mut registry = self.registry.lock();
-            let moved = match registry.listening.refresh() {
+            let Reached::Addresses(listening) = &mut registry.listening else {
+                return;
+            };
+            let moved = match listening.refresh() {
                 Ok(moved) => moved,
                 Err(error) => {
                     tracing::warn!(kind = %self.kind, %error, "the locations stay as they were");
@@ -229,7 +324,7 @@ impl Endpoint {
             let incarnation = self.config.identity.incarnation;
             let told = moved
                 .relocated
-                .then(|| registry.listening.locations(self.kind, incarnation));
+                .then(|| listening.locations(self.kind, incarnation));
             let links: Vec<_> = match moved.lost.is_empty() {
                 true => Vec::new(),
                 false => registry.links.values().cloned().collect(),
@@ -257,8 +352,8 @@ impl Endpoint {
 
     /// Ends everything. The connections' tasks conclude what is outstanding.
     pub(crate) fn close(&self) {
-        self.couriers.close();
-        self.accept_queue.close();
+        #[cfg(feature = "ip")]
+        self.legacy.close();
         let (links, tasks) = {
             let mut registry = self.registry.lock();
             registry.phase = Phase::Closed;
@@ -383,7 +478,10 @@ impl Endpoint {
         if links.iter().any(unsent) {
             return Abandoned::NotSent;
         }
-        self.couriers.abandon(attempt)
+        #[cfg(feature = "ip")]
+        return self.legacy.abandon(attempt);
+        #[cfg(not(feature = "ip"))]
+        Abandoned::Unconfirmed
     }
 
     /// A link for a connection that was accepted, unless the endpoint has been closed.
@@ -427,12 +525,12 @@ impl Endpoint {
         &self,
         link: &Arc<Link>,
         peer: &Hello,
-        from: SocketAddr,
+        from: Source,
     ) -> Result<Hop, End> {
         let incarnation = peer.identity.incarnation;
         let inbound = Inbound {
             incarnation,
-            ip: from.ip(),
+            home: from.home(),
             dialled: peer.dialled.clone(),
         };
         let mut superseded = None;
@@ -447,7 +545,7 @@ impl Endpoint {
                     count(&self.tally.refused_crowd);
                     return Err(End::Crowd);
                 }
-                let home = whose(from.ip());
+                let home = from.home().whole();
                 let at_home = registry.homes.values().filter(|it| **it == home).count();
                 if self.config.limits_peer_at(home) && at_home >= self.limits().max_per_address {
                     count(&self.tally.refused_crowd);
@@ -468,14 +566,14 @@ impl Endpoint {
                 let this = (peer.serial, link.clone());
                 registry.inbound.insert(inbound, this);
             }
-            registry.places.insert(link.number, from.ip());
+            registry.places.insert(link.number, from.home());
             let known = registry.known.entry(incarnation).or_default();
             others = known.clone();
             known.push(link.clone());
             count(&self.tally.connections);
             let elsewhere = |other: &Arc<Link>| {
                 let place = registry.places.get(&other.number);
-                place.is_some_and(|place| *place != from.ip())
+                place.is_some_and(|place| *place != from.home())
             };
             others.retain(elsewhere);
         }
@@ -490,8 +588,15 @@ impl Endpoint {
             superseded.leave(End::Superseded);
             superseded.over().await;
         }
-        let remote = self.config.identity.is_remote(&peer.identity);
-        let back = address::way_back(&peer.listening, from).to_string();
+        let (remote, back) = match from {
+            // A process of this host is reached at the socket that bears its incarnation.
+            Source::Process(_) => (false, incarnation.to_string()),
+            #[cfg(feature = "ip")]
+            Source::Address(from) => (
+                self.config.identity.is_remote(&peer.identity),
+                address::way_back(&peer.listening, from).to_string(),
+            ),
+        };
         let location = Location::new(self.kind, &back)
             .map_err(|error| End::Nonsense(error.to_string()))?
             .with_incarnation(incarnation);
@@ -539,11 +644,21 @@ impl Endpoint {
         }
     }
 
-    /// Gives a place to a connection accepted from this address that has not introduced itself, unless
+    /// Accepting a connection has failed: tells that, and rests.
+    pub(crate) async fn accept_failed(&self, error: &io::Error) {
+        let before = self.tally.accept_failures.fetch_add(1, Ordering::Relaxed);
+        warn_seldom(
+            before,
+            format_args!("cannot accept a connection: {error} (`ulimit -n`?)"),
+        );
+        sleep(REST).await;
+    }
+
+    /// Gives a place to a connection accepted from this home that has not introduced itself, unless
     /// the endpoint has been closed. One too many pushes out another; so does one more of an address
     /// that has half of all places.
-    pub(crate) fn receive_stranger(self: &Arc<Self>, from: IpAddr) -> Option<Stranger> {
-        let home = whose(from);
+    pub(crate) fn receive_stranger(self: &Arc<Self>, from: Source) -> Option<Stranger> {
+        let home = from.home().whole();
         let (number, pushed_out) = {
             let mut registry = self.registry.lock();
             if registry.phase != Phase::Open {
@@ -576,46 +691,6 @@ impl Endpoint {
         self.registry.lock().strangers.len() * 2 >= self.limits().max_strangers
     }
 
-    /// Resets a connection for which the accept queue has no room, so that its sender sees an error.
-    pub(crate) fn reset(self: &Arc<Self>, stream: TcpStream, from: SocketAddr, full: Full) {
-        let limits = self.limits();
-        let (whose, most) = match full {
-            Full::Address => ("of its address", limits.max_unread_per_address),
-            Full::All => ("of all addresses", limits.max_unread),
-            Full::Closed => return,
-        };
-        count(&self.tally.refused_crowd);
-        // Without the time to linger, closing sends a reset.
-        if let Err(error) = SockRef::from(&stream).set_linger(Some(Duration::ZERO)) {
-            tracing::debug!(%from, "cannot reset a connection: {error}");
-        }
-        drop(stream);
-        if !self.resets.count() {
-            return;
-        }
-        tracing::warn!(
-            %from,
-            "connection reset: {most} connections {whose} wait to be read; a letter on it is lost, let \
-             its sender send more slowly"
-        );
-        let endpoint = Arc::downgrade(self);
-        self.runtime.spawn(async move {
-            loop {
-                sleep(Duration::from_secs(1)).await;
-                let Some(endpoint) = endpoint.upgrade() else {
-                    return;
-                };
-                let Some(resets) = endpoint.resets.take() else {
-                    return;
-                };
-                tracing::warn!(
-                    resets,
-                    "connections reset within a second: too many wait to be read"
-                );
-            }
-        });
-    }
-
     /// The stranger with this number is served by this task.
     pub(crate) fn stranger_started(&self, number: u64, task: AbortHandle) {
         // Otherwise it is no stranger any more, or gone.
@@ -629,8 +704,8 @@ impl Registry {
     /// Which stranger goes when another one comes from this home: the oldest of those from the home
     /// that has the most places then. So those who knock often push out each other, and somebody with
     /// a slow link gets in beside them.
-    fn one_too_many(&self, coming: IpAddr) -> Option<u64> {
-        let mut homes: HashMap<IpAddr, (usize, Reverse<u64>)> = HashMap::new();
+    fn one_too_many(&self, coming: Home) -> Option<u64> {
+        let mut homes: HashMap<Home, (usize, Reverse<u64>)> = HashMap::new();
         for (number, (home, task)) in &self.strangers {
             if task.is_some() {
                 let fresh = || (usize::from(*home == coming), Reverse(*number));
@@ -643,6 +718,7 @@ impl Registry {
 }
 
 /// Tells an endpoint of changes of the interfaces, until it is gone or the task is aborted.
+#[cfg(feature = "ip")]
 async fn follow_interfaces(endpoint: Weak<Endpoint>, mut changes: Changes) {
     loop {
         changes.next().await;

@@ -1,0 +1,59 @@
+//! Where the other end of a connection is, as far as the operating system vouches for it.
+
+use std::fmt;
+#[cfg(feature = "ip")]
+use std::net::{IpAddr, SocketAddr};
+
+#[cfg(feature = "ip")]
+use crate::ration::whose;
+
+/// The other end of a connection.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Source {
+    /// A process of this host and of this user, by its process number (Unix domain socket).
+    Process(i32),
+    /// An address (TCP and QUIC).
+    #[cfg(feature = "ip")]
+    Address(SocketAddr),
+}
+
+/// What the connections of one peer have in common.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(crate) enum Home {
+    /// The process of this host.
+    Process(i32),
+    /// The address without the port.
+    #[cfg(feature = "ip")]
+    Address(IpAddr),
+}
+
+impl Source {
+    pub(crate) fn home(self) -> Home {
+        match self {
+            Self::Process(number) => Home::Process(number),
+            #[cfg(feature = "ip")]
+            Self::Address(address) => Home::Address(address.ip()),
+        }
+    }
+}
+
+impl Home {
+    /// The home that all addresses of one peer share; see [`whose`].
+    pub(crate) fn whole(self) -> Self {
+        match self {
+            Self::Process(_) => self,
+            #[cfg(feature = "ip")]
+            Self::Address(ip) => Self::Address(whose(ip)),
+        }
+    }
+}
+
+impl fmt::Display for Source {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Process(number) => write!(f, "process {number}"),
+            #[cfg(feature = "ip")]
+            Self::Address(address) => address.fmt(f),
+        }
+    }
+}

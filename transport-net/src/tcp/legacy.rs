@@ -1,0 +1,85 @@
+//! What an endpoint keeps for legacy peers: their letters, in both directions.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use fipa_transport::{Abandoned, AttemptId};
+use socket2::SockRef;
+use tokio::net::TcpStream;
+use tokio::time::sleep;
+
+use super::accept_queue::{AcceptQueue, Full};
+use super::courier::Couriers;
+use crate::seldom::PerSecond;
+use crate::stream::counters::count;
+use crate::stream::endpoint::Endpoint;
+
+/// Letters of legacy peers.
+#[derive(Debug, Default)]
+pub(crate) struct Legacy {
+    /// Letters to them.
+    pub(super) couriers: Couriers,
+    /// Accepted connections that may bring a letter of one.
+    pub(super) accept_queue: AcceptQueue,
+    /// Connections that were reset because the accept queue was full.
+    resets: PerSecond,
+}
+
+impl Legacy {
+    pub(crate) fn close(&self) {
+        self.couriers.close();
+        self.accept_queue.close();
+    }
+
+    /// Ends the attempt to send a letter.
+    pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
+        self.couriers.abandon(attempt)
+    }
+
+    /// Resets a connection for which the accept queue has no room, so that its sender sees an error.
+    pub(super) fn reset(
+        &self,
+        endpoint: &Arc<Endpoint>,
+        stream: TcpStream,
+        from: SocketAddr,
+        full: Full,
+    ) {
+        let limits = endpoint.limits();
+        let (whose, most) = match full {
+            Full::Address => ("of its address", limits.max_unread_per_address),
+            Full::All => ("of all addresses", limits.max_unread),
+            Full::Closed => return,
+        };
+        count(&endpoint.tally().refused_crowd);
+        // Without the time to linger, closing sends a reset.
+        if let Err(error) = SockRef::from(&stream).set_linger(Some(Duration::ZERO)) {
+            tracing::debug!(%from, "cannot reset a connection: {error}");
+        }
+        drop(stream);
+        if !self.resets.count() {
+            return;
+        }
+        tracing::warn!(
+            %from,
+            "connection reset: {most} connections {whose} wait to be read; a letter on it is lost, let \
+             its sender send more slowly"
+        );
+        let weak = Arc::downgrade(endpoint);
+        endpoint.runtime.spawn(async move {
+            loop {
+                sleep(Duration::from_secs(1)).await;
+                let Some(endpoint) = weak.upgrade() else {
+                    return;
+                };
+                let Some(resets) = endpoint.legacy.resets.take() else {
+                    return;
+                };
+                tracing::warn!(
+                    resets,
+                    "connections reset within a second: too many wait to be read"
+                );
+            }
+        });
+    }
+}

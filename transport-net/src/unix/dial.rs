@@ -1,0 +1,62 @@
+//! The calling side: opening a connection to a location.
+
+use std::io;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bytes::BytesMut;
+use fipa_transport::{Location, Sink};
+use tokio::net::UnixStream;
+use tokio::time::timeout;
+
+use super::directory::Directory;
+use crate::end::End;
+use crate::stream::endpoint::Endpoint;
+use crate::stream::frame::FrameReader;
+use crate::stream::link::{Link, Running};
+use crate::stream::proof::Proof;
+use crate::stream::source::Source;
+use crate::stream::wire;
+
+/// Opens the connection of a link that has been made up, and serves it.
+pub(super) async fn dial(
+    endpoint: Arc<Endpoint>,
+    directory: Option<Arc<Directory>>,
+    link: Arc<Link>,
+    sink: Arc<dyn Sink>,
+    to: Location,
+) {
+    let limits = endpoint.limits().clone();
+    let running = Running::new(endpoint, link.clone(), sink, Some(to.clone()));
+    let Some(directory) = directory else {
+        return running.fail(End::Closed);
+    };
+    let connected = tokio::select! {
+        connected = connect(&directory, to.address(), limits.connect_timeout) => connected,
+        end = link.leaving() => return running.fail(end),
+    };
+    let (stream, number) = match connected {
+        Ok(connected) => connected,
+        Err(error) => return running.fail(End::unreachable(&to, &error)),
+    };
+    link.connected(Instant::now());
+    let reader = FrameReader::new(limits.max_letter, BytesMut::new());
+    let from = Source::Process(number);
+    running
+        .serve(wire::unix(stream), Proof::default(), reader, from, || {})
+        .await;
+}
+
+async fn connect(
+    directory: &Directory,
+    name: &str,
+    patience: Duration,
+) -> io::Result<(UnixStream, i32)> {
+    match timeout(patience, directory.connect(name)).await {
+        Ok(connected) => connected,
+        Err(_) => Err(io::Error::new(
+            io::ErrorKind::TimedOut,
+            format!("no connection within {patience:?} (connect_timeout)"),
+        )),
+    }
+}

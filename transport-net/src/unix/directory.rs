@@ -1,0 +1,285 @@
+//! The socket files of a domain, in a directory that only this user may enter.
+//!
+//! Every process has one socket, named after its incarnation. Files are used relative to the
+//! directory's descriptor, so that what was checked is what is used; `bind` and `connect` take them
+//! by their names below `/proc/self/fd`, because the path of the directory may be longer than the
+//! 108 bytes of a socket's address (unix(7)). Abstract addresses are not used: they have no
+//! permissions.
+
+use std::fs::DirBuilder;
+use std::io;
+use std::os::fd::{AsRawFd as _, OwnedFd};
+use std::os::unix::fs::DirBuilderExt as _;
+use std::os::unix::net::{UnixListener, UnixStream as StdStream};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use fipa_transport::Incarnation;
+use rustix::fs::{AtFlags, Dir, FileType, FlockOperation, Mode, OFlags, Stat};
+use rustix::io::Errno;
+use rustix::net::{
+    AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, connect, listen, socket_with,
+};
+use tokio::net::UnixStream;
+use tokio::time::sleep;
+
+/// Connections that wait to be accepted.
+const BACKLOG: i32 = 1024;
+
+/// Time before a socket whose backlog is full is tried again.
+const RETRY_AFTER: Duration = Duration::from_millis(2);
+
+/// Time to wait for the lock of the directory, which is held for some milliseconds at most.
+const LOCKING: Duration = Duration::from_secs(1);
+
+/// Why the sockets of a domain cannot be used.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum UnixError {
+    /// The operating system refuses something.
+    #[error("cannot {what} {}: {source}", path.display())]
+    Io {
+        /// What was tried.
+        what: &'static str,
+        /// The directory of the sockets.
+        path: PathBuf,
+        /// What the operating system said.
+        source: io::Error,
+    },
+    /// Another user could use what is in the directory.
+    #[error("{} must be a directory that only this user may enter, and {why}", path.display())]
+    NotPrivate {
+        /// The directory of the sockets.
+        path: PathBuf,
+        /// What is wrong.
+        why: String,
+    },
+}
+
+/// A file, however it is called.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct FileId {
+    device: u64,
+    inode: u64,
+}
+
+impl FileId {
+    fn of(stat: &Stat) -> Self {
+        Self {
+            device: stat.st_dev,
+            inode: stat.st_ino,
+        }
+    }
+}
+
+/// The directory of a domain's sockets.
+#[derive(Debug)]
+pub(super) struct Directory {
+    path: PathBuf,
+    dir: OwnedFd,
+}
+
+/// The lock of the directory, until this is dropped.
+struct Locked(#[expect(dead_code, reason = "closing it unlocks")] OwnedFd);
+
+impl Directory {
+    /// Opens the directory, and makes it if need be.
+    pub(super) fn open(path: &Path) -> Result<Self, UnixError> {
+        let io_error = |what, source| UnixError::Io {
+            what,
+            path: path.to_owned(),
+            source,
+        };
+        match DirBuilder::new().mode(0o700).create(path) {
+            Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
+                return Err(io_error("create", error));
+            }
+            // What exists, perhaps as something else, is checked next.
+            _ => {}
+        }
+        let refused = |why: String| UnixError::NotPrivate {
+            path: path.to_owned(),
+            why,
+        };
+        let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
+        let dir = match rustix::fs::open(path, flags, Mode::empty()) {
+            Ok(dir) => dir,
+            Err(Errno::LOOP | Errno::NOTDIR) => {
+                return Err(refused("it is a link or a file".into()));
+            }
+            Err(error) => return Err(io_error("open", error.into())),
+        };
+        let stat = rustix::fs::fstat(&dir).map_err(|error| io_error("examine", error.into()))?;
+        if stat.st_uid != rustix::process::geteuid().as_raw() {
+            return Err(refused(format!("it belongs to user {}", stat.st_uid)));
+        }
+        if stat.st_mode & 0o077 != 0 {
+            return Err(refused(format!("its mode is {:03o}", stat.st_mode & 0o777)));
+        }
+        Ok(Self {
+            path: path.to_owned(),
+            dir,
+        })
+    }
+
+    /// The error of this directory for a failure of the system.
+    pub(super) fn failed(&self, what: &'static str, source: io::Error) -> UnixError {
+        UnixError::Io {
+            what,
+            path: self.path.clone(),
+            source,
+        }
+    }
+
+    /// Makes a listening, non-blocking socket with this name that only this user may connect to.
+    pub(super) fn bind(&self, name: &str) -> Result<(UnixListener, FileId), UnixError> {
+        let make = || {
+            // The file is there a moment before the kernel finds the socket by it; a sweep must not
+            // come in between. Without the lock, because a process that sweeps was stopped, the
+            // worst is that the file is removed, and made again.
+            let _lock = self.lock(FlockOperation::NonBlockingLockShared, LOCKING);
+            self.remove_file(name)?;
+            let socket = new_socket(SocketType::STREAM)?;
+            let path = format!("/proc/self/fd/{}/{name}", self.dir.as_raw_fd());
+            bind(&socket, &SocketAddrUnix::new(path)?)?;
+            let stat = rustix::fs::statat(&self.dir, name, AtFlags::SYMLINK_NOFOLLOW)?;
+            let private = Mode::RUSR | Mode::WUSR;
+            rustix::fs::chmodat(&self.dir, name, private, AtFlags::empty())?;
+            listen(&socket, BACKLOG)?;
+            Ok((socket.into(), FileId::of(&stat)))
+        };
+        make().map_err(|error: Errno| self.failed("make a socket in", error.into()))
+    }
+
+    /// Connects to the socket with this name. Returns the connection and the number of the process
+    /// at its other end.
+    pub(super) async fn connect(&self, name: &str) -> io::Result<(UnixStream, i32)> {
+        if name.parse::<Incarnation>().is_err() {
+            let what = "not the address of a Unix domain socket (16 hexadecimal digits expected)";
+            return Err(io::Error::new(io::ErrorKind::InvalidInput, what));
+        }
+        // What is examined here is what is connected to below, whatever the name is given to.
+        let flags = OFlags::PATH | OFlags::NOFOLLOW | OFlags::CLOEXEC;
+        let file = rustix::fs::openat(&self.dir, name, flags, Mode::empty())?;
+        let stat = rustix::fs::fstat(&file)?;
+        if FileType::from_raw_mode(stat.st_mode) != FileType::Socket
+            || stat.st_uid != rustix::process::geteuid().as_raw()
+        {
+            let what = "it is not a socket of this user";
+            return Err(io::Error::new(io::ErrorKind::PermissionDenied, what));
+        }
+        let address = SocketAddrUnix::new(format!("/proc/self/fd/{}", file.as_raw_fd()))?;
+        let socket = new_socket(SocketType::STREAM)?;
+        loop {
+            match connect(&socket, &address) {
+                Ok(()) => break,
+                // The backlog is full.
+                Err(Errno::AGAIN) => sleep(RETRY_AFTER).await,
+                Err(Errno::INTR) => {}
+                Err(error) => return Err(error.into()),
+            }
+        }
+        let stream = UnixStream::from_std(StdStream::from(socket))?;
+        let number = peer(&stream)?;
+        Ok((stream, number))
+    }
+
+    /// Removes the sockets that dead processes have left, unless another process is at it, or makes
+    /// its own.
+    pub(super) fn sweep(&self) {
+        let exclusive = FlockOperation::NonBlockingLockExclusive;
+        let Some(_lock) = self.lock(exclusive, Duration::ZERO) else {
+            return;
+        };
+        let entries = Dir::read_from(&self.dir).into_iter().flatten().flatten();
+        for entry in entries {
+            let Ok(name) = entry.file_name().to_str() else {
+                continue;
+            };
+            if name.parse::<Incarnation>().is_ok() && self.is_dead(name) {
+                let removed = self.remove_file(name);
+                tracing::debug!(name, ?removed, "the socket of a dead process");
+            }
+        }
+    }
+
+    /// Whether no process has the socket with this name open. Connecting with another type of
+    /// socket tells that without reaching the process: the kernel compares the types when it has
+    /// found the socket, and refuses the connection when there is none.
+    fn is_dead(&self, name: &str) -> bool {
+        let probe = || {
+            let path = format!("/proc/self/fd/{}/{name}", self.dir.as_raw_fd());
+            let probe = new_socket(SocketType::DGRAM)?;
+            connect(&probe, &SocketAddrUnix::new(path)?)
+        };
+        probe() == Err(Errno::CONNREFUSED)
+    }
+
+    /// Whether this directory is that of its path, and has this socket. What cannot be examined
+    /// counts as there.
+    pub(super) fn is_there(&self, name: &str, file: FileId) -> bool {
+        let is = |found: rustix::io::Result<Stat>, id: Option<FileId>| match found {
+            Ok(found) => id.is_none_or(|id| FileId::of(&found) == id),
+            Err(error) => !matches!(error, Errno::NOENT | Errno::NOTDIR),
+        };
+        let own = rustix::fs::fstat(&self.dir).ok().map(|it| FileId::of(&it));
+        let socket = rustix::fs::statat(&self.dir, name, AtFlags::SYMLINK_NOFOLLOW);
+        is(rustix::fs::lstat(&self.path), own) && is(socket, Some(file))
+    }
+
+    /// Removes the socket with this name, if it is this file.
+    pub(super) fn remove(&self, name: &str, file: FileId) {
+        let found = rustix::fs::statat(&self.dir, name, AtFlags::SYMLINK_NOFOLLOW);
+        if found.is_ok_and(|found| FileId::of(&found) == file)
+            && let Err(error) = self.remove_file(name)
+        {
+            tracing::debug!(name, %error, "cannot remove the socket of this process");
+        }
+    }
+
+    fn remove_file(&self, name: &str) -> rustix::io::Result<()> {
+        match rustix::fs::unlinkat(&self.dir, name, AtFlags::empty()) {
+            Err(Errno::NOENT) => Ok(()),
+            removed => removed,
+        }
+    }
+
+    /// Locks the directory, if that is possible within this time.
+    fn lock(&self, operation: FlockOperation, patience: Duration) -> Option<Locked> {
+        // Opened again: a lock belongs to the open file, which the threads of a process share.
+        let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
+        let dir = rustix::fs::openat(&self.dir, ".", flags, Mode::empty()).ok()?;
+        let began = Instant::now();
+        loop {
+            match rustix::fs::flock(&dir, operation) {
+                Ok(()) => return Some(Locked(dir)),
+                Err(Errno::WOULDBLOCK) if began.elapsed() < patience => {
+                    std::thread::sleep(Duration::from_millis(1));
+                }
+                Err(Errno::INTR) => {}
+                Err(_) => return None,
+            }
+        }
+    }
+}
+
+/// The number of the process at the other end, which is 0 when it is in another PID namespace.
+///
+/// # Errors
+/// When it belongs to another user, or the system does not tell.
+pub(super) fn peer(stream: &UnixStream) -> io::Result<i32> {
+    let peer = stream.peer_cred()?;
+    let own = rustix::process::geteuid().as_raw();
+    let number = peer.pid().unwrap_or_default();
+    if peer.uid() != own {
+        let user = peer.uid();
+        let what = format!("process {number} belongs to user {user}, and this one to user {own}");
+        return Err(io::Error::new(io::ErrorKind::PermissionDenied, what));
+    }
+    Ok(number)
+}
+
+fn new_socket(kind: SocketType) -> rustix::io::Result<OwnedFd> {
+    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+    socket_with(AddressFamily::UNIX, kind, flags, None)
+}

@@ -1,0 +1,263 @@
+//! Letters between the processes of one domain on one host, over Unix domain sockets.
+//!
+//! Frames, hello, limits and the account of parcels are those of [`crate::stream`]; here is what
+//! differs: where sockets are, how connections are made, and how the kernel proves the peer's user.
+//!
+//! * [`directory`]: the socket files of a domain.
+//! * [`accept`] and [`dial`] make connections.
+
+mod accept;
+mod dial;
+mod directory;
+
+use std::os::unix::net::UnixListener as StdListener;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use fipa_transport::{
+    Abandoned, Answer, AttemptId, Kind, ListenError, Location, OwnerProcess, Parcel, Sink, Ticket,
+    Transport, WayError,
+};
+use parking_lot::Mutex;
+use tokio::net::UnixListener;
+use tokio::runtime::Handle;
+use tokio::task::spawn_blocking;
+use tokio::time::sleep;
+
+pub use self::directory::UnixError;
+use self::directory::{Directory, FileId};
+use crate::Identity;
+use crate::stream::config::{Limits, StreamConfig};
+use crate::stream::counters::Counters;
+use crate::stream::endpoint::Endpoint;
+
+/// Time between the end of a process and the look for its socket, in which the kernel closes it, and
+/// further processes may end.
+const TIDY_AFTER: Duration = Duration::from_millis(100);
+
+/// How often the directory is opened again when a process that leaves has just removed it.
+const RETRIES: u32 = 20;
+
+/// Configuration of a [`UnixTransport`].
+#[derive(Debug, Clone)]
+pub struct UnixConfig {
+    /// The directory of the domain's sockets, private to this user. Created when it is missing, in
+    /// a directory that exists. Its path may be longer than the address of a socket.
+    pub directory: PathBuf,
+    /// How this endpoint introduces itself. Its socket is named after the incarnation.
+    pub identity: Identity,
+    /// What it takes and how long it waits.
+    pub limits: Limits,
+}
+
+/// Carries parcels over Unix domain sockets between processes of one user on one host.
+///
+/// An address is the incarnation of the service, 16 hexadecimal digits: the name of its socket in
+/// the directory of the domain. Both sides check that the peer belongs to the same user
+/// (`SO_PEERCRED`). Connections are kept, shared and closed as those of TCP.
+///
+/// Dropping it closes it and removes the socket. After [`close`](Transport::close) the attempts are
+/// concluded by the runtime's threads, so the runtime must live on for a moment.
+#[derive(Debug)]
+pub struct UnixTransport {
+    path: PathBuf,
+    endpoint: Arc<Endpoint>,
+    /// The socket, while the endpoint listens.
+    bound: Arc<Mutex<Option<Bound>>>,
+    closed: AtomicBool,
+    /// Whether a look for sockets of dead processes is due.
+    tidying: Arc<AtomicBool>,
+    owner: OwnerProcess,
+}
+
+/// A socket in the directory.
+#[derive(Debug)]
+struct Bound {
+    directory: Arc<Directory>,
+    file: FileId,
+}
+
+impl UnixTransport {
+    /// An endpoint that does its work on `runtime`, which must have input, output and time
+    /// enabled. Nothing is opened before `listen`.
+    #[must_use]
+    pub fn new(config: UnixConfig, runtime: Handle) -> Self {
+        let UnixConfig {
+            directory,
+            identity,
+            limits,
+        } = config;
+        let config = StreamConfig {
+            identity,
+            limits,
+            #[cfg(feature = "secure")]
+            security: None,
+        };
+        Self {
+            path: directory,
+            endpoint: Endpoint::new(Kind::Unix, config, runtime),
+            bound: Arc::default(),
+            closed: AtomicBool::new(false),
+            tidying: Arc::default(),
+            owner: OwnerProcess::this(),
+        }
+    }
+
+    /// What happened so far.
+    #[must_use]
+    pub fn counters(&self) -> Counters {
+        self.endpoint.tally().read()
+    }
+
+    /// Processes of this domain have ended: removes the sockets that dead ones have left, in the
+    /// background.
+    pub fn tidy(&self) {
+        if self.tidying.swap(true, Ordering::AcqRel) {
+            return;
+        }
+        let (tidying, bound) = (self.tidying.clone(), self.bound.clone());
+        self.endpoint.runtime.spawn(async move {
+            sleep(TIDY_AFTER).await;
+            tidying.store(false, Ordering::Release);
+            let directory = bound.lock().as_ref().map(|it| it.directory.clone());
+            if let Some(directory) = directory {
+                // An error is that the runtime ends.
+                let _ = spawn_blocking(move || directory.sweep()).await;
+            }
+        });
+    }
+
+    /// Whether other processes find the socket. False when another program has removed it, or the
+    /// directory. What cannot be examined counts as there, and so does an endpoint that does not
+    /// listen.
+    #[must_use]
+    pub fn is_there(&self) -> bool {
+        let bound = self.bound.lock();
+        bound
+            .as_ref()
+            .is_none_or(|bound| bound.directory.is_there(&self.name(), bound.file))
+    }
+
+    /// Makes the socket again if it was removed, and says whether that was necessary. Connections
+    /// that are open stay so.
+    ///
+    /// # Errors
+    /// When the directory or the socket cannot be made; to be tried again.
+    pub fn rejoin(&self) -> Result<bool, UnixError> {
+        let is_closed = self.closed.load(Ordering::SeqCst) || !self.owner.is_this();
+        if is_closed || self.is_there() {
+            return Ok(false);
+        }
+        let (listener, bound) = self.bind()?;
+        let _inside = self.endpoint.runtime.enter();
+        let listener = UnixListener::from_std(listener)
+            .map_err(|source| bound.directory.failed("use a socket in", source))?;
+        *self.bound.lock() = Some(bound);
+        self.endpoint.replace_listener(|| {
+            let accept = accept::accept(self.endpoint.clone(), listener);
+            self.endpoint.runtime.spawn(accept)
+        });
+        Ok(true)
+    }
+
+    /// The name of this endpoint's socket.
+    fn name(&self) -> String {
+        self.endpoint.config.identity.incarnation.to_string()
+    }
+
+    fn bind(&self) -> Result<(StdListener, Bound), UnixError> {
+        let name = self.name();
+        let bind = || {
+            let directory = Directory::open(&self.path)?;
+            let (listener, file) = directory.bind(&name)?;
+            let directory = Arc::new(directory);
+            Ok((listener, Bound { directory, file }))
+        };
+        let mut bound = bind();
+        for _ in 0..RETRIES {
+            match &bound {
+                // The last process has left in between, and taken the directory with it.
+                Err(UnixError::Io { source, .. })
+                    if source.kind() == std::io::ErrorKind::NotFound =>
+                {
+                    bound = bind();
+                }
+                _ => break,
+            }
+        }
+        bound
+    }
+}
+
+impl Transport for UnixTransport {
+    fn kind(&self) -> Kind {
+        Kind::Unix
+    }
+
+    fn max_letter(&self) -> usize {
+        self.endpoint.limits().max_letter
+    }
+
+    fn answers_at_once(&self) -> bool {
+        false
+    }
+
+    fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError> {
+        let runtime = &self.endpoint.runtime;
+        let open = || {
+            let unavailable = |error: UnixError| ListenError::Unavailable(error.to_string());
+            let (listener, bound) = self.bind().map_err(unavailable)?;
+            let listener = UnixListener::from_std(listener).map_err(|source| {
+                bound.directory.remove(&self.name(), bound.file);
+                unavailable(bound.directory.failed("use a socket in", source))
+            })?;
+            // What processes left that were killed.
+            bound.directory.sweep();
+            *self.bound.lock() = Some(bound);
+            Ok((listener, self.name()))
+        };
+        self.endpoint.listen_at(sink, open, |listener| {
+            runtime.spawn(accept::accept(self.endpoint.clone(), listener))
+        })
+    }
+
+    fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError> {
+        self.endpoint.check(to, &parcel)?;
+        self.endpoint.dispatch(attempt, to, &parcel, |link, sink| {
+            let bound = self.bound.lock();
+            let directory = bound.as_ref().map(|it| it.directory.clone());
+            let dialling = dial::dial(self.endpoint.clone(), directory, link, sink, to.clone());
+            self.endpoint.runtime.spawn(dialling)
+        })
+    }
+
+    fn abandon(&self, attempt: AttemptId) -> Abandoned {
+        self.endpoint.abandon(attempt)
+    }
+
+    fn answer(&self, ticket: Ticket, answer: Answer) {
+        self.endpoint.answer(ticket, &answer);
+    }
+
+    fn close(&self) {
+        self.closed.store(true, Ordering::SeqCst);
+        self.endpoint.close();
+        if let Some(bound) = self.bound.lock().take() {
+            bound.directory.remove(&self.name(), bound.file);
+            bound.directory.sweep();
+        }
+    }
+}
+
+impl Drop for UnixTransport {
+    fn drop(&mut self) {
+        if self.owner.is_this() {
+            self.close();
+        } else {
+            // In a forked child the socket and the connections stay the parent's.
+            std::mem::forget(self.endpoint.clone());
+        }
+    }
+}

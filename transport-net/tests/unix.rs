@@ -1,0 +1,213 @@
+//! What endpoints over Unix domain sockets do for each other.
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test or bench that cannot go on may panic"
+)]
+
+mod common;
+
+use std::fs;
+use std::io::Read as _;
+use std::os::unix::fs::{FileTypeExt as _, MetadataExt as _, PermissionsExt as _};
+use std::os::unix::net::UnixStream;
+use std::os::unix::process::CommandExt as _;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use common::{Party, Recorder, accepted, parcel, unix_config, until};
+use fipa_transport::{Conclusion, Incarnation, Kind, ListenError, Location, Transport, WayFault};
+use fipa_transport_net::UnixTransport;
+
+type Unix = Party<UnixTransport>;
+
+fn party(directory: &Path) -> Unix {
+    let config = unix_config(directory);
+    Party::over(Recorder::default(), |runtime| {
+        UnixTransport::new(config, runtime)
+    })
+}
+
+fn sockets(directory: &Path) -> Vec<PathBuf> {
+    let entries = fs::read_dir(directory).unwrap();
+    entries.map(|entry| entry.unwrap().path()).collect()
+}
+
+/// A directory whose path is longer than the address of a socket can be.
+fn long(home: &Path) -> PathBuf {
+    let path = home.join("d".repeat(200)).join("e".repeat(200));
+    fs::create_dir_all(path.parent().unwrap()).unwrap();
+    path
+}
+
+#[test]
+fn letters_go_both_ways_in_a_directory_with_a_long_path() {
+    let home = tempfile::tempdir().unwrap();
+    let directory = long(home.path());
+    let (a, b) = (party(&directory), party(&directory));
+    a.assert_reaches(1, &b);
+    b.assert_reaches(1, &a);
+    // Over the same connection, whichever side opened it.
+    assert_eq!(a.transport.counters().dialled, 1);
+    assert_eq!(b.transport.counters().dialled, 0);
+    let (_, from, _) = b.sink.record.lock().arrivals.remove(0);
+    assert_eq!(&from.location, a.location());
+    assert!(!from.remote);
+}
+
+#[test]
+fn nothing_but_the_socket_of_its_owner_is_in_a_private_directory() {
+    let home = tempfile::tempdir().unwrap();
+    let directory = home.path().join("unix");
+    let a = party(&directory);
+    assert_eq!(fs::metadata(&directory).unwrap().mode() & 0o777, 0o700);
+    let [socket] = &sockets(&directory)[..] else {
+        panic!("one socket")
+    };
+    let found = fs::symlink_metadata(socket).unwrap();
+    assert!(found.file_type().is_socket());
+    assert_eq!(found.mode() & 0o777, 0o600);
+    assert_eq!(
+        socket.file_name().unwrap().to_str(),
+        Some(a.location().address())
+    );
+    a.transport.close();
+    assert!(sockets(&directory).is_empty());
+}
+
+#[test]
+fn a_directory_that_others_may_enter_is_not_used() {
+    let home = tempfile::tempdir().unwrap();
+    fs::set_permissions(home.path(), fs::Permissions::from_mode(0o711)).unwrap();
+    let runtime = common::runtime();
+    let transport = UnixTransport::new(unix_config(home.path()), runtime.handle().clone());
+    let error = transport.listen(std::sync::Arc::new(Recorder::default()));
+    let Err(ListenError::Unavailable(text)) = error else {
+        panic!("{error:?}")
+    };
+    assert!(text.contains("its mode is 711"), "{text}");
+}
+
+/// Set for the process that the test starts as another user: the socket to connect to.
+const CONNECT: &str = "FIPA_TEST_CONNECT";
+
+/// Not a test of its own: connects, and waits until the other side hangs up.
+#[test]
+fn as_another_user() {
+    let Some(path) = std::env::var_os(CONNECT) else {
+        return;
+    };
+    let mut stream = UnixStream::connect(path).unwrap();
+    let mut rest = Vec::new();
+    stream.read_to_end(&mut rest).unwrap();
+    assert!(rest.is_empty());
+}
+
+#[test]
+fn a_process_of_another_user_is_refused() {
+    let is_root = fs::metadata("/proc/self").unwrap().uid() == 0;
+    if !is_root {
+        eprintln!("needs root, to be another user");
+        return;
+    }
+    let home = tempfile::tempdir().unwrap();
+    let directory = home.path().join("unix");
+    let a = party(&directory);
+    let socket = directory.join(a.location().address());
+    // As if an administrator had opened what is private.
+    for (path, mode) in [(home.path(), 0o711), (&directory, 0o711), (&socket, 0o666)] {
+        fs::set_permissions(path, fs::Permissions::from_mode(mode)).unwrap();
+    }
+    // Where other users can execute it.
+    let program = home.path().join("program");
+    fs::copy(std::env::current_exe().unwrap(), &program).unwrap();
+    fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).unwrap();
+    let mut other = Command::new(program);
+    let other = other.args(["--exact", "as_another_user"]);
+    let other = other.env(CONNECT, &socket).current_dir("/");
+    let ended = other.uid(65534).gid(65534).stdout(Stdio::null()).status();
+    assert!(ended.unwrap().success(), "the other user is not hung up on");
+    assert_eq!(a.transport.counters().refused_unproved, 1);
+    assert_eq!(a.transport.counters().accepted, 0);
+}
+
+#[test]
+fn sockets_of_dead_processes_are_removed_and_those_of_others_are_not() {
+    let home = tempfile::tempdir().unwrap();
+    let directory = home.path().join("unix");
+    let a = party(&directory);
+    // Dropping the standard library's listener leaves the file, as the end of a process does.
+    let dead = directory.join("00000000000000aa");
+    drop(std::os::unix::net::UnixListener::bind(&dead).unwrap());
+    fs::write(directory.join("notes"), "not a socket of fipa").unwrap();
+    a.transport.tidy();
+    until("the dead socket to go", || (!dead.exists()).then_some(()));
+    assert!(directory.join("notes").exists());
+    drop(std::os::unix::net::UnixListener::bind(&dead).unwrap());
+    // One that starts does the same.
+    let b = party(&directory);
+    assert!(!dead.exists());
+    a.assert_reaches(1, &b);
+    b.assert_reaches(1, &a);
+}
+
+#[test]
+fn an_endpoint_whose_socket_was_removed_makes_it_again_and_keeps_its_connections() {
+    let home = tempfile::tempdir().unwrap();
+    let directory = home.path().join("unix");
+    let (a, b) = (party(&directory), party(&directory));
+    a.assert_reaches(1, &b);
+    fs::remove_dir_all(&directory).unwrap();
+    assert!(!b.transport.is_there());
+    a.assert_reaches(2, &b);
+    assert!(b.transport.rejoin().unwrap());
+    assert!(b.transport.is_there());
+    assert!(!b.transport.rejoin().unwrap());
+    assert!(a.transport.rejoin().unwrap());
+    a.assert_reaches(3, &b);
+    let c = party(&directory);
+    c.assert_reaches(1, &b);
+    a.assert_reaches(4, &c);
+    assert_eq!(a.transport.counters().dialled, 2);
+    a.transport.close();
+    assert!(!a.transport.rejoin().unwrap(), "it is closed");
+}
+
+#[test]
+fn no_path_is_an_address() {
+    let home = tempfile::tempdir().unwrap();
+    let a = party(&home.path().join("unix"));
+    let b = party(&home.path().join("other"));
+    let there = format!("../other/{}", b.location().address());
+    let unknown = Incarnation::UNKNOWN;
+    for (attempt, address) in [&*there, ".", "x"].into_iter().enumerate() {
+        let attempt = attempt as u64;
+        let to = Location::new(Kind::Unix, address).unwrap();
+        a.send(attempt, &to.with_incarnation(unknown), parcel(1, "x"))
+            .unwrap();
+        let concluded = a.conclusion(attempt);
+        let Conclusion::NotSent(error) = concluded else {
+            panic!("{concluded:?}")
+        };
+        assert_eq!(error.fault, WayFault::Unreachable);
+    }
+    assert_eq!(b.arrivals(), 0);
+}
+
+#[test]
+fn the_end_of_the_other_side_is_noticed_and_an_answer_is_not_made_up() {
+    let home = tempfile::tempdir().unwrap();
+    let directory = home.path().join("unix");
+    let a = party(&directory);
+    let b = party(&directory);
+    a.assert_reaches(1, &b);
+    let gone = b.location().clone();
+    drop(b);
+    until("the connection to end", || {
+        (a.transport.counters().connections == 0).then_some(())
+    });
+    a.send(2, &gone, parcel(2, "x")).unwrap();
+    assert!(matches!(a.conclusion(2), Conclusion::NotSent(_)));
+    let c = party(&directory);
+    a.send(3, c.location(), parcel(3, "x")).unwrap();
+    assert_eq!(a.conclusion(3), accepted());
+}
