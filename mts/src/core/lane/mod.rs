@@ -26,7 +26,8 @@ use std::time::{Duration, Instant};
 
 use fipa_sds::Entry;
 use fipa_transport::{
-    Attempt, Body, FailureReason, Incarnation, Location, Outcome, Parcel, Stream, WayError, WayFault,
+    Attempt, Body, FailureReason, Incarnation, Location, Outcome, Parcel, Stream, WayError,
+    WayFault,
 };
 
 pub(crate) use self::delivery::Delivery;
