@@ -143,3 +143,32 @@ fn the_reason_at_the_deadline_is_the_size() {
     let reason = FailureReason::TooLarge;
     assert!(matches!(outcome, Outcome::Failed { reason: it, .. } if it == reason));
 }
+
+/// Later letters wait behind it.
+#[test]
+fn the_wait_for_another_route_is_short() {
+    let mut bench = Bench::new();
+    bench.reached_by(0, &["udp://192.0.2.1:1"]);
+    bench.send();
+    let mut tried = 0;
+    for ms in (0..3000).step_by(10) {
+        bench.core.handle_timeout(bench.at(ms));
+        while let Some(action) = bench.core.poll_action() {
+            match action {
+                Action::Dispatch { attempt, .. } => {
+                    tried += 1;
+                    bench.is_too_large(ms, attempt);
+                }
+                Action::Outcome { outcome, .. } => {
+                    let reason = FailureReason::TooLarge;
+                    assert!(matches!(outcome, Outcome::Failed { reason: it, .. } if it == reason));
+                    assert!(ms >= 1900, "{ms} ms");
+                    assert!(tried > 1);
+                    return;
+                }
+                _ => {}
+            }
+        }
+    }
+    panic!("the letter still waits");
+}

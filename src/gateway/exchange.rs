@@ -19,7 +19,7 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
 use super::Network;
-use super::neighbours::Neighbours;
+use super::neighbours::{Neighbour, Neighbours};
 use super::publisher::{Contested, own_agents};
 use crate::service::Service;
 
@@ -129,15 +129,15 @@ impl Exchanging {
     fn work(&self, means: &Means, sent: &mut JoinSet<(Incarnation, bool)>) -> Option<Instant> {
         let now = Instant::now();
         let neighbours = means.neighbours.all();
-        let present: Vec<(Mts, Vec<Location>)> = neighbours
-            .iter()
-            .map(|neighbour| {
-                (
-                    neighbour.entry.mts.clone(),
-                    neighbour.entry.locations.clone(),
-                )
-            })
-            .collect();
+        let announced = means.network.clone().map(Network::directory);
+        let announced_at = locations_by_gateway(announced.as_deref());
+        let located = |neighbour: &Neighbour| {
+            let entry = &neighbour.entry;
+            let others = announced_at.get(&entry.incarnation);
+            let others = others.into_iter().flatten();
+            (entry.mts.clone(), with_others(&entry.locations, others))
+        };
+        let present: Vec<(Mts, Vec<Location>)> = neighbours.iter().map(located).collect();
         let mut core = self.core.lock();
         core.handle_neighbours(now, &present);
         for (location, fault) in means.neighbours.take_doubted() {
@@ -151,7 +151,7 @@ impl Exchanging {
                 means.service.mts.greet(vec![(at.address().into(), at)]);
             }
         }
-        if let Some(announced) = means.network.clone().map(Network::directory) {
+        if let Some(announced) = announced {
             core.leave_to_others(|entry| announced.known_incarnation(entry.incarnation).is_some());
         }
         core.handle_timeout(now);
@@ -188,6 +188,24 @@ impl Exchanging {
         // Whoever has not heard it notices that the connection ends.
         while sent.join_next().await.is_some() {}
     }
+}
+
+/// Where gateways announce that they take letters.
+fn locations_by_gateway(announced: Option<&dyn Directory>) -> HashMap<Incarnation, Vec<Location>> {
+    let entries = announced.map(Directory::entries);
+    let entries = entries.iter().flat_map(|entries| entries.iter());
+    let by_gateway = |entry: &Arc<Entry>| (entry.mts.incarnation, entry.locations.clone());
+    entries.map(by_gateway).collect()
+}
+
+/// These locations, and others of kinds that are not among them.
+fn with_others<'a>(
+    known: &'a [Location],
+    others: impl Iterator<Item = &'a Location>,
+) -> Vec<Location> {
+    let is_new = |other: &&Location| known.iter().all(|it| it.kind() != other.kind());
+    let all = known.iter().chain(others.filter(is_new));
+    all.take(Entry::MAX_LOCATIONS).cloned().collect()
 }
 
 /// How long somebody else has to have a name before its later owner is told: news of an agent that
@@ -274,5 +292,19 @@ impl Means {
             deadline,
         };
         Some(self.service.mts.send_to(submission, to))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_kind_without_a_connection_is_reached_where_it_is_announced() {
+        let at = |text: &str| -> Location { text.parse().unwrap() };
+        let open = [at("udp://10.0.0.2:1")];
+        let announced = [at("udp://10.0.0.9:1"), at("tcp://10.0.0.2:1")];
+        let all = with_others(&open, announced.iter());
+        assert_eq!(all, [at("udp://10.0.0.2:1"), at("tcp://10.0.0.2:1")]);
     }
 }

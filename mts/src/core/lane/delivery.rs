@@ -54,6 +54,8 @@ pub(super) struct Progress {
     pub(super) uncertain: bool,
     /// The receiver's queue was full.
     pub(super) busy: bool,
+    /// Since when it fits none of the kinds that its receiver shows.
+    pub(super) unfit_since: Option<Instant>,
     /// The letter came back because its predecessor was not taken.
     pub(super) hold: Option<Holding>,
 }
@@ -114,6 +116,7 @@ impl Delivery {
             handed: SmallVec::new(),
             uncertain: false,
             busy: false,
+            unfit_since: None,
             hold: None,
         };
         Self {

@@ -54,6 +54,8 @@ const HOP_MARGIN: Duration = Duration::from_millis(100);
 const MOVING_PATIENCE: Duration = Duration::from_secs(2);
 /// How long letters that were handed over for a registration that has ended are waited for.
 const ENDED_PATIENCE: Duration = Duration::from_secs(2);
+/// How long a letter that is too large for the kinds that its receiver shows waits for another kind.
+const KIND_PATIENCE: Duration = Duration::from_secs(2);
 
 /// The number of a lane within its core.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -435,7 +437,7 @@ impl Lane {
             return true;
         }
         delivery.progress.tried.clear();
-        if let Some(reason) = self.never_fits(index, desk) {
+        if let Some(reason) = self.never_fits(now, index, desk) {
             self.fail(now, index, reason, desk);
             return true;
         }
@@ -445,15 +447,18 @@ impl Lane {
 
     /// The reason why no repetition can succeed, after all routes of the receiver were tried.
     ///
-    /// A letter that is too large for all of them waits for a kind that the directory does not show
-    /// at present and that may return. Kinds within a host are left out, because they do not lead to
-    /// other hosts. A letter that a legacy peer's dialect cannot express waits for nothing.
-    fn never_fits(&self, index: usize, desk: &Desk) -> Option<FailureReason> {
-        let delivery = &self.letters[index];
+    /// A letter that is too large for all of them waits for a while for a kind that the directory does
+    /// not show at present and that may return. Later letters wait behind it. Kinds within a host are
+    /// left out, because they do not lead to other hosts. A letter that a legacy peer's dialect cannot
+    /// express waits for nothing.
+    fn never_fits(&mut self, now: Instant, index: usize, desk: &Desk) -> Option<FailureReason> {
+        let delivery = &mut self.letters[index];
         let reason = delivery.unfit()?;
+        let since = *delivery.progress.unfit_since.get_or_insert(now);
         let attempts = &delivery.progress.attempts;
         let mut order = desk.config.order_for(&self.receiver).iter();
         let waits = reason == FailureReason::TooLarge
+            && now < since + KIND_PATIENCE
             && !order.all(|kind| {
                 kind.is_host_local() || attempts.iter().any(|attempt| attempt.via == *kind)
             });
