@@ -401,6 +401,7 @@ fn tcp(
         listen: listen(&config.transport.tcp.listen, role),
         identity: identity(config, role, place, incarnation)?,
         limits: stream_limits(config),
+        processes: config.transport.tcp.processes,
         #[cfg(feature = "secure")]
         security: role.security.clone(),
     };

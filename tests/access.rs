@@ -170,6 +170,7 @@ impl Sink for Told {
 /// a process, and returns what that process says.
 async fn hand_over(gateway: &Gateway, to: &Entry) -> Conclusion {
     let config = TcpConfig {
+        processes: true,
         listen: Vec::new(),
         identity: Identity {
             name: gateway.name().to_owned(),

@@ -22,6 +22,7 @@ fn service(name: &str) -> (Mts, Arc<MemoryDirectory>, Location) {
     let incarnation = Incarnation::random();
     let patient = Duration::from_secs(60);
     let config = TcpConfig {
+        processes: true,
         listen: vec!["127.0.0.1:0".to_owned()],
         identity: Identity {
             name: name.into(),

@@ -499,6 +499,7 @@ impl Parrot {
                     listen,
                     identity,
                     limits,
+                    processes: true,
                     security: Some(security),
                 };
                 Arc::new(TcpTransport::new(config, Handle::current()))

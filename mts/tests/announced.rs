@@ -11,7 +11,7 @@ use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory, Entry, Mts, Reach, Role, Source, Subscriber};
 use fipa_transport::{
-    Answer, Arrival, Conclusion, Hop, Incarnation, Kind, Parcel, Ticket, Verdict,
+    Answer, Arrival, Conclusion, Hop, Incarnation, Kind, Parcel, Principal, Ticket, Verdict,
 };
 
 const ROVER: Incarnation = Incarnation::from_u64(0xb);
@@ -115,7 +115,7 @@ impl Gateway {
             },
             from: Hop {
                 location: "shm://1#0000000000000001".parse().unwrap(),
-                remote: false,
+                principal: Principal::Host,
             },
             ticket: Ticket(1),
         };

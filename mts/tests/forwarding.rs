@@ -12,7 +12,7 @@ use fipa_mts::letter_for;
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
-    Outcome, Parcel, Report, Stream, Ticket, Verdict,
+    Outcome, Parcel, Principal, Report, Stream, Ticket, Verdict,
 };
 
 const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
@@ -53,7 +53,10 @@ impl Gateway {
     fn arrive(&mut self, ms: u64, via: Kind, parcel: Parcel) -> Verdict {
         let from = Hop {
             location: tcp(0x1),
-            remote: via == Kind::Tcp,
+            principal: match via {
+                Kind::Tcp => Principal::Unproved,
+                _ => Principal::Host,
+            },
         };
         let arrival = Arrival {
             parcel,

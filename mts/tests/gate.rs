@@ -10,8 +10,8 @@ use fipa_mts::core::{Action, Core, CoreConfig, Now};
 use fipa_mts::{Gate, Link, letter_for};
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
-    Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Stream, Ticket,
-    Verdict,
+    Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Principal,
+    Stream, Ticket, Verdict,
 };
 use parking_lot::Mutex;
 
@@ -65,7 +65,7 @@ fn arrival(to: Incarnation, called: &str, sequence: u64) -> Arrival {
         parcel,
         from: Hop {
             location,
-            remote: false,
+            principal: Principal::Host,
         },
         ticket: Ticket(sequence),
     }

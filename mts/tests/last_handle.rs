@@ -10,7 +10,7 @@ use fipa_mts::{Contacts, Mts, RuntimeConfig};
 use fipa_sds::MemoryDirectory;
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Hop, Incarnation, Introduction, Kind, ListenError, Location,
-    Parcel, Sink, Ticket, Transport, WayError, WayFault,
+    Parcel, Principal, Sink, Ticket, Transport, WayError, WayFault,
 };
 use parking_lot::Mutex;
 
@@ -122,7 +122,7 @@ fn no_transport_is_closed_from_within_a_call_of_its_own() {
         name: "crex-mts".into(),
         hop: Hop {
             location: "shm://crex".parse().unwrap(),
-            remote: true,
+            principal: Principal::Unproved,
         },
         dialled: None,
     };

@@ -17,7 +17,7 @@ use fipa_sds::{
 };
 use fipa_transport::{
     Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
-    Outcome, Parcel, Ticket, Verdict, WayError, WayFault,
+    Outcome, Parcel, Principal, Ticket, Verdict, WayError, WayFault,
 };
 
 /// What a fipa_services agent, `cpp-sender`, sent to an agent `echo`.
@@ -545,7 +545,7 @@ fn a_letter_to_an_old_peers_agent_is_sent_not_delivered() {
         parcel,
         from: Hop {
             location: back,
-            remote: false,
+            principal: Principal::Host,
         },
         ticket: Ticket(1),
     };
@@ -562,7 +562,7 @@ fn a_letter_to_an_old_peers_agent_is_sent_not_delivered() {
         parcel: report,
         from: Hop {
             location: near.parse().unwrap(),
-            remote: false,
+            principal: Principal::Host,
         },
         ticket: Ticket(2),
     };

@@ -112,7 +112,7 @@ impl Neighbours {
     pub(super) fn introduced(&self, peer: &Introduction) {
         let incarnation = peer.hop.location.incarnation();
         // Other processes of this host open connections, too.
-        if !peer.hop.remote || !incarnation.is_known() {
+        if !peer.hop.is_remote() || !incarnation.is_known() {
             return;
         }
         let mut state = self.state.lock();
@@ -325,7 +325,7 @@ impl Directory for View {
 
 #[cfg(test)]
 mod tests {
-    use fipa_transport::Hop;
+    use fipa_transport::{Hop, Principal};
 
     use super::*;
 
@@ -342,7 +342,7 @@ mod tests {
             name: "crex-mts".into(),
             hop: Hop {
                 location: at(address),
-                remote: true,
+                principal: Principal::Unproved,
             },
             dialled: dialled.map(|text| text.parse().unwrap()),
         }

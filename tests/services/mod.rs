@@ -158,6 +158,7 @@ impl Place {
                 listen: listen.clone(),
                 identity: identity.clone(),
                 limits: limits.clone(),
+                processes: true,
                 #[cfg(feature = "secure")]
                 security: security.clone(),
             };

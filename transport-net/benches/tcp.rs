@@ -68,6 +68,7 @@ fn endpoint(runtime: &Runtime) -> Party {
 
 fn config() -> TcpConfig {
     TcpConfig {
+        processes: true,
         listen: vec!["127.0.0.1:0".into()],
         identity: Identity {
             name: "bench".into(),

@@ -262,7 +262,7 @@ fn who_has_keys_is_not_taken_for_one_of_this_host<T: Proving>() {
     to.assert_reaches(2, &from);
     for party in [&from, &to] {
         let (_, hop, _) = party.sink.record.lock().arrivals[0].clone();
-        assert!(hop.remote, "{hop:?}");
+        assert!(hop.is_remote(), "{hop:?}");
     }
 }
 

@@ -86,7 +86,7 @@ fn one_connection_serves_both_directions_also_for_who_does_not_listen() {
     let b = Party::new();
     silent.assert_reaches(1, &b);
     let hop = b.sink.record.lock().arrivals[0].1.clone();
-    assert!(!hop.remote);
+    assert!(!hop.is_remote());
     b.send(1, &hop.location, parcel(1, "back")).unwrap();
     assert_eq!(b.conclusion(1), accepted());
     assert_eq!(silent.arrivals(), 1);
@@ -106,7 +106,7 @@ fn another_host_or_domain_is_remote() {
         far.identity.host = host.into();
         far.identity.domain = domain.into();
         Party::with(far).assert_reaches(1, &b);
-        assert!(b.sink.record.lock().arrivals[attempt].1.remote);
+        assert!(b.sink.record.lock().arrivals[attempt].1.is_remote());
     }
 }
 

@@ -51,7 +51,7 @@ fn letters_go_both_ways_in_a_directory_with_a_long_path() {
     assert_eq!(b.transport.counters().dialled, 0);
     let (_, from, _) = b.sink.record.lock().arrivals.remove(0);
     assert_eq!(&from.location, a.location());
-    assert!(!from.remote);
+    assert!(!from.is_remote());
 }
 
 #[test]

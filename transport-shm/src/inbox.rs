@@ -7,7 +7,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use bytes::Bytes;
 use fipa_transport::wire::ParcelHeader;
 use fipa_transport::{
-    Answer, Arrival, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Sink, Ticket, Verdict,
+    Answer, Arrival, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Principal, Sink,
+    Ticket, Verdict,
 };
 use iceoryx2::port::{DegradationAction, ReceiveError};
 use iceoryx2::prelude::{BackpressureStrategy, Node, PortFactory, ServiceName};
@@ -192,7 +193,7 @@ impl Inbox {
             parcel,
             from: Hop {
                 location: self.location_of_sender(sender),
-                remote: false,
+                principal: Principal::Host,
             },
             ticket: Ticket(self.tickets),
         };

@@ -33,5 +33,5 @@ pub use owner::{Forked, OwnerProcess};
 pub use parcel::{Body, Parcel, Report, Stream};
 pub use transport::{
     Abandoned, Answer, Arrival, Arriving, AttemptId, Conclusion, Hop, Introduction, ListenError,
-    LoanedContent, Sink, Ticket, Transport, Verdict, WayError, WayFault,
+    LoanedContent, Principal, Sink, Ticket, Transport, Verdict, WayError, WayFault,
 };

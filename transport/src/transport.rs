@@ -216,8 +216,29 @@ pub struct Hop {
     /// Where to send reports and credits about the parcel, with the incarnation of the service
     /// that is there.
     pub location: Location,
-    /// Whether the parcel came from another host.
-    pub remote: bool,
+    /// What the link proves about that service.
+    pub principal: Principal,
+}
+
+impl Hop {
+    /// Whether the service is on another host, as far as is proved.
+    #[must_use]
+    pub fn is_remote(&self) -> bool {
+        self.principal != Principal::Host
+    }
+}
+
+/// What a link proves about the service at its other end. Only this separates two services: what one
+/// says of itself does not.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Principal {
+    /// It is a process of this user on this host: the link is shared memory or a Unix domain socket, or
+    /// loopback where the owner of the host has allowed that.
+    Host,
+    /// It has the key of the certificate with this SHA-256 fingerprint (of its DER form).
+    Certificate([u8; 32]),
+    /// Nothing. All services without proof are one.
+    Unproved,
 }
 
 /// What a sink says about an arrival.

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use fipa_transport::conformance::Fixture;
 use fipa_transport::{
     Abandoned, Answer, Arrival, AttemptId, Conclusion, Faulty, Hop, Incarnation, Kind, ListenError,
-    Location, Parcel, Sink, Ticket, Transport, Verdict, WayError, WayFault, wire,
+    Location, Parcel, Principal, Sink, Ticket, Transport, Verdict, WayError, WayFault, wire,
 };
 use parking_lot::Mutex;
 
@@ -135,7 +135,7 @@ impl Transport for Local {
                 drop(state);
                 let from = Hop {
                     location: sender.location.clone(),
-                    remote: false,
+                    principal: Principal::Host,
                 };
                 if let Verdict::Now(answer) = sink.arrived(Arrival {
                     parcel,

@@ -7,8 +7,8 @@ use fipa_acl::{Letter, Payload};
 use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
-    Answer, Arrival, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel, Stream, Ticket,
-    Verdict,
+    Answer, Arrival, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel, Principal, Stream,
+    Ticket, Verdict,
 };
 
 const PEERS: usize = 1_000;
@@ -116,7 +116,7 @@ impl Crowd {
         };
         let from = Hop {
             location: self.peer.clone(),
-            remote: true,
+            principal: Principal::Unproved,
         };
         let arrival = Arrival {
             parcel,

@@ -135,13 +135,13 @@ impl Core {
         if let Err(why) = self.admits(now, &entry.name, &stamped, link_of(via, &from.location)) {
             return Verdict::Now(Answer::failed(FailureReason::Refused, why));
         }
-        if from.remote {
+        if from.is_remote() {
             self.hear(stream.sender, &stamped, &from);
         }
         self.desk
             .notice(stream, parcel.sequence, &entry.name, || News::Passed {
                 via,
-                remote: from.remote,
+                remote: from.is_remote(),
                 letter: stamped.clone(),
             });
         let deadline = now.instant + parcel.remaining.min(MAX_DEADLINE);
@@ -226,7 +226,7 @@ impl Core {
             ));
         }
         // Letters from the network are for this host: a gateway never relays between others.
-        if from.remote && entry.reach != Reach::Local {
+        if from.is_remote() && entry.reach != Reach::Local {
             return Err(unknown("the agent is not on the gateway's host"));
         }
         match stamp::carries(&letter, &config.name, config.incarnation) {

@@ -7,8 +7,8 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Kind, Location, Parcel, Ticket, Verdict,
-    WayError, WayFault,
+    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Kind, Location, Parcel, Principal, Ticket,
+    Verdict, WayError, WayFault,
 };
 
 use super::gates::number_of;
@@ -342,7 +342,13 @@ impl World {
         let ticket = Ticket(process.next_ticket);
         let arrival = Arrival {
             parcel,
-            from: Hop { location, remote },
+            from: Hop {
+                location,
+                principal: match remote {
+                    true => Principal::Unproved,
+                    false => Principal::Host,
+                },
+            },
             ticket,
         };
         let at_once = kind == Kind::Shm;

@@ -77,6 +77,7 @@ impl QuicTransport {
         let config = StreamConfig {
             identity,
             limits,
+            processes: false,
             security: Some(security),
         };
         Self {

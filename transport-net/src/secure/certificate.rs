@@ -42,6 +42,10 @@ impl Fingerprint {
         fingerprint.copy_from_slice(digest(&SHA256, certificate).as_ref());
         Self(fingerprint)
     }
+
+    pub(crate) fn into_bytes(self) -> [u8; SHA256_OUTPUT_LEN] {
+        self.0
+    }
 }
 
 impl fmt::Display for Fingerprint {

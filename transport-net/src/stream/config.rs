@@ -1,5 +1,7 @@
 //! What the owner of an endpoint chooses.
 
+#[cfg(feature = "ip")]
+use fipa_transport::Principal;
 use std::time::Duration;
 
 use super::source::Home;
@@ -12,21 +14,35 @@ use crate::ration::{Rates, is_one_peer};
 pub(crate) struct StreamConfig {
     pub(crate) identity: Identity,
     pub(crate) limits: Limits,
+    /// Whether processes of this host connect over loopback.
+    #[cfg(feature = "ip")]
+    pub(crate) processes: bool,
     /// What peers have to prove. Without it nobody has to prove anything.
     #[cfg(feature = "secure")]
     pub(crate) security: Option<crate::secure::Security>,
 }
 
 impl StreamConfig {
-    /// Whether frames are taken from a peer at this address that has proved nothing.
+    /// Whether frames are exchanged with a peer at this address that has proved nothing.
     #[cfg(feature = "ip")]
     pub(crate) fn takes_frames_of(&self, ip: std::net::IpAddr) -> bool {
         #[cfg(feature = "secure")]
         if let Some(security) = &self.security {
-            return !security.covers(ip);
+            return !security.covers(ip) && self.processes;
         }
-        let _anybody = ip;
+        let _unproved = ip;
         true
+    }
+
+    /// What a peer has proved that connects from this address, without a certificate, and says this of
+    /// itself. Strangers can say that they are of this host.
+    #[cfg(feature = "ip")]
+    pub(crate) fn principal_at(&self, ip: std::net::IpAddr, peer: &Identity) -> Principal {
+        let is_here = self.processes && ip.to_canonical().is_loopback();
+        match is_here && !self.identity.is_remote(peer) {
+            true => Principal::Host,
+            false => Principal::Unproved,
+        }
     }
 
     /// Whether there are limits to what a peer there may have: if it is one peer of another host, or

@@ -11,7 +11,8 @@ use std::time::{Duration, Instant};
 
 use fipa_acl::{EnvelopeView, Letter, MessageView};
 use fipa_transport::{
-    Abandoned, Answer, AttemptId, Body, Conclusion, Incarnation, Parcel, WayError, WayFault,
+    Abandoned, Answer, AttemptId, Body, Conclusion, Incarnation, Parcel, Principal, WayError,
+    WayFault,
 };
 
 use super::config::Limits;
@@ -202,9 +203,9 @@ impl Connection {
         self.peer.as_ref()
     }
 
-    /// Whether the peer is on another host, whatever it says: those of this one have no keys.
-    pub(crate) fn is_from_afar(&self) -> bool {
-        self.proof.is_given()
+    /// The certificate that the peer has proved to have the key of, if any.
+    pub(crate) fn proved_principal(&self) -> Option<Principal> {
+        self.proof.principal()
     }
 
     /// Takes a parcel for sending.

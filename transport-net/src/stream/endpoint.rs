@@ -19,8 +19,8 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use fipa_transport::{
-    Abandoned, Answer, AttemptId, Hop, Incarnation, Kind, ListenError, Location, Parcel, Sink,
-    Ticket, WayError, WayFault,
+    Abandoned, Answer, AttemptId, Hop, Incarnation, Kind, ListenError, Location, Parcel, Principal,
+    Sink, Ticket, WayError, WayFault,
 };
 use parking_lot::Mutex;
 use tokio::runtime::Handle;
@@ -588,19 +588,22 @@ impl Endpoint {
             superseded.leave(End::Superseded);
             superseded.over().await;
         }
-        let (remote, back) = match from {
+        let (principal, back) = match from {
             // A process of this host is reached at the socket that bears its incarnation.
-            Source::Process(_) => (false, incarnation.to_string()),
+            Source::Process(_) => (Principal::Host, incarnation.to_string()),
             #[cfg(feature = "ip")]
             Source::Address(from) => (
-                self.config.identity.is_remote(&peer.identity),
+                self.config.principal_at(from.ip(), &peer.identity),
                 address::way_back(&peer.listening, from).to_string(),
             ),
         };
         let location = Location::new(self.kind, &back)
             .map_err(|error| End::Nonsense(error.to_string()))?
             .with_incarnation(incarnation);
-        Ok(Hop { location, remote })
+        Ok(Hop {
+            location,
+            principal,
+        })
     }
 
     /// A connection has ended: nothing leads there any more.

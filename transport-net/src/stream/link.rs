@@ -488,14 +488,13 @@ impl Running {
     ) -> Result<(), End> {
         match event {
             Event::Greeted => {
-                let (peer, from_afar) = {
+                let (peer, proved) = {
                     let connection = &self.link.state.lock().connection;
-                    (connection.peer().cloned(), connection.is_from_afar())
+                    (connection.peer().cloned(), connection.proved_principal())
                 };
                 if let Some(peer) = peer {
                     let mut hop = self.endpoint.enter(&self.link, &peer, from).await?;
-                    // Letters of this host are passed on to others, those of others are not.
-                    hop.remote |= from_afar;
+                    hop.principal = proved.unwrap_or(hop.principal);
                     self.peer = Some(Introduction {
                         name: peer.identity.name.into(),
                         hop,

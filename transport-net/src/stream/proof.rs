@@ -2,6 +2,8 @@
 //!
 //! Without TLS nothing is proved, and nothing follows.
 
+use fipa_transport::Principal;
+
 #[cfg(feature = "secure")]
 use crate::secure::{Certificate, Security};
 
@@ -53,13 +55,14 @@ impl Proof {
         false
     }
 
-    /// Whether the peer has proved anything: only those on other hosts do.
-    pub(crate) fn is_given(&self) -> bool {
+    /// The certificate whose key the peer has, if it has proved one.
+    pub(crate) fn principal(&self) -> Option<Principal> {
         #[cfg(feature = "secure")]
-        if self.certificate.is_some() {
-            return true;
+        if let Some((_, certificate)) = &self.certificate {
+            let fingerprint = certificate.fingerprint();
+            return Some(Principal::Certificate(fingerprint.into_bytes()));
         }
-        false
+        None
     }
 
     /// Waits until the peer is not trusted any more.

@@ -15,6 +15,10 @@ pub struct TcpConfig {
     pub identity: Identity,
     /// What it takes and how long it waits.
     pub limits: Limits,
+    /// Whether processes of this host connect over loopback. Without it a peer that connects from a
+    /// loopback address is a stranger, whatever host and domain it says to be of, and with `security`
+    /// it has to prove itself, too.
+    pub processes: bool,
     /// What peers have to prove. Without it nobody has to prove anything.
     #[cfg(feature = "secure")]
     pub security: Option<crate::secure::Security>,

@@ -107,7 +107,7 @@ async fn prove(
 ) -> Result<((Reading, Writing), Proof), String> {
     let config = &running.endpoint().config;
     match &config.security {
-        Some(security) if security.covers(peer.ip()) => {
+        Some(security) if !config.takes_frames_of(peer.ip()) => {
             let patience = config.limits.handshake_timeout;
             let secured = tls::connect(security, stream, peer, patience).await?;
             Ok((secured.ends, Proof::of(security, secured.certificate)))

@@ -64,12 +64,14 @@ impl TcpTransport {
             listen,
             identity,
             limits,
+            processes,
             #[cfg(feature = "secure")]
             security,
         } = config;
         let config = StreamConfig {
             identity,
             limits,
+            processes,
             #[cfg(feature = "secure")]
             security,
         };

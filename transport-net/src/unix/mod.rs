@@ -92,6 +92,8 @@ impl UnixTransport {
         let config = StreamConfig {
             identity,
             limits,
+            #[cfg(feature = "ip")]
+            processes: false,
             #[cfg(feature = "secure")]
             security: None,
         };

@@ -100,6 +100,7 @@ pub(crate) fn unix_config(directory: &Path) -> UnixConfig {
 pub(crate) fn config(listen: &[&str]) -> TcpConfig {
     TcpConfig {
         listen: listen.iter().map(|text| (*text).into()).collect(),
+        processes: true,
         identity: identity(),
         limits: Limits {
             // Whoever waits this long in a test waits for ever.

@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::time::Instant;
 
-use fipa_transport::{Hop, Kind, Location};
+use fipa_transport::{Hop, Kind, Location, Principal};
 
 use super::super::connection::{Connection, Path};
 use super::super::packet::{self, NO_COOKIE};
@@ -158,7 +158,7 @@ impl Core {
         let location = Location::new(Kind::Udp, &back).ok()?;
         Some(Hop {
             location: location.with_incarnation(peer.identity.incarnation),
-            remote: self.identity.is_remote(&peer.identity),
+            principal: Principal::Unproved,
         })
     }
 
