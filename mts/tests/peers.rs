@@ -10,7 +10,8 @@ use fipa_mts::core::{Action, Core, CoreConfig, Now, Peer, Submission};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory as _, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
-    Answer, AttemptId, Body, Conclusion, Incarnation, Kind, Location, WayError, WayFault,
+    Answer, AttemptId, Body, Conclusion, Hop, Incarnation, Introduction, Kind, Location, Principal,
+    WayError, WayFault,
 };
 
 struct Bench {
@@ -114,12 +115,20 @@ fn who_answers_is_asked_seldom_and_at_once_when_the_connection_ends() {
     bench.answers(attempt);
     bench.now.instant += Duration::from_secs(1);
     let location: Location = "tcp://a:2".parse().unwrap();
-    bench.core.handle_parted(bench.now, &location);
+    let parted = Introduction {
+        name: "crex".into(),
+        hop: Hop {
+            location: location.clone(),
+            principal: Principal::Unproved,
+        },
+        dialled: Some(location),
+    };
+    bench.core.handle_parted(bench.now, &parted);
     assert_eq!(bench.wait(), Duration::ZERO);
     let (attempt, _) = bench.asked().unwrap();
     bench.answers(attempt);
     // One that comes and goes all the time is not asked all the time.
-    bench.core.handle_parted(bench.now, &location);
+    bench.core.handle_parted(bench.now, &parted);
     assert_eq!(bench.wait(), Duration::from_millis(200));
 }
 

@@ -12,7 +12,7 @@ use fipa_acl::{AgentId, Message, Performative};
 use fipa_mts::core::{Received, Submission};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Entry, Matcher, Query};
-use fipa_transport::Incarnation;
+use fipa_transport::{Hop, Incarnation};
 
 use super::exchange::Exchanging;
 use super::neighbours::Neighbours;
@@ -36,18 +36,25 @@ impl Clerk {
     pub(crate) async fn run(self) {
         let (mts, own) = (&self.service.mts, self.service.own.incarnation);
         while let Some(received) = mts.receive(own).await {
-            let Received { letter, sender, .. } = received;
-            match Message::decode(letter.payload()) {
-                Ok(message) => self.handle(&message, sender),
+            match Message::decode(received.letter.payload()) {
+                Ok(message) => self.handle(&message, &received),
                 Err(error) => tracing::info!(%error, "a letter to the gateway makes no sense"),
             }
         }
     }
 
-    fn handle(&self, message: &Message, sender: Incarnation) {
+    fn handle(&self, message: &Message, received: &Received) {
+        let (sender, from) = (received.sender, received.from.as_ref());
         if message.ontology() == Some(EXCHANGE_ONTOLOGY)
             && *message.performative() == Performative::Inform
         {
+            // A gateway speaks for itself, on its own connections.
+            if from.is_none_or(|from| from.location.incarnation() != sender) {
+                tracing::info!(
+                    "what a gateway tells was not used: it came over another's connection"
+                );
+                return;
+            }
             let content = message.content().map(|content| &content[..]);
             return self.exchange.received(sender, content.unwrap_or_default());
         }
@@ -63,6 +70,12 @@ impl Clerk {
             return;
         }
         match message.ontology() {
+            // Routes name the incarnations of agents and gateways, and are for this host only.
+            Some(routes::ONTOLOGY) if from.is_some_and(Hop::is_remote) => {
+                self.answer(message, sender, Performative::Refuse, |answer| {
+                    answer.content("routes are told to agents of the gateway's host only")
+                });
+            }
             Some(routes::ONTOLOGY) => self.tell_routes(message, sender),
             _ => self.answer(message, sender, Performative::NotUnderstood, |answer| {
                 answer.content("the gateway does not know this ontology")

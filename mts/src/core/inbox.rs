@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::Letter;
-use fipa_transport::{Answer, FailureReason, Incarnation, Kind, Location, Parcel, Stream};
+use fipa_transport::{Answer, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Stream};
 
 use super::rules::{self, Offer};
 use super::{CoreConfig, MAX_DEADLINE};
@@ -23,6 +23,9 @@ pub struct Received {
     pub sender: Incarnation,
     /// How it came, on its last stretch; none for what this process told the agent itself.
     pub via: Option<Kind>,
+    /// The service that handed it over; none for what this process told the agent itself, and for a
+    /// letter of a legacy peer.
+    pub from: Option<Hop>,
 }
 
 /// An agent of this process.
@@ -86,7 +89,7 @@ impl Inbox {
         now: Instant,
         parcel: &Parcel,
         letter: Letter,
-        (via, back): (Kind, &Location),
+        (via, from): (Kind, &Hop),
         gate: Option<&dyn Gate>,
     ) -> Answer {
         let (stream, sequence) = (parcel.stream, parcel.sequence);
@@ -106,11 +109,11 @@ impl Inbox {
         }
         let len = letter.len();
         if !self.has_room(len) {
-            self.wait(stream, back);
+            self.wait(stream, &from.location);
             return Answer::Busy;
         }
         if let Some(gate) = gate
-            && let Err(why) = gate.admits(now, &self.name, &letter, link_of(via, back))
+            && let Err(why) = gate.admits(now, &self.name, &letter, link_of(via, &from.location))
         {
             return Answer::failed(FailureReason::Refused, why);
         }
@@ -124,6 +127,7 @@ impl Inbox {
             letter,
             sender: stream.sender,
             via: Some(via),
+            from: Some(from.clone()),
         });
         Answer::Accepted
     }
@@ -145,6 +149,7 @@ impl Inbox {
             letter,
             sender: Incarnation::UNKNOWN,
             via: Some(via),
+            from: None,
         });
         true
     }
@@ -160,6 +165,7 @@ impl Inbox {
             letter,
             sender: Incarnation::UNKNOWN,
             via: None,
+            from: None,
         });
         true
     }
@@ -292,8 +298,11 @@ mod tests {
         Inbox::new("b".into(), &config)
     }
 
-    fn back() -> Location {
-        "shm://1#0000000000000001".parse().unwrap()
+    fn back() -> Hop {
+        Hop {
+            location: "shm://1#0000000000000001".parse().unwrap(),
+            principal: fipa_transport::Principal::Host,
+        }
     }
 
     fn offer(inbox: &mut Inbox, sequence: u64, after: u64) -> Answer {

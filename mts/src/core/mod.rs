@@ -31,6 +31,7 @@ mod lane;
 mod limits;
 mod notice;
 mod peers;
+mod principals;
 mod routes;
 #[doc(hidden)]
 pub mod rules;
@@ -43,8 +44,8 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_acl::Letter;
 use fipa_sds::{Directory, Entry, Pattern, Resolution, Role};
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
-    Outcome, Parcel, Report, Stream, Verdict, WayError, WayFault,
+    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction,
+    Kind, Location, Outcome, Parcel, Report, Stream, Verdict, WayError, WayFault,
 };
 
 pub use config::{CoreConfig, MAX_DEADLINE};
@@ -60,6 +61,7 @@ pub use notice::{News, Notice};
 use crate::{Gate, Map};
 use peers::Peers;
 pub use peers::{Peer, PeerState};
+use principals::Principals;
 pub use routes::{Route, Standing, Way, WayState};
 
 /// What time it is, by both clocks.
@@ -113,6 +115,7 @@ pub struct Core {
     timers: BinaryHeap<Reverse<(Instant, LaneId)>>,
     notes: BinaryHeap<Reverse<LateNote>>,
     peers: Peers,
+    principals: Principals,
     gate: Option<Arc<dyn Gate>>,
     failure_limit: FailureLimit,
     /// Limits how many agents of legacy peers become known by their letters.
@@ -176,6 +179,7 @@ impl Core {
             timers: BinaryHeap::new(),
             notes: BinaryHeap::new(),
             peers: Peers::default(),
+            principals: Principals::default(),
             gate: None,
             failure_limit: FailureLimit::default(),
             contact_limit: forward::contact_limit(),
@@ -495,8 +499,17 @@ impl Core {
             from,
             ticket,
         } = arrival;
+        if let Err(impostor) = self.principals.check_service(&from) {
+            return Verdict::Now(Answer::failed(FailureReason::Refused, impostor.to_string()));
+        }
         match std::mem::replace(&mut parcel.body, Body::Credit) {
             Body::Letter(letter) => {
+                let sender = parcel.stream.sender;
+                let directory = &*self.desk.directory;
+                if let Err(impostor) = self.principals.check_sender(sender, &from, directory) {
+                    let detail = impostor.to_string();
+                    return Verdict::Now(Answer::failed(FailureReason::Refused, detail));
+                }
                 if parcel.sequence == 0 || parcel.after >= parcel.sequence {
                     let detail = "the letter's sequence is not above its predecessor's";
                     return Verdict::Now(Answer::failed(FailureReason::Refused, detail));
@@ -505,7 +518,7 @@ impl Core {
                 if let Some(inbox) = self.agents.get_mut(&parcel.stream.receiver) {
                     let seen = watched.then(|| letter.clone());
                     let gate = self.gate.as_deref();
-                    let came = (via, &from.location);
+                    let came = (via, &from);
                     let answer = inbox.accept(now.instant, &parcel, letter, came, gate);
                     if answer == Answer::Accepted {
                         if let Some(letter) = seen {
@@ -563,7 +576,6 @@ impl Core {
                 ..
             } = *parcel;
             let letter = (stream.receiver, sequence, transfer);
-            let from = from.location.incarnation();
             self.with_lane(now, lane, |lane, desk| {
                 lane.reported(now.instant, from, letter, report, desk);
             });
@@ -712,8 +724,21 @@ impl Core {
     }
 
     /// A connection that was opened for this location has ended.
-    pub fn handle_parted(&mut self, now: Now, location: &Location) {
-        self.peers.parted(now.instant, location);
+    pub fn handle_parted(&mut self, now: Now, peer: &Introduction) {
+        self.principals.parted(peer);
+        if let Some(dialled) = &peer.dialled {
+            self.peers.parted(now.instant, dialled);
+        }
+    }
+
+    /// A service has introduced itself on a connection. From now on its incarnation belongs to what the
+    /// link proves, and what failed on routes to it before may work.
+    pub fn handle_introduced(&mut self, now: Now, peer: &Introduction) {
+        self.principals.introduced(peer);
+        let service = peer.hop.location.incarnation();
+        if service.is_known() {
+            self.handle_reachable(now, Some(service));
+        }
     }
 
     /// The network of this host has changed, or this service has opened a connection: what failed

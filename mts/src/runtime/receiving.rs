@@ -99,12 +99,9 @@ impl Sink for Receiving {
         if let Some(contacts) = &shared.config.contacts {
             contacts.introduced(peer);
         }
-        let service = peer.hop.location.incarnation();
-        if service.is_known() {
-            let mut state = shared.state.lock();
-            state.core.handle_reachable(Now::read(), Some(service));
-            shared.carry_out(state);
-        }
+        let mut state = shared.state.lock();
+        state.core.handle_introduced(Now::read(), peer);
+        shared.carry_out(state);
     }
 
     fn parted(&self, peer: &Introduction) {
@@ -114,11 +111,9 @@ impl Sink for Receiving {
         if let Some(contacts) = &shared.config.contacts {
             contacts.parted(peer);
         }
-        if let Some(dialled) = &peer.dialled {
-            let mut state = shared.state.lock();
-            state.core.handle_parted(Now::read(), dialled);
-            shared.carry_out(state);
-        }
+        let mut state = shared.state.lock();
+        state.core.handle_parted(Now::read(), peer);
+        shared.carry_out(state);
     }
 }
 

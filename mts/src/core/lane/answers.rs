@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use fipa_sds::Entry;
 use fipa_transport::{
-    Answer, AttemptId, Conclusion, FailureReason, Incarnation, Kind, Location, Outcome, Report,
-    Signature, WayError, WayFault,
+    Answer, AttemptId, Conclusion, FailureReason, Hop, Incarnation, Kind, Location, Outcome,
+    Report, Signature, WayError, WayFault,
 };
 
 use super::super::desk::{Desk, Settlement};
@@ -255,7 +255,7 @@ impl Lane {
     pub(crate) fn reported(
         &mut self,
         now: Instant,
-        from: Incarnation,
+        from: &Hop,
         (registration, sequence, transfer): (Incarnation, u64, u64),
         report: Report,
         desk: &mut Desk,

@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use fipa_acl::Letter;
 use fipa_transport::{
-    Answer, Attempt, AttemptId, FailureReason, Incarnation, Location, WayError, WayFault,
+    Answer, Attempt, AttemptId, FailureReason, Hop, Incarnation, Location, WayError, WayFault,
 };
 use smallvec::SmallVec;
 
@@ -48,8 +48,8 @@ pub(super) struct Progress {
     pub(super) attempts: Vec<Attempt>,
     /// The ways tried in this round.
     pub(super) tried: SmallVec<[Location; 1]>,
-    /// The services that the letter was handed to.
-    pub(super) handed: SmallVec<[Incarnation; 2]>,
+    /// The services that the letter was handed to, and whether over a route within the host.
+    pub(super) handed: SmallVec<[(Incarnation, bool); 2]>,
     /// An attempt may have delivered it. Never cleared.
     pub(super) uncertain: bool,
     /// The receiver's queue was full.
@@ -162,14 +162,19 @@ impl Delivery {
     pub(super) fn handed_to(&mut self, location: &Location) {
         let service = location.incarnation();
         let handed = &mut self.progress.handed;
-        if service.is_known() && !handed.contains(&service) && handed.len() < MAX_HANDED {
-            handed.push(service);
+        let hand_over = (service, location.kind().is_host_local());
+        if service.is_known() && !handed.contains(&hand_over) && handed.len() < MAX_HANDED {
+            handed.push(hand_over);
         }
     }
 
-    /// Whether the letter was ever handed to this service.
-    pub(super) fn was_handed_to(&self, service: Incarnation) -> bool {
-        self.progress.handed.contains(&service)
+    /// Whether the letter was ever handed to this service. One of this host, which proves nothing to
+    /// others, is not believed to be on another.
+    pub(super) fn was_handed_to(&self, service: &Hop) -> bool {
+        let mut handed = self.progress.handed.iter();
+        handed.any(|(incarnation, local)| {
+            *incarnation == service.location.incarnation() && !(*local && service.is_remote())
+        })
     }
 
     /// The reason when every attempt failed because of the letter itself: it is too large, or the

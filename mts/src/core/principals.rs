@@ -1,0 +1,241 @@
+//! Which principal a service or a registration of an agent belongs to.
+//!
+//! A parcel names the service that handed it over, and the registration of the agent that sent it. Both
+//! names are public, so they count only as far as the link proves them: a service belongs to the
+//! [principal](Principal) that introduced itself with its incarnation, and an agent to the principal of
+//! its gateway. Without keys all services of other hosts are one principal.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use fipa_sds::{Directory, Reach};
+use fipa_transport::{Hop, Incarnation, Introduction, Principal};
+
+use crate::Map;
+
+/// Services that are remembered, at most. Of those without a connection the one that was first
+/// connected is forgotten first.
+const MAX_SERVICES: usize = 4096;
+/// Registrations that are remembered for one principal, at most: who invents senders makes this service
+/// forget no senders of others.
+const MAX_SENDERS: usize = 4096;
+
+/// The services and senders of other hosts.
+#[derive(Debug, Default)]
+pub(super) struct Principals {
+    services: Map<Incarnation, Service>,
+    /// The services in the order in which they were first connected.
+    order: VecDeque<Incarnation>,
+    /// Senders that the directory did not know when they first wrote.
+    senders: Map<Incarnation, Principal>,
+    heard: Map<Principal, VecDeque<Incarnation>>,
+}
+
+#[derive(Debug)]
+struct Service {
+    principal: Principal,
+    name: Arc<str>,
+    /// Connections that are open with it.
+    connections: usize,
+}
+
+/// Why a parcel is refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub(super) enum Impostor {
+    /// The service of the link belongs to another principal.
+    #[error("another service has proved to be the one that this link names")]
+    Service,
+    /// The sender belongs to another principal.
+    #[error("the link does not prove to speak for the sender of this letter")]
+    Sender,
+}
+
+impl Principals {
+    /// A service has introduced itself on a connection. It keeps its principal while it is connected;
+    /// later a service of the same name may have renewed its certificate.
+    pub(super) fn introduced(&mut self, peer: &Introduction) {
+        let incarnation = peer.hop.location.incarnation();
+        if !peer.hop.is_remote() || !incarnation.is_known() {
+            return;
+        }
+        let principal = peer.hop.principal;
+        if let Some(known) = self.services.get_mut(&incarnation) {
+            let renewed = known.connections == 0 && known.name == peer.name;
+            if renewed {
+                known.principal = principal;
+            }
+            known.connections += usize::from(known.principal == principal);
+            return;
+        }
+        self.make_room();
+        let service = Service {
+            principal,
+            name: Arc::clone(&peer.name),
+            connections: 1,
+        };
+        self.services.insert(incarnation, service);
+        self.order.push_back(incarnation);
+    }
+
+    /// A connection with this service has ended.
+    pub(super) fn parted(&mut self, peer: &Introduction) {
+        let service = self.services.get_mut(&peer.hop.location.incarnation());
+        if let Some(service) = service.filter(|it| it.principal == peer.hop.principal) {
+            service.connections = service.connections.saturating_sub(1);
+        }
+    }
+
+    fn make_room(&mut self) {
+        let services = &mut self.services;
+        if services.len() < MAX_SERVICES {
+            return;
+        }
+        let is_idle =
+            |known: &Incarnation| services.get(known).is_none_or(|it| it.connections == 0);
+        if let Some(place) = self.order.iter().position(is_idle)
+            && let Some(oldest) = self.order.remove(place)
+        {
+            services.remove(&oldest);
+        }
+    }
+
+    /// Whether the link proves the service that it names. Every parcel is asked for this.
+    pub(super) fn check_service(&self, from: &Hop) -> Result<(), Impostor> {
+        let known = self.services.get(&from.location.incarnation());
+        match known {
+            Some(known) if known.principal != from.principal => Err(Impostor::Service),
+            _ => Ok(()),
+        }
+    }
+
+    /// Whether the link may carry letters of this sender. The directory decides where it knows the
+    /// sender; else the link on which the sender was first heard.
+    pub(super) fn check_sender(
+        &mut self,
+        sender: Incarnation,
+        from: &Hop,
+        directory: &dyn Directory,
+    ) -> Result<(), Impostor> {
+        if !from.is_remote() || !sender.is_known() {
+            return Ok(());
+        }
+        // The letters of a service itself come on links of its own only.
+        if self.services.contains_key(&sender) && sender != from.location.incarnation() {
+            return Err(Impostor::Sender);
+        }
+        let owner = match directory.known_incarnation(sender).map(|it| it.reach) {
+            Some(Reach::Local) => Some(Principal::Host),
+            Some(Reach::Remote { gateway }) => self.services.get(&gateway).map(|it| it.principal),
+            None => None,
+        };
+        let owner = owner.unwrap_or_else(|| self.first_heard(sender, from.principal));
+        match owner == from.principal {
+            true => Ok(()),
+            false => Err(Impostor::Sender),
+        }
+    }
+
+    fn first_heard(&mut self, sender: Incarnation, principal: Principal) -> Principal {
+        if let Some(owner) = self.senders.get(&sender) {
+            return *owner;
+        }
+        let heard = self.heard.entry(principal).or_default();
+        if heard.len() >= MAX_SENDERS
+            && let Some(oldest) = heard.pop_front()
+        {
+            self.senders.remove(&oldest);
+        }
+        heard.push_back(sender);
+        self.senders.insert(sender, principal);
+        principal
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use fipa_sds::{MemoryDirectory, Mts};
+
+    use super::*;
+
+    const ROVER: Principal = Principal::Certificate([1; 32]);
+    const CREX: Principal = Principal::Certificate([2; 32]);
+    const SERVICE: u64 = 7;
+
+    fn hop(service: u64, principal: Principal) -> Hop {
+        let location: fipa_transport::Location = "tcp://192.0.2.1:1".parse().unwrap();
+        Hop {
+            location: location.with_incarnation(Incarnation::from_u64(service)),
+            principal,
+        }
+    }
+
+    fn peer(name: &str, principal: Principal) -> Introduction {
+        Introduction {
+            name: name.into(),
+            hop: hop(SERVICE, principal),
+            dialled: None,
+        }
+    }
+
+    fn nobody() -> MemoryDirectory {
+        MemoryDirectory::new(Mts::new("mts", Incarnation::from_u64(1)))
+    }
+
+    #[test]
+    fn a_connected_service_keeps_its_principal() {
+        let mut principals = Principals::default();
+        principals.introduced(&peer("rover", ROVER));
+        principals.introduced(&peer("crex", CREX));
+        principals.introduced(&peer("rover", CREX));
+        assert_eq!(principals.check_service(&hop(SERVICE, ROVER)), Ok(()));
+        let other = principals.check_service(&hop(SERVICE, CREX));
+        assert_eq!(other, Err(Impostor::Service));
+        // A connection of the impostor ends, which changes nothing.
+        principals.parted(&peer("rover", CREX));
+        principals.introduced(&peer("rover", CREX));
+        assert_eq!(principals.check_service(&hop(SERVICE, ROVER)), Ok(()));
+    }
+
+    #[test]
+    fn a_certificate_can_be_renewed_under_the_same_name_only() {
+        let mut principals = Principals::default();
+        principals.introduced(&peer("rover", ROVER));
+        principals.parted(&peer("rover", ROVER));
+        principals.introduced(&peer("crex", CREX));
+        let other = principals.check_service(&hop(SERVICE, CREX));
+        assert_eq!(other, Err(Impostor::Service));
+        principals.introduced(&peer("rover", CREX));
+        assert_eq!(principals.check_service(&hop(SERVICE, CREX)), Ok(()));
+    }
+
+    #[test]
+    fn invented_senders_displace_those_of_the_same_principal_only() {
+        let mut principals = Principals::default();
+        let directory = nobody();
+        let mut hear = |sender: u64, principal| {
+            let sender = Incarnation::from_u64(sender);
+            principals.check_sender(sender, &hop(SERVICE, principal), &directory)
+        };
+        assert_eq!(hear(100, ROVER), Ok(()));
+        for sender in 0..2 * MAX_SENDERS as u64 {
+            assert_eq!(hear(1000 + sender, CREX), Ok(()));
+        }
+        assert_eq!(hear(100, CREX), Err(Impostor::Sender));
+        assert!(principals.senders.len() <= MAX_SENDERS + 1);
+    }
+
+    #[test]
+    fn services_are_bounded() {
+        let mut principals = Principals::default();
+        for service in 0..2 * MAX_SERVICES as u64 {
+            let peer = Introduction {
+                hop: hop(1000 + service, ROVER),
+                ..peer("rover", ROVER)
+            };
+            principals.introduced(&peer);
+            principals.parted(&peer);
+        }
+        assert_eq!(principals.services.len(), MAX_SERVICES);
+        assert_eq!(principals.order.len(), MAX_SERVICES);
+    }
+}

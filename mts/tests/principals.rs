@@ -1,0 +1,257 @@
+//! Trusted peers that speak for others: with certificates, each peer speaks for itself and its agents.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use fipa_acl::{AgentId, Letter, Message, Performative};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
+use fipa_mts::letter_for;
+use fipa_sds::{ContactDirectory, Directory, MemoryDirectory, MergedDirectory, Mts, Registration};
+use fipa_transport::{
+    Answer, Arrival, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction, Kind,
+    Location, Outcome, Parcel, Principal, Report, Stream, Ticket, Verdict,
+};
+
+const GATEWAY: Incarnation = Incarnation::from_u64(1);
+/// A process of this host, with the arm.
+const PROCESS: Incarnation = Incarnation::from_u64(2);
+const ARM: Incarnation = Incarnation::from_u64(3);
+/// A gateway of another host, with the rover.
+const HONEST: Incarnation = Incarnation::from_u64(4);
+const ROVER: Incarnation = Incarnation::from_u64(5);
+/// Another gateway, as trusted as that one.
+const LIAR: Incarnation = Incarnation::from_u64(6);
+
+/// The gateway of a host, which has met both peers.
+struct Bench {
+    core: Core,
+    now: Now,
+    tickets: u64,
+}
+
+fn at(service: Incarnation, address: &str) -> Location {
+    let location: Location = address.parse().unwrap();
+    location.with_incarnation(service)
+}
+
+/// A link with one of the two peers, which names this service.
+fn link(service: Incarnation, holder: Incarnation) -> Hop {
+    let number = u8::try_from(holder.as_u64()).unwrap();
+    Hop {
+        location: at(service, "tcp://192.0.2.4:1"),
+        principal: Principal::Certificate([number; 32]),
+    }
+}
+
+fn letter() -> Letter {
+    let message = Message::builder(Performative::Inform)
+        .sender(AgentId::new("rover").unwrap())
+        .receiver(AgentId::new("arm").unwrap())
+        .build()
+        .unwrap();
+    letter_for(&message, SystemTime::UNIX_EPOCH).unwrap()
+}
+
+impl Bench {
+    fn new() -> Self {
+        let own = Arc::new(MemoryDirectory::new(Mts::new("mts", PROCESS)));
+        let arm = vec![at(PROCESS, "shm://arms")];
+        own.register(Registration::new("arm", ARM, arm)).unwrap();
+        let contacts = Arc::new(ContactDirectory::new());
+        let rover = at(HONEST, "tcp://192.0.2.4:1");
+        contacts
+            .heard(Instant::now(), "rover", ROVER, rover)
+            .unwrap();
+        let all: Vec<Arc<dyn Directory>> = vec![own, contacts];
+        let config = CoreConfig {
+            forwards: true,
+            ..CoreConfig::new("mts", GATEWAY, vec![Kind::Shm, Kind::Tcp])
+        };
+        let mut core = Core::new(config, Arc::new(MergedDirectory::new(all)));
+        let now = Now {
+            instant: Instant::now(),
+            utc: SystemTime::UNIX_EPOCH,
+        };
+        core.register("mts".into(), GATEWAY);
+        for (name, peer) in [("honest", HONEST), ("liar", LIAR)] {
+            let introduction = Introduction {
+                name: name.into(),
+                hop: link(peer, peer),
+                dialled: None,
+            };
+            core.handle_introduced(now, &introduction);
+        }
+        Self {
+            core,
+            now,
+            tickets: 0,
+        }
+    }
+
+    fn arrives(
+        &mut self,
+        from: Hop,
+        stream: (Incarnation, Incarnation),
+        what: (u64, Body),
+    ) -> Verdict {
+        let ((sender, receiver), (sequence, body)) = (stream, what);
+        self.tickets += 1;
+        let parcel = Parcel {
+            receiver: if receiver == GATEWAY { "mts" } else { "arm" }.into(),
+            stream: Stream { sender, receiver },
+            sequence,
+            after: 0,
+            transfer: 1,
+            remaining: Duration::from_secs(5),
+            body,
+        };
+        let ticket = Ticket(self.tickets);
+        let arrival = Arrival {
+            parcel,
+            from,
+            ticket,
+        };
+        self.core
+            .handle_arrival(self.now, Kind::Tcp, false, arrival)
+    }
+
+    fn letter(&mut self, from: Hop, stream: (Incarnation, Incarnation), sequence: u64) -> Verdict {
+        self.arrives(from, stream, (sequence, Body::Letter(letter())))
+    }
+}
+
+fn is_refused(verdict: &Verdict) -> bool {
+    let reason = FailureReason::Refused;
+    matches!(verdict, Verdict::Now(Answer::Failed { reason: it, .. }) if *it == reason)
+}
+
+#[test]
+fn a_gateway_speaks_for_itself() {
+    let mut bench = Bench::new();
+    let goodbye = bench.letter(link(LIAR, LIAR), (HONEST, GATEWAY), 1 << 48);
+    assert!(is_refused(&goodbye), "{goodbye:?}");
+    // Nor when the liar names the honest one as itself.
+    let goodbye = bench.letter(link(HONEST, LIAR), (HONEST, GATEWAY), 1 << 48);
+    assert!(is_refused(&goodbye), "{goodbye:?}");
+    let own = bench.letter(link(HONEST, HONEST), (HONEST, GATEWAY), 1);
+    assert_eq!(own, Verdict::Now(Answer::Accepted));
+}
+
+#[test]
+fn letters_in_the_stream_of_another_host_are_refused() {
+    let mut bench = Bench::new();
+    for sequence in 1..=98 {
+        let junk = bench.letter(link(LIAR, LIAR), (ROVER, ARM), sequence);
+        assert!(is_refused(&junk), "{junk:?}");
+        let junk = bench.letter(link(HONEST, LIAR), (ROVER, ARM), sequence);
+        assert!(is_refused(&junk), "{junk:?}");
+    }
+    let real = bench.letter(link(HONEST, HONEST), (ROVER, ARM), 1);
+    assert_eq!(real, Verdict::Later);
+    // Nor does another host speak for an agent of this one.
+    let own = bench.letter(link(LIAR, LIAR), (ARM, GATEWAY), 1);
+    assert!(is_refused(&own), "{own:?}");
+}
+
+#[test]
+fn a_sender_that_nothing_is_known_of_belongs_to_the_first_link() {
+    let mut bench = Bench::new();
+    let stranger = Incarnation::from_u64(99);
+    let first = bench.letter(link(HONEST, HONEST), (stranger, ARM), 1);
+    assert_eq!(first, Verdict::Later);
+    let second = bench.letter(link(LIAR, LIAR), (stranger, ARM), 2);
+    assert!(is_refused(&second), "{second:?}");
+}
+
+#[test]
+fn only_the_service_that_has_a_letter_reports_of_it() {
+    let mut bench = Bench::new();
+    bench
+        .core
+        .register("camera".into(), Incarnation::from_u64(50));
+    let submission = Submission {
+        sender: Incarnation::from_u64(50),
+        letter: letter(),
+        receivers: vec!["rover".into()],
+        deadline: Duration::from_secs(5),
+    };
+    bench.core.send(bench.now, submission);
+    let Some(Action::Dispatch {
+        attempt, parcel, ..
+    }) = bench.core.poll_action()
+    else {
+        panic!("the letter is dispatched");
+    };
+    let custody = Conclusion::Answered(Answer::Custody);
+    bench.core.handle_conclusion(bench.now, attempt, custody);
+    let report = |bench: &mut Bench, from| {
+        let delivered = Outcome::Delivered {
+            via: Kind::Tcp,
+            attempts: Vec::new(),
+        };
+        let report = Parcel {
+            body: Body::Report(Report::Settled(delivered)),
+            ..parcel.clone()
+        };
+        bench.tickets += 1;
+        let arrival = Arrival {
+            parcel: report,
+            from,
+            ticket: Ticket(bench.tickets),
+        };
+        let now = bench.now;
+        bench.core.handle_arrival(now, Kind::Tcp, false, arrival);
+        let actions = std::iter::from_fn(|| bench.core.poll_action());
+        actions
+            .filter(|action| matches!(action, Action::Outcome { .. }))
+            .count()
+    };
+    assert_eq!(report(&mut bench, link(LIAR, LIAR)), 0);
+    assert_eq!(report(&mut bench, link(HONEST, LIAR)), 0);
+    assert_eq!(report(&mut bench, link(HONEST, HONEST)), 1);
+}
+
+#[test]
+fn a_process_of_this_host_is_not_believed_to_be_on_another() {
+    let mut bench = Bench::new();
+    let taken = bench.letter(link(HONEST, HONEST), (ROVER, ARM), 1);
+    assert_eq!(taken, Verdict::Later);
+    let Some(Action::Dispatch {
+        attempt,
+        location,
+        parcel,
+    }) = std::iter::from_fn(|| bench.core.poll_action())
+        .find(|action| matches!(action, Action::Dispatch { .. }))
+    else {
+        panic!("the letter is passed on");
+    };
+    assert_eq!(location.incarnation(), PROCESS);
+    let custody = Conclusion::Answered(Answer::Custody);
+    bench.core.handle_conclusion(bench.now, attempt, custody);
+    let delivered = Outcome::Delivered {
+        via: Kind::Shm,
+        attempts: Vec::new(),
+    };
+    let report = |bench: &mut Bench, from| {
+        let arrival = Arrival {
+            parcel: Parcel {
+                body: Body::Report(Report::Settled(delivered.clone())),
+                ..parcel.clone()
+            },
+            from,
+            ticket: Ticket(1000),
+        };
+        let now = bench.now;
+        bench.core.handle_arrival(now, Kind::Tcp, false, arrival);
+        std::iter::from_fn(|| bench.core.poll_action())
+            .any(|action| matches!(action, Action::Answer { .. }))
+    };
+    assert!(!report(&mut bench, link(PROCESS, LIAR)));
+    let process = Hop {
+        location: at(PROCESS, "shm://arms"),
+        principal: Principal::Host,
+    };
+    assert!(report(&mut bench, process));
+}
