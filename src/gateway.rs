@@ -78,8 +78,7 @@ impl Gateway {
                     let told = exchange.directory() as Arc<dyn Directory>;
                     let there = network.clone().map(Network::directory);
                     let old = Arc::new(old_peers(config)?) as Arc<dyn Directory>;
-                    // What a connected gateway tells is newer than what was announced before.
-                    let known = [told].into_iter().chain(there).chain([old]).collect();
+                    let known = there.into_iter().chain([told, old]).collect();
                     let known = Arc::new(MergedDirectory::new(known));
                     let heard = Arc::clone(&contacts.directory) as Arc<dyn Directory>;
                     let beyond = Arc::clone(&known) as Arc<dyn Directory>;

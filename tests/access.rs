@@ -15,7 +15,8 @@ use fipa::{
 };
 use fipa_mts::letter_for;
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Parcel, Sink, Stream, Transport as _, Verdict,
+    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Parcel, Sink, Stream,
+    Transport as _, Verdict,
 };
 use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport};
 
@@ -192,8 +193,9 @@ async fn hand_over(gateway: &Gateway, to: &Entry) -> Conclusion {
         .unwrap();
     let parcel = Parcel {
         receiver: Arc::clone(&to.name),
+        // A registration that the directory does not know: one that it knows belongs to its own link.
         stream: Stream {
-            sender: gateway.incarnation(),
+            sender: Incarnation::random(),
             receiver: to.incarnation,
         },
         sequence: 1,

@@ -12,9 +12,11 @@ use crate::{
 
 /// Several directories as one.
 ///
-/// When more than one knows a name, the entry that [precedes](Entry::precedes) is seen, and of
-/// equals (one registration learnt twice) that of the directory named first. Registrations go to
-/// the first directory that can be written.
+/// When more than one knows a name, the entry that [precedes](Entry::precedes) is seen. Of equals (one
+/// registration learnt twice) it is that of the directory named first, unless they name different
+/// message transport services, because the agent's one was started anew: then it is that of a
+/// directory that [speaks](Directory::speaks_for) for the service. Registrations go to the first
+/// directory that can be written.
 pub struct MergedDirectory {
     back_ends: BackEnds,
     sorted: ArcSwapOption<Sorted>,
@@ -77,21 +79,23 @@ impl Directory for MergedDirectory {
         }
         // Taken before reading: what changes meanwhile is read again next time.
         let generations = self.generations().collect();
-        let mut merged: HashMap<Arc<str>, Arc<Entry>> = HashMap::new();
+        let mut merged: HashMap<Arc<str>, Claim> = HashMap::new();
         for (at, one) in self.back_ends.iter().enumerate() {
             for entry in one.entries().iter() {
                 if !counts(&self.back_ends, at, entry) {
                     continue;
                 }
-                let better = merged
-                    .get(&entry.name)
-                    .is_none_or(|holder| entry.precedes(holder));
-                if better {
-                    merged.insert(entry.name.clone(), Arc::clone(entry));
+                let claim = Claim {
+                    at,
+                    entry: Arc::clone(entry),
+                };
+                let holder = merged.get(&entry.name);
+                if holder.is_none_or(|holder| claim.is_better(holder, &self.back_ends)) {
+                    merged.insert(entry.name.clone(), claim);
                 }
             }
         }
-        let mut entries: Vec<_> = merged.into_values().collect();
+        let mut entries: Vec<_> = merged.into_values().map(|claim| claim.entry).collect();
         entries.sort_unstable_by(|a, b| a.name.cmp(&b.name));
         let entries: Arc<[_]> = entries.into();
         self.sorted.store(Some(Arc::new(Sorted {
@@ -153,9 +157,38 @@ impl Directory for MergedDirectory {
 fn holder(back_ends: &[Arc<dyn Directory>], name: &str) -> Option<Arc<Entry>> {
     let claims = back_ends.iter().enumerate().filter_map(|(at, one)| {
         let entry = one.known(name)?;
-        counts(back_ends, at, &entry).then_some(entry)
+        counts(back_ends, at, &entry).then_some(Claim { at, entry })
     });
-    claims.reduce(|best, next| if next.precedes(&best) { next } else { best })
+    let better = |best: Claim, next: Claim| match next.is_better(&best, back_ends) {
+        true => next,
+        false => best,
+    };
+    claims.reduce(better).map(|claim| claim.entry)
+}
+
+/// What one of the directories says of a name.
+struct Claim {
+    /// The place of the directory.
+    at: usize,
+    entry: Arc<Entry>,
+}
+
+impl Claim {
+    /// Whether this is seen rather than the claim of a directory that was named before.
+    fn is_better(&self, before: &Self, back_ends: &[Arc<dyn Directory>]) -> bool {
+        let (new, old) = (&self.entry, &before.entry);
+        let is_moved = new.incarnation == old.incarnation
+            && new.incarnation.is_known()
+            && new.mts.incarnation != old.mts.incarnation;
+        let speaks = |claim: &Self| {
+            let back_end = back_ends.get(claim.at);
+            back_end.is_some_and(|it| it.speaks_for(claim.entry.mts.incarnation))
+        };
+        match is_moved {
+            true => speaks(self) && !speaks(before),
+            false => new.precedes(old),
+        }
+    }
 }
 
 /// Whether what that back end says counts: of coalitions, what the one that
@@ -294,6 +327,20 @@ mod tests {
         assert_eq!(merged.known("team"), None);
         first.deregister("team", id).unwrap();
         assert_eq!(watch.try_next(), None);
+        // Of an agent whose service was started anew, what the new service says is seen.
+        let anew = Arc::new(Speaker(MemoryDirectory::new(Mts::new(
+            "mts",
+            Incarnation::from_u64(2),
+        ))));
+        let merged = MergedDirectory::new(vec![first.clone(), anew.clone()]);
+        let leg = Registration {
+            registered: std::time::UNIX_EPOCH,
+            ..Registration::new("leg", Incarnation::from_u64(9), Vec::new())
+        };
+        first.register(leg.clone()).unwrap();
+        let moved = anew.0.register(leg).unwrap();
+        assert_eq!(merged.known("leg"), Some(Arc::clone(&moved)));
+        assert!(merged.entries().contains(&moved));
         // Agents are there as long as anybody knows them.
         let agent = Registration::new("arm", Incarnation::from_u64(8), Vec::new());
         first.register(agent).unwrap();

@@ -73,7 +73,7 @@ fn mistakes_are_named_with_line_and_key() {
         (
             "[mts]\ntransports = [\"udt\"]\n",
             "fipa.toml:2: `mts.transports` is wrong: \"udt\": unknown transport \"udt\" \
-             (known: shm, tcp, udp, quic); expected a list of transports such as [\"shm\", \"tcp\"]",
+             (known: shm, unix, tcp, udp, quic); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
         ),
         (
             "[mts]\nname = true\n",
