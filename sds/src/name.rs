@@ -1,5 +1,7 @@
 //! What may be the name of an agent.
 
+use fipa_acl::is_unprintable;
+
 /// Longest name of an agent, in bytes.
 ///
 /// The standards set no limit. This one leaves room for the longest names in use (`agent@host:port`
@@ -16,9 +18,12 @@ pub enum NameError {
     /// The name is longer than [`MAX_NAME`].
     #[error("the name has {0} bytes; at most {MAX_NAME} are allowed")]
     TooLong(usize),
-    /// The name has a control character.
-    #[error("the name {name:?} has the control character {character:?} at byte {at}; remove it")]
-    Control {
+    /// The name has a control character, a format character (bidirectional ones are such), or a
+    /// separator of lines: it could look like another name.
+    #[error(
+        "the name {name:?} has the control or format character {character:?} at byte {at}; remove it"
+    )]
+    Unprintable {
         /// The name.
         name: String,
         /// The character.
@@ -28,8 +33,8 @@ pub enum NameError {
     },
 }
 
-/// Whether this can be the name of an agent: UTF-8 of 1 to [`MAX_NAME`] bytes without control
-/// characters.
+/// Whether this can be the name of an agent: UTF-8 of 1 to [`MAX_NAME`] bytes without
+/// [unprintable](is_unprintable) characters.
 ///
 /// # Errors
 /// Says what is wrong with the name.
@@ -40,8 +45,8 @@ pub fn check_name(name: &str) -> Result<(), NameError> {
     if name.len() > MAX_NAME {
         return Err(NameError::TooLong(name.len()));
     }
-    match name.char_indices().find(|(_, c)| c.is_control()) {
-        Some((at, character)) => Err(NameError::Control {
+    match name.char_indices().find(|(_, c)| is_unprintable(*c)) {
+        Some((at, character)) => Err(NameError::Unprintable {
             name: name.to_owned(),
             character,
             at,
@@ -68,9 +73,17 @@ mod tests {
         assert_eq!(check_name(""), Err(NameError::Empty));
         let long = "é".repeat(MAX_NAME / 2 + 1);
         assert_eq!(check_name(&long), Err(NameError::TooLong(MAX_NAME + 2)));
-        for (bad, place) in [("a\nb", 1), ("\0", 0), ("é\u{85}", 2)] {
+        for (bad, place) in [
+            ("a\nb", 1),
+            ("\0", 0),
+            ("é\u{85}", 2),
+            ("arm\u{202e}tfel", 3),
+            ("rover\u{200b}", 5),
+            ("\u{feff}rover", 0),
+            ("a\u{2028}b", 1),
+        ] {
             assert!(
-                matches!(check_name(bad), Err(NameError::Control { at, .. }) if at == place),
+                matches!(check_name(bad), Err(NameError::Unprintable { at, .. }) if at == place),
                 "{bad:?}"
             );
         }

@@ -355,7 +355,7 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     exchange.handle_letter(now, new, told).unwrap();
     assert!(directory.speaks_for(old));
     // It ends: they leave at once, and those of the new one are there.
-    exchange.handle_neighbours(now, &[restarted.clone()]);
+    exchange.handle_neighbours(now, std::slice::from_ref(&restarted));
     assert!(!directory.speaks_for(old));
     assert_eq!(gateway(), Some(new));
 
@@ -364,7 +364,7 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     let at = location(0).with_incarnation(newer);
     let started_again = (Mts::new("same-name-mts", newer), vec![at]);
     exchange.handle_neighbours(now, &[]);
-    exchange.handle_neighbours(now, &[started_again.clone()]);
+    exchange.handle_neighbours(now, std::slice::from_ref(&started_again));
     assert_eq!(gateway(), Some(new));
     exchange.handle_letter(now, newer, told).unwrap();
     assert_eq!(gateway(), Some(newer));
