@@ -2,6 +2,8 @@
 
 use fipa_acl::is_unprintable;
 
+use crate::is_pattern;
+
 /// Longest name of an agent, in bytes.
 ///
 /// The standards set no limit. This one leaves room for the longest names in use (`agent@host:port`
@@ -31,10 +33,15 @@ pub enum NameError {
         /// Where it stands, in bytes from the beginning.
         at: usize,
     },
+    /// The name is a pattern: its agent would get the letters to those that match.
+    #[error(
+        "the name {0:?} is a pattern; use a name without any of * + ? [ ( {{ | ^ $ \\ (a dot is allowed)"
+    )]
+    Pattern(String),
 }
 
 /// Whether this can be the name of an agent: UTF-8 of 1 to [`MAX_NAME`] bytes without
-/// [unprintable](is_unprintable) characters.
+/// [unprintable](is_unprintable) characters that [is no pattern](is_pattern).
 ///
 /// # Errors
 /// Says what is wrong with the name.
@@ -51,6 +58,7 @@ pub fn check_name(name: &str) -> Result<(), NameError> {
             character,
             at,
         }),
+        None if is_pattern(name) => Err(NameError::Pattern(name.to_owned())),
         None => Ok(()),
     }
 }
@@ -65,12 +73,27 @@ mod tests {
             "a",
             "béla@home:1099/JADE",
             ".",
-            "arm (left)",
+            "arm.left",
+            "arm left)]}",
             &"x".repeat(MAX_NAME),
         ] {
             assert_eq!(check_name(good), Ok(()));
         }
         assert_eq!(check_name(""), Err(NameError::Empty));
+        for pattern in [
+            "arm_.*",
+            "arm?left",
+            "arm (left)",
+            "[a]",
+            "a|b",
+            "^a",
+            "a$",
+            r"a\.b",
+            "a+",
+        ] {
+            let error = NameError::Pattern(pattern.to_owned());
+            assert_eq!(check_name(pattern), Err(error));
+        }
         let long = "é".repeat(MAX_NAME / 2 + 1);
         assert_eq!(check_name(&long), Err(NameError::TooLong(MAX_NAME + 2)));
         for (bad, place) in [
