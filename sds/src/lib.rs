@@ -49,5 +49,5 @@ pub use memory::{MemoryDirectory, StaticDirectory};
 pub use merged::MergedDirectory;
 pub use name::{MAX_NAME, NameError, check_name};
 pub use query::{Matcher, Pattern, PatternError, Query, is_pattern};
-pub use resolve::{Resolution, resolve, resolve_legacy};
+pub use resolve::{Resolution, is_legacy_pattern, resolve, resolve_legacy};
 pub use watch::{Change, Subscriber, Watch};

@@ -72,11 +72,17 @@ pub fn resolve_legacy(
     if !receiver.contains('?') {
         return resolve(directory, receiver, sender);
     }
-    let dotted = receiver.replace('?', ".");
-    match is_pattern(&dotted) {
+    match is_legacy_pattern(receiver) {
         true => resolve(directory, receiver, sender),
-        false => resolve(directory, &dotted, sender),
+        false => resolve(directory, &receiver.replace('?', "."), sender),
     }
+}
+
+/// Whether [`resolve_legacy`] compiles this name: it has other special characters of a pattern than
+/// `?`.
+#[must_use]
+pub fn is_legacy_pattern(receiver: &str) -> bool {
+    is_pattern(&receiver.replace('?', "."))
 }
 
 #[cfg(test)]
