@@ -168,3 +168,27 @@ fn a_name_that_draws_lines_is_no_name() {
     ]));
     assert_eq!(trusted.unwrap()[0].certified().agents(), ["arm_*"]);
 }
+
+#[test]
+fn a_certificate_that_others_can_write_is_not_trusted() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let ((_a, crex), (_b, rover)) = (keys(), keys());
+    let made = crex.init("crex-mts", &[], VALID).unwrap();
+    rover.init("rover-mts", &[], VALID).unwrap();
+    rover.trust(&fs::read(crex.own_file()).unwrap()).unwrap();
+    let file = rover.file("trusted", made.fingerprint());
+    let chmod = |mode| fs::set_permissions(&file, fs::Permissions::from_mode(mode)).unwrap();
+    for mode in [0o664, 0o646] {
+        chmod(mode);
+        assert!(matches!(rover.trusted(), Err(KeysError::Writable(path)) if path == file));
+        assert!(rover.credentials().is_err());
+        let (confirmed, doubtful) = rover.confirmed();
+        assert_eq!((confirmed.len(), doubtful.len()), (0, 1));
+    }
+    chmod(0o644);
+    assert_eq!(rover.trusted().unwrap(), std::slice::from_ref(&made));
+    if rustix::process::geteuid().is_root() {
+        std::os::unix::fs::chown(&file, Some(65_534), None).unwrap();
+        assert!(matches!(rover.trusted(), Err(KeysError::Writable(_))));
+    }
+}
