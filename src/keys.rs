@@ -109,7 +109,9 @@ impl Holding {
             Self::Well => None,
             Self::EndsSoon => Some("ends within 30 days"),
             Self::Ended => Some("has ended"),
-            Self::NotYet => Some("does not hold yet; is the clock right?"),
+            Self::NotYet => Some(
+                "begins later than now: the clock of this host is before its making; set the clock",
+            ),
         }
     }
 }

@@ -10,6 +10,7 @@
 
 use std::fmt;
 use std::sync::Arc;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use fipa_acl::{escape, is_unprintable};
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, percent_decode_str, utf8_percent_encode};
@@ -154,6 +155,13 @@ impl Certificate {
     #[must_use]
     pub fn validity(&self) -> (i64, i64) {
         (self.from, self.until)
+    }
+
+    /// The time from `now` until it has expired.
+    pub(crate) fn left(&self, now: SystemTime) -> Duration {
+        let last = u64::try_from(self.until).unwrap_or(0);
+        let end = Duration::from_secs(last.saturating_add(1));
+        end.saturating_sub(now.duration_since(UNIX_EPOCH).unwrap_or_default())
     }
 
     /// Whether it holds at this time.
