@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
-use fipa_acl::{AgentId, DecodeError, Letter, Message, MessageBuilder, Performative};
+use fipa_acl::{AgentId, DecodeError, Letter, Message, MessageBuilder, Performative, escape};
 use fipa_mts::core::Submission;
 use fipa_mts::{PostError, Sending, letter_around, letter_for};
 use fipa_sds::{DeregisterError, Directory};
@@ -396,7 +396,7 @@ impl fmt::Display for Deliveries {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for (index, Delivery { receiver, outcome }) in self.0.iter().enumerate() {
             let newline = if index > 0 { "\n" } else { "" };
-            write!(f, "{newline}{receiver}: {outcome}")?;
+            write!(f, "{newline}{}: {outcome}", escape(receiver))?;
         }
         Ok(())
     }

@@ -7,8 +7,8 @@ use fipa_sds::{
 };
 use fipa_transport::Incarnation;
 
-use crate::RegisterOptions;
-use crate::domain::Domain;
+use crate::domain::{Domain, warn_of_name};
+use crate::{AgentId, RegisterOptions};
 
 /// A name of its own for several agents, wherever they are: a message to it reaches all members
 /// but its sender, each with an outcome of its own, or the leader only when there is one.
@@ -44,6 +44,9 @@ impl Domain {
             ..Registration::new(name, Incarnation::random(), Vec::new())
         };
         self.inner.service.host.register(registration.clone())?;
+        if let Ok(id) = AgentId::new(name) {
+            warn_of_name(&id);
+        }
         Ok(Coalition {
             domain: self.clone(),
             registration,

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use fipa_acl::{Dialect, Message, Performative, Representation};
 use fipa_sds::{Directory, HostError, Query, RegisterError, Registration};
 use fipa_transport::{Incarnation, Kind, ListenError};
 
@@ -177,7 +178,10 @@ impl Domain {
             ..Registration::new(Arc::clone(&name), incarnation, service.locations())
         };
         match service.host.register(registration) {
-            Ok(_) => Ok(Agent::new(self.clone(), id, name, incarnation)),
+            Ok(_) => {
+                warn_of_name(&id);
+                Ok(Agent::new(self.clone(), id, name, incarnation))
+            }
             Err(error) => {
                 // Nobody can have written to it.
                 drop(service.mts.deregister(incarnation));
@@ -208,5 +212,23 @@ impl Domain {
             return;
         }
         self.inner.service.close().await;
+    }
+}
+
+/// Logs that legacy peers cannot be told this name, if so: their encodings write names as words.
+pub(crate) fn warn_of_name(id: &AgentId) {
+    let fails = |dialect| {
+        let message = Message::builder(Performative::Inform)
+            .sender(id.clone())
+            .build()
+            .ok()?;
+        message.encode(Representation::String, dialect).err()
+    };
+    if let Some(error) = fails(Dialect::Standard).or_else(|| fails(Dialect::Jade)) {
+        tracing::warn!(
+            "agents of legacy peers (string encoding, JADE) can neither get letters from {:?} nor name it \
+             ({error}); use a name without blanks and parentheses where there are such peers",
+            id.name()
+        );
     }
 }

@@ -8,7 +8,8 @@
 //! | `trusted/<fingerprint>.pem` | a certificate of a trusted peer |
 //! | `revoked/<fingerprint>.pem` | one that is never to be trusted again |
 //!
-//! All are PEM (RFC 7468). Nobody but its owner may write to the directory. A gateway looks after it
+//! All are PEM (RFC 7468). Only their owner may write to the directory and to the certificates of
+//! others. A gateway looks after it
 //! while it runs: what is changed here counts within seconds, without a new start.
 //!
 //! What must not live here: what is done with keys on connections (`fipa_transport_net::secure`).
@@ -17,7 +18,7 @@ mod error;
 #[cfg(test)]
 mod tests;
 
-use std::fs::{self, DirBuilder, OpenOptions};
+use std::fs::{self, DirBuilder, Metadata, OpenOptions};
 use std::io::{self, Write as _};
 use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
@@ -108,7 +109,9 @@ impl Holding {
             Self::Well => None,
             Self::EndsSoon => Some("ends within 30 days"),
             Self::Ended => Some("has ended"),
-            Self::NotYet => Some("does not hold yet; is the clock right?"),
+            Self::NotYet => Some(
+                "begins later than now: the clock of this host is before its making; set the clock",
+            ),
         }
     }
 }
@@ -379,7 +382,7 @@ impl Keys {
             let Ok(meta) = fs::metadata(&dir) else {
                 continue;
             };
-            if meta.mode() & 0o022 != 0 || ![0, user].contains(&meta.uid()) {
+            if can_be_written_by_others(&meta) {
                 return Err(KeysError::Writable(dir));
             }
         }
@@ -425,7 +428,8 @@ impl Keys {
             }
             match entry.map(|entry| entry.path()) {
                 Ok(path) if path.extension().is_some_and(|it| it == "pem") => {
-                    match read(&path).and_then(|pem| only(&path, &pem)) {
+                    let read = owned(&path).and_then(|()| read(&path));
+                    match read.and_then(|pem| only(&path, &pem)) {
                         Ok(certificate) => all.push(certificate),
                         Err(error) => unread.push(error),
                     }
@@ -441,6 +445,21 @@ impl Keys {
                 .then(a.fingerprint().cmp(&b.fingerprint()))
         });
         (all, unread)
+    }
+}
+
+/// Whether others than this user and root can change the file or directory.
+fn can_be_written_by_others(meta: &Metadata) -> bool {
+    let user = rustix::process::geteuid().as_raw();
+    meta.mode() & 0o022 != 0 || ![0, user].contains(&meta.uid())
+}
+
+/// Checks that only this user and root can change the certificate in this file.
+fn owned(file: &Path) -> Result<(), KeysError> {
+    let meta = fs::metadata(file).map_err(|source| io_error(file, source))?;
+    match can_be_written_by_others(&meta) {
+        true => Err(KeysError::Writable(file.to_owned())),
+        false => Ok(()),
     }
 }
 

@@ -8,7 +8,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use fipa_acl::{AgentId, Performative};
+use fipa_acl::{AgentId, Performative, escape};
 pub use fipa_mts::core::{Route, Standing, Way, WayState};
 use fipa_sds::{Directory, Entry, Query, Role};
 use fipa_transport::{Incarnation, Location};
@@ -89,7 +89,7 @@ pub enum AskError {
     #[error(transparent)]
     Receive(#[from] ReceiveError),
     /// What came is no report.
-    #[error("the gateway's answer is not understood: {0}; is it of another version?")]
+    #[error("the gateway's answer is not understood: {}; is it of another version?", escape(.0))]
     NotUnderstood(String),
 }
 

@@ -3,6 +3,7 @@
 use std::fmt;
 use std::str::FromStr;
 
+use crate::escape;
 use crate::word::{is_token, push_string_literal};
 
 /// Who an agent is: a globally unique name, and hints how to reach it.
@@ -192,9 +193,10 @@ impl fmt::Display for AgentId {
     }
 }
 
+/// The whole identifier, [escaped](escape).
 impl fmt::Debug for AgentId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{self:#}")
+        f.write_str(&escape(&format!("{self:#}")))
     }
 }
 

@@ -9,6 +9,7 @@
 //! * [`Envelope`] is what message transport services read (FIPA00067): a base and the extensions
 //!   that services put in front on the way. [`EnvelopeView`] is its borrowed counterpart.
 //! * [`Letter`] is both, encoded, and what everything else in this project passes around.
+//! * [`escape`] makes text from outside fit for a terminal or a log.
 //! * [`explain()`] tells people what every byte of a bit-efficient message or letter means.
 //!
 //! ```
@@ -41,6 +42,7 @@ mod codec;
 mod dialect;
 mod envelope;
 mod error;
+mod escape;
 mod explain;
 #[cfg(feature = "json")]
 pub mod json;
@@ -63,6 +65,7 @@ pub use envelope::{
     Envelope, EnvelopeParams, EnvelopeView, Received, ReceiverNames, StampView, Stamps,
 };
 pub use error::{DecodeError, EncodeError, Problem};
+pub use escape::{escape, is_unprintable};
 pub use explain::{Explanation, Span, explain};
 pub use letter::{Letter, Payload};
 pub use message::Message;

@@ -6,7 +6,7 @@ use bytes::Bytes;
 
 use crate::builder::MessageBuilder;
 use crate::word::{is_token, push_string_literal};
-use crate::{AgentId, Performative, Time};
+use crate::{AgentId, Performative, Time, escape};
 
 /// A FIPA message.
 ///
@@ -202,18 +202,19 @@ impl Message {
 /// Longest text or content that [`Message`]'s `Display` shows, in characters.
 const SHOWN: usize = 80;
 
-/// Like FIPA00070, for people to read: agents by name only, long texts cut. Not for machines.
+/// Like FIPA00070, for people to read: agents by name only, long texts cut, all texts
+/// [escaped](escape). Not for machines.
 impl fmt::Display for Message {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "({}", self.performative)?;
+        write!(f, "({}", escape(self.performative.as_str()))?;
         if let Some(sender) = &self.sender {
-            write!(f, " :sender {sender}")?;
+            write!(f, " :sender {}", escape(sender.name()))?;
         }
         for (key, agents) in [("receiver", &self.receivers), ("reply-to", &self.reply_to)] {
             if !agents.is_empty() {
                 write!(f, " :{key} (set")?;
                 for agent in agents {
-                    write!(f, " {agent}")?;
+                    write!(f, " {}", escape(agent.name()))?;
                 }
                 f.write_str(")")?;
             }
@@ -235,7 +236,7 @@ impl fmt::Display for Message {
             write!(f, " :reply-by {reply_by}")?;
         }
         for (name, value) in &self.user_defined {
-            write!(f, " :X-{name} {}", shown(value))?;
+            write!(f, " :X-{} {}", escape(name), shown(value))?;
         }
         if let Some(content) = &self.content {
             write!(f, " :content {}", shown_content(content))?;
@@ -246,7 +247,7 @@ impl fmt::Display for Message {
 
 fn shown(text: &str) -> String {
     if is_token(text) && text.chars().nth(SHOWN).is_none() {
-        return text.to_owned();
+        return escape(text).into_owned();
     }
     shown_quoted(text)
 }
@@ -259,7 +260,7 @@ fn shown_quoted(text: &str) -> String {
 fn shown_start(start: &str, len: usize) -> String {
     let cut: String = start.chars().take(SHOWN).collect();
     let mut out = String::new();
-    push_string_literal(&mut out, &cut.chars().flat_map(visible).collect::<String>());
+    push_string_literal(&mut out, &escape(&cut));
     if cut.len() < len {
         out.push_str(&format!("… ({len} bytes)"));
     }
@@ -278,13 +279,6 @@ fn shown_content(content: &Bytes) -> String {
         }
         Err(_) => format!("<{} bytes>", content.len()),
     }
-}
-
-/// Control characters would play tricks on a terminal.
-fn visible(c: char) -> impl Iterator<Item = char> {
-    let escaped = c.is_control().then(|| c.escape_default());
-    let plain = (!c.is_control()).then_some(c);
-    escaped.into_iter().flatten().chain(plain)
 }
 
 #[cfg(test)]

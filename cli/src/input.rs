@@ -4,6 +4,8 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
+use fipa_acl::escape;
+
 use crate::report::Failure;
 
 /// All bytes of a file, or of standard input when it is named `-`; at most `limit`.
@@ -34,7 +36,7 @@ pub(crate) fn name(path: &Path) -> String {
     if path == Path::new("-") {
         "standard input".to_owned()
     } else {
-        path.display().to_string()
+        escape(&path.to_string_lossy()).into_owned()
     }
 }
 

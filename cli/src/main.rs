@@ -16,10 +16,15 @@ mod options;
 mod output;
 mod report;
 
+use std::fmt::{self, Debug};
 use std::io::IsTerminal;
 use std::process::ExitCode;
 
+use anstyle::Style;
+use fipa_acl::{escape, is_unprintable};
+use tracing::field::Field;
 use tracing_subscriber::EnvFilter;
+use tracing_subscriber::fmt::format::{self, Writer};
 
 fn main() -> ExitCode {
     let command_line = options::CommandLine::read();
@@ -47,5 +52,25 @@ fn log_to_stderr(global: &options::Global) {
         .with_env_filter(filter)
         .with_ansi(std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none())
         .with_writer(std::io::stderr)
+        .fmt_fields(format::debug_fn(log_field))
         .init();
+}
+
+/// Writes one field of an event. Names and texts of peers are among the values, so a value with
+/// unprintable characters is escaped; others stay, because they may have been escaped already.
+fn log_field(writer: &mut Writer<'_>, field: &Field, value: &dyn Debug) -> fmt::Result {
+    let mut text = format!("{value:?}");
+    if text.contains(is_unprintable) {
+        text = escape(&text).into_owned();
+    }
+    match field.name() {
+        "message" => writer.write_str(&text),
+        // Where in a crate that logs with `log` the event came from.
+        name if name.starts_with("log.") => Ok(()),
+        name if writer.has_ansi_escapes() => {
+            let (italic, dimmed) = (Style::new().italic(), Style::new().dimmed());
+            write!(writer, " {italic}{name}{italic:#}{dimmed}={dimmed:#}{text}")
+        }
+        name => write!(writer, " {name}={text}"),
+    }
 }

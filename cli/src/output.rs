@@ -1,8 +1,13 @@
 //! Prints to standard output what was asked for.
+//!
+//! Commands [escape](fipa_acl::escape) texts from outside where they put them into lines.
 
+use std::borrow::Cow;
+use std::fmt::Write as _;
 use std::io::{self, Write};
 
 use fipa::{Deliveries, Outcome};
+use fipa_acl::{escape, is_unprintable};
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::io::Errno;
 use serde::Serialize;
@@ -13,7 +18,22 @@ use crate::report::Failure;
 
 /// Prints a text that ends its last line itself.
 pub(crate) fn text(text: &str) -> Result<(), Failure> {
-    bytes(text.as_bytes())
+    bytes(printable(text).as_bytes())
+}
+
+/// The text with those of its lines escaped that still have unprintable characters, such as errors
+/// of the operating system that name a file. A line without them stays: it may have been escaped.
+pub(crate) fn printable(text: &str) -> Cow<'_, str> {
+    if !text.contains(|c| c != '\n' && is_unprintable(c)) {
+        return Cow::Borrowed(text);
+    }
+    let lines = text
+        .split('\n')
+        .map(|line| match line.contains(is_unprintable) {
+            true => escape(line),
+            false => Cow::Borrowed(line),
+        });
+    Cow::Owned(lines.collect::<Vec<_>>().join("\n"))
 }
 
 /// Prints bytes as they are.
@@ -89,7 +109,28 @@ fn document(document: serde_json::Result<String>) -> Result<(), Failure> {
             "leave out --json",
         )
     })?;
-    text(&format!("{document}\n"))
+    text(&format!("{}\n", visible_in_json(&document)))
+}
+
+/// The JSON document with the characters escaped that serde_json leaves as they are. They stand in
+/// texts only, where JSON has `\u` for them (RFC 8259 clause 7).
+pub(crate) fn visible_in_json(document: &str) -> Cow<'_, str> {
+    let is_left = |c: char| c != '\n' && is_unprintable(c);
+    if !document.contains(is_left) {
+        return Cow::Borrowed(document);
+    }
+    let mut out = String::with_capacity(document.len() + 16);
+    for c in document.chars() {
+        if is_left(c) {
+            for unit in c.encode_utf16(&mut [0; 2]) {
+                // Writing to a string cannot fail.
+                let _ = write!(out, "\\u{unit:04x}");
+            }
+        } else {
+            out.push(c);
+        }
+    }
+    Cow::Owned(out)
 }
 
 /// What became of a message, one object per receiver: `receiver`, `outcome`, `via` or `reason`,
@@ -124,4 +165,27 @@ pub(crate) fn deliveries(deliveries: &Deliveries) -> Value {
         }
     };
     deliveries.0.iter().map(one).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn json_means_the_same_when_it_is_visible() {
+        let value = json!({ "a\u{9b}b": "\u{7f}\u{202e}\u{e0001}\n\\u{1b}", "c": [1, "é"] });
+        for document in [value.to_string(), format!("{value:#}")] {
+            let visible = visible_in_json(&document);
+            assert!(
+                !visible.contains(|c| c != '\n' && is_unprintable(c)),
+                "{visible:?}"
+            );
+            assert_eq!(serde_json::from_str::<Value>(&visible).unwrap(), value);
+        }
+    }
+
+    #[test]
+    fn what_is_escaped_already_is_not_escaped_again() {
+        assert_eq!(printable("a\\u{1b}\nb\u{9b}\n"), "a\\u{1b}\nb\\u{9b}\n");
+    }
 }

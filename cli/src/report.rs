@@ -6,6 +6,8 @@ use std::process::ExitCode;
 
 use fipa::config::{ConfigError, Mistake};
 
+use crate::output;
+
 /// Why a command ended without having done what it was told, and the exit code for that.
 ///
 /// Displayed, for each trouble, as
@@ -97,11 +99,11 @@ impl Failure {
         } in &self.troubles
         {
             // Writing to a string cannot fail.
-            let _ = writeln!(text, "error: {what}");
+            let _ = writeln!(text, "error: {}", indented(what));
             if let Some(place) = place {
-                let _ = writeln!(text, "where: {place}");
+                let _ = writeln!(text, "where: {}", indented(place));
             }
-            let _ = writeln!(text, "   do: {advice}");
+            let _ = writeln!(text, "   do: {}", indented(advice));
         }
         to_stderr(&text);
         ExitCode::from(self.code)
@@ -138,7 +140,12 @@ impl From<Mistake> for Trouble {
 
 /// Says something that stops nothing.
 pub(crate) fn warn(what: &str) {
-    to_stderr(&format!("warning: {what}\n"));
+    to_stderr(&format!("warning: {}\n", indented(what)));
+}
+
+/// The text with all lines but the first indented: none of them looks like one of this module.
+fn indented(text: &str) -> String {
+    output::printable(text).replace('\n', "\n       ")
 }
 
 /// When standard error is closed there is nobody left to tell.

@@ -153,3 +153,33 @@ fn failure_messages_that_are_left_out_are_counted_in_the_log() {
     }
     gateway.tells(&["left out failure messages", "count="]);
 }
+
+#[test]
+fn a_name_that_legacy_peers_cannot_read_is_warned_of_once() {
+    let host = Host::new();
+    for name in ["arm.left", "béla@home:1099/JADE"] {
+        let (code, told) = host.echo(name).signal("-INT");
+        assert_eq!((code, told.as_str()), (Some(0), ""), "{name}");
+    }
+    for arguments in [&["echo", "a b"][..], &["coalition", "a b", "arm"]] {
+        let (code, told) = host.start(arguments).signal("-INT");
+        assert_eq!(code, Some(0));
+        let warned = "can neither get letters from \"a b\" nor name it";
+        assert_eq!(told.matches(warned).count(), 1, "{told}");
+    }
+}
+
+#[test]
+fn no_agent_takes_the_letters_to_a_pattern() {
+    let host = Host::new();
+    let mut arms = [host.echo("arm_1"), host.echo("arm_2")];
+    for arguments in [&["echo", "arm_.*"][..], &["coalition", "arm_.*", "arm_1"]] {
+        let told = host.run(arguments).failed(2);
+        assert!(told.contains("is a pattern"), "{told}");
+    }
+    host.run(&["send", "--to", "arm_.*", "--content", "stop"])
+        .done();
+    for arm in &mut arms {
+        assert!(arm.line().contains("stop"));
+    }
+}

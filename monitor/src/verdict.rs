@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use fipa_acl::escape;
+
 /// What a monitor says about a message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
@@ -190,8 +192,11 @@ impl fmt::Display for Violation {
         let to = listed(receivers.iter().map(String::as_str), " and ");
         write!(
             f,
-            "{performative} from {sender} to {to} breaks {protocol} in conversation \
-             {conversation_id:?}: "
+            "{} from {} to {} breaks {} in conversation {conversation_id:?}: ",
+            escape(performative),
+            escape(sender),
+            escape(&to),
+            escape(protocol)
         )?;
         f.write_str(match self.kind {
             ViolationKind::Unexpected => "not allowed",
@@ -207,7 +212,10 @@ impl fmt::Display for Violation {
             ViolationKind::TooMany => "more participants than can be watched",
         })?;
         match (&self.state, &self.participant) {
-            (Some(state), Some(participant)) => write!(f, "; state {state:?} with {participant}")?,
+            (Some(state), Some(participant)) => {
+                let participant = escape(participant);
+                write!(f, "; state {state:?} with {participant}")?;
+            }
             (Some(state), None) => write!(f, "; state {state:?}")?,
             (None, _) => {}
         }
@@ -218,6 +226,7 @@ impl fmt::Display for Violation {
                 to,
             } = expected;
             let before = if index == 0 { "; expected" } else { ", or" };
+            let [performative, from, to] = [performative, from, to].map(|text| escape(text));
             write!(f, "{before} {performative} from {from} to {to}")?;
         }
         Ok(())

@@ -19,7 +19,7 @@ use std::time::SystemTime;
 
 use fipa_acl::{
     AclRepresentation, AgentId, Dialect, EnvelopeView, Letter, Message, Performative,
-    Representation,
+    Representation, escape,
 };
 use fipa_transport::FailureReason;
 use fipa_transport::wire::truncated;
@@ -179,10 +179,10 @@ fn path(letter: &Letter) -> Vec<String> {
     path
 }
 
-/// The beginning of a text, without control characters: fipa_services reads line by line.
+/// The beginning of a text as one line: fipa_services reads line by line.
 fn one_line(text: &str) -> String {
-    let plain = |c: char| if c.is_control() { ' ' } else { c };
-    truncated(text, 400).chars().map(plain).collect()
+    let line = escape(truncated(text, 400));
+    truncated(&line, 400).to_owned()
 }
 
 /// A string literal of FIPA SL (FIPA00008): `\"` is its only escape.

@@ -74,11 +74,12 @@ pub(crate) fn room(name: &str) -> usize {
 }
 
 /// The names in the letter's effective intended-receiver parameter, or `to` when it has none.
-pub(crate) fn receivers(letter: &Letter) -> Result<Vec<String>, DecodeError> {
+pub(crate) fn receivers(letter: &Letter, most: usize) -> Result<Vec<String>, DecodeError> {
     let envelope = letter.envelope();
     let view = EnvelopeView::parse(&envelope)?;
     Ok(view
         .receivers()
+        .take(most)
         .map(|name| name.as_str().into_owned())
         .collect())
 }

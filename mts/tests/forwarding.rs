@@ -342,7 +342,7 @@ fn an_old_peers_letter_is_for_whom_its_envelope_names() {
     gateway.core.handle_unframed(
         now,
         Duration::from_secs(2),
-        Unframed::read(letter(), Kind::Tcp, HERE),
+        read(&gateway.core, letter(), Kind::Tcp, HERE),
     );
     let (attempt, location, parcel) = gateway.dispatched();
     assert_eq!(location, shm(0x9));
@@ -583,4 +583,9 @@ fn a_note_lowers_the_predecessor_of_a_held_letter() {
     );
     let (_, _, again) = gateway.dispatched();
     assert_eq!((again.sequence, again.after), (8, 3));
+}
+
+/// The letter as it is read for this core.
+fn read(core: &Core, letter: Letter, via: Kind, from: IpAddr) -> Unframed {
+    Unframed::read(letter, via, from, &**core.directory()).unwrap()
 }

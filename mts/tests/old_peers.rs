@@ -101,7 +101,7 @@ fn who_sent_a_recorded_letter_to_nobody_is_told_in_its_own_words() {
     core.handle_unframed(
         now(),
         Duration::from_secs(5),
-        Unframed::read(recorded(LETTER), Kind::Tcp, HERE),
+        read(&core, recorded(LETTER), Kind::Tcp, HERE),
     );
     let (attempt, location, parcel) = dispatched(&mut core).unwrap();
     assert_eq!(location.to_string(), "tcp://127.0.0.1:45615;fipa-services");
@@ -151,7 +151,7 @@ fn each_receiver_is_told_of_once_and_failures_never() {
             .sender(AgentId::new("old").unwrap())
             .receiver(AgentId::new("nobody").unwrap())
             .receiver(AgentId::new("nobody-else").unwrap())
-            .content("x")
+            .content("x".repeat(600))
             .build()
             .unwrap()
     };
@@ -160,7 +160,7 @@ fn each_receiver_is_told_of_once_and_failures_never() {
     core.handle_unframed(
         now(),
         deadline,
-        Unframed::read(letter(Performative::Request), Kind::Tcp, HERE),
+        read(&core, letter(Performative::Request), Kind::Tcp, HERE),
     );
     let mut told = Vec::new();
     while let Some((_, location, parcel)) = dispatched(&mut core) {
@@ -172,7 +172,7 @@ fn each_receiver_is_told_of_once_and_failures_never() {
     core.handle_unframed(
         now(),
         deadline,
-        Unframed::read(letter(Performative::Failure), Kind::Tcp, HERE),
+        read(&core, letter(Performative::Failure), Kind::Tcp, HERE),
     );
     assert!(core.poll_action().is_none());
 }
@@ -185,7 +185,7 @@ fn nobody_is_told_where_somebody_elses_letter_says_it_is() {
     core.handle_unframed(
         now(),
         deadline,
-        Unframed::read(recorded(LETTER), Kind::Tcp, elsewhere),
+        read(&core, recorded(LETTER), Kind::Tcp, elsewhere),
     );
     assert!(core.poll_action().is_none(), "it came from {elsewhere}");
 }
@@ -223,7 +223,7 @@ fn who_is_refused_is_told_in_its_own_words_and_not_without_end() {
         core.handle_unframed(
             then,
             deadline,
-            Unframed::read(recorded(LETTER), Kind::Tcp, HERE),
+            read(&core, recorded(LETTER), Kind::Tcp, HERE),
         );
     }
     let mut told = 0;
@@ -270,7 +270,7 @@ fn the_sender_of_a_recorded_letter_becomes_known_at_the_address_that_it_gives() 
         Core::new(config, host_of("echo"))
     };
     let arrives = |core: &mut Core, letter, from| {
-        let unframed = Unframed::read(letter, Kind::Tcp, from);
+        let unframed = read(core, letter, Kind::Tcp, from);
         core.handle_unframed(now(), Duration::from_secs(5), unframed);
     };
     let known = |at: &str| vec![("cpp-sender".to_owned(), at.to_owned())];
@@ -313,7 +313,7 @@ fn agents_become_known_by_letters_at_a_limited_rate() {
             .build()
             .unwrap();
         let letter = letter_for(&message, then.utc).unwrap();
-        let unframed = Unframed::read(letter, Kind::Tcp, HERE);
+        let unframed = read(&core, letter, Kind::Tcp, HERE);
         core.handle_unframed(then, Duration::from_secs(5), unframed);
     }
     assert_eq!(heard(&mut core).len(), 20);
@@ -347,7 +347,7 @@ fn an_agent_that_became_known_by_a_letter_keeps_its_name_while_it_writes() {
             instant: start.instant + since,
             utc: start.utc + since,
         };
-        let unframed = Unframed::read(letter, Kind::Tcp, from);
+        let unframed = read(&core, letter, Kind::Tcp, from);
         core.handle_unframed(then, Duration::from_secs(5), unframed);
         let heard = heard(&mut core);
         for (name, at) in &heard {
@@ -386,7 +386,7 @@ fn the_sender_of_a_recorded_letter_that_cannot_be_decoded_is_told() {
     let mut core = Core::new(config, host_of("echo"));
     let letter = without_end(&recorded(LETTER));
     let deadline = Duration::from_secs(5);
-    let unframed = Unframed::read(letter.clone(), Kind::Tcp, HERE);
+    let unframed = read(&core, letter.clone(), Kind::Tcp, HERE);
     core.handle_unframed(now(), deadline, unframed);
     let (_, location, parcel) = dispatched(&mut core).unwrap();
     // The envelope says where the sender is, as the message of another letter does.
@@ -404,7 +404,7 @@ fn the_sender_of_a_recorded_letter_that_cannot_be_decoded_is_told() {
     assert!(core.poll_action().is_none());
 
     // An address of another host is not believed.
-    let unframed = Unframed::read(letter, Kind::Tcp, IpAddr::from([10, 0, 0, 66]));
+    let unframed = read(&core, letter, Kind::Tcp, IpAddr::from([10, 0, 0, 66]));
     core.handle_unframed(now(), deadline, unframed);
     assert!(core.poll_action().is_none());
 }
@@ -475,7 +475,7 @@ fn a_name_with_a_dot_is_reached_as_legacy_peers_write_it() {
     core.handle_unframed(
         now(),
         deadline,
-        Unframed::read(recorded_to("arm?left"), Kind::Tcp, HERE),
+        read(&core, recorded_to("arm?left"), Kind::Tcp, HERE),
     );
     let (_, location, parcel) = dispatched(&mut core).unwrap();
     assert_eq!(location.kind(), Kind::Shm);
@@ -499,7 +499,7 @@ fn a_sender_whose_letters_all_fail_keeps_no_failure_message_from_another() {
     };
     let then = now();
     let told = |core: &mut Core, name: &str| {
-        let unframed = Unframed::read(letter_of(name), Kind::Tcp, HERE);
+        let unframed = read(core, letter_of(name), Kind::Tcp, HERE);
         core.handle_unframed(then, deadline, unframed);
         dispatched(core).is_some_and(|(attempt, _, parcel)| {
             assert_eq!(&*parcel.receiver, name);
@@ -510,6 +510,44 @@ fn a_sender_whose_letters_all_fail_keeps_no_failure_message_from_another() {
     let loud = (0..200).filter(|_| told(&mut core, "loud")).count();
     assert_eq!(loud, 20);
     assert!(told(&mut core, "quiet"));
+}
+
+/// The names of the receivers that failure messages tell of, when a letter to these has come.
+fn told_of(core: &mut Core, receivers: &[String]) -> Vec<String> {
+    let mut message = Message::builder(Performative::Request).sender(AgentId::new("old").unwrap());
+    for receiver in receivers {
+        message = message.receiver(AgentId::new(receiver).unwrap());
+    }
+    let letter = letter_for(&message.build().unwrap(), now().utc).unwrap();
+    let unframed = read(core, letter, Kind::Tcp, HERE);
+    core.handle_unframed(now(), Duration::from_secs(5), unframed);
+    let mut told = Vec::new();
+    while let Some((_, _, parcel)) = dispatched(core) {
+        let content = message_of(&parcel).content().unwrap().clone();
+        told.push(nested(&content).receivers()[0].name().to_owned());
+    }
+    told
+}
+
+#[test]
+fn a_letter_to_too_many_receivers_or_patterns_is_refused_as_a_whole() {
+    let names =
+        |count: usize| -> Vec<String> { (0..count).map(|it| format!("nobody-{it}")).collect() };
+    let patterns =
+        |count: usize| -> Vec<String> { (0..count).map(|it| format!("nobody{{{it}}}")).collect() };
+    for refused in [names(65), names(20_000), patterns(2), patterns(1_000)] {
+        let mut core = core(true, &[("old", OLD_PEER)]);
+        assert_eq!(told_of(&mut core, &refused), [refused[0].clone()]);
+    }
+    let long = format!("nobody-{}.*", "x".repeat(120));
+    let mut one = core(true, &[("old", OLD_PEER)]);
+    assert_eq!(told_of(&mut one, std::slice::from_ref(&long)), [long]);
+
+    // What is allowed reaches who is meant, and the sender is told of the others, but gets no more
+    // bytes than it has sent.
+    let mut core = core(true, &[("old", OLD_PEER), ("nobody.x", OLD_PEER)]);
+    let told = told_of(&mut core, &names(64));
+    assert!((1..10).contains(&told.len()), "{told:?}");
 }
 
 #[test]
@@ -623,4 +661,9 @@ fn an_old_peer_that_cannot_be_reached_fails_like_anybody() {
     let told = Message::decode(told.letter.payload()).unwrap();
     assert_eq!(*told.performative(), Performative::Failure);
     assert_eq!(told.language(), Some("fipa-sl"));
+}
+
+/// The letter as it is read for this core.
+fn read(core: &Core, letter: Letter, via: Kind, from: IpAddr) -> Unframed {
+    Unframed::read(letter, via, from, &**core.directory()).unwrap()
 }

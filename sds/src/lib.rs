@@ -12,7 +12,8 @@
 //!
 //! The crate depends on `fipa-transport`, sideways, for two words only: an entry lists
 //! [`Location`](fipa_transport::Location)s, and a registration is told from an earlier one of the
-//! same name by its [`Incarnation`](fipa_transport::Incarnation).
+//! same name by its [`Incarnation`](fipa_transport::Incarnation); and on `fipa-acl` for which
+//! characters a name may have ([`is_unprintable`](fipa_acl::is_unprintable)).
 //!
 //! What must not live here: letters, routes, connections. Which of an agent's locations is tried
 //! first is the delivery core's business.
@@ -48,5 +49,5 @@ pub use memory::{MemoryDirectory, StaticDirectory};
 pub use merged::MergedDirectory;
 pub use name::{MAX_NAME, NameError, check_name};
 pub use query::{Matcher, Pattern, PatternError, Query, is_pattern};
-pub use resolve::{Resolution, resolve, resolve_legacy};
+pub use resolve::{Resolution, is_legacy_pattern, resolve, resolve_legacy};
 pub use watch::{Change, Subscriber, Watch};

@@ -27,7 +27,7 @@ impl Pattern {
     pub const MAX_LEN: usize = MAX_NAME;
 
     /// Bound of the compiled expression, in bytes.
-    const MAX_COMPILED: usize = 1024 * 1024;
+    const MAX_COMPILED: usize = 128 * 1024;
 
     /// How deep groups may be nested.
     const MAX_DEPTH: u32 = 32;

@@ -24,9 +24,8 @@ pub enum Resolution {
 
 /// Whom `receiver` means in a letter from `sender`.
 ///
-/// An exact name comes first, whatever characters it has; that of a coalition means its members,
-/// without the sender, or its leader. Otherwise, what
-/// [is a pattern](is_pattern) means every agent whose whole name matches, except the sender
+/// The name of a coalition means its members, without the sender, or its leader. What
+/// [is a pattern](is_pattern), which no name is, means every agent whose whole name matches, except the sender
 /// itself and gateways, which nobody means who writes to `.*`.
 ///
 /// # Errors
@@ -59,34 +58,31 @@ pub fn resolve(
     })
 }
 
-/// Resolves the receiver of a legacy peer's letter: as [`resolve`] does, and when that finds nothing,
-/// as a name in which each `?` stands for itself or for a dot. fipa_services announces and asks for
-/// names whose dots are replaced by `?`.
+/// Resolves the receiver of a legacy peer's letter: as [`resolve`] does, except for a name whose only
+/// special character is `?`. That is no pattern but the name of an agent with dots in place of `?`, as
+/// fipa_services writes it, and costs one look-up.
 ///
 /// # Errors
-/// When the name is a pattern that is not valid and no such name exists.
+/// When the name is a pattern that is not valid.
 pub fn resolve_legacy(
     directory: &dyn Directory,
     receiver: &str,
     sender: &str,
 ) -> Result<Resolution, PatternError> {
-    let resolved = resolve(directory, receiver, sender);
-    let found = !matches!(resolved, Ok(Resolution::None) | Err(_));
-    if found || !receiver.contains('?') {
-        return resolved;
+    if !receiver.contains('?') {
+        return resolve(directory, receiver, sender);
     }
-    let dotted = receiver.replace('?', ".");
-    if directory.lookup(&dotted).is_some() {
-        return resolve(directory, &dotted, sender);
+    match is_legacy_pattern(receiver) {
+        true => resolve(directory, receiver, sender),
+        false => resolve(directory, &receiver.replace('?', "."), sender),
     }
-    // Some of its question marks are its own.
-    let entries = directory.entries();
-    let means = |entry: &&Arc<Entry>| entry.name.replace('.', "?") == receiver;
-    let mut meant = entries.iter().filter(means);
-    match (meant.next(), meant.next()) {
-        (Some(entry), None) => resolve(directory, &entry.name, sender),
-        _ => resolved,
-    }
+}
+
+/// Whether [`resolve_legacy`] compiles this name: it has other special characters of a pattern than
+/// `?`.
+#[must_use]
+pub fn is_legacy_pattern(receiver: &str) -> bool {
+    is_pattern(&receiver.replace('?', "."))
 }
 
 #[cfg(test)]
@@ -117,17 +113,21 @@ mod tests {
     }
 
     #[test]
-    fn exact_names_come_before_patterns() {
-        let directory = directory(&["arm_.*", "arm_left", "arm_right", "arm.left"]);
-        let exact = resolve(&directory, "arm_.*", "me").unwrap();
-        assert!(matches!(exact, Resolution::Exact(_)));
-        assert_eq!(names(&exact), ["arm_.*"]);
+    fn a_dot_is_a_dot_in_a_name() {
+        let directory = directory(&["arm_left", "arm.left"]);
         let dot = resolve(&directory, "arm.left", "me").unwrap();
         assert_eq!(names(&dot), ["arm.left"]);
-        assert_eq!(
-            resolve(&directory, "arm.right", "me").unwrap(),
-            Resolution::None
-        );
+        let nobody = resolve(&directory, "arm.right", "me").unwrap();
+        assert_eq!(nobody, Resolution::None);
+    }
+
+    #[test]
+    fn no_agent_has_the_name_of_a_pattern() {
+        let directory = directory(&["arm_left", "arm_right"]);
+        let thief = Registration::new("arm_.*", Incarnation::random(), Vec::new());
+        assert!(directory.register(thief).is_err());
+        let both = resolve(&directory, "arm_.*", "me").unwrap();
+        assert_eq!(names(&both), ["arm_left", "arm_right"]);
     }
 
     #[test]
@@ -145,24 +145,17 @@ mod tests {
     }
 
     #[test]
-    fn a_question_mark_of_a_legacy_peer_means_a_dot_when_nothing_else_matches() {
-        let directory = directory(&[
-            "arm.left",
-            "armright",
-            "arm?up",
-            "arm.up",
-            "who?is.it",
-            "?.x",
-        ]);
+    fn a_question_mark_of_a_legacy_peer_means_a_dot() {
+        let directory = directory(&["arm.left", "armright", "who.is.it", "leg_1"]);
         let legacy = |name: &str| names(&resolve_legacy(&directory, name, "me").unwrap()).join(" ");
         assert_eq!(legacy("arm?left"), "arm.left");
-        assert_eq!(legacy("arm?right"), "armright", "a pattern comes first");
-        assert_eq!(legacy("arm?up"), "arm?up", "an exact name comes first");
-        assert_eq!(legacy("who?is?it"), "who?is.it");
-        // It is no valid pattern.
-        assert_eq!(legacy("??x"), "?.x");
+        assert_eq!(legacy("who?is?it"), "who.is.it");
         assert_eq!(legacy("arm?down"), "");
-        assert!(resolve_legacy(&directory, "?down", "me").is_err());
+        // It is no valid pattern, and not read as one.
+        assert_eq!(legacy("?down"), "");
+        assert_eq!(legacy("arm?right"), "", "no pattern");
+        assert_eq!(legacy("le?g_[0-9]"), "leg_1", "a pattern");
+        assert_eq!(legacy("armright"), "armright");
         let resolved = resolve(&directory, "arm?left", "me").unwrap();
         assert_eq!(resolved, Resolution::None, "only for legacy peers");
     }

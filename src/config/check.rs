@@ -262,7 +262,8 @@ impl Findings {
 
     fn name(&mut self, path: &[&str], name: &str) {
         let help = format!(
-            "use 1 to {} bytes of UTF-8 without control characters",
+            "use 1 to {} bytes of UTF-8 without control or format characters, and none of \
+             * + ? [ ( {{ | ^ $ \\",
             MAX_MTS_NAME
         );
         if name.len() > MAX_MTS_NAME {

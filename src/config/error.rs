@@ -4,6 +4,7 @@ use std::fmt;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use fipa_acl::escape;
 use serde::{Serialize, Serializer};
 
 /// Why there is no configuration.
@@ -86,25 +87,15 @@ impl fmt::Display for Origin {
         match self {
             Self::Default => f.write_str("default"),
             Self::File { path, line } => write!(f, "{}:{line}", shown(path)),
-            Self::Set { assignment } => write!(f, "--set {}", printable(assignment)),
+            Self::Set { assignment } => write!(f, "--set {}", escape(assignment)),
         }
     }
 }
 
-/// A path as it is shown to people.
+/// A path as it is shown to people: a file name may contain anything, and this goes to terminals and
+/// into comments of a TOML file.
 fn shown(path: &Path) -> String {
-    printable(&path.to_string_lossy())
-}
-
-/// A file name may contain anything, and this goes to terminals and into comments of a TOML file.
-fn printable(text: &str) -> String {
-    text.chars()
-        .flat_map(|c| {
-            let escaped = c.is_control().then(|| c.escape_default());
-            let plain = escaped.is_none().then_some(c);
-            escaped.into_iter().flatten().chain(plain)
-        })
-        .collect()
+    escape(&path.to_string_lossy()).into_owned()
 }
 
 /// A path that is not UTF-8 is still worth showing.

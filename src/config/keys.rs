@@ -8,6 +8,8 @@ use std::ops::Range;
 use std::time::Duration;
 
 use bytesize::ByteSize;
+use fipa_acl::is_unprintable;
+use fipa_sds::is_pattern;
 use fipa_transport::{Kind, Location, LocationError};
 use toml_edit::Value as Toml;
 
@@ -314,7 +316,9 @@ fn shown(rules: &[AccessRule]) -> Vec<(&str, Value)> {
 /// The default of `mts.name`: the host's name, with what a name cannot have replaced.
 pub(super) fn default_mts_name(host_name: &str) -> String {
     let start: String = host_name.chars().take(60).collect();
-    let host = start.replace(|c: char| c.is_control() || c.is_whitespace(), "-");
+    let is_left_out =
+        |c: char| c.is_whitespace() || is_unprintable(c) || is_pattern(c.encode_utf8(&mut [0; 4]));
+    let host = start.replace(is_left_out, "-");
     let host = if host.is_empty() {
         "localhost"
     } else {

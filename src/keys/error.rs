@@ -1,9 +1,10 @@
 //! Why something cannot be done with keys.
 
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use fipa_acl::escape;
 use fipa_transport_net::secure::{CertificateError, Fingerprint};
 
 /// Why something cannot be done with keys.
@@ -11,7 +12,7 @@ use fipa_transport_net::secure::{CertificateError, Fingerprint};
 #[non_exhaustive]
 pub enum KeysError {
     /// A file or directory cannot be used.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {source}", shown(path))]
     Io {
         /// Which one.
         path: PathBuf,
@@ -19,13 +20,13 @@ pub enum KeysError {
         source: io::Error,
     },
     /// There are keys already.
-    #[error("{} is there already; nothing was changed", .0.display())]
+    #[error("{} is there already; nothing was changed", shown(.0))]
     Exists(PathBuf),
     /// There are none.
-    #[error("there are no keys in {}; make them with `fipa keys init`", .0.display())]
+    #[error("there are no keys in {}; make them with `fipa keys init`", shown(.0))]
     Missing(PathBuf),
     /// No keys have been made that could take the place of these.
-    #[error("there are no next keys in {}; make them with `fipa keys renew`", .0.display())]
+    #[error("there are no next keys in {}; make them with `fipa keys renew`", shown(.0))]
     NoNext(PathBuf),
     /// A certificate would hold for no time, or beyond the year 9999.
     #[error("a certificate cannot hold for {}", humantime::format_duration(*.0))]
@@ -34,18 +35,18 @@ pub enum KeysError {
     #[error(
         "{} can be read by others than its owner, or is not this user's; `chmod 600` it, and make new \
          keys if somebody may have read it",
-        .0.display()
+        shown(.0)
     )]
     Readable(PathBuf),
     /// Others could give trust, or withdraw it.
     #[error(
         "{} can be written by others than its owner, or is not this user's: they could trust whom they \
          like; `chmod go-w` it, and look whom it trusts (`fipa keys list`)",
-        .0.display()
+        shown(.0)
     )]
     Writable(PathBuf),
     /// A file is not what its name says.
-    #[error("{}: {what}", path.display())]
+    #[error("{}: {}", shown(path), escape(what))]
     Contents {
         /// Which one.
         path: PathBuf,
@@ -71,7 +72,7 @@ pub enum KeysError {
     #[error(
         "the certificate in {} is of {certified:?}, and mts.name is {name:?}: peers would refuse this \
          gateway",
-        dir.display()
+        shown(dir)
     )]
     Name {
         /// Where the certificate is.
@@ -97,4 +98,9 @@ pub enum KeysError {
     /// A key or certificate could not be made.
     #[error("could not make a key: {0}")]
     Make(String),
+}
+
+/// A path as it is shown to people: a file name may contain anything.
+fn shown(path: &Path) -> String {
+    escape(&path.to_string_lossy()).into_owned()
 }

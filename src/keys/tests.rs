@@ -130,3 +130,65 @@ fn what_is_no_certificate_is_told() {
     fs::write(keys.own_file(), b"hello").unwrap();
     assert!(matches!(keys.own(), Err(KeysError::Contents { .. })));
 }
+
+/// The PEM text of a certificate with these alternative names.
+fn named(uris: &[&str]) -> Vec<u8> {
+    let mut params = CertificateParams::default();
+    for uri in uris {
+        let uri = (*uri).try_into().unwrap();
+        params.subject_alt_names.push(SanType::URI(uri));
+    }
+    let key = KeyPair::generate().unwrap();
+    params.self_signed(&key).unwrap().pem().into_bytes()
+}
+
+#[test]
+fn a_name_that_draws_lines_is_no_name() {
+    let (_dir, keys) = keys();
+    let forged = "urn:fipa:mts:crex%0A%20%20fingerprint%20";
+    for uris in [
+        &[forged][..],
+        &["urn:fipa:mts:crex", "urn:fipa:agent:arm%1B%5B2J"],
+        &["urn:fipa:mts:crex%C2%9B31m"],
+        &["urn:fipa:mts:crex", "urn:fipa:agent:arm%E2%80%AEtfel"],
+        &["urn:fipa:mts:cr%E2%80%8Bex"],
+        &["urn:fipa:mts:"],
+        &[&format!("urn:fipa:mts:{}", "x".repeat(1025))],
+    ] {
+        let error = keys.trust(&named(uris)).unwrap_err();
+        assert!(
+            matches!(error, KeysError::Certificate(CertificateError::Name(_))),
+            "{error:?}"
+        );
+        assert!(!error.to_string().contains('\n'), "{error}");
+    }
+    let trusted = keys.trust(&named(&[
+        "urn:fipa:mts:crex%20mts",
+        "urn:fipa:agent:arm_%2A",
+    ]));
+    assert_eq!(trusted.unwrap()[0].certified().agents(), ["arm_*"]);
+}
+
+#[test]
+fn a_certificate_that_others_can_write_is_not_trusted() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let ((_a, crex), (_b, rover)) = (keys(), keys());
+    let made = crex.init("crex-mts", &[], VALID).unwrap();
+    rover.init("rover-mts", &[], VALID).unwrap();
+    rover.trust(&fs::read(crex.own_file()).unwrap()).unwrap();
+    let file = rover.file("trusted", made.fingerprint());
+    let chmod = |mode| fs::set_permissions(&file, fs::Permissions::from_mode(mode)).unwrap();
+    for mode in [0o664, 0o646] {
+        chmod(mode);
+        assert!(matches!(rover.trusted(), Err(KeysError::Writable(path)) if path == file));
+        assert!(rover.credentials().is_err());
+        let (confirmed, doubtful) = rover.confirmed();
+        assert_eq!((confirmed.len(), doubtful.len()), (0, 1));
+    }
+    chmod(0o644);
+    assert_eq!(rover.trusted().unwrap(), std::slice::from_ref(&made));
+    if rustix::process::geteuid().is_root() {
+        std::os::unix::fs::chown(&file, Some(65_534), None).unwrap();
+        assert!(matches!(rover.trusted(), Err(KeysError::Writable(_))));
+    }
+}

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, BuildError, Message, MessageBuilder, Performative, Time};
+use fipa_acl::{AgentId, BuildError, Message, MessageBuilder, Performative, Time, escape};
 use fipa_monitor::{Header, Monitor, Unchecked, Verdict, Violation};
 use fipa_mts::Sending;
 use fipa_transport::{FailureReason, Incarnation, Outcome};
@@ -27,7 +27,7 @@ pub enum DialogueError {
     #[error("cancelled: {0}")]
     Cancelled(Box<Message>),
     /// A message did not reach its receiver.
-    #[error("not delivered to {receiver}: {reason}")]
+    #[error("not delivered to {}: {reason}", escape(receiver))]
     NotDelivered {
         /// The receiver.
         receiver: String,

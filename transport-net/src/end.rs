@@ -29,7 +29,11 @@ pub(crate) enum End {
     /// There are too many connections.
     Crowd,
     /// Trust in the peer has been withdrawn.
+    #[cfg(feature = "secure")]
     Distrusted,
+    /// The peer's certificate has expired.
+    #[cfg(feature = "secure")]
+    Expired,
     /// The peer opened another connection in place of this one.
     Superseded,
     /// This endpoint closes.
@@ -98,7 +102,13 @@ impl End {
                 WayFault::Congested,
                 "too many connections (max_connections)",
             ),
+            #[cfg(feature = "secure")]
             Self::Distrusted => (WayFault::Refused, "the peer is not trusted any more"),
+            #[cfg(feature = "secure")]
+            Self::Expired => (
+                WayFault::Refused,
+                "the peer's certificate has expired: `fipa keys renew` there",
+            ),
             Self::Superseded => (WayFault::Broken, "the peer opened another connection"),
             Self::Closed => (WayFault::Closed, "this endpoint has been closed"),
         };

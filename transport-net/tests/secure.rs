@@ -81,6 +81,7 @@ over_both! {
     a_peer_speaks_for_its_own_agents_only,
     who_has_keys_is_not_taken_for_one_of_this_host,
     withdrawn_trust_ends_the_connection,
+    an_expired_certificate_ends_the_connection,
     a_new_key_takes_over_while_letters_pass,
     who_sends_more_than_it_may_is_read_later_and_loses_nothing,
     one_address_cannot_take_all_connections,
@@ -187,6 +188,8 @@ fn certificates_that_do_not_hold_now_are_refused<T: Proving>() {
             told.contains(what) && told.contains("renew` there"),
             "{told}"
         );
+        let clock = told.contains("the clock of this host is before the making");
+        assert_eq!(clock, what == "NotValidYet", "{told}");
         let told = assert_refused(&to, &from);
         assert!(
             told.contains("this host's certificate does not hold"),
@@ -284,6 +287,28 @@ fn withdrawn_trust_ends_the_connection<T: Proving>() {
     // And trust that is given again lets in again.
     security.replace(crex.credentials(&[&rover])).unwrap();
     from.assert_reaches(3, &to);
+}
+
+fn an_expired_certificate_ends_the_connection<T: Proving>() {
+    let now = SystemTime::now();
+    // Time for a handshake under load.
+    let ends = now + Duration::from_secs(4);
+    let day = Duration::from_secs(86_400);
+    let (rover, crex) = (
+        Host::valid(NAME, &[], now - day, ends),
+        Host::new(NAME, &[]),
+    );
+    let (from, to) = friends::<T>(&rover, &crex);
+    from.assert_reaches(1, &to);
+    until("the connection ends", || {
+        (to.transport.counters().connections == 0).then_some(())
+    });
+    assert!(SystemTime::now() > ends, "not before it expires");
+    until("the other side has noticed", || {
+        (from.transport.counters().connections == 0).then_some(())
+    });
+    from.send(2, to.location(), parcel(2, "again")).unwrap();
+    assert!(matches!(from.conclusion(2), Conclusion::NotSent(_)));
 }
 
 fn a_new_key_takes_over_while_letters_pass<T: Proving>() {

@@ -4,6 +4,7 @@ use std::fmt;
 use std::str::FromStr;
 use std::sync::Arc;
 
+use fipa_acl::is_unprintable;
 use serde::{Deserialize, Serialize};
 
 use crate::Incarnation;
@@ -178,17 +179,17 @@ impl Location {
     ///
     /// # Errors
     /// When the address is empty, too long, or has characters that an address cannot have
-    /// (white space, control characters, `#`, `;`).
+    /// (white space, [unprintable](fipa_acl::is_unprintable) characters, `#`, `;`).
     pub fn new(kind: Kind, address: &str) -> Result<Self, LocationError> {
         if address.is_empty() || address.len() > Self::MAX_ADDRESS {
             return Err(LocationError::AddressLength(address.len()));
         }
         if address
             .chars()
-            .any(|c| c.is_whitespace() || c.is_control() || matches!(c, '#' | ';'))
+            .any(|c| c.is_whitespace() || is_unprintable(c) || matches!(c, '#' | ';'))
         {
             return Err(LocationError::AddressCharacters(
-                address.escape_default().collect(),
+                address.chars().take(40).collect(),
             ));
         }
         Ok(Self {
@@ -285,7 +286,7 @@ pub enum LocationError {
     #[error("address of {0} bytes (1 to {max} allowed)", max = Location::MAX_ADDRESS)]
     AddressLength(usize),
     /// The address has characters that no address has.
-    #[error("address with white space, control characters, '#' or ';': {0:?}")]
+    #[error("address with white space, control or format characters, '#' or ';': {0:?}")]
     AddressCharacters(String),
     /// What stands behind `;` is no signature.
     #[error("unknown signature behind ';' (known: fipa-services, jade, fipa): {0:?}")]

@@ -5,7 +5,7 @@ use std::net::IpAddr;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use fipa_acl::Letter;
+use fipa_acl::{Letter, escape};
 use serde::Serialize;
 
 use crate::{FailureReason, Kind, Location, Parcel, Stream};
@@ -333,11 +333,12 @@ pub enum Conclusion {
 
 /// Why a way did not work.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error, Serialize)]
-#[error("{}{}{detail}", fault.description(), if detail.is_empty() { "" } else { ": " })]
+#[error("{}{}{}", fault.description(), if detail.is_empty() { "" } else { ": " }, escape(detail))]
 pub struct WayError {
     /// What kind of fault it was.
     pub fault: WayFault,
-    /// More about it, for people: what the operating system said, and what to do.
+    /// More about it, for people: what the operating system said, and what to do. It may be the text
+    /// of a peer; `Display` [escapes](fipa_acl::escape) it.
     pub detail: String,
 }
 

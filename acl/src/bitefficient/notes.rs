@@ -3,10 +3,11 @@
 //! The readers of messages and envelopes say in passing what each stretch of bytes means. Whoever
 //! only wants to decode listens with [`Silent`], of which nothing is left in the program.
 
+use std::borrow::Cow;
 use std::fmt::Write as _;
 
 use crate::bitefficient::without_x;
-use crate::{Text, Time, Zone};
+use crate::{Text, Time, Zone, escape};
 
 /// Listens to the remarks of a reader.
 pub(crate) trait Notes {
@@ -112,16 +113,9 @@ pub(crate) fn content(bytes: &[u8]) -> String {
     format!("'{}'{more}", visible(text))
 }
 
-fn visible(text: &str) -> String {
-    let mut out = String::new();
-    for c in text.chars().take(SHOWN) {
-        if c.is_control() {
-            out.extend(c.escape_default());
-        } else {
-            out.push(c);
-        }
-    }
-    out
+fn visible(text: &str) -> Cow<'_, str> {
+    let end = text.char_indices().nth(SHOWN).map(|(at, _)| at);
+    escape(end.and_then(|end| text.get(..end)).unwrap_or(text))
 }
 
 fn ellipsis(text: &str) -> &'static str {

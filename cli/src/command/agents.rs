@@ -9,6 +9,7 @@ use std::time::Duration;
 use clap::Args;
 use comfy_table::{Table, presets};
 use fipa::{Directory, Entry, Kind, Location, Matcher, Query, Reach, Role, Source, Time};
+use fipa_acl::escape;
 use serde_json::{Value, json};
 
 use crate::membership;
@@ -228,8 +229,8 @@ impl Row {
                 let leads = |name: &Arc<str>| members.leader().is_some_and(|leader| leader == name);
                 let names = members.names().iter();
                 let line = |name: &Arc<str>| match leads(name) {
-                    true => format!("{name} (leads)"),
-                    false => name.to_string(),
+                    true => format!("{} (leads)", escape(name)),
+                    false => escape(name).into_owned(),
                 };
                 names.map(line).collect()
             }
@@ -237,14 +238,14 @@ impl Row {
         };
         let reach = match through {
             None => "this host".to_owned(),
-            Some(gateway) => format!("via {gateway}"),
+            Some(gateway) => format!("via {}", escape(&gateway)),
         };
         let cells = [
-            entry.name.to_string(),
-            entry.agent_type.clone(),
+            escape(&entry.name).into_owned(),
+            escape(&entry.agent_type).into_owned(),
             reach,
             places.join("\n"),
-            entry.mts.name.to_string(),
+            escape(&entry.mts.name).into_owned(),
             learnt(entry.source).to_owned(),
             age(entry),
         ];

@@ -2,6 +2,7 @@
 
 use clap::Args;
 use fipa::{AgentId, CoalitionError, Domain, RegisterOptions};
+use fipa_acl::escape;
 
 use crate::membership::{self, Stop};
 use crate::options::{self, Global};
@@ -66,7 +67,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
                 };
                 let told = output::text(&format!(
                     "{} of the domain {} has {members}; Ctrl-C dissolves it\n",
-                    coalition.name(),
+                    escape(coalition.name()),
                     config.domain,
                 ));
                 stop.requested().await;

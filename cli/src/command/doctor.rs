@@ -3,6 +3,7 @@
 use clap::Args;
 use comfy_table::{Table, presets};
 use fipa::doctor::{Check, Verdict, examine};
+use fipa_acl::escape;
 use serde_json::json;
 
 use crate::options::Global;
@@ -68,9 +69,9 @@ fn table(checks: &[Check]) -> String {
         column.set_padding((0, 2));
     }
     for check in checks {
-        let mut found = check.found.clone();
+        let mut found = escape(&check.found).into_owned();
         if let Some(advice) = &check.advice {
-            found = format!("{found}\n-> {advice}");
+            found = format!("{found}\n-> {}", escape(advice));
         }
         table.add_row([word(check.verdict), check.area, check.check, &found]);
     }

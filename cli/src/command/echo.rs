@@ -4,6 +4,7 @@ use clap::Args;
 use fipa::{
     Agent, AgentId, Config, Incoming, Message, Performative, ReceiveError, RegisterOptions,
 };
+use fipa_acl::escape;
 
 use crate::membership::{self, Stop};
 use crate::options::{self, Global};
@@ -58,7 +59,7 @@ async fn serve(arguments: Arguments, config: &Config) -> Result<(), Failure> {
     let agent = membership::register(&domain, arguments.name.name(), options, config)?;
     output::text(&format!(
         "{} of the domain {} answers; Ctrl-C ends it\n",
-        agent.name(),
+        escape(agent.name()),
         config.domain
     ))?;
     let ended = tokio::select! {

@@ -7,6 +7,7 @@ use clap::builder::NonEmptyStringValueParser;
 use clap::{Args, Subcommand};
 use comfy_table::{Table, presets};
 use fipa::keys::{Certificate, Holding, Keys, KeysError, VALID};
+use fipa_acl::escape;
 use serde_json::{Value, json};
 
 use crate::options::{self, Global};
@@ -128,7 +129,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
                 "made a key and a certificate for {}\n{}\
                  give {} to the owners of other hosts, and use it:\n\n\
                  [security]\nkeys = {:?}\n",
-                made.certified().mts(),
+                escape(made.certified().mts()),
                 described(&made),
                 keys.own_file().display(),
                 // From wherever the gateway is started.
@@ -154,7 +155,10 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             })?;
             let mut text = String::new();
             for certificate in &trusted {
-                text.push_str(&format!("trusts {}\n", certificate.certified().mts()));
+                text.push_str(&format!(
+                    "trusts {}\n",
+                    escape(certificate.certified().mts())
+                ));
                 text.push_str(&described(certificate));
             }
             output::text(&text)
@@ -167,7 +171,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             for certificate in &revoked {
                 text.push_str(&format!(
                     "trusts {} no more\n{}",
-                    certificate.certified().mts(),
+                    escape(certificate.certified().mts()),
                     described(certificate)
                 ));
             }
@@ -250,7 +254,10 @@ fn ends(certificate: &Certificate) -> String {
 fn spoken_for(certificate: &Certificate) -> String {
     match certificate.certified().agents() {
         [] => "every agent".to_owned(),
-        agents => agents.join(", "),
+        agents => {
+            let escaped: Vec<_> = agents.iter().map(|agent| escape(agent)).collect();
+            escaped.join(", ")
+        }
     }
 }
 
@@ -300,7 +307,7 @@ fn list(keys: &Keys, json: bool) -> Result<Result<(), Failure>, KeysError> {
         for certificate in certificates {
             table.add_row([
                 what.to_owned(),
-                certificate.certified().mts().to_owned(),
+                escape(certificate.certified().mts()).into_owned(),
                 spoken_for(certificate),
                 ends(certificate),
                 certificate.fingerprint().to_string(),

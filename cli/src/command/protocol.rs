@@ -9,6 +9,7 @@ use clap::{Args, Subcommand, ValueEnum};
 use comfy_table::{Table, presets};
 use fipa::monitor::scxml::MAX_FILE;
 use fipa::monitor::{After, Cancel, Library, Machine, Scope, State, Subprotocol, Transition};
+use fipa_acl::escape;
 use serde_json::{Value, json};
 
 use crate::input;
@@ -209,9 +210,9 @@ fn list(library: &Library, as_json: bool) -> Result<(), Failure> {
     for machine in library.iter() {
         let aliases = machine.aliases().join(", ");
         table.add_row([
-            machine.name(),
-            machine.title().unwrap_or_default(),
-            &aliases,
+            escape(machine.name()),
+            escape(machine.title().unwrap_or_default()),
+            escape(&aliases),
         ]);
     }
     output::text(&format!("{}\n", table.trim_fmt()))
@@ -225,7 +226,7 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
                 Ok(machine) => output::text(&format!(
                     "{}: {}, states: {}, no mistakes\n",
                     input::name(file),
-                    machine.name(),
+                    escape(machine.name()),
                     machine.states().len()
                 ))?,
                 Err(failure) => failures.push(failure),
@@ -367,7 +368,8 @@ fn told(machine: &Machine) -> String {
             (false, true) => " (final)",
             (false, false) => "",
         };
-        lines.push(format!("\n{}{marks}", state.id()));
+        lines.push(String::new());
+        lines.push(format!("{}{marks}", state.id()));
         for step in state.transitions() {
             let optional = if step.is_optional() {
                 " (may be left out)"
@@ -399,5 +401,6 @@ fn told(machine: &Machine) -> String {
         }
     }
     lines.push(String::new());
+    let lines: Vec<_> = lines.iter().map(|line| escape(line)).collect();
     lines.join("\n")
 }

@@ -6,6 +6,7 @@ use clap::Args;
 use comfy_table::{Table, presets};
 use fipa::routes::{self, AskError, Report, Route, Standing, WayState};
 use fipa::{Domain, Incarnation, Matcher, Query, Reach, RegisterOptions, Role};
+use fipa_acl::escape;
 use serde_json::json;
 
 use crate::membership;
@@ -150,7 +151,7 @@ fn told(process: &Report, gateway: Option<&Report>) -> String {
 
 fn gateway_told(gateway: &Report) -> String {
     let locations: Vec<String> = gateway.locations.iter().map(ToString::to_string).collect();
-    let mut text = format!("\nThe gateway {}:\n", gateway.mts);
+    let mut text = format!("\nThe gateway {}:\n", escape(&gateway.mts));
     text.push_str(&format!("takes letters at {}\n", locations.join(", ")));
     let mut ways = table(&[
         "WAY",
@@ -182,10 +183,12 @@ fn gateway_told(gateway: &Report) -> String {
     for peer in &gateway.peers {
         let stands = match (&peer.answers, peer.failures.last()) {
             (Some(location), _) => format!("answers at {location}"),
-            (None, Some((location, why))) => format!("does not answer; last at {location}: {why}"),
+            (None, Some((location, why))) => {
+                format!("does not answer; last at {location}: {}", escape(why))
+            }
             (None, None) => "has not answered yet".to_owned(),
         };
-        text.push_str(&format!("static peer {}: {stands}\n", peer.name));
+        text.push_str(&format!("static peer {}: {stands}\n", escape(&peer.name)));
     }
     for neighbour in &gateway.neighbours {
         let locations = neighbour.locations.iter().map(ToString::to_string);
@@ -193,7 +196,7 @@ fn gateway_told(gateway: &Report) -> String {
         let since = humantime::format_duration(Duration::from_secs(neighbour.seconds));
         text.push_str(&format!(
             "connected with {} for {since}: {}\n",
-            neighbour.name,
+            escape(&neighbour.name),
             locations.join(", ")
         ));
     }
@@ -202,8 +205,8 @@ fn gateway_told(gateway: &Report) -> String {
 
 fn rows_of(table: &mut Table, route: &Route, from: &str) {
     let receiver = match &route.exception {
-        Some(pattern) => format!("{} (by routes.{pattern:?})", route.receiver),
-        None => route.receiver.clone(),
+        Some(pattern) => format!("{} (by routes.{pattern:?})", escape(&route.receiver)),
+        None => escape(&route.receiver).into_owned(),
     };
     if route.ways.is_empty() {
         table.add_row([receiver.as_str(), from, "none", "it has no locations"]);
@@ -230,7 +233,10 @@ fn standing(standing: &Standing) -> String {
             error,
         } => {
             let left = humantime::format_duration(Duration::from_millis(*milliseconds));
-            format!("failed {failures} times, put back for {left}: {error}")
+            format!(
+                "failed {failures} times, put back for {left}: {}",
+                escape(error)
+            )
         }
         Standing::NotInOrder => "not used: not in the order of transports".to_owned(),
         Standing::Unsupported => "not used: unsupported transport".to_owned(),
@@ -242,7 +248,7 @@ fn last_error(way: &WayState) -> String {
     match (&way.last_error, way.last_error_seconds) {
         (Some(error), Some(seconds)) => {
             let ago = humantime::format_duration(Duration::from_secs(seconds));
-            format!("{error} ({ago} ago)")
+            format!("{} ({ago} ago)", escape(error))
         }
         _ => String::new(),
     }

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use clap::Args;
 use fipa::{Change, Config, Entry, Gateway};
+use fipa_acl::escape;
 use serde_json::{Value, json};
 
 use crate::membership::{self, Stop, Wish};
@@ -114,7 +115,7 @@ fn reload(gateway: &mut Gateway, global: &Global) {
 fn ready(config: &Config, gateway: &Gateway, problem: Option<&str>) -> String {
     let mut text = format!(
         "gateway {} of the domain {} is ready\n",
-        gateway.name(),
+        escape(gateway.name()),
         config.domain
     );
     for location in gateway.locations() {
@@ -123,7 +124,7 @@ fn ready(config: &Config, gateway: &Gateway, problem: Option<&str>) -> String {
     let discovery = match (config.discovery.mdns, problem) {
         (false, _) => "are not looked for (discovery.mdns = false)".to_owned(),
         (true, None) => "are looked for by mDNS".to_owned(),
-        (true, Some(problem)) => format!("may not be found by mDNS: {problem}"),
+        (true, Some(problem)) => format!("may not be found by mDNS: {}", escape(problem)),
     };
     text.push_str(&format!("  other hosts {discovery}\n  Ctrl-C ends it\n"));
     text

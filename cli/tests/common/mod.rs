@@ -202,6 +202,11 @@ impl Running {
         }
     }
 
+    /// The next line that it printed before it ended, if there is one.
+    pub(crate) fn next_line(&mut self) -> Option<String> {
+        self.lines.recv_timeout(WATCHDOG).ok()
+    }
+
     /// Waits until it says something on standard error that has all these parts.
     #[track_caller]
     pub(crate) fn tells(&mut self, parts: &[&str]) {

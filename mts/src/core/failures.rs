@@ -130,6 +130,9 @@ impl Core {
                     continue;
                 }
             };
+            if !self.failure_limit.has_paid(now.instant, from, letter.len()) {
+                continue;
+            }
             let stream = Stream {
                 sender: self.desk.config.incarnation,
                 receiver: life_of(&entry),

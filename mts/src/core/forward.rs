@@ -4,8 +4,8 @@ use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_acl::{Letter, Message, Representation};
-use fipa_sds::{Entry, Reach, Resolution, Role, Source};
+use fipa_acl::{DecodeError, Letter, Message, Representation};
+use fipa_sds::{Directory, Entry, Reach, Resolution, Role, Source};
 use fipa_transport::{
     Answer, FailureReason, Hop, Incarnation, Kind, Location, Outcome, Parcel, Signature, Stream,
     Ticket, Verdict,
@@ -36,35 +36,84 @@ const LEFT_FOR_DELIVERY: Duration = Duration::from_millis(250);
 /// than the time after which it is forgotten.
 const HEARD_AGAIN_AFTER: Duration = Duration::from_secs(15);
 
-/// A letter of a legacy peer, read as far as the core needs it. Reading takes time in proportion to
-/// the bytes of the letter, so it comes before the core is locked.
+/// Receivers of one letter of a legacy peer, at most. fipa_services writes one.
+const MAX_UNFRAMED_RECEIVERS: usize = 64;
+/// Patterns among the receivers of one letter of a legacy peer, at most.
+const MAX_UNFRAMED_PATTERNS: usize = 1;
+/// Longest pattern of a legacy peer, in bytes: a longer one takes tens of milliseconds to compile.
+const MAX_UNFRAMED_PATTERN: usize = 128;
+
+/// A letter of a legacy peer, read as far as the core needs it, with its receivers looked up. That
+/// takes time in proportion to the bytes of the letter, so it comes before the core is locked.
 #[derive(Debug)]
 pub struct Unframed {
     letter: Letter,
     via: Kind,
     from: IpAddr,
+    /// The receivers that the envelope names, and the entries meant.
+    receivers: Vec<(Arc<str>, Resolution)>,
     /// The name of the sender, and a location that it gives as its own.
     sender: Option<(String, Location)>,
-    /// Why the message cannot be decoded, if it cannot.
+    /// Why the letter is refused, if it is.
     fault: Option<String>,
 }
 
 impl Unframed {
-    /// Reads the letter, which came from this address.
-    #[must_use]
-    pub fn read(letter: Letter, via: Kind, from: IpAddr) -> Self {
-        let (sender, fault) = match Message::decode(letter.payload()) {
-            Ok(message) => (locate(&message, &letter, from), None),
-            Err(error) => (None, Some(cannot_be_decoded(&error))),
+    /// Reads the letter, which came from this address, and looks up its receivers.
+    ///
+    /// # Errors
+    /// When the envelope cannot be read.
+    pub fn read(
+        letter: Letter,
+        via: Kind,
+        from: IpAddr,
+        directory: &dyn Directory,
+    ) -> Result<Self, DecodeError> {
+        let mut names = stamp::receivers(&letter, MAX_UNFRAMED_RECEIVERS + 1)?;
+        let (sender, fault) = match (too_many(&names), Message::decode(letter.payload())) {
+            (Some(fault), _) => {
+                names.truncate(1);
+                (None, Some(fault))
+            }
+            (None, Ok(message)) => (locate(&message, &letter, from), None),
+            (None, Err(error)) => (None, Some(cannot_be_decoded(&error))),
         };
-        Self {
+        let named = stamp::sender(&letter).unwrap_or_default();
+        let resolved = |name: String| {
+            let resolved = match fault {
+                Some(_) => Ok(Resolution::None),
+                None => fipa_sds::resolve_legacy(directory, &name, &named),
+            };
+            (name.into(), resolved.unwrap_or(Resolution::None))
+        };
+        let receivers = names.into_iter().map(resolved).collect();
+        Ok(Self {
             letter,
             via,
             from,
+            receivers,
             sender,
             fault,
-        }
+        })
     }
+}
+
+/// Why a legacy peer's letter to these receivers is refused, if it is.
+fn too_many(names: &[String]) -> Option<String> {
+    if names.len() > MAX_UNFRAMED_RECEIVERS {
+        return Some(format!(
+            "the letter has more than {MAX_UNFRAMED_RECEIVERS} receivers"
+        ));
+    }
+    let is_pattern = |name: &&String| fipa_sds::is_legacy_pattern(name);
+    let patterns: Vec<&String> = names.iter().filter(is_pattern).collect();
+    if patterns.len() > MAX_UNFRAMED_PATTERNS {
+        return Some(format!(
+            "the letter has more than {MAX_UNFRAMED_PATTERNS} pattern among its receivers"
+        ));
+    }
+    let too_long = patterns.iter().any(|it| it.len() > MAX_UNFRAMED_PATTERN);
+    too_long.then(|| format!("the pattern has more than {MAX_UNFRAMED_PATTERN} bytes"))
 }
 
 /// The name of the sender, and the first location that it gives as its own.
@@ -303,57 +352,48 @@ impl Core {
     }
 
     /// A legacy peer's letter arrived, for the agents of this host that its envelope names. If its
-    /// message cannot be decoded, it is refused, and its sender is told.
+    /// message cannot be decoded, or it has too many receivers, it is refused, and its sender is told.
     pub fn handle_unframed(&mut self, now: Now, deadline: Duration, unframed: Unframed) {
         let Unframed {
             letter,
             via,
             from,
+            receivers,
             sender: mut located,
             fault,
         } = unframed;
-        let receivers = match stamp::receivers(&letter) {
-            Ok(receivers) => receivers,
-            Err(error) => {
-                tracing::warn!(%error, "an unframed letter with a malformed envelope was dropped");
-                return;
-            }
-        };
+        self.failure_limit.came(now.instant, from, letter.len());
         if let Some(fault) = fault {
             tracing::info!(%from, "refused a letter of a legacy peer: {fault}");
-            for receiver in receivers {
+            for (receiver, _) in receivers {
                 let why = (FailureReason::Refused, fault.clone());
-                self.unframed_failed(&receiver.into(), &letter, (via, from), why);
+                self.unframed_failed(&receiver, &letter, (via, from), why);
             }
             self.tell_failures(now);
             return;
         }
-        let directory = Arc::clone(&self.desk.directory);
-        let sender = stamp::sender(&letter).unwrap_or_default();
         let stream_sender = self.desk.config.incarnation;
         let unproved = Link {
             via,
             service: Incarnation::UNKNOWN,
         };
-        for receiver in receivers {
-            let (entries, missing) = match fipa_sds::resolve_legacy(&*directory, &receiver, &sender)
-            {
-                Ok(Resolution::Exact(entry)) => (vec![entry], Vec::new()),
-                Ok(Resolution::Multicast(entries)) => (entries, Vec::new()),
-                Ok(Resolution::Coalition {
+        for (receiver, resolution) in receivers {
+            let (entries, missing) = match resolution {
+                Resolution::Exact(entry) => (vec![entry], Vec::new()),
+                Resolution::Multicast(entries) => (entries, Vec::new()),
+                Resolution::Coalition {
                     agents,
                     mut missing,
-                }) => {
+                } => {
                     // Its members elsewhere are not reached from here, and the sender is told.
                     let away = agents.iter().filter(|entry| entry.reach != Reach::Local);
                     missing.extend(away.map(|entry| Arc::clone(&entry.name)));
                     (agents, missing)
                 }
-                Ok(Resolution::None) | Err(_) => (Vec::new(), Vec::new()),
+                Resolution::None => (Vec::new(), Vec::new()),
             };
             let here = entries.iter().filter(|entry| entry.reach == Reach::Local);
             let nobody = here.clone().next().is_none() && missing.is_empty();
-            let receiver: Arc<str> = receiver.as_str().into();
             for name in missing.into_iter().chain(nobody.then_some(receiver)) {
                 tracing::info!(receiver = %name, %from, "an unframed letter names nobody of this host");
                 let why = (FailureReason::NoSuchAgent, String::new());

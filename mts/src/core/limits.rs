@@ -19,6 +19,16 @@ const PER_ADDRESS: f64 = 100.0;
 const IN_ALL: f64 = 400.0;
 /// How long an allowance is remembered. After that it is a full one again, so nothing is lost.
 const MEMORY: Duration = Duration::from_secs(1);
+/// Addresses whose bytes are remembered, at most.
+const MAX_PAID: usize = 4096;
+/// How long they are remembered when another address needs the room. Longer than the deadline of most
+/// letters.
+const PAID_MEMORY: Duration = Duration::from_secs(60);
+/// Bytes that a letter counts as, at least. A failure message about a letter of 119 bytes has 300 to 700, and
+/// the headers of the letter's own connection have 270.
+const MIN_PAID: u64 = 1024;
+/// Bytes that an address may have in store, at most.
+const MAX_CREDIT: u64 = 1 << 20;
 /// How often it is logged that failure messages were left out.
 const LOG_EVERY: Duration = Duration::from_secs(1);
 
@@ -93,10 +103,20 @@ impl SenderLimit {
     }
 }
 
+/// Bytes that came from one address, less those of the failure messages about them.
+#[derive(Debug, Clone, Copy)]
+struct Paid {
+    bytes: u64,
+    last: Instant,
+}
+
 /// Limits failure messages, and counts those that are left out. Sans-I/O, but for the log.
 #[derive(Debug)]
 pub(super) struct FailureLimit {
     limit: SenderLimit,
+    /// What legacy peers have sent: failure messages about letters from one address never have more
+    /// bytes than these letters count as.
+    paid: Map<IpAddr, Paid>,
     left_out: u64,
     /// When it is logged how many were left out.
     log_at: Option<Instant>,
@@ -106,6 +126,7 @@ impl Default for FailureLimit {
     fn default() -> Self {
         Self {
             limit: SenderLimit::new(PER_SENDER, PER_ADDRESS, IN_ALL),
+            paid: Map::default(),
             left_out: 0,
             log_at: None,
         }
@@ -120,6 +141,48 @@ impl FailureLimit {
             self.leave_out(now);
         }
         allowed
+    }
+
+    /// A letter of so many bytes came from a legacy peer at this address. It counts as
+    /// [`MIN_PAID`] at least.
+    pub(super) fn came(&mut self, now: Instant, from: IpAddr, bytes: usize) {
+        let (from, bytes) = (host(from), (bytes as u64).max(MIN_PAID));
+        if self.paid.len() >= MAX_PAID && !self.paid.contains_key(&from) {
+            let is_recent = |it: &Paid| now.saturating_duration_since(it.last) < PAID_MEMORY;
+            self.paid.retain(|_, paid| is_recent(paid));
+            if self.paid.len() >= MAX_PAID {
+                // Its failure messages are left out.
+                return;
+            }
+        }
+        let none = Paid {
+            bytes: 0,
+            last: now,
+        };
+        let paid = self.paid.entry(from).or_insert(none);
+        paid.bytes = paid.bytes.saturating_add(bytes).min(MAX_CREDIT);
+        paid.last = now;
+    }
+
+    /// Whether letters from this address had as many bytes as a failure message about one of them, and
+    /// takes these bytes away. If not, the message is counted. Without an address nothing is limited:
+    /// the sender is an agent of another gateway.
+    pub(super) fn has_paid(&mut self, now: Instant, from: Option<IpAddr>, bytes: usize) -> bool {
+        let Some(from) = from else { return true };
+        let paid = self.paid.get_mut(&host(from));
+        let left = paid
+            .as_ref()
+            .and_then(|it| it.bytes.checked_sub(bytes as u64));
+        match (paid, left) {
+            (Some(paid), Some(left)) => {
+                paid.bytes = left;
+                true
+            }
+            _ => {
+                self.leave_out(now);
+                false
+            }
+        }
     }
 
     /// Counts a failure message that does not leave.
@@ -141,7 +204,8 @@ impl FailureLimit {
             tracing::warn!(
                 count,
                 "left out failure messages: more than {PER_SENDER} a second to one sender, \
-                 {PER_ADDRESS} to one address or {IN_ALL} in all, or the sender does not take them"
+                 {PER_ADDRESS} to one address or {IN_ALL} in all, more bytes than came from one address, or \
+                 the sender does not take them"
             );
         }
     }
@@ -215,6 +279,27 @@ mod tests {
         }
         // Ten seconds, and what may leave at once.
         assert!((4000..=4400).contains(&allowed), "{allowed}");
+    }
+
+    #[test]
+    fn an_address_gets_no_more_bytes_than_came_from_it() {
+        let (mut limit, now) = (FailureLimit::default(), Instant::now());
+        let [one, other] = [1, 2].map(|last| address(last).unwrap());
+        limit.came(now, one, 1500);
+        assert!(limit.has_paid(now, Some(one), 1000));
+        assert!(!limit.has_paid(now, Some(one), 600));
+        assert!(!limit.has_paid(now, Some(other), 1));
+        assert_eq!(limit.left_out, 2);
+        limit.came(now, one, 200);
+        assert!(limit.has_paid(now, Some(one), 600), "200 count as 1024");
+        assert!(limit.has_paid(now, None, 600), "another gateway's agent");
+        for number in 0..2 * MAX_PAID as u32 {
+            limit.came(now, Ipv4Addr::from(number).into(), 1);
+        }
+        assert_eq!(limit.paid.len(), MAX_PAID);
+        limit.came(now + PAID_MEMORY, other, 9);
+        assert_eq!(limit.paid.len(), 1);
+        assert!(limit.has_paid(now + PAID_MEMORY, Some(other), 9));
     }
 
     #[test]

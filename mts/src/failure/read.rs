@@ -10,8 +10,8 @@ use super::one_line;
 pub struct DeliveryFailure {
     /// The name of the receiver, if the message gives it.
     pub receiver: Option<String>,
-    /// The reason, as the service words it: one line of at most 400 bytes, without control
-    /// characters.
+    /// The reason, as the service words it: one line of at most 400 bytes,
+    /// [escaped](fipa_acl::escape).
     pub reason: String,
 }
 
@@ -211,6 +211,9 @@ mod tests {
         );
         let open = "(MTS-error (agent-identifier :name arm) (internal-error \"a\u{1b}b";
         let failure = message(Performative::Failure, open);
-        assert_eq!(DeliveryFailure::read(&failure), Some(told("arm", "a b")));
+        assert_eq!(
+            DeliveryFailure::read(&failure),
+            Some(told("arm", r"a\u{1b}b"))
+        );
     }
 }

@@ -41,7 +41,14 @@ impl Sink for Receiving {
         let Some(shared) = self.shared.upgrade() else {
             return;
         };
-        let unframed = Unframed::read(letter, via, from);
+        let directory = Arc::clone(shared.state.lock().core.directory());
+        let unframed = match Unframed::read(letter, via, from, &*directory) {
+            Ok(unframed) => unframed,
+            Err(error) => {
+                tracing::warn!(%error, "an unframed letter with a malformed envelope was dropped");
+                return;
+            }
+        };
         let mut state = shared.state.lock();
         let deadline = state.unframed_deadline;
         state.core.handle_unframed(Now::read(), deadline, unframed);

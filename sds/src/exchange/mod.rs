@@ -23,6 +23,7 @@ use std::ops::Bound;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use fipa_acl::escape;
 use fipa_transport::{Incarnation, Location};
 
 pub use directory::ExchangeDirectory;
@@ -695,7 +696,7 @@ pub enum ExchangeError {
     #[error("the letter has {0} bytes; at most {max} are read", max = Exchange::MAX_CONTENT)]
     TooLarge(usize),
     /// It is none that is understood.
-    #[error("the letter makes no sense: {0}")]
+    #[error("the letter makes no sense: {}", escape(&.0.to_string()))]
     Malformed(#[from] serde_json::Error),
     /// There are more agents than are kept.
     #[error(

@@ -19,6 +19,7 @@ mod everything;
 mod tests;
 
 use std::collections::HashMap;
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -34,6 +35,10 @@ use super::{MdnsDirectory, SERVICE_TYPE};
 
 /// Most records that are introduced and not known yet. Each is asked for a few times.
 const MAX_UNKNOWN: usize = 4096;
+/// Of all that is kept, the share of one source address: a quarter. One source cannot fill the tables.
+const MAX_SHARE: usize = MdnsDirectory::MAX_RECORDS / 4;
+const MAX_SHARE_BYTES: usize = MdnsDirectory::MAX_BYTES / 4;
+const MAX_SHARE_UNKNOWN: usize = MAX_UNKNOWN / 4;
 /// When what is missing of a record is asked for, each after the one before: who has just said it
 /// must not repeat it within a second (RFC 6762 clause 6).
 const MISSING: &[Duration] = &[
@@ -81,6 +86,8 @@ pub(super) struct Browser {
     unknown: usize,
     /// How many bytes the others say.
     bytes: usize,
+    /// What of that each source address has introduced.
+    shares: HashMap<IpAddr, Share>,
     /// When the beacons of a gateway last said what is held of it.
     confirmed: HashMap<Incarnation, Instant>,
     everything: Everything,
@@ -91,9 +98,20 @@ pub(super) struct Browser {
     next: Option<Instant>,
 }
 
+/// The records that one source address has introduced.
+#[derive(Debug, Clone, Copy, Default)]
+struct Share {
+    records: usize,
+    /// How many of them are not known yet.
+    unknown: usize,
+    bytes: usize,
+}
+
 #[derive(Debug)]
 struct Record {
     fullname: Arc<str>,
+    /// The address that introduced it.
+    from: IpAddr,
     /// Who announces it, if that is one of our gateways.
     gateway: Incarnation,
     /// Its SRV record, and the host that says.
@@ -163,6 +181,7 @@ impl Browser {
             records: HashMap::new(),
             unknown: 0,
             bytes: 0,
+            shares: HashMap::new(),
             confirmed: HashMap::new(),
             everything: Everything::new(now, chance),
             share: 0.0,
@@ -177,8 +196,14 @@ impl Browser {
         self.everything = Everything::new(now, chance);
     }
 
-    /// A packet has been heard. `chance`, from 0 to 1, says how much jitter there is.
-    pub(super) fn handle_packet(&mut self, now: Instant, packet: &[u8], chance: f64) -> Heard {
+    /// A packet has been heard from this address. `chance`, from 0 to 1, says how much jitter there is.
+    pub(super) fn handle_packet(
+        &mut self,
+        now: Instant,
+        from: IpAddr,
+        packet: &[u8],
+        chance: f64,
+    ) -> Heard {
         let mut heard = Heard::default();
         let ours = packet::may_name_our_type(packet);
         let Some(packet) = ours.then(|| packet::parse(packet)).flatten() else {
@@ -194,7 +219,7 @@ impl Browser {
         let mut new = Vec::new();
         for record in &there {
             if let Some(label) = introduced(&record.name, &record.rdata) {
-                match self.introduce(now, label, chance) {
+                match self.introduce(now, from, label, chance) {
                     Introduced::New => new.push(label),
                     Introduced::Refused => heard.refused += 1,
                     Introduced::Already => {}
@@ -218,11 +243,15 @@ impl Browser {
                     if known.text.is_none() || known.digest != digest {
                         let len = len_of(&said);
                         let others = self.bytes - known.len;
-                        if others + len > MdnsDirectory::MAX_BYTES {
+                        let share = self.shares.entry(known.from).or_default();
+                        let others_of_share = share.bytes - known.len;
+                        if others + len > MdnsDirectory::MAX_BYTES
+                            || others_of_share + len > MAX_SHARE_BYTES
+                        {
                             heard.refused += 1;
                             continue;
                         }
-                        self.bytes = others + len;
+                        (self.bytes, share.bytes) = (others + len, others_of_share + len);
                         (known.digest, known.len) = (digest, len);
                         known.news = Some(said);
                     }
@@ -233,7 +262,10 @@ impl Browser {
             if known.place.is_none() || known.text.is_none() {
                 continue;
             }
-            self.unknown -= usize::from(!known.known);
+            if !known.known {
+                self.unknown -= 1;
+                self.shares.entry(known.from).or_default().unknown -= 1;
+            }
             known.known = true;
             known.is_there();
             if let Some(news) = known.news.take() {
@@ -245,7 +277,9 @@ impl Browser {
         }
         // What comes with all that it says is not waited for.
         for label in new {
-            if self.unknown > MAX_UNKNOWN && self.records.get(label).is_some_and(|it| !it.known) {
+            let share = self.shares.get(&from).copied().unwrap_or_default();
+            let are_too_many = self.unknown > MAX_UNKNOWN || share.unknown > MAX_SHARE_UNKNOWN;
+            if are_too_many && self.records.get(label).is_some_and(|it| !it.known) {
                 self.remove(label);
                 heard.refused += 1;
             }
@@ -259,14 +293,15 @@ impl Browser {
     }
 
     /// There is such a record.
-    fn introduce(&mut self, now: Instant, label: &str, chance: f64) -> Introduced {
+    fn introduce(&mut self, now: Instant, from: IpAddr, label: &str, chance: f64) -> Introduced {
         if let Some(known) = self.records.get_mut(label) {
             if known.known {
                 known.is_there();
             }
             return Introduced::Already;
         }
-        if self.records.len() >= MdnsDirectory::MAX_RECORDS {
+        let share = self.shares.get(&from).copied().unwrap_or_default();
+        if self.records.len() >= MdnsDirectory::MAX_RECORDS || share.records >= MAX_SHARE {
             return Introduced::Refused;
         }
         let jitter = JITTER.mul_f64(chance.clamp(0.0, 1.0));
@@ -274,6 +309,7 @@ impl Browser {
         let due = questions.due;
         let record = Record {
             fullname: format!("{label}.{SERVICE_TYPE}").into(),
+            from,
             gateway: Incarnation::UNKNOWN,
             place: None,
             host: String::new(),
@@ -286,6 +322,8 @@ impl Browser {
             questions: Some(questions),
         };
         self.records.insert(label.to_owned(), record);
+        let share = self.shares.entry(from).or_default();
+        (share.records, share.unknown) = (share.records + 1, share.unknown + 1);
         self.unknown += 1;
         self.wake(due);
         Introduced::New
@@ -295,6 +333,7 @@ impl Browser {
         if let Some(gone) = self.records.remove(label) {
             self.unknown -= usize::from(!gone.known);
             self.bytes -= gone.len;
+            forget(&mut self.shares, &gone);
         }
     }
 
@@ -426,6 +465,7 @@ impl Browser {
             if record.end().is_some_and(|end| end <= now) {
                 self.unknown -= usize::from(!record.known);
                 self.bytes -= record.len;
+                forget(&mut self.shares, record);
                 if record.known {
                     due.gone.push(Arc::clone(&record.fullname));
                 }
@@ -574,6 +614,18 @@ impl Life {
         let due = self.asked < RENEWED.len() && self.due(share) <= now + self.ttl / ALONG;
         self.asked += usize::from(due);
         due
+    }
+}
+
+/// Takes a record that is gone out of the share of its source.
+fn forget(shares: &mut HashMap<IpAddr, Share>, gone: &Record) {
+    if let Some(share) = shares.get_mut(&gone.from) {
+        share.records -= 1;
+        share.unknown -= usize::from(!gone.known);
+        share.bytes -= gone.len;
+        if share.records == 0 {
+            shares.remove(&gone.from);
+        }
     }
 }
 

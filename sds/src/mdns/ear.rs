@@ -105,10 +105,10 @@ impl Ear {
 
     /// Hears one packet.
     pub(super) async fn listen(&mut self, shared: &Shared) -> Heard {
-        let (packet, port) = self.sockets.receive().await;
+        let (packet, from) = self.sockets.receive().await;
         let now = Instant::now();
         let is_question = packet.get(2).is_some_and(|flags| flags & 0x80 == 0);
-        if is_question && port != shared.config.port {
+        if is_question && from.port() != shared.config.port {
             // Who asks so is answered directly (RFC 6762 clause 6.7), which we do not hear.
             return Heard::default();
         }
@@ -118,7 +118,8 @@ impl Ear {
             }
             return Heard::default();
         }
-        self.browser.handle_packet(now, packet, fastrand::f64())
+        self.browser
+            .handle_packet(now, from.ip(), packet, fastrand::f64())
     }
 
     pub(super) fn handle_beacon(

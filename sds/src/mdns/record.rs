@@ -367,7 +367,9 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::MAX_NAME;
+    use fipa_acl::is_unprintable;
+
+    use crate::{MAX_NAME, check_name, is_pattern};
 
     const SIGNATURE: &str = Signature::FipaServices.signature_type();
 
@@ -573,7 +575,10 @@ mod tests {
     }
 
     fn any_name() -> impl Strategy<Value = String> {
-        any_text(MAX_NAME).prop_filter("not empty", |name| !name.is_empty())
+        any_text(MAX_NAME).prop_filter_map("no name", |mut name| {
+            name.retain(|c| !is_unprintable(c) && !is_pattern(c.encode_utf8(&mut [0; 4])));
+            check_name(&name).is_ok().then_some(name)
+        })
     }
 
     fn any_location() -> impl Strategy<Value = Location> {

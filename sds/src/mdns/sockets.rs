@@ -87,23 +87,23 @@ impl Sockets {
         }
     }
 
-    /// The next packet, and the port it came from. Cancelling the future loses nothing.
-    pub(super) async fn receive(&mut self) -> (&[u8], u16) {
+    /// The next packet, and the address and port it came from. Cancelling the future loses nothing.
+    pub(super) async fn receive(&mut self) -> (&[u8], SocketAddr) {
         let Self { open, buffer, .. } = self;
-        let (len, port) = std::future::poll_fn(|context| {
+        let (len, from) = std::future::poll_fn(|context| {
             for (socket, _) in open.iter() {
                 let mut packet = ReadBuf::new(buffer);
                 // An error is told once, and stands for a packet that did not come.
                 while let Poll::Ready(received) = socket.poll_recv_from(context, &mut packet) {
                     if let Ok(from) = received {
-                        return Poll::Ready((packet.filled().len(), from.port()));
+                        return Poll::Ready((packet.filled().len(), from));
                     }
                 }
             }
             Poll::Pending
         })
         .await;
-        (self.buffer.get(..len).unwrap_or_default(), port)
+        (self.buffer.get(..len).unwrap_or_default(), from)
     }
 }
 

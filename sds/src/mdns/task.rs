@@ -251,6 +251,8 @@ fn contested(shared: &Shared, theirs: &Arc<Entry>) {
 
 #[cfg(test)]
 mod tests {
+    use std::net::Ipv4Addr;
+
     use super::super::SERVICE_TYPE;
     use super::super::anew::tests::directory;
     use super::super::beacon::{Announced, Digest};
@@ -275,9 +277,12 @@ mod tests {
 
         let (mut ear, now) = (Ear::new(shared), Instant::now());
         let at = |seconds| now + Duration::from_secs(seconds);
-        let heard = ear
-            .browser
-            .handle_packet(now, &answer("arm", &parts, 120), 0.0);
+        let heard = ear.browser.handle_packet(
+            now,
+            Ipv4Addr::LOCALHOST.into(),
+            &answer("arm", &parts, 120),
+            0.0,
+        );
         handle(shared, &mut ear, heard);
         assert!(directory.lookup("arm").is_some());
         let mut all = Digest::default();

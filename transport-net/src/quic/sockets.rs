@@ -103,6 +103,12 @@ pub(super) fn why_lost(error: &ConnectionError) -> String {
         ConnectionError::ConnectionClosed(close) => (u64::from(close.error_code), Finder::Peer),
         other => return other.to_string(),
     };
+    // Of the error of TLS, quinn keeps the text and the alert, which is that of an expired one.
+    if let ConnectionError::TransportError(failed) = error
+        && failed.reason.ends_with("NotValidYet")
+    {
+        return format!("{error} ({})", advice::NOT_YET);
+    }
     // An alert of TLS (RFC 9001 section 4.8).
     match code.checked_sub(0x100).map(u8::try_from) {
         Some(Ok(alert)) => format!("{error} ({})", advice::of_alert(alert, finder)),

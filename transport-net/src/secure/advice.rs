@@ -5,6 +5,10 @@ use rustls::{CertificateError, Error};
 /// What is to be done when neither side says more.
 const LOOK: &str = "`fipa keys list` on both sides";
 
+/// What is to be done when a certificate begins later than now.
+pub(crate) const NOT_YET: &str = "the clock of this host is before the making of the peer's certificate: set the clock \
+                       of this host; if it is right, set that of the peer and `fipa keys renew` there";
+
 /// Alerts (RFC 8446 section 6.2) that are about certificates.
 const BAD_CERTIFICATE: u8 = 42;
 const CERTIFICATE_EXPIRED: u8 = 45;
@@ -26,7 +30,8 @@ pub(crate) fn of_alert(alert: u8, finder: Finder) -> &'static str {
             "the peer's certificate does not hold now: `fipa keys renew` there; are the clocks right?"
         }
         (CERTIFICATE_EXPIRED, Finder::Peer) => {
-            "this host's certificate does not hold now: `fipa keys renew`; are the clocks right?"
+            "this host's certificate does not hold now by the clock of the peer: set the clocks of both \
+             hosts, or `fipa keys renew`"
         }
         (UNKNOWN_CA, Finder::Here) => {
             "the peer is not trusted here: `fipa keys trust` the own.pem of that host"
@@ -45,9 +50,10 @@ pub(crate) fn of_error(error: &Error) -> &'static str {
         Error::InvalidCertificate(CertificateError::UnknownIssuer) => {
             of_alert(UNKNOWN_CA, Finder::Here)
         }
-        Error::InvalidCertificate(CertificateError::Expired | CertificateError::NotValidYet) => {
+        Error::InvalidCertificate(CertificateError::Expired) => {
             of_alert(CERTIFICATE_EXPIRED, Finder::Here)
         }
+        Error::InvalidCertificate(CertificateError::NotValidYet) => NOT_YET,
         _ => LOOK,
     }
 }

@@ -4,13 +4,15 @@
 //! Both stand among the subject's alternative names as URIs (RFC 5280 section 4.2.1.6):
 //! `urn:fipa:mts:NAME`, exactly once, and `urn:fipa:agent:NAME` for each agent; without one the
 //! service may speak for every agent. Names are percent-encoded UTF-8; an agent's name that ends
-//! with `*` stands for all names that begin so.
+//! with `*` stands for all names that begin so. Names are checked when they are decoded.
 //!
 //! What must not live here: whether anybody is trusted.
 
 use std::fmt;
 use std::sync::Arc;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
+use fipa_acl::{escape, is_unprintable};
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, percent_decode_str, utf8_percent_encode};
 use ring::digest::{SHA256, SHA256_OUTPUT_LEN, digest};
 use rustls::pki_types::{CertificateDer, UnixTime};
@@ -28,6 +30,9 @@ const KEPT: &AsciiSet = &NON_ALPHANUMERIC
 
 /// Longest certificate that is looked at, in bytes.
 const MAX_LEN: usize = 64 * 1024;
+
+/// Longest name, in bytes.
+const MAX_NAME: usize = 1024;
 
 /// Most agents that a certificate may name.
 const MAX_AGENTS: usize = 1024;
@@ -86,7 +91,7 @@ pub enum CertificateError {
     #[error("{0} bytes; at most {MAX_LEN} are looked at")]
     TooLong(usize),
     /// It is no X.509 certificate.
-    #[error("no X.509 certificate: {0}")]
+    #[error("no X.509 certificate: {}", escape(.0))]
     Malformed(String),
     /// It names no message transport service, or several.
     #[error("{0} names of message transport services ({MTS}…) where one has to be")]
@@ -94,8 +99,12 @@ pub enum CertificateError {
     /// It names more agents than are looked at.
     #[error("it names more than {MAX_AGENTS} agents")]
     Agents,
-    /// A name is no UTF-8, or empty.
-    #[error("{0}: not a name")]
+    /// A name is no UTF-8, empty, longer than 1,024 bytes, or has
+    /// [unprintable](fipa_acl::is_unprintable) characters.
+    #[error(
+        "{}: not a name (1 to {MAX_NAME} bytes of UTF-8 without control and format characters)",
+        escape(.0)
+    )]
     Name(String),
 }
 
@@ -150,6 +159,13 @@ impl Certificate {
     #[must_use]
     pub fn validity(&self) -> (i64, i64) {
         (self.from, self.until)
+    }
+
+    /// The time from `now` until it has expired.
+    pub(crate) fn left(&self, now: SystemTime) -> Duration {
+        let last = u64::try_from(self.until).unwrap_or(0);
+        let end = Duration::from_secs(last.saturating_add(1));
+        end.saturating_sub(now.duration_since(UNIX_EPOCH).unwrap_or_default())
     }
 
     /// Whether it holds at this time.
@@ -225,9 +241,15 @@ impl Certified {
 fn decoded(encoded: &str) -> Result<String, CertificateError> {
     let name = percent_decode_str(encoded).decode_utf8();
     match name {
-        Ok(name) if !name.is_empty() => Ok(name.into_owned()),
-        _ => Err(CertificateError::Name(encoded.to_owned())),
+        Ok(name) if is_name(&name) => Ok(name.into_owned()),
+        _ => Err(CertificateError::Name(encoded.chars().take(80).collect())),
     }
+}
+
+/// Whether an agent or a service can have this name, or an agent one that begins so: what is shown of a
+/// certificate to the owner who is to trust it must not look like something else.
+fn is_name(name: &str) -> bool {
+    !name.is_empty() && name.len() <= MAX_NAME && !name.contains(is_unprintable)
 }
 
 /// The alternative names with which a certificate says this.

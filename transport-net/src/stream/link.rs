@@ -319,7 +319,7 @@ impl Running {
         );
         let end = tokio::select! {
             end = exchange => end,
-            () = proof.withdrawn() => End::Distrusted,
+            end = proof.withdrawn() => end,
         };
         self.end = end;
         drop((writer, beside));

@@ -5,6 +5,13 @@
 use fipa_transport::Principal;
 
 #[cfg(feature = "secure")]
+use std::time::{Duration, SystemTime};
+
+#[cfg(feature = "secure")]
+use tokio::time::{Instant, sleep_until};
+
+use crate::end::End;
+#[cfg(feature = "secure")]
 use crate::secure::{Certificate, Security};
 
 /// What a peer has proved about itself.
@@ -65,18 +72,43 @@ impl Proof {
         None
     }
 
-    /// Waits until the peer is not trusted any more.
-    pub(crate) async fn withdrawn(&self) {
+    /// Waits until the peer is not trusted any more, or its certificate expires.
+    ///
+    /// The time until then is taken from the calendar once and counts on the clock that never jumps: a
+    /// calendar that is set ahead ends no connection. The calendar is asked again when the time is up.
+    pub(crate) async fn withdrawn(&self) -> End {
         #[cfg(feature = "secure")]
         if let Some((security, certificate)) = &self.certificate {
             let mut changes = security.changes();
+            let mut ends = after(certificate.left(SystemTime::now()));
             while security.trusts(certificate.fingerprint()) {
-                if changes.changed().await.is_err() {
-                    break;
+                tokio::select! {
+                    changed = changes.changed() => if changed.is_err() {
+                        break;
+                    },
+                    () = sleep_until(ends.min(after(LONGEST_SLEEP))) => {}
+                }
+                if ends <= Instant::now() {
+                    let left = certificate.left(SystemTime::now());
+                    if left.is_zero() {
+                        return End::Expired;
+                    }
+                    ends = after(left);
                 }
             }
-            return;
+            return End::Distrusted;
         }
         std::future::pending().await
     }
+}
+
+/// The longest time for which a timer is set.
+#[cfg(feature = "secure")]
+const LONGEST_SLEEP: Duration = Duration::from_secs(86_400);
+
+/// So much later; what no clock reaches is cut to a century.
+#[cfg(feature = "secure")]
+fn after(time: Duration) -> Instant {
+    const CENTURY: Duration = Duration::from_secs(100 * 365 * 86_400);
+    Instant::now() + time.min(CENTURY)
 }

@@ -5,6 +5,7 @@
 use std::fmt::Write as _;
 
 use fipa::monitor::{Machine, State};
+use fipa_acl::escape;
 
 use super::{act, role, within};
 
@@ -360,13 +361,12 @@ fn arrow_right(x: usize, y: usize, colour: &str) -> String {
 
 fn escaped(text: &str) -> String {
     let mut out = String::new();
-    for c in text.chars() {
+    for c in escape(text).chars() {
         match c {
             '&' => out.push_str("&amp;"),
             '<' => out.push_str("&lt;"),
             '>' => out.push_str("&gt;"),
             '"' => out.push_str("&quot;"),
-            c if c.is_control() => out.push(' '),
             c => out.push(c),
         }
     }

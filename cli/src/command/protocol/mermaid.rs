@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 
 use fipa::monitor::Machine;
+use fipa_acl::escape;
 
 use super::{act, role, within};
 
@@ -54,7 +55,7 @@ pub(super) fn diagram(machine: &Machine) -> String {
 /// Without what means something to Mermaid.
 fn escaped(text: &str) -> String {
     let mut out = String::new();
-    for c in text.chars() {
+    for c in escape(text).chars() {
         match c {
             // Older versions take a second colon for the end of a label.
             ':' => out.push_str("#58;"),
@@ -63,7 +64,6 @@ fn escaped(text: &str) -> String {
             '"' => out.push_str("#quot;"),
             '<' => out.push_str("#lt;"),
             '>' => out.push_str("#gt;"),
-            c if c.is_control() => out.push(' '),
             c => out.push(c),
         }
     }

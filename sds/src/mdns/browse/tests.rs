@@ -1,11 +1,15 @@
 //! What a browser does with packets and time.
 
+use std::net::Ipv4Addr;
+
 use proptest::prelude::*;
 
 use super::super::packet::tests::{Part, answer, asked};
 use super::*;
 
 const HOST: &str = "host.local";
+/// Where packets come from.
+const FROM: IpAddr = IpAddr::V4(Ipv4Addr::new(192, 0, 2, 9));
 const OWN: Incarnation = Incarnation::from_u64(1);
 const OTHER: Incarnation = Incarnation::from_u64(7);
 
@@ -25,7 +29,7 @@ fn announced(label: &str, text: &[u8], ttl: u32) -> Vec<u8> {
 fn browser(now: Instant, labels: &[&str]) -> Browser {
     let mut browser = Browser::new(now, OWN, 0.0);
     for label in labels {
-        let heard = browser.handle_packet(now, &announced(label, b"TYPE=x", 120), 0.0);
+        let heard = browser.handle_packet(now, FROM, &announced(label, b"TYPE=x", 120), 0.0);
         assert_eq!(names(&heard), [*label]);
     }
     browser
@@ -73,7 +77,7 @@ fn what_is_announced_is_found_once_with_all_its_strings() {
         b"=",
     ];
     let parts = [Part::Txt(&strings), Part::Srv(HOST), Part::Ptr];
-    let heard = browser.handle_packet(now, &answer("Arm.left", &parts, 120), 0.0);
+    let heard = browser.handle_packet(now, FROM, &answer("Arm.left", &parts, 120), 0.0);
     let [(fullname, properties)] = &heard.found[..] else {
         panic!("{heard:?}");
     };
@@ -87,16 +91,19 @@ fn what_is_announced_is_found_once_with_all_its_strings() {
     let expected = expected.map(|(key, value)| (key.to_owned(), value.to_vec()));
     assert_eq!(*properties, expected);
     // The same is no news, something else is.
-    let again = browser.handle_packet(now, &answer("Arm.left", &parts, 120), 0.0);
+    let again = browser.handle_packet(now, FROM, &answer("Arm.left", &parts, 120), 0.0);
     assert_eq!(again, Heard::default());
     let other = answer("Arm.left", &[Part::Txt(&[b"TYPE=x"])], 120);
     assert_eq!(
-        names(&browser.handle_packet(now, &other, 0.0)),
+        names(&browser.handle_packet(now, FROM, &other, 0.0)),
         ["Arm.left"]
     );
     // What nobody has introduced is of no interest.
     let stranger = answer("leg", &[Part::Srv(HOST), Part::Txt(&strings)], 120);
-    assert_eq!(browser.handle_packet(now, &stranger, 0.0), Heard::default());
+    assert_eq!(
+        browser.handle_packet(now, FROM, &stranger, 0.0),
+        Heard::default()
+    );
     assert_eq!(browser.records.len(), 1);
 }
 
@@ -104,14 +111,20 @@ fn what_is_announced_is_found_once_with_all_its_strings() {
 fn what_is_missing_is_asked_for_a_few_times() {
     let (mut browser, start) = (browser(Instant::now(), &[]), Instant::now());
     for label in ["arm", "leg"] {
-        browser.handle_packet(start, &answer(label, &[Part::Ptr], 4500), 0.0);
+        browser.handle_packet(start, FROM, &answer(label, &[Part::Ptr], 4500), 0.0);
     }
     let (questions, _) = goes_on(&mut browser, start, 0.5);
     assert_eq!(questions.len(), 4, "{questions:?}");
     let half = answer("arm", &[Part::Srv(HOST)], 120);
-    assert_eq!(browser.handle_packet(start, &half, 0.0), Heard::default());
+    assert_eq!(
+        browser.handle_packet(start, FROM, &half, 0.0),
+        Heard::default()
+    );
     let half = answer("arm", &[Part::Txt(&[b"TYPE=x"])], 120);
-    assert_eq!(names(&browser.handle_packet(start, &half, 0.0)), ["arm"]);
+    assert_eq!(
+        names(&browser.handle_packet(start, FROM, &half, 0.0)),
+        ["arm"]
+    );
     let (questions, gone) = goes_on(&mut browser, start, 30.0);
     let times: Vec<u64> = questions.iter().map(|(at, _)| *at).collect();
     assert_eq!(times, [12, 12, 42, 42, 132, 132]);
@@ -132,7 +145,7 @@ fn what_is_not_heard_of_is_asked_for_and_gone_in_the_end() {
     assert_eq!((asked, gone), (expected.to_vec(), vec![]));
     for part in [Part::Srv(HOST), Part::Txt(&[b"TYPE=x"])] {
         let now = start + seconds(80.0);
-        browser.handle_packet(now, &answer("arm", &[part], 120), 0.0);
+        browser.handle_packet(now, FROM, &answer("arm", &[part], 120), 0.0);
     }
     let (questions, gone) = goes_on(&mut browser, start, 130.0);
     let of_leg = questions.iter().filter(|(_, what)| what == "leg SRV");
@@ -148,7 +161,7 @@ fn hosts_ask_at_different_times_and_for_many_at_once() {
     for number in 0..30 {
         let now = start + seconds(f64::from(number) * 0.1);
         let label = format!("agent {number}");
-        first.handle_packet(now, &announced(&label, b"TYPE=x", 120), 0.0);
+        first.handle_packet(now, FROM, &announced(&label, b"TYPE=x", 120), 0.0);
     }
     let (questions, _) = goes_on(&mut first, start, 75.0);
     let times: std::collections::HashSet<u64> = questions.iter().map(|(at, _)| *at).collect();
@@ -191,13 +204,13 @@ fn goodbyes_count_after_a_second_unless_they_are_taken_back() {
     let start = Instant::now();
     let mut browser = browser(start, &["arm", "leg", "eye"]);
     for label in ["arm", "leg"] {
-        browser.handle_packet(start, &announced(label, b"TYPE=x", 0), 0.0);
+        browser.handle_packet(start, FROM, &announced(label, b"TYPE=x", 0), 0.0);
     }
     // Somebody else has had that label, and leaves.
     let parts = [Part::Ptr, Part::Srv("other.local"), Part::Txt(&[b"TYPE=y"])];
-    browser.handle_packet(start, &answer("eye", &parts, 0), 0.0);
+    browser.handle_packet(start, FROM, &answer("eye", &parts, 0), 0.0);
     let back = start + seconds(0.5);
-    let heard = browser.handle_packet(back, &announced("leg", b"TYPE=x", 120), 0.0);
+    let heard = browser.handle_packet(back, FROM, &announced("leg", b"TYPE=x", 120), 0.0);
     assert_eq!(heard, Heard::default());
     let (_, gone) = goes_on(&mut browser, start, 5.0);
     assert_eq!(gone, [10]);
@@ -213,7 +226,7 @@ fn who_is_doubted_answers_or_is_gone() {
     let (questions, _) = goes_on(&mut browser, start, 0.5);
     assert_eq!(questions.len(), 4, "{questions:?}");
     let now = start + seconds(0.5);
-    browser.handle_packet(now, &answer("leg", &[Part::Srv(HOST)], 120), 0.0);
+    browser.handle_packet(now, FROM, &answer("leg", &[Part::Srv(HOST)], 120), 0.0);
     let (questions, gone) = goes_on(&mut browser, start, 5.0);
     let mut again = questions.iter().map(|(at, what)| (*at, what.as_str()));
     assert_eq!(again.next(), Some((11, "arm SRV")));
@@ -242,7 +255,7 @@ fn everything_is_asked_for_ever_more_rarely_by_one_of_many() {
             for packet in packets {
                 times[asking].push((next - start).as_secs());
                 for host in &mut hosts {
-                    host.handle_packet(next, &packet, 0.0);
+                    host.handle_packet(next, FROM, &packet, 0.0);
                 }
             }
         }
@@ -265,10 +278,10 @@ fn everything_is_asked_for_ever_more_rarely_by_one_of_many() {
     let mut host = Browser::new(start, OWN, 0.0);
     host.handle_timeout(start + seconds(0.2), 0.0);
     let before = host.poll_timeout();
-    host.handle_packet(start + seconds(1.1), knows_more, 0.0);
+    host.handle_packet(start + seconds(1.1), FROM, knows_more, 0.0);
     assert_eq!(host.poll_timeout(), before);
     let question = &packet::question_for_all(&[])[0];
-    host.handle_packet(start + seconds(1.1), question, 0.0);
+    host.handle_packet(start + seconds(1.1), FROM, question, 0.0);
     assert!(host.poll_timeout() > before);
 }
 
@@ -312,18 +325,24 @@ fn peers_are_known_answers_before_others() {
     assert!(known.contains(&Some(labels[0])) && known.contains(&Some(labels[1])));
 }
 
+/// The address of one of eight hosts.
+fn one_of_many(number: usize) -> IpAddr {
+    let last = u8::try_from(number % 8).unwrap();
+    Ipv4Addr::new(198, 51, 100, last).into()
+}
+
 #[test]
 fn what_is_remembered_is_bounded() {
     let now = Instant::now();
     let mut browser = Browser::new(now, OWN, 0.0);
     for number in 0..MAX_UNKNOWN + 10 {
         let introduced = answer(&format!("unknown {number}"), &[Part::Ptr], 120);
-        let heard = browser.handle_packet(now, &introduced, 1.0);
+        let heard = browser.handle_packet(now, one_of_many(number), &introduced, 1.0);
         assert_eq!(heard.refused, u64::from(number >= MAX_UNKNOWN));
     }
     assert_eq!(browser.unknown, MAX_UNKNOWN);
     // They are not in the way of who says all at once.
-    let heard = browser.handle_packet(now, &announced("arm", b"TYPE=x", 10), 0.0);
+    let heard = browser.handle_packet(now, FROM, &announced("arm", b"TYPE=x", 10), 0.0);
     assert_eq!((names(&heard), heard.refused), (vec!["arm"], 0));
     goes_on(&mut browser, now, 20.0);
     assert_eq!((browser.records.len(), browser.unknown), (0, 0));
@@ -335,7 +354,7 @@ fn what_is_remembered_is_bounded() {
         let strings = if number < long + 5 { &strings[..] } else { &[] };
         let parts = [Part::Ptr, Part::Srv(HOST), Part::Txt(strings)];
         let label = format!("agent {number}");
-        browser.handle_packet(now, &answer(&label, &parts, 120), 0.0);
+        browser.handle_packet(now, one_of_many(number), &answer(&label, &parts, 120), 0.0);
         assert!(browser.bytes <= MdnsDirectory::MAX_BYTES);
     }
     assert_eq!(browser.records.len(), MdnsDirectory::MAX_RECORDS);
@@ -345,6 +364,40 @@ fn what_is_remembered_is_bounded() {
         (browser.records.len(), browser.unknown, browser.bytes),
         (0, 0, 0)
     );
+    assert!(browser.shares.is_empty());
+}
+
+#[test]
+fn one_source_cannot_fill_the_table() {
+    let now = Instant::now();
+    let mut browser = Browser::new(now, OWN, 0.0);
+    let others = one_of_many(1);
+    for number in 0..MAX_SHARE_UNKNOWN + 10 {
+        let introduced = answer(&format!("unknown {number}"), &[Part::Ptr], 120);
+        browser.handle_packet(now, FROM, &introduced, 1.0);
+    }
+    assert_eq!(browser.unknown, MAX_SHARE_UNKNOWN);
+    browser.handle_packet(now, others, &answer("late", &[Part::Ptr], 120), 1.0);
+    assert_eq!(browser.unknown, MAX_SHARE_UNKNOWN + 1);
+    goes_on(&mut browser, now, 20.0);
+
+    let long = [b'x'; 255];
+    let long: Vec<&[u8]> = vec![&long; 33];
+    for strings in [&long[..], &[b"TYPE=x"]] {
+        let mut browser = Browser::new(now, OWN, 0.0);
+        let mut refused = 0;
+        let parts = [Part::Ptr, Part::Srv(HOST), Part::Txt(strings)];
+        for number in 0..MdnsDirectory::MAX_RECORDS {
+            let packet = answer(&format!("agent {number}"), &parts, 120);
+            refused += browser.handle_packet(now, FROM, &packet, 0.0).refused;
+        }
+        assert!(refused > 0);
+        assert!(browser.records.len() <= MAX_SHARE && browser.bytes <= MAX_SHARE_BYTES);
+        let heard = browser.handle_packet(now, others, &answer("arm", &parts, 120), 0.0);
+        assert_eq!(names(&heard), ["arm"]);
+        goes_on(&mut browser, now, 200.0);
+        assert!(browser.shares.is_empty());
+    }
 }
 
 proptest! {
@@ -357,7 +410,7 @@ proptest! {
         if let Some(header) = packet.first_chunk_mut::<12>() {
             *header = [0, 0, 0x84, 0, 0, 0, 0, answers, 0, 0, 0, 0];
         }
-        browser.handle_packet(Instant::now(), &packet, 0.5);
+        browser.handle_packet(Instant::now(), FROM, &packet, 0.5);
     }
 
     #[test]
@@ -367,7 +420,7 @@ proptest! {
             if let Some(broken) = packet.get_mut(at) {
                 *broken = byte;
             }
-            browser.handle_packet(Instant::now(), &packet, 0.5);
+            browser.handle_packet(Instant::now(), FROM, &packet, 0.5);
             prop_assert!(browser.unknown <= browser.records.len());
         }
     }

@@ -1,0 +1,155 @@
+//! Text from outside on its way to a terminal or a log.
+//!
+//! Names, contents and reasons come from peers and files. A control character can move the cursor
+//! of a terminal or draw a line that looks like the program's own, and a bidirectional character
+//! changes the order in which a line is read. [`escape`] makes them visible.
+//!
+//! What must not live here: what a format such as XML or Mermaid has to escape besides.
+
+use std::borrow::Cow;
+use std::fmt::Write as _;
+
+/// Returns the text with each [unprintable](is_unprintable) character written as `\u{…}` in
+/// hexadecimal digits: `\u{1b}`.
+///
+/// A `\` that stands before `u{` in the text is written `\u{5c}`. So two texts never look the same,
+/// and every other text stays as it is. The result is one line.
+#[must_use]
+pub fn escape(text: &str) -> Cow<'_, str> {
+    let Some(first) = first_to_escape(text) else {
+        return Cow::Borrowed(text);
+    };
+    let (plain, mut rest) = text.split_at(first);
+    let mut out = String::with_capacity(text.len() + 16);
+    out.push_str(plain);
+    while let Some(c) = rest.chars().next() {
+        if is_escaped(c, rest) {
+            // Writing to a string cannot fail.
+            let _ = write!(out, "\\u{{{:x}}}", u32::from(c));
+        } else {
+            out.push(c);
+        }
+        rest = rest.get(c.len_utf8()..).unwrap_or_default();
+    }
+    Cow::Owned(out)
+}
+
+/// Whether a terminal, or a reader, may take a text with this character for something else: control
+/// characters (Cc), format characters, the bidirectional ones among them (Cf), and the separators
+/// of lines and paragraphs (Zl, Zp) of Unicode 17.
+#[must_use]
+pub fn is_unprintable(c: char) -> bool {
+    match c {
+        ' '..='~' => false,
+        '\0'..='\u{9f}' => true,
+        _ => matches!(
+            c,
+            '\u{ad}'
+                | '\u{600}'..='\u{605}'
+                | '\u{61c}'
+                | '\u{6dd}'
+                | '\u{70f}'
+                | '\u{890}'..='\u{891}'
+                | '\u{8e2}'
+                | '\u{180e}'
+                | '\u{200b}'..='\u{200f}'
+                | '\u{2028}'..='\u{202e}'
+                | '\u{2060}'..='\u{2064}'
+                | '\u{2066}'..='\u{206f}'
+                | '\u{feff}'
+                | '\u{fff9}'..='\u{fffb}'
+                | '\u{110bd}'
+                | '\u{110cd}'
+                | '\u{13430}'..='\u{1343f}'
+                | '\u{1bca0}'..='\u{1bca3}'
+                | '\u{1d173}'..='\u{1d17a}'
+                | '\u{e0001}'
+                | '\u{e0020}'..='\u{e007f}'
+        ),
+    }
+}
+
+fn first_to_escape(text: &str) -> Option<usize> {
+    let mut characters = text.char_indices();
+    let found = characters.find(|(at, c)| is_escaped(*c, text.get(*at..).unwrap_or_default()));
+    found.map(|(at, _)| at)
+}
+
+/// Whether `c`, at the beginning of `rest`, is written as an escape sequence.
+fn is_escaped(c: char, rest: &str) -> bool {
+    is_unprintable(c) || c == '\\' && rest.starts_with("\\u{")
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// The text that an escaped text stands for.
+    fn read(escaped: &str) -> String {
+        let mut out = String::new();
+        let mut rest = escaped;
+        while let Some(c) = rest.chars().next() {
+            let sequence = rest
+                .strip_prefix("\\u{")
+                .and_then(|rest| rest.split_once('}'));
+            rest = match sequence {
+                Some((digits, after)) => {
+                    let code = u32::from_str_radix(digits, 16).unwrap();
+                    out.push(char::from_u32(code).unwrap());
+                    after
+                }
+                None => {
+                    out.push(c);
+                    &rest[c.len_utf8()..]
+                }
+            };
+        }
+        out
+    }
+
+    #[test]
+    fn what_is_printable_stays_as_it_is() {
+        for text in [
+            "",
+            "arm.left",
+            r"C:\u",
+            r"arm_\d+",
+            "béla 机器人 👩",
+            "a\u{301}",
+        ] {
+            assert!(matches!(escape(text), Cow::Borrowed(same) if same == text));
+        }
+    }
+
+    #[test]
+    fn what_a_terminal_obeys_is_made_visible() {
+        assert_eq!(escape("a\u{1b}[2J\nb"), r"a\u{1b}[2J\u{a}b");
+        assert_eq!(escape("\u{9b}31m"), r"\u{9b}31m");
+        assert_eq!(escape("x\u{202e}y\u{2028}"), r"x\u{202e}y\u{2028}");
+        assert_eq!(escape(r"\u{1b}"), r"\u{5c}u{1b}");
+        assert_eq!(escape("\\\u{1b}"), r"\\u{1b}");
+    }
+
+    /// The categories of a second implementation, which follows the releases of Unicode.
+    #[test]
+    fn the_characters_are_those_of_unicode() {
+        let expected = regex::Regex::new(r"^[\p{Cc}\p{Cf}\p{Zl}\p{Zp}]$").unwrap();
+        let mut text = String::new();
+        for c in char::MIN..=char::MAX {
+            text.clear();
+            text.push(c);
+            assert_eq!(is_unprintable(c), expected.is_match(&text), "{c:?}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn a_result_stands_for_one_text(text in r"([a\\u{}1\x1b\n\u{9b}\u{202e}]|\PC){0,12}") {
+            let escaped = escape(&text);
+            prop_assert!(!escaped.chars().any(is_unprintable));
+            prop_assert_eq!(read(&escaped), text);
+        }
+    }
+}

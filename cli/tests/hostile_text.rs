@@ -1,0 +1,291 @@
+//! Every command that prints text from outside gets text that is made to deceive a terminal.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+
+mod common;
+
+use std::fs;
+use std::io::Write;
+use std::net::TcpStream;
+use std::thread;
+
+use common::{Host, Ran, Running};
+use fipa::{AgentId, Envelope, EnvelopeParams, Letter, Message, Performative};
+use fipa_acl::{AclRepresentation, is_unprintable};
+use serde_json::Value;
+
+/// The title of the window, a colour by a C1 control, the order of writing, the direction of a line,
+/// an invisible space, separators of lines, and a line like one of the program.
+const HOSTILE: &str = "x\u{1b}]0;t\u{7}\u{9b}31m\u{202e}\u{2066}\u{200b}\u{2028}\r\nerror: forged";
+/// What of it a word can have.
+const WORD: &str = "x\u{9b}31m\u{202e}\u{2066}\u{200b}";
+
+/// Nothing that a terminal obeys was printed, and no line of a peer's.
+#[track_caller]
+fn harmless(text: &str) {
+    let found = text.chars().find(|&c| c != '\n' && is_unprintable(c));
+    assert_eq!(found, None, "{text:?}");
+    let forged = text.lines().find(|line| line.starts_with("error: forged"));
+    assert_eq!(forged, None, "{text}");
+}
+
+#[track_caller]
+fn all_harmless(ran: &Ran) -> String {
+    let printed = String::from_utf8(ran.stdout.clone()).unwrap();
+    harmless(&printed);
+    harmless(&ran.stderr);
+    printed
+}
+
+/// The address at which the gateway takes letters of legacy peers.
+fn address(gateway: &Running) -> String {
+    let ready: Value = serde_json::from_str(&gateway.ready).unwrap();
+    let locations = ready["locations"].as_array().unwrap();
+    let mut locations = locations.iter().filter_map(Value::as_str);
+    let tcp = locations.find_map(|it| it.strip_prefix("tcp://")).unwrap();
+    tcp.split('#').next().unwrap().to_owned()
+}
+
+#[test]
+fn decode_prints_json_and_notes_without_unprintable_characters() {
+    let host = Host::new();
+    let message = Message::builder(WORD.parse().unwrap())
+        .sender(AgentId::new(HOSTILE).unwrap())
+        .receiver(AgentId::new("arm").unwrap())
+        .protocol(WORD)
+        .conversation_id(HOSTILE)
+        .content(HOSTILE)
+        .build()
+        .unwrap();
+    let bytes = message.to_payload().to_bytes();
+    for options in [
+        &[][..],
+        &["--compact"],
+        &["--explain"],
+        &["--explain", "--json"],
+    ] {
+        let ran = host.run_with_input(&[&["decode"], options].concat(), &bytes);
+        assert_eq!(ran.code, Some(0), "{ran:?}");
+        all_harmless(&ran);
+    }
+    let json = host.run_with_input(&["decode"], &bytes).done_json();
+    assert_eq!(json["message"]["content"], HOSTILE, "the text is the same");
+}
+
+#[test]
+fn messages_and_entries_are_shown_without_unprintable_characters() {
+    let host = Host::new();
+    let direction = "arm\u{202e}\u{200b}\u{2066}";
+    let mut arm = host.start(&[
+        "echo",
+        "arm",
+        "--type",
+        direction,
+        "--description",
+        direction,
+    ]);
+    let mut watching = host.start(&["watch", "--content=200", "--count", "6"]);
+    let mut drawing = host.start(&[
+        "watch",
+        "--sequence",
+        "--mermaid",
+        "all.mmd",
+        "--count",
+        "6",
+    ]);
+    let mut machine = host.start(&["watch", "--json", "--content=200", "--count", "6"]);
+    let mut following = host.start(&["agents", "--watch"]);
+
+    for arguments in [
+        &["agents"][..],
+        &["agents", "--json"],
+        &["routes"],
+        &["routes", "--json"],
+    ] {
+        let printed = all_harmless(&host.run(arguments));
+        assert!(printed.contains("arm"), "{printed}");
+    }
+    harmless(&following.line());
+
+    let hostile = |to: &'static str, from: &'static str| {
+        let mut all = vec!["send", "--to", to, "--from", from, "--performative", WORD];
+        all.extend([
+            "--content",
+            HOSTILE,
+            "--protocol",
+            WORD,
+            "--ontology",
+            HOSTILE,
+        ]);
+        all
+    };
+    // A reply with the same content.
+    let mut asked = hostile("arm", "rover");
+    asked.extend(["--wait", "--timeout", "30s", "--conversation-id", HOSTILE]);
+    let ran = host.run(&asked);
+    assert_eq!(ran.code, Some(0), "{ran:?}");
+    assert!(all_harmless(&ran).contains("reply: "));
+    harmless(&arm.line());
+    let ran = host.run(&[&asked[..], &["--json"]].concat());
+    all_harmless(&ran);
+    harmless(&arm.line());
+
+    // A failure message, after a message that is no reply. The echo does not answer a reply.
+    let mut asked = hostile("arm", "crane");
+    asked.extend([
+        "--in-reply-to",
+        "a",
+        "--reply-with",
+        "b",
+        "--conversation-id",
+        "c",
+    ]);
+    asked.extend(["--wait", "--timeout", "30s"]);
+    let told = thread::scope(|scope| {
+        let (host, asked) = (&host, &asked);
+        let waiting = scope.spawn(move || host.run(asked));
+        harmless(&arm.line());
+        assert_eq!(host.run(&hostile("crane", "other")).code, Some(0));
+        let failure = format!(
+            "((action (agent-identifier :name crane) (ACLMessage)) (MTS-error \
+             (agent-identifier :name \"{HOSTILE}\") (internal-error \"{HOSTILE}\")))"
+        );
+        let told = host.run(&[
+            "send",
+            "--to",
+            "crane",
+            "--from",
+            "other",
+            "--performative",
+            "failure",
+            "--in-reply-to",
+            "b",
+            "--conversation-id",
+            "c",
+            "--content",
+            &failure,
+        ]);
+        assert_eq!(told.code, Some(0), "{told:?}");
+        waiting.join().unwrap()
+    });
+    assert_eq!(told.code, Some(1), "{told:?}");
+    all_harmless(&told);
+    assert!(told.stderr.contains("warning: not a reply"), "{told:?}");
+    assert!(
+        told.stderr.contains("error: not delivered: x\\u{1b}]0;t"),
+        "{told:?}"
+    );
+
+    for watching in [&mut watching, &mut drawing, &mut machine] {
+        let (code, errors) = watching.end();
+        assert_eq!((code, errors.as_str()), (Some(0), ""));
+        let mut printed = watching.ready.clone();
+        while let Some(line) = watching.next_line() {
+            printed.push_str(&format!("\n{line}"));
+        }
+        harmless(&printed);
+        assert!(printed.contains("31m"), "{printed}");
+    }
+    harmless(&fs::read_to_string(host.path("all.mmd")).unwrap());
+
+    // Names that nobody could tell from others.
+    for arguments in [
+        &["echo", direction][..],
+        &["coalition", direction, "arm"],
+        &["coalition", "arms", direction],
+        &["send", "--to", "arm", "--from", HOSTILE],
+        &["up", "--set", "mts.name=rover\u{202e}"],
+    ] {
+        let ran = host.run(arguments);
+        assert_eq!(ran.code, Some(2), "{ran:?}");
+        all_harmless(&ran);
+    }
+    let ran = host.run(&["send", "--to", HOSTILE]);
+    assert_eq!(ran.code, Some(1), "{ran:?}");
+    all_harmless(&ran);
+}
+
+#[test]
+fn the_gateway_logs_letters_of_legacy_peers_without_unprintable_characters() {
+    let host = Host::new();
+    let mut gateway = host.start(&["up", "--json", "-vv"]);
+    let arm = AgentId::new("arm\u{202e}").unwrap();
+    let message = Message::builder(Performative::Request)
+        .sender(AgentId::new(HOSTILE).unwrap())
+        .receiver(arm.clone())
+        .content(HOSTILE)
+        .build()
+        .unwrap();
+    let envelope = Envelope {
+        base: EnvelopeParams {
+            to: vec![arm],
+            from: message.sender().cloned(),
+            acl_representation: Some(AclRepresentation::BitEfficient),
+            date: Some("20261121T120000000Z".parse().unwrap()),
+            ..EnvelopeParams::default()
+        },
+        extensions: Vec::new(),
+    };
+    let letter = Letter::new(envelope.encode_standard().unwrap(), message.to_payload());
+    let mut stream = TcpStream::connect(address(&gateway)).unwrap();
+    stream.write_all(&letter.to_bytes()).unwrap();
+    drop(stream);
+    gateway.tells(&["nobody to send a failure message to"]);
+    let (_, told) = gateway.signal("-INT");
+    harmless(&told);
+    assert!(told.contains("31m"), "{told}");
+}
+
+#[test]
+fn protocol_files_are_shown_without_unprintable_characters() {
+    let host = Host::new();
+    let name = "p&#x9b;31m&#x202e;&#10;error: forged";
+    let scxml = format!(
+        "<scxml xmlns=\"http://www.w3.org/2005/07/scxml\" id=\"{name}\" initial=\"a&#x9b;\">\
+         <state id=\"a&#x9b;\"><transition event=\"inform\" from=\"i\" to=\"r\" target=\"b&#x202e;\"/>\
+         </state><state id=\"b&#x202e;\" final=\"yes\"/></scxml>"
+    );
+    fs::write(host.path("p.scxml"), scxml).unwrap();
+    let file = host.path("p.scxml").display().to_string();
+    for arguments in [
+        &["protocol", "check", &file][..],
+        &["protocol", "check", "--json", &file],
+        &["protocol", "show", &file],
+        &["protocol", "show", "--json", &file],
+        &["protocol", "draw", &file],
+        &["protocol", "draw", "--format", "mermaid", &file],
+        &[
+            "protocol",
+            "list",
+            "--set",
+            "monitor.protocols=[\"p.scxml\"]",
+        ],
+        &["protocol", "show", "nothing\u{9b}/"],
+    ] {
+        all_harmless(&host.run(arguments));
+    }
+}
+
+#[test]
+fn configuration_and_doctor_are_shown_without_unprintable_characters() {
+    let host = Host::new();
+    fs::write(
+        host.path("c\u{9b}.toml"),
+        "[mts]\n\"a\u{202e}\u{9b}\" = 1\n",
+    )
+    .unwrap();
+    let keys = "security.keys=/nowhere/\u{9b}\u{202e}";
+    for arguments in [
+        &["config", "check", "--config", "c\u{9b}.toml"][..],
+        &["config", "show", "--set", keys],
+        &["config", "show", "--json", "--set", keys],
+        &["doctor", "--set", keys],
+        &["doctor", "--json", "--set", keys],
+        &["up", "--set", keys],
+        &["keys", "list", "--dir", "/nowhere/\u{9b}\u{202e}"],
+        &["keys", "trust", "/nowhere/\u{9b}\u{202e}"],
+    ] {
+        let ran = host.run(arguments);
+        all_harmless(&ran);
+    }
+}
