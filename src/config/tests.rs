@@ -359,7 +359,7 @@ fn no_file_name_breaks_what_is_shown() {
 prop_compose! {
     fn configs()(
         domain in "[A-Za-z0-9_-]{1,32}",
-        name in "\\PC{1,40}",
+        name in names(),
         transports in kinds(),
         deadline in 1..=3_600_000_000_000_u64,
         queue in 1..=65_536_usize,
@@ -371,7 +371,7 @@ prop_compose! {
         ports in prop::collection::btree_set(1_u16.., 0..4),
         mdns: bool,
         interfaces in prop::collection::btree_set("[a-z]{1,9}[0-9]", 0..4),
-        peers in prop::collection::btree_map("[^\\p{Cc}]{1,20}", 1_u16.., 0..4),
+        peers in prop::collection::btree_map(names(), 1_u16.., 0..4),
         check in prop::sample::select(Check::ALL.to_vec()),
         answer: bool,
     ) -> Config {
@@ -409,6 +409,12 @@ prop_compose! {
         config.monitor.answer = answer;
         config
     }
+}
+
+/// Names that agents and gateways can have.
+fn names() -> impl Strategy<Value = String> {
+    let is_name = |name: &String| fipa_sds::check_name(name).is_ok();
+    "\\PC{1,20}".prop_filter("a name", is_name)
 }
 
 fn kinds() -> impl Strategy<Value = Vec<Kind>> {
