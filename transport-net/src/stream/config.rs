@@ -4,7 +4,7 @@
 use fipa_transport::Principal;
 use std::time::Duration;
 
-use super::source::Home;
+use super::source::{Account, Home};
 use crate::Identity;
 #[cfg(feature = "ip")]
 use crate::ration::{Rates, is_one_peer};
@@ -63,6 +63,20 @@ impl StreamConfig {
         }
     }
 
+    /// How many introduced connections one account may have at a time. No account has more than half
+    /// of all places, so none stops the listener.
+    pub(crate) fn places_of(&self, account: &Account) -> usize {
+        let half = (self.limits.max_connections / 2).max(1);
+        let is_one_peer = match account {
+            Account::Unproved(home) => self.limits_peer_at(*home),
+            Account::Certificate(_) => true,
+        };
+        match is_one_peer {
+            true => self.limits.max_per_address.min(half),
+            false => half,
+        }
+    }
+
     /// Whether letters may go to an old peer at this address, which cannot prove anything.
     #[cfg(feature = "ip")]
     pub(crate) fn gives_old_peers_at(&self, ip: std::net::IpAddr) -> bool {
@@ -81,7 +95,9 @@ impl StreamConfig {
 pub struct Limits {
     /// Largest letter sent or taken, in bytes. Default 64 MiB.
     pub max_letter: usize,
-    /// Most connections whose peer has introduced itself, or that this side opened. Default 256.
+    /// Maximum number of connections whose peer has introduced itself, or that this side opened.
+    /// Default 256. The peers of one source have at most half of them: one certificate, one address
+    /// (with IPv6, one network of 64 bits), all loopback addresses together, or one process.
     pub max_connections: usize,
     /// Maximum number of accepted connections that have not introduced themselves: those whose
     /// handshake has begun and those that have been silent for 250 ms. One more pushes out the oldest
@@ -96,12 +112,13 @@ pub struct Limits {
     pub max_unread_per_address: usize,
     /// The same for all addresses together. Default 1024.
     pub max_unread: usize,
-    /// Most connections that the peers at one address have opened and introduced themselves on.
-    /// Default 64. This and the next two are not for loopback addresses, unless peers there have to
-    /// prove who they are, too.
+    /// Maximum number of connections that the peers with one certificate, or the peers at one address
+    /// that have proved nothing, have opened and introduced themselves on. Default 64. It does not
+    /// apply to loopback addresses, unless peers there have to prove who they are, too.
     pub max_per_address: usize,
     /// Letters a second that are taken from one address, as many of which may come at once; what is
-    /// more is read later. 0: any number. Default 20,000.
+    /// more is read later. 0: any number. Default 20,000. This and the next are not for loopback
+    /// addresses either.
     pub peer_letters: u64,
     /// The same of bytes. Default 256 MiB.
     pub peer_bytes: u64,

@@ -493,8 +493,7 @@ impl Running {
                     (connection.peer().cloned(), connection.proved_principal())
                 };
                 if let Some(peer) = peer {
-                    let mut hop = self.endpoint.enter(&self.link, &peer, from).await?;
-                    hop.principal = proved.unwrap_or(hop.principal);
+                    let hop = self.endpoint.enter(&self.link, &peer, proved, from).await?;
                     self.peer = Some(Introduction {
                         name: peer.identity.name.into(),
                         hop,

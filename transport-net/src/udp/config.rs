@@ -1,10 +1,11 @@
 //! What the owner of a UDP endpoint chooses.
 
+use std::net::IpAddr;
 use std::time::Duration;
 
 use super::packet::{BASE, LARGEST};
 use crate::Identity;
-use crate::ration::Rates;
+use crate::ration::{Rates, is_one_peer};
 
 /// Configuration of a [`UdpTransport`](crate::UdpTransport).
 #[derive(Debug, Clone)]
@@ -28,10 +29,11 @@ pub struct UdpLimits {
     /// [`UdpLimits::LARGEST`]. What the path to a peer carries counts as well; it begins as
     /// `BASE` and is found out when a letter needs more. Default `LARGEST`.
     pub max_datagram: usize,
-    /// Most connections. Default 256.
+    /// Maximum number of connections. Default 256. The peers at one address (with IPv6, in one network
+    /// of 64 bits), and those at all loopback addresses together, open at most half of them.
     pub max_connections: usize,
-    /// Most connections that the peers at one address open. Default 64. This and the next two are not
-    /// for loopback addresses.
+    /// Maximum number of connections that the peers at one address open. Default 64. This and the next
+    /// two are not for loopback addresses.
     pub max_per_address: usize,
     /// Letters a second that are taken from one address, as many of which may come at once; what is
     /// more is taken when the peer sends it again. 0: any number. Default 20,000.
@@ -57,6 +59,16 @@ impl UdpLimits {
     pub const BASE: usize = BASE;
     /// Largest datagram there is: 65,487 bytes.
     pub const LARGEST: usize = LARGEST;
+
+    /// How many connections the peers at this address may open. No address, and not all of loopback
+    /// together, has more than half of all places.
+    pub(super) fn places_of(&self, home: IpAddr) -> usize {
+        let half = (self.max_connections / 2).max(1);
+        match is_one_peer(home) {
+            true => self.max_per_address.min(half),
+            false => half,
+        }
+    }
 
     pub(super) fn rates(&self) -> Rates {
         Rates {

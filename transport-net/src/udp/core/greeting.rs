@@ -11,7 +11,7 @@ use super::{Core, Inbound, MAX_OUTBOX};
 use crate::address;
 use crate::end::End;
 use crate::hello::Hello;
-use crate::ration::{is_one_peer, whose};
+use crate::ration::whose;
 
 impl Core {
     /// A stranger says hello.
@@ -59,7 +59,7 @@ impl Core {
         }
         let home = whose(from.ip());
         let same_address = self.greeted.keys().filter(|(a, _)| whose(a.ip()) == home);
-        let greedy = is_one_peer(home) && same_address.count() >= self.limits.max_per_address;
+        let greedy = same_address.count() >= self.limits.places_of(home);
         if greedy || self.connections.len() >= self.limits.max_connections {
             self.counters.refused_crowd += 1;
             self.reply(path, packet::refused(initiator));
