@@ -8,6 +8,7 @@ mod common;
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, TcpStream};
+use std::thread::JoinHandle;
 use std::time::Duration;
 
 use common::{Party, accepted, config, parcel, rogue_hello, until, written};
@@ -378,4 +379,74 @@ fn memory_for_announced_content_is_bounded_and_nobody_else_notices() {
     // Who leaves gives back what it had.
     drop(rogues);
     until("no place", || (party.lent().0 == 0).then_some(()));
+}
+
+/// A peer that says hello, announces a letter of so many bytes, sends half of it, and then as much at a
+/// time as keeps other letters from being called slow. Returns whether it was shut out.
+fn sends_half(party: &Party, incarnation: u64, len: usize, at_a_time: usize) -> JoinHandle<bool> {
+    let mut stream = connect(party);
+    std::thread::spawn(move || {
+        let letter = frame(1, &parcel(1, vec![0; len]));
+        let mut begun = hello(incarnation);
+        begun.extend(&letter[..letter.len() / 2]);
+        let mut rest = letter[letter.len() / 2..].chunks(at_a_time);
+        let mut open = stream.write_all(&begun).is_ok();
+        while let Some(piece) = rest.next().filter(|_| open) {
+            std::thread::sleep(Duration::from_millis(50));
+            open = stream.write_all(piece).is_ok();
+        }
+        !open
+    })
+}
+
+#[test]
+fn half_letters_take_no_more_memory_than_the_budget_and_stop_nobody() {
+    const EACH: usize = 1 << 20;
+    let mut small = config(&["127.0.0.1:0"]);
+    small.limits.max_arriving = usize::MAX;
+    small.limits.max_incoming = 4 * EACH;
+    // Loopback has twice as much.
+    small.limits.max_incoming_per_source = EACH + EACH / 4;
+    small.limits.stall_timeout = Duration::from_millis(150);
+    // All of them together would have 32 MiB.
+    let party = Party::lending(small);
+    let rogues: Vec<JoinHandle<bool>> = (1..=32)
+        .map(|n| sends_half(&party, n, EACH, 5000))
+        .collect();
+    counted(&party, |c| c.connections, 32);
+    until("two letters", || (party.lent().0 == 2 * EACH).then_some(()));
+    let honest = Party::new();
+    for attempt in 1..=3 {
+        let sent = parcel(attempt, vec![attempt as u8; EACH]);
+        honest.send(attempt, party.location(), sent).unwrap();
+    }
+    for attempt in 1..=3 {
+        assert_eq!(honest.conclusion(attempt), accepted());
+    }
+    assert_eq!(honest.transport.counters().dialled, 1);
+    assert!(party.lent().1 <= 2 * EACH, "{:?}", party.lent());
+    let shut_out = rogues.into_iter().map(|rogue| rogue.join().unwrap());
+    assert!(shut_out.filter(|out| *out).count() >= 2);
+}
+
+/// Its signs of life are not read meanwhile, and it hears that this side lives.
+#[test]
+fn a_connection_that_is_not_read_for_lack_of_memory_stays_open() {
+    let lively = || {
+        let mut config = config(&["127.0.0.1:0"]);
+        config.limits.keep_alive = Duration::from_millis(200);
+        config
+    };
+    let mut small = lively();
+    small.limits.max_incoming = 1 << 20;
+    small.limits.stall_timeout = Duration::from_millis(1500);
+    let party = Party::lending(small);
+    let rogue = sends_half(&party, 77, 1 << 20, 500);
+    until("its letter", || (party.lent().0 == 1 << 20).then_some(()));
+    let honest = Party::with(lively());
+    let sent = parcel(1, vec![1; 1 << 20]);
+    honest.send(1, party.location(), sent).unwrap();
+    assert_eq!(honest.conclusion(1), accepted());
+    assert_eq!(party.transport.counters().refused_nonsense, 1);
+    assert!(rogue.join().unwrap());
 }

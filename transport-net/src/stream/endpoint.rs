@@ -31,7 +31,7 @@ use super::config::{Limits, StreamConfig};
 use super::connection::{Connection, Role, SendError, letter_len};
 use super::counters::{Tally, count};
 use super::link::{Link, MAX_LINKS, of_ticket};
-use super::place::Rooms;
+use super::place::{Meter, Rooms};
 use super::source::{Account, Home, Source};
 #[cfg(feature = "ip")]
 use crate::address::{self, Listening};
@@ -57,7 +57,7 @@ pub(crate) struct Endpoint {
     /// Letters of legacy peers, in both directions.
     #[cfg(feature = "ip")]
     pub(crate) legacy: Legacy,
-    /// What is taken for content that is arriving.
+    /// What is taken for letters that are arriving.
     pub(crate) rooms: Rooms,
     /// What peers may still send.
     #[cfg(feature = "ip")]
@@ -182,6 +182,12 @@ impl Endpoint {
             #[cfg(feature = "ip")]
             Home::Address(ip) => self.rations.of(ip, self.limits().rates(), Instant::now()),
         }
+    }
+
+    /// Takes memory for arriving letters of this account.
+    pub(crate) fn meter(&self, account: &Account) -> Meter {
+        let budget = self.config.budget_of(account);
+        self.rooms.meter(account.clone(), budget)
     }
 
     pub(crate) fn tally(&self) -> &Tally {

@@ -26,7 +26,7 @@ use crate::stream::endpoint::{Endpoint, Stranger};
 use crate::stream::frame::{FrameReader, MAGIC};
 use crate::stream::link::Running;
 use crate::stream::proof::Proof;
-use crate::stream::source::{Home, Source};
+use crate::stream::source::{Account, Home, Source};
 use crate::stream::wire;
 
 /// Connections that the system holds until they are accepted: the letters of a legacy peer wait there
@@ -345,16 +345,17 @@ async fn receive_letter(
     let Some(mut stream) = Arc::into_inner(stream) else {
         return Ok(());
     };
-    let letter = unframed::read(endpoint, &mut stream, || place.stalled()).await?;
+    let account = Account::of(Source::Address(from), None);
+    let read = unframed::read(endpoint, &place, &account, &mut stream).await?;
     drop(stream);
     place.is_first().await;
     if let Some(ration) = endpoint.ration(Home::Address(from.ip()))
-        && let Some(until) = ration.spend(1, letter.len(), Instant::now())
+        && let Some(until) = ration.spend(1, read.letter.len(), Instant::now())
     {
         count(&endpoint.tally().held_back);
         sleep_until(until.into()).await;
     }
-    unframed::hand_on(endpoint, letter, from.ip());
+    unframed::hand_on(endpoint, read.letter, from.ip());
     Ok(())
 }
 

@@ -6,6 +6,7 @@ use std::time::Duration;
 use super::packet::{BASE, LARGEST};
 use crate::Identity;
 use crate::ration::{Rates, is_one_peer};
+use crate::stream::place::Budget;
 
 /// Configuration of a [`UdpTransport`](crate::UdpTransport).
 #[derive(Debug, Clone)]
@@ -21,8 +22,8 @@ pub struct UdpConfig {
     pub limits: UdpLimits,
 }
 
-/// Bounds of a UDP endpoint. Memory is at most about `max_connections` × `max_queued_bytes` in
-/// each direction.
+/// Bounds of a UDP endpoint. Memory is at most about `max_incoming` for what arrives, and
+/// `max_connections` × `max_queued_bytes` for what is sent.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct UdpLimits {
     /// Largest datagram sent, in bytes without the headers of IP and UDP: [`UdpLimits::BASE`] to
@@ -45,6 +46,12 @@ pub struct UdpLimits {
     /// Most bytes per connection and direction that wait to be sent, or for an earlier parcel that
     /// was lost; a single letter is always let in. Default 4 MiB.
     pub max_queued_bytes: usize,
+    /// Maximum number of bytes of parcels that wait for an earlier one, on all connections together;
+    /// a parcel for which there is no room is taken when the peer sends it again. Default 64 MiB.
+    pub max_incoming: usize,
+    /// The same for one source: one address (with IPv6, one network of 64 bits), and with twice as much
+    /// all loopback addresses together. Default 16 MiB.
+    pub max_incoming_per_source: usize,
     /// How long opening a connection may take. Default 2 s.
     pub connect_timeout: Duration,
     /// After this long without a packet from a peer that has something to acknowledge or to
@@ -70,6 +77,18 @@ impl UdpLimits {
         }
     }
 
+    /// How many bytes of the peers at this address may wait for earlier ones, and of all.
+    pub(super) fn budget_of(&self, home: IpAddr) -> Budget {
+        let each = self.max_incoming_per_source;
+        Budget {
+            total: self.max_incoming,
+            each: match is_one_peer(home) {
+                true => each,
+                false => each.saturating_mul(2),
+            },
+        }
+    }
+
     pub(super) fn rates(&self) -> Rates {
         Rates {
             letters: self.peer_letters,
@@ -88,6 +107,8 @@ impl Default for UdpLimits {
             peer_bytes: 256 << 20,
             max_in_flight: 1024,
             max_queued_bytes: 4 << 20,
+            max_incoming: 64 << 20,
+            max_incoming_per_source: 16 << 20,
             connect_timeout: Duration::from_secs(2),
             silence: Duration::from_secs(2),
             idle_close: Duration::from_secs(60),

@@ -74,7 +74,7 @@ impl Core {
         let name = peer.identity.name.as_str().into();
         let limits = self.limits.clone();
         let connection = Connection::accepted(limits, id, initiator, peer, path, now)
-            .rationed(self.ration(from.ip(), now));
+            .bounded(self.ration(from.ip(), now), self.meter(from.ip()));
         let number = self.insert(connection, None, Some((from, initiator)));
         self.greeted.insert((from, initiator), number);
         self.inbound.insert(inbound, (serial, number));
@@ -100,11 +100,13 @@ impl Core {
         };
         let hop = self.hop(&peer, path.remote);
         let ration = self.ration(path.remote.ip(), now);
+        let meter = self.meter(path.remote.ip());
         let mut greeted = None;
         self.of_dialling(to, path, |number, connection| {
             let name = peer.identity.name.as_str().into();
             connection.welcomed(path, acceptor, peer, now)?;
             connection.ration = ration;
+            connection.meter = Some(meter);
             greeted = Some((number, name));
             Ok(())
         });
