@@ -450,3 +450,36 @@ fn a_connection_that_is_not_read_for_lack_of_memory_stays_open() {
     assert_eq!(party.transport.counters().refused_nonsense, 1);
     assert!(rogue.join().unwrap());
 }
+
+#[test]
+fn the_address_of_a_third_party_in_a_hello_is_never_dialed() {
+    let third = std::net::TcpListener::bind("127.0.0.2:0").unwrap();
+    let party = Party::new();
+    let mut stream = connect(&party);
+    let listening = third.local_addr().unwrap();
+    let mut body = rogue_hello(77);
+    // In place of no addresses.
+    body.pop();
+    body.push(1);
+    let text = listening.to_string();
+    body.extend((text.len() as u16).to_le_bytes());
+    body.extend(text.as_bytes());
+    stream.write_all(&fipa_testbed::frame(1, 1, &body)).unwrap();
+    stream
+        .write_all(&frame(1, &parcel(1, "answer there")))
+        .unwrap();
+    let back = until("its letter", || {
+        let record = party.sink.record.lock();
+        Some(record.arrivals.first()?.1.location.clone())
+    });
+    let mut at = stream.local_addr().unwrap();
+    at.set_port(listening.port());
+    assert_eq!(back.address(), at.to_string());
+    drop(stream);
+    counted(&party, |c| c.connections, 0);
+    party.send(1, &back, parcel(1, "answer")).unwrap();
+    assert!(matches!(party.conclusion(1), Conclusion::NotSent(_)));
+    third.set_nonblocking(true).unwrap();
+    let dialed = third.accept().unwrap_err();
+    assert_eq!(dialed.kind(), std::io::ErrorKind::WouldBlock);
+}
