@@ -220,8 +220,8 @@ pub struct Security {
     /// `old_peers`: addresses of old peers, which cannot prove who they are; letters in their
     /// dialects are exchanged with them nevertheless. At most 64.
     pub old_peers: Vec<IpAddr>,
-    /// `peer_connections`: how many connections of each transport the peers at one address may open.
-    /// This and the next two go for other hosts, and for loopback addresses where those have to prove
+    /// `peer_connections`: how many connections of each transport the peers with one certificate, or the
+    /// peers at one address without keys, may open. This and the next two go for other hosts, and for loopback addresses where those have to prove
     /// who they are, too.
     pub peer_connections: usize,
     /// `peer_letters`: letters a second that each transport takes from one address, as many of which may

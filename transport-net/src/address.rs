@@ -255,35 +255,33 @@ fn usable(bound: SocketAddr, interfaces: &[Interface]) -> Vec<SocketAddr> {
     global
 }
 
-/// The address at which a connected peer can be reached again, from the addresses it says it
-/// listens on and the one its connection comes from.
+/// The address at which a connected peer can be reached again: the one that its connection comes
+/// from, with a port from the addresses that it says it listens on.
 ///
-/// The same machine may be known under addresses that lead to it from elsewhere only, so the one
-/// the connection was made with goes first: when it is listed, or when the peer listens on all of
-/// its addresses and may have got this one since it made the list. Then comes one that is no
-/// loopback address when the peer is not on loopback either. A link-local address is taken with the
-/// scope as this host sees it.
+/// Nothing else of these addresses is used: a peer may list those of third parties, which are never
+/// to be dialed because of that. The port is that of the same address when it is listed; else that of
+/// an unspecified address, when the peer listens on all of its addresses and may have got this one
+/// since it made the list; else that of the first other address, when the peer is known under another
+/// one (address translation). A loopback address says nothing about a connection from elsewhere.
 pub(crate) fn way_back(listening: &[String], from: SocketAddr) -> SocketAddr {
-    let (any, parsed): (Vec<SocketAddr>, Vec<SocketAddr>) = listening
+    let listening: Vec<SocketAddr> = listening
         .iter()
         .filter_map(|text| numeric_ignoring_scope(text))
         .filter(|address| address.port() != 0)
-        .partition(|address| address.ip().is_unspecified());
-    let with_port = |port| {
-        let mut address = from;
-        address.set_port(port);
-        address
-    };
-    let listed = parsed.iter().find(|address| address.ip() == from.ip());
-    let any = any.iter().find(|any| any.is_ipv4() == from.is_ipv4());
-    if let Some(same) = listed.or(any) {
-        return with_port(same.port());
-    }
-    parsed
-        .into_iter()
-        .filter(|address| !is_link_local(address.ip()))
-        .find(|address| from.ip().is_loopback() || !address.ip().is_loopback())
-        .unwrap_or(from)
+        .collect();
+    let first = |fits: &dyn Fn(IpAddr) -> bool| listening.iter().find(|it| fits(it.ip()));
+    let port = first(&|ip| ip == from.ip())
+        .or_else(|| first(&|ip| ip.is_unspecified() && ip.is_ipv4() == from.is_ipv4()))
+        .or_else(|| {
+            first(&|ip| {
+                let is_reachable = from.ip().is_loopback() || !ip.is_loopback();
+                is_reachable && !ip.is_unspecified() && !is_link_local(ip)
+            })
+        })
+        .map_or(from.port(), |address| address.port());
+    let mut back = from;
+    back.set_port(port);
+    back
 }
 
 /// The scope names an interface of another host: it must not be looked up here.
@@ -309,6 +307,7 @@ mod tests {
     use std::net::Ipv4Addr;
 
     use if_addrs::{IfAddr, Ifv4Addr};
+    use proptest::prelude::*;
 
     use super::*;
 
@@ -434,6 +433,25 @@ mod tests {
         assert_eq!(listening.texts(), ["10.0.0.1:7788"]);
     }
 
+    proptest! {
+        #[test]
+        fn the_way_back_leads_nowhere_but_to_the_peer(
+            listening in prop::collection::vec(
+                prop_oneof![
+                    any::<SocketAddr>().prop_map(|address| address.to_string()),
+                    any::<u16>().prop_map(|port| format!("0.0.0.0:{port}")),
+                    any::<u16>().prop_map(|port| format!("[fe80::1%eth0]:{port}")),
+                    ".{0,20}",
+                ],
+                0..6,
+            ),
+            from: SocketAddr,
+        ) {
+            let back = way_back(&listening, from);
+            prop_assert_eq!(back.ip(), from.ip());
+        }
+    }
+
     #[test]
     fn the_way_back_leads_to_where_the_peer_listens() {
         let back = |listening: &[&str], from: &str| {
@@ -442,10 +460,7 @@ mod tests {
         };
         let from = "10.0.0.2:40000";
         assert_eq!(back(&["192.168.0.2:7", "10.0.0.2:8"], from), "10.0.0.2:8");
-        assert_eq!(
-            back(&["127.0.0.1:7", "192.168.0.2:7"], from),
-            "192.168.0.2:7"
-        );
+        assert_eq!(back(&["127.0.0.1:6", "192.168.0.2:7"], from), "10.0.0.2:7");
         assert_eq!(back(&["127.0.0.1:7"], "127.0.0.1:40000"), "127.0.0.1:7");
         assert_eq!(back(&["127.0.0.1:7"], from), from);
         assert_eq!(back(&[], from), from);

@@ -4,7 +4,7 @@
 //! peer is an address here: it is what costs something to have many of. Sans-I/O but for the lock.
 
 use std::collections::HashMap;
-use std::net::IpAddr;
+use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -114,10 +114,12 @@ pub(crate) fn is_one_peer(ip: IpAddr) -> bool {
     !ip.to_canonical().is_loopback()
 }
 
-/// The address that stands for a peer: of IPv6, where everybody has many, the network of the host.
+/// The address that stands for a source: of IPv6, where every host has many addresses, the network of
+/// 64 bits; of loopback, where every user of this host has all addresses, one of them.
 pub(crate) fn whose(ip: IpAddr) -> IpAddr {
     match ip.to_canonical() {
-        IpAddr::V6(v6) if !v6.is_unicast_link_local() && !v6.is_loopback() => {
+        ip if ip.is_loopback() => IpAddr::V4(Ipv4Addr::LOCALHOST),
+        IpAddr::V6(v6) if !v6.is_unicast_link_local() => {
             let network = u128::from(v6) & !u128::from(u64::MAX);
             IpAddr::V6(network.into())
         }
@@ -156,6 +158,15 @@ mod tests {
         assert_eq!(whose("2001:db8::1"), whose("2001:db8::ffff:2"));
         assert_ne!(whose("2001:db8::1"), whose("2001:db8:0:1::1"));
         assert_ne!(whose("fe80::1"), whose("fe80::2"));
+    }
+
+    #[test]
+    fn all_loopback_addresses_are_one_source() {
+        let whose = |ip: &str| whose(ip.parse().unwrap());
+        for other in ["127.0.0.2", "127.255.255.254", "::1", "::ffff:127.0.0.3"] {
+            assert_eq!(whose(other), whose("127.0.0.1"), "{other}");
+        }
+        assert_ne!(whose("127.0.0.1"), whose("10.0.0.1"));
     }
 
     #[test]

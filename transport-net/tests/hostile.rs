@@ -7,7 +7,8 @@
 mod common;
 
 use std::io::{Read, Write};
-use std::net::{Shutdown, SocketAddr, TcpStream};
+use std::net::{Shutdown, TcpStream};
+use std::thread::JoinHandle;
 use std::time::Duration;
 
 use common::{Party, accepted, config, parcel, rogue_hello, until, written};
@@ -15,7 +16,6 @@ use fipa_acl::Envelope;
 use fipa_testbed::frame_header;
 use fipa_transport::{Conclusion, Kind, Location, Parcel, Transport as _, Verdict, WayFault};
 use fipa_transport_net::{Counters, Limits};
-use socket2::{Domain, Socket, Type};
 
 /// A letter as a fipa_services peer sent it.
 const TCP_LETTER: &[u8] = include_bytes!("data/tcp_letter.bin");
@@ -207,31 +207,12 @@ fn a_thousand_silent_connections_hold_few_descriptors_and_stop_nobody() {
 }
 
 #[test]
-fn who_knocks_often_pushes_out_nobody_else() {
-    let party = Party::new();
-    // Somebody at another address, with a slow link.
-    let slow = Socket::new(Domain::IPV4, Type::STREAM, None).unwrap();
-    let other: SocketAddr = "127.0.0.2:0".parse().unwrap();
-    slow.bind(&other.into()).unwrap();
-    let at: SocketAddr = party.location().address().parse().unwrap();
-    slow.connect(&at.into()).unwrap();
-    let mut slow = TcpStream::from(slow);
-    let mut said = hello(77);
-    said.extend(frame(1, &parcel(1, "hello")));
-    slow.write_all(&said[..10]).unwrap();
-    let max = Limits::default().max_strangers as u64;
-    let _crowd: Vec<TcpStream> = (0..2 * max).map(|_| connect(&party)).collect();
-    counted(&party, |c| c.refused_crowd, max + 1);
-    slow.write_all(&said[10..]).unwrap();
-    until("his letter", || (party.arrivals() == 1).then_some(()));
-}
-
-#[test]
 fn too_many_introduced_peers_are_refused_and_told() {
     let mut few = config(&["127.0.0.1:0"]);
-    few.limits.max_connections = 2;
+    few.limits.max_connections = 4;
     let party = Party::with(few);
-    let peers = [Party::new(), Party::new(), Party::new()];
+    // All of loopback together has half of the places.
+    let peers: Vec<Party> = (0..5).map(|_| Party::new()).collect();
     peers[0].assert_reaches(1, &party);
     peers[1].assert_reaches(1, &party);
     peers[2].send(1, party.location(), parcel(1, "x")).unwrap();
@@ -239,8 +220,11 @@ fn too_many_introduced_peers_are_refused_and_told() {
         Conclusion::NotSent(error) => assert_eq!(error.fault, WayFault::Refused, "{error}"),
         other => panic!("{other:?}"),
     }
+    // The others are for connections that this side opens, and for other hosts.
+    party.assert_reaches(1, &peers[2]);
+    party.assert_reaches(2, &peers[3]);
     let error = party
-        .send(1, peers[2].location(), parcel(1, "x"))
+        .send(3, peers[4].location(), parcel(1, "x"))
         .unwrap_err();
     assert_eq!(error.fault, WayFault::Congested, "{error}");
     peers[0].assert_reaches(2, &party);
@@ -395,4 +379,107 @@ fn memory_for_announced_content_is_bounded_and_nobody_else_notices() {
     // Who leaves gives back what it had.
     drop(rogues);
     until("no place", || (party.lent().0 == 0).then_some(()));
+}
+
+/// A peer that says hello, announces a letter of so many bytes, sends half of it, and then as much at a
+/// time as keeps other letters from being called slow. Returns whether it was shut out.
+fn sends_half(party: &Party, incarnation: u64, len: usize, at_a_time: usize) -> JoinHandle<bool> {
+    let mut stream = connect(party);
+    std::thread::spawn(move || {
+        let letter = frame(1, &parcel(1, vec![0; len]));
+        let mut begun = hello(incarnation);
+        begun.extend(&letter[..letter.len() / 2]);
+        let mut rest = letter[letter.len() / 2..].chunks(at_a_time);
+        let mut open = stream.write_all(&begun).is_ok();
+        while let Some(piece) = rest.next().filter(|_| open) {
+            std::thread::sleep(Duration::from_millis(50));
+            open = stream.write_all(piece).is_ok();
+        }
+        !open
+    })
+}
+
+#[test]
+fn half_letters_take_no_more_memory_than_the_budget_and_stop_nobody() {
+    const EACH: usize = 1 << 20;
+    let mut small = config(&["127.0.0.1:0"]);
+    small.limits.max_arriving = usize::MAX;
+    small.limits.max_incoming = 4 * EACH;
+    // Loopback has twice as much.
+    small.limits.max_incoming_per_source = EACH + EACH / 4;
+    small.limits.stall_timeout = Duration::from_millis(150);
+    // All of them together would have 32 MiB.
+    let party = Party::lending(small);
+    let rogues: Vec<JoinHandle<bool>> = (1..=32)
+        .map(|n| sends_half(&party, n, EACH, 5000))
+        .collect();
+    counted(&party, |c| c.connections, 32);
+    until("two letters", || (party.lent().0 == 2 * EACH).then_some(()));
+    let honest = Party::new();
+    for attempt in 1..=3 {
+        let sent = parcel(attempt, vec![attempt as u8; EACH]);
+        honest.send(attempt, party.location(), sent).unwrap();
+    }
+    for attempt in 1..=3 {
+        assert_eq!(honest.conclusion(attempt), accepted());
+    }
+    assert_eq!(honest.transport.counters().dialled, 1);
+    assert!(party.lent().1 <= 2 * EACH, "{:?}", party.lent());
+    let shut_out = rogues.into_iter().map(|rogue| rogue.join().unwrap());
+    assert!(shut_out.filter(|out| *out).count() >= 2);
+}
+
+/// Its signs of life are not read meanwhile, and it hears that this side lives.
+#[test]
+fn a_connection_that_is_not_read_for_lack_of_memory_stays_open() {
+    let lively = || {
+        let mut config = config(&["127.0.0.1:0"]);
+        config.limits.keep_alive = Duration::from_millis(200);
+        config
+    };
+    let mut small = lively();
+    small.limits.max_incoming = 1 << 20;
+    small.limits.stall_timeout = Duration::from_millis(1500);
+    let party = Party::lending(small);
+    let rogue = sends_half(&party, 77, 1 << 20, 500);
+    until("its letter", || (party.lent().0 == 1 << 20).then_some(()));
+    let honest = Party::with(lively());
+    let sent = parcel(1, vec![1; 1 << 20]);
+    honest.send(1, party.location(), sent).unwrap();
+    assert_eq!(honest.conclusion(1), accepted());
+    assert_eq!(party.transport.counters().refused_nonsense, 1);
+    assert!(rogue.join().unwrap());
+}
+
+#[test]
+fn the_address_of_a_third_party_in_a_hello_is_never_dialed() {
+    let third = std::net::TcpListener::bind("127.0.0.2:0").unwrap();
+    let party = Party::new();
+    let mut stream = connect(&party);
+    let listening = third.local_addr().unwrap();
+    let mut body = rogue_hello(77);
+    // In place of no addresses.
+    body.pop();
+    body.push(1);
+    let text = listening.to_string();
+    body.extend((text.len() as u16).to_le_bytes());
+    body.extend(text.as_bytes());
+    stream.write_all(&fipa_testbed::frame(1, 1, &body)).unwrap();
+    stream
+        .write_all(&frame(1, &parcel(1, "answer there")))
+        .unwrap();
+    let back = until("its letter", || {
+        let record = party.sink.record.lock();
+        Some(record.arrivals.first()?.1.location.clone())
+    });
+    let mut at = stream.local_addr().unwrap();
+    at.set_port(listening.port());
+    assert_eq!(back.address(), at.to_string());
+    drop(stream);
+    counted(&party, |c| c.connections, 0);
+    party.send(1, &back, parcel(1, "answer")).unwrap();
+    assert!(matches!(party.conclusion(1), Conclusion::NotSent(_)));
+    third.set_nonblocking(true).unwrap();
+    let dialed = third.accept().unwrap_err();
+    assert_eq!(dialed.kind(), std::io::ErrorKind::WouldBlock);
 }

@@ -25,6 +25,15 @@ const TCP_LETTER: &[u8] = include_bytes!("data/tcp_letter.bin");
 
 const HERE: [u8; 4] = [127, 0, 0, 1];
 
+/// Another source: all loopback addresses are one.
+const ELSEWHERE: [u8; 4] = [10, 99, 0, 1];
+
+/// Makes a host with both addresses.
+fn at_both_addresses() {
+    fipa_testbed::enter();
+    fipa_testbed::run("ip addr add 10.99.0.1/32 dev lo");
+}
+
 /// Records what arrives, and can be made to hold up the letters of 127.0.0.1: then those wait for
 /// the core, as on a busy machine.
 #[derive(Default)]
@@ -187,6 +196,16 @@ fn letters_of_any_length_arrive_in_the_order_of_their_connections() {
 /// The letters lie complete in the kernel's buffers, and their senders have long gone.
 #[test]
 fn letters_that_wait_for_a_busy_gateway_are_all_read_later() {
+    fipa_testbed::isolated(
+        "inside_letters_that_wait_for_a_busy_gateway_are_all_read_later",
+        &["ip"],
+    );
+}
+
+#[test]
+#[ignore = "is run by the other test in namespaces of its own"]
+fn inside_letters_that_wait_for_a_busy_gateway_are_all_read_later() {
+    at_both_addresses();
     let gateway = Gateway::new();
     gateway.sink.hold();
     for number in 0..500 {
@@ -194,12 +213,12 @@ fn letters_that_wait_for_a_busy_gateway_are_all_read_later() {
     }
     // Another address is not held up.
     for number in 0..100 {
-        gateway.send([127, 0, 0, 2], number);
+        gateway.send(ELSEWHERE, number);
     }
     until("the letters of the other address", || {
-        (gateway.sink.of([127, 0, 0, 2]).len() == 100).then_some(())
+        (gateway.sink.of(ELSEWHERE).len() == 100).then_some(())
     });
-    assert_eq!(gateway.sink.of([127, 0, 0, 2]), numbers(0..100));
+    assert_eq!(gateway.sink.of(ELSEWHERE), numbers(0..100));
     assert!(gateway.sink.of(HERE).is_empty());
     gateway.sink.release();
     until("the letters that waited", || {
@@ -211,6 +230,16 @@ fn letters_that_wait_for_a_busy_gateway_are_all_read_later() {
 
 #[test]
 fn beyond_the_bounds_the_newest_connection_is_reset_and_its_sender_sees_it() {
+    fipa_testbed::isolated(
+        "inside_beyond_the_bounds_the_newest_connection_is_reset_and_its_sender_sees_it",
+        &["ip"],
+    );
+}
+
+#[test]
+#[ignore = "is run by the other test in namespaces of its own"]
+fn inside_beyond_the_bounds_the_newest_connection_is_reset_and_its_sender_sees_it() {
+    at_both_addresses();
     let gateway = Gateway::new();
     gateway.sink.hold();
     let limits = Limits::default();
@@ -231,9 +260,9 @@ fn beyond_the_bounds_the_newest_connection_is_reset_and_its_sender_sees_it() {
             (gateway.refused_crowd() == number).then_some(())
         });
     }
-    gateway.send([127, 0, 0, 2], 1);
+    gateway.send(ELSEWHERE, 1);
     until("a letter of another address", || {
-        (gateway.sink.of([127, 0, 0, 2]) == [1]).then_some(())
+        (gateway.sink.of(ELSEWHERE) == [1]).then_some(())
     });
     gateway.sink.release();
     until("the letters that waited", || {

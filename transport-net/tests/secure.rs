@@ -8,7 +8,7 @@
 mod common;
 
 use std::io::{Read as _, Write as _};
-use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpStream};
+use std::net::{IpAddr, Ipv4Addr, TcpStream};
 use std::time::{Duration, Instant, SystemTime};
 
 use common::certificates::Host;
@@ -445,33 +445,52 @@ fn one_address_cannot_take_all_connections<T: Proving>() {
     assert_eq!(first.conclusion(2), accepted());
 }
 
-/// A connection from this address of this host.
-fn connect_from(ip: [u8; 4], to: &Party) -> TcpStream {
-    let socket = socket2::Socket::new(
-        socket2::Domain::IPV4,
-        socket2::Type::STREAM,
-        Some(socket2::Protocol::TCP),
-    )
-    .unwrap();
-    socket.bind(&SocketAddr::from((ip, 0)).into()).unwrap();
-    let there: SocketAddr = to.location().address().parse().unwrap();
-    socket.connect(&there.into()).unwrap();
-    socket.into()
-}
-
+/// Connections of a local user that never say anything, that say half a hello, that say hello, and
+/// that begin a letter of a legacy peer: more than there is room for.
 #[test]
-fn who_knocks_again_and_again_pushes_out_itself_and_nobody_else() {
-    let crex = Host::new(NAME, &[]);
-    let there = TcpTransport::limited(crex.security(&[]), |limits| limits.max_strangers = 8);
-    let mut quiet = connect_from([127, 0, 0, 2], &there);
-    let knocking: Vec<_> = (0..20)
-        .map(|_| connect_from([127, 0, 0, 3], &there))
-        .collect();
-    until("all that are too many have been pushed out", || {
-        (there.transport.counters().refused_crowd >= 16).then_some(())
+fn connections_of_a_local_user_keep_out_no_peer_with_keys() {
+    let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
+    let rules = Rules {
+        loopback: false,
+        ..Rules::default()
+    };
+    let security = Security::new(crex.credentials(&[&rover]), rules).unwrap();
+    let limits = Limits {
+        max_connections: 32,
+        max_strangers: 8,
+        max_reads_per_address: 8,
+        max_unread_per_address: 32,
+        ..config(&[]).limits
+    };
+    let there = Party::with(fipa_transport_net::TcpConfig {
+        security: Some(security),
+        limits: limits.clone(),
+        ..config(&["127.0.0.1:0"])
     });
-    quiet.set_nonblocking(true).unwrap();
-    let kept = quiet.read(&mut [0]).unwrap_err();
-    assert_eq!(kept.kind(), std::io::ErrorKind::WouldBlock);
-    drop(knocking);
+    let address = there.location().address();
+    let connect = |said: &[u8]| {
+        let mut stream = TcpStream::connect(address).unwrap();
+        // It may be closed already.
+        let _ = stream.write_all(said);
+        stream
+    };
+    let introduced: Vec<TcpStream> = (1..=limits.max_connections as u64)
+        .map(|n| connect(&fipa_testbed::frame(1, 1, &common::rogue_hello(n))))
+        .collect();
+    let half = limits.max_connections as u64 / 2;
+    until("each has a place or none", || {
+        let counters = there.transport.counters();
+        (counters.connections == half && counters.refused_crowd >= half).then_some(())
+    });
+    let letters: Vec<TcpStream> = (0..limits.max_unread_per_address + limits.max_reads_per_address)
+        .map(|_| connect(&[0xfe]))
+        .collect();
+    let silent: Vec<TcpStream> = (0..2 * limits.max_strangers)
+        .map(|n| connect(&b"fip"[..n % 4]))
+        .collect();
+    for attempt in 1..=3 {
+        let here = party(rover.security(&[&crex]));
+        here.assert_reaches(attempt, &there);
+    }
+    drop((introduced, letters, silent));
 }

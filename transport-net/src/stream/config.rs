@@ -4,7 +4,8 @@
 use fipa_transport::Principal;
 use std::time::Duration;
 
-use super::source::Home;
+use super::place::Budget;
+use super::source::{Account, Home};
 use crate::Identity;
 #[cfg(feature = "ip")]
 use crate::ration::{Rates, is_one_peer};
@@ -63,6 +64,39 @@ impl StreamConfig {
         }
     }
 
+    /// How many introduced connections one account may have at a time. No account has more than half
+    /// of all places, so none stops the listener.
+    pub(crate) fn places_of(&self, account: &Account) -> usize {
+        let half = (self.limits.max_connections / 2).max(1);
+        let is_one_peer = match account {
+            Account::Unproved(home) => self.limits_peer_at(*home),
+            Account::Certificate(_) => true,
+        };
+        match is_one_peer {
+            true => self.limits.max_per_address.min(half),
+            false => half,
+        }
+    }
+
+    /// How much memory the letters of one account may take while they arrive, and those of all.
+    pub(crate) fn budget_of(&self, account: &Account) -> Budget {
+        let each = self.limits.max_incoming_per_source;
+        // Loopback stands for many processes.
+        let is_many = match account {
+            #[cfg(feature = "ip")]
+            Account::Unproved(Home::Address(ip)) => !is_one_peer(*ip),
+            _ => false,
+        };
+        Budget {
+            total: self.limits.max_incoming,
+            each: if is_many {
+                each.saturating_mul(2)
+            } else {
+                each
+            },
+        }
+    }
+
     /// Whether letters may go to an old peer at this address, which cannot prove anything.
     #[cfg(feature = "ip")]
     pub(crate) fn gives_old_peers_at(&self, ip: std::net::IpAddr) -> bool {
@@ -75,13 +109,16 @@ impl StreamConfig {
     }
 }
 
-/// Bounds of an endpoint whose letters go over streams of bytes. Memory is at most about `max_connections` × (`max_queued_bytes` +
-/// `max_letter`), and only when every peer drives it there by really sending the bytes.
+/// Bounds of an endpoint whose letters go over streams of bytes. Memory is at most about
+/// `max_incoming` for letters that are arriving, and `max_connections` × `max_queued_bytes` for those
+/// that wait to be sent, the latter only when this side sends them.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Limits {
     /// Largest letter sent or taken, in bytes. Default 64 MiB.
     pub max_letter: usize,
-    /// Most connections whose peer has introduced itself, or that this side opened. Default 256.
+    /// Maximum number of connections whose peer has introduced itself, or that this side opened.
+    /// Default 256. The peers of one source have at most half of them: one certificate, one address
+    /// (with IPv6, one network of 64 bits), all loopback addresses together, or one process.
     pub max_connections: usize,
     /// Maximum number of accepted connections that have not introduced themselves: those whose
     /// handshake has begun and those that have been silent for 250 ms. One more pushes out the oldest
@@ -96,12 +133,13 @@ pub struct Limits {
     pub max_unread_per_address: usize,
     /// The same for all addresses together. Default 1024.
     pub max_unread: usize,
-    /// Most connections that the peers at one address have opened and introduced themselves on.
-    /// Default 64. This and the next two are not for loopback addresses, unless peers there have to
-    /// prove who they are, too.
+    /// Maximum number of connections that the peers with one certificate, or the peers at one address
+    /// that have proved nothing, have opened and introduced themselves on. Default 64. It does not
+    /// apply to loopback addresses, unless peers there have to prove who they are, too.
     pub max_per_address: usize,
     /// Letters a second that are taken from one address, as many of which may come at once; what is
-    /// more is read later. 0: any number. Default 20,000.
+    /// more is read later. 0: any number. Default 20,000. This and the next are not for loopback
+    /// addresses either.
     pub peer_letters: u64,
     /// The same of bytes. Default 256 MiB.
     pub peer_bytes: u64,
@@ -110,6 +148,17 @@ pub struct Limits {
     /// Most bytes per connection that wait to be handed to the kernel; a single letter is always
     /// let in. Default 64 MiB.
     pub max_queued_bytes: usize,
+    /// Maximum number of bytes of letters that are arriving, on all connections together: the whole
+    /// length of a letter of 32 KiB or more from its header to its end, and the memory of a legacy
+    /// peer's letter from 64 KiB on. When there is no room for another letter, its connection is not
+    /// read until there is. A letter that is larger than this arrives alone. While others wait, a
+    /// letter that has not arrived within 12 times `stall_timeout` at its present pace ends its
+    /// connection. Default 256 MiB.
+    pub max_incoming: usize,
+    /// The same for the peers with one certificate, or for one source that has proved nothing: one
+    /// address (with IPv6, one network of 64 bits) or process, and with twice as much all loopback
+    /// addresses together. Default 64 MiB.
+    pub max_incoming_per_source: usize,
     /// Most bytes of [the sink's memory](fipa_transport::Sink::memory_for) that are taken for
     /// content which has been announced and is arriving, on all connections together. What is
     /// beyond is read into memory that grows as it arrives. Default 32 MiB.
@@ -155,6 +204,8 @@ impl Default for Limits {
             peer_bytes: 256 << 20,
             max_in_flight: 1024,
             max_queued_bytes: 64 << 20,
+            max_incoming: 256 << 20,
+            max_incoming_per_source: 64 << 20,
             max_arriving: 32 << 20,
             connect_timeout: Duration::from_secs(2),
             handshake_timeout: Duration::from_secs(5),

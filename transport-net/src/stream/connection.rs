@@ -68,6 +68,8 @@ pub(crate) struct Connection {
     proof: Proof,
     /// Whether parcels may be sent: the peer is known, and knows this side.
     open: bool,
+    /// Whether nothing is read, because there is no memory for the next letter.
+    paused: bool,
     /// Whether it is about to end for idleness: what comes now needs another connection.
     retiring: bool,
     ended: bool,
@@ -124,6 +126,7 @@ impl Connection {
             peer: None,
             proof: Proof::default(),
             open: false,
+            paused: false,
             retiring: false,
             ended: false,
             outbox: Outbox::default(),
@@ -301,11 +304,21 @@ impl Connection {
         };
     }
 
+    /// Nothing is read from now on, or it is again. Meanwhile the peer is told that this side lives,
+    /// and is not given up, because its signs of life are not read either.
+    pub(crate) fn pause(&mut self, paused: bool, now: Instant) {
+        if std::mem::replace(&mut self.paused, paused) != paused {
+            self.clock.received = now;
+            self.clock.pinged = false;
+            self.clock.doubted = None;
+        }
+    }
+
     /// There is reason to believe that the peer is elsewhere by now: it is asked for a sign of life,
     /// with less patience than usual. Does nothing when the peer has been heard within `quiet`.
     /// Returns whether the connection is in doubt.
     pub(crate) fn doubt(&mut self, now: Instant, quiet: Duration) -> bool {
-        if self.ended || self.peer.is_none() || now < self.clock.received + quiet {
+        if self.ended || self.paused || self.peer.is_none() || now < self.clock.received + quiet {
             return false;
         }
         if self.clock.doubted.is_none() {
@@ -427,11 +440,12 @@ impl Connection {
             .min()
     }
 
-    /// Does what is due.
+    /// Does what is due. `least_progress` is how many bytes the frame that is half arrived needs to
+    /// get in the time in which that is measured.
     ///
     /// # Errors
     /// When the connection is over.
-    pub(crate) fn handle_timeout(&mut self, now: Instant) -> Result<(), End> {
+    pub(crate) fn handle_timeout(&mut self, now: Instant, least_progress: u64) -> Result<(), End> {
         let Some(connected) = self.clock.connected else {
             return Ok(());
         };
@@ -445,7 +459,7 @@ impl Connection {
         if let Some((since, bytes)) = self.clock.partial
             && now >= since + self.limits.stall_timeout
         {
-            if bytes < Limits::MIN_PROGRESS {
+            if bytes < least_progress.max(Limits::MIN_PROGRESS) {
                 return Err(End::TooSlow("the peer stopped in the middle of a frame"));
             }
             self.clock.partial = Some((now, 0));
@@ -458,6 +472,13 @@ impl Connection {
             return Err(End::Silent);
         }
         if now >= self.sign_of_life_due() {
+            if self.paused {
+                self.clock.received = now;
+                if self.control_waiting < MAX_CONTROL {
+                    self.push_control(frame::pong());
+                }
+                return Ok(());
+            }
             if self.clock.pinged {
                 return Err(End::Silent);
             }
@@ -512,6 +533,10 @@ impl Connection {
     /// When the peer must be asked for a sign of life, or (after that) given up. Bytes that the
     /// kernel still takes show that the peer reads: it may be busy with a large letter.
     fn sign_of_life_due(&self) -> Instant {
+        if self.paused {
+            // Before the peer begins to ask.
+            return self.clock.received + self.limits.keep_alive / 2;
+        }
         if self.clock.pinged {
             let last = self.clock.received.max(self.clock.written);
             return last.max(self.clock.received + self.limits.keep_alive) + self.limits.keep_alive;

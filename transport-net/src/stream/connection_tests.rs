@@ -413,14 +413,14 @@ fn silence_is_asked_about_and_then_ends_it() {
     for _ in 0..5 {
         now += keep_alive;
         assert!(a.connection.poll_timeout().unwrap() <= now);
-        a.connection.handle_timeout(now).unwrap();
+        a.connection.handle_timeout(now, 0).unwrap();
         settle(&mut a, &mut b, now);
     }
     now += keep_alive;
-    a.connection.handle_timeout(now).unwrap();
+    a.connection.handle_timeout(now, 0).unwrap();
     a.transmit(usize::MAX, &mut b.coming, now);
     now += keep_alive;
-    assert_eq!(a.connection.handle_timeout(now), Err(End::Silent));
+    assert_eq!(a.connection.handle_timeout(now, 0), Err(End::Silent));
 }
 
 #[test]
@@ -434,7 +434,7 @@ fn a_peer_in_doubt_has_a_quarter_of_the_usual_time() {
     assert!(a.connection.doubt(now, patience));
     settle(&mut a, &mut b, now);
     now += patience;
-    a.connection.handle_timeout(now).unwrap();
+    a.connection.handle_timeout(now, 0).unwrap();
     // One that does not is given up; doubting again grants no more time.
     assert!(a.connection.doubt(now, Duration::ZERO));
     a.transmit(usize::MAX, &mut b.coming, now);
@@ -442,8 +442,8 @@ fn a_peer_in_doubt_has_a_quarter_of_the_usual_time() {
     assert_eq!(due, now + patience);
     now += patience / 2;
     assert!(a.connection.doubt(now, Duration::ZERO));
-    a.connection.handle_timeout(now).unwrap();
-    assert_eq!(a.connection.handle_timeout(due), Err(End::Silent));
+    a.connection.handle_timeout(now, 0).unwrap();
+    assert_eq!(a.connection.handle_timeout(due, 0), Err(End::Silent));
 }
 
 #[test]
@@ -457,10 +457,10 @@ fn a_peer_in_doubt_that_still_reads_is_not_given_up() {
     for _ in 0..10 {
         now += patience / 2;
         a.transmit(100, &mut BytesMut::new(), now);
-        a.connection.handle_timeout(now).unwrap();
+        a.connection.handle_timeout(now, 0).unwrap();
     }
     now += patience;
-    assert_eq!(a.connection.handle_timeout(now), Err(End::Silent));
+    assert_eq!(a.connection.handle_timeout(now, 0), Err(End::Silent));
 }
 
 #[test]
@@ -473,8 +473,8 @@ fn idleness_ends_it_but_not_while_something_is_open() {
     b.receive(usize::MAX, now);
     for _ in 0..20 {
         now += limits().keep_alive;
-        a.connection.handle_timeout(now).unwrap();
-        b.connection.handle_timeout(now).unwrap();
+        a.connection.handle_timeout(now, 0).unwrap();
+        b.connection.handle_timeout(now, 0).unwrap();
         a.transmit(usize::MAX, &mut b.coming, now);
         b.receive(usize::MAX, now);
         b.transmit(usize::MAX, &mut a.coming, now);
@@ -483,7 +483,7 @@ fn idleness_ends_it_but_not_while_something_is_open() {
     settle(&mut a, &mut b, now);
     assert_eq!(a.concluded.len(), 1);
     now += limits().idle_close;
-    assert_eq!(a.connection.handle_timeout(now), Err(End::Idle));
+    assert_eq!(a.connection.handle_timeout(now, 0), Err(End::Idle));
     assert_eq!(a.dispatch(1), Err(SendError::Ended));
 }
 
@@ -497,7 +497,7 @@ fn a_frame_that_stops_half_way_ends_it_and_a_slow_one_does_not() {
         a.connection
             .received(Limits::MIN_PROGRESS as usize, true, now);
         now += limits().stall_timeout / 2;
-        a.connection.handle_timeout(now).unwrap();
+        a.connection.handle_timeout(now, 0).unwrap();
     }
     // One byte a second.
     for _ in 0..10 {
@@ -505,7 +505,7 @@ fn a_frame_that_stops_half_way_ends_it_and_a_slow_one_does_not() {
         a.connection.received(1, true, now);
     }
     assert!(matches!(
-        a.connection.handle_timeout(now),
+        a.connection.handle_timeout(now, 0),
         Err(End::TooSlow(_))
     ));
 }
@@ -517,7 +517,7 @@ fn a_hello_must_come_in_time() {
     let late = now + limits().handshake_timeout;
     assert_eq!(b.connection.poll_timeout(), Some(late));
     assert!(matches!(
-        a.connection.handle_timeout(late),
+        a.connection.handle_timeout(late, 0),
         Err(End::TooSlow(_))
     ));
 }

@@ -31,8 +31,8 @@ use super::config::{Limits, StreamConfig};
 use super::connection::{Connection, Role, SendError, letter_len};
 use super::counters::{Tally, count};
 use super::link::{Link, MAX_LINKS, of_ticket};
-use super::place::Rooms;
-use super::source::{Home, Source};
+use super::place::{Meter, Rooms};
+use super::source::{Account, Home, Source};
 #[cfg(feature = "ip")]
 use crate::address::{self, Listening};
 use crate::end::End;
@@ -57,7 +57,7 @@ pub(crate) struct Endpoint {
     /// Letters of legacy peers, in both directions.
     #[cfg(feature = "ip")]
     pub(crate) legacy: Legacy,
-    /// What is taken for content that is arriving.
+    /// What is taken for letters that are arriving.
     pub(crate) rooms: Rooms,
     /// What peers may still send.
     #[cfg(feature = "ip")]
@@ -81,8 +81,8 @@ struct Registry {
     known: HashMap<Incarnation, Vec<Arc<Link>>>,
     /// The peers' last connections for each of the locations they dialled.
     inbound: HashMap<Inbound, (u64, Arc<Link>)>,
-    /// Whose the accepted ones are.
-    homes: HashMap<u32, Home>,
+    /// The accounts of the accepted ones.
+    accounts: HashMap<u32, Account>,
     /// Where the peer of a link was when it introduced itself.
     places: HashMap<u32, Home>,
     /// Accepted connections that have not introduced themselves, oldest first, and whose they are.
@@ -182,6 +182,12 @@ impl Endpoint {
             #[cfg(feature = "ip")]
             Home::Address(ip) => self.rations.of(ip, self.limits().rates(), Instant::now()),
         }
+    }
+
+    /// Takes memory for arriving letters of this account.
+    pub(crate) fn meter(&self, account: &Account) -> Meter {
+        let budget = self.config.budget_of(account);
+        self.rooms.meter(account.clone(), budget)
     }
 
     pub(crate) fn tally(&self) -> &Tally {
@@ -525,6 +531,7 @@ impl Endpoint {
         &self,
         link: &Arc<Link>,
         peer: &Hello,
+        proved: Option<Principal>,
         from: Source,
     ) -> Result<Hop, End> {
         let incarnation = peer.identity.incarnation;
@@ -541,17 +548,15 @@ impl Endpoint {
                 return Err(End::Closed);
             }
             if !registry.links.contains_key(&link.number) {
-                if registry.links.len() >= self.limits().max_connections {
+                let account = Account::of(from, proved.as_ref());
+                let taken = registry.accounts.values().filter(|it| **it == account);
+                if registry.links.len() >= self.limits().max_connections
+                    || taken.count() >= self.config.places_of(&account)
+                {
                     count(&self.tally.refused_crowd);
                     return Err(End::Crowd);
                 }
-                let home = from.home().whole();
-                let at_home = registry.homes.values().filter(|it| **it == home).count();
-                if self.config.limits_peer_at(home) && at_home >= self.limits().max_per_address {
-                    count(&self.tally.refused_crowd);
-                    return Err(End::Crowd);
-                }
-                registry.homes.insert(link.number, home);
+                registry.accounts.insert(link.number, account);
                 registry.links.insert(link.number, link.clone());
             }
             if peer.dialled.is_empty() {
@@ -602,7 +607,7 @@ impl Endpoint {
             .with_incarnation(incarnation);
         Ok(Hop {
             location,
-            principal,
+            principal: proved.unwrap_or(principal),
         })
     }
 
@@ -629,7 +634,7 @@ impl Endpoint {
             .is_some_and(|there| Arc::ptr_eq(there, link))
         {
             registry.links.remove(&link.number);
-            registry.homes.remove(&link.number);
+            registry.accounts.remove(&link.number);
             registry.places.remove(&link.number);
         }
         let is_other = |other: &Arc<Link>| !Arc::ptr_eq(other, link);
@@ -744,3 +749,7 @@ impl Drop for Stranger {
         self.endpoint.registry.lock().strangers.remove(&self.number);
     }
 }
+
+#[cfg(all(test, feature = "ip"))]
+#[path = "endpoint_tests.rs"]
+mod tests;

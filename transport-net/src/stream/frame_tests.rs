@@ -83,8 +83,8 @@ impl LoanedContent for Memory {
 }
 
 fn place(len: usize) -> Option<Place> {
-    let room = Rooms::default().take(len, len)?;
-    Some(Place::new(Box::new(Memory(vec![0; len])), room))
+    let loan = Rooms::default().lend(len, len)?;
+    Some(Place::new(Box::new(Memory(vec![0; len])), loan))
 }
 
 fn content(frame: &Frame) -> &Bytes {
@@ -181,8 +181,8 @@ fn large_content_is_read_into_the_memory_that_is_offered_and_nowhere_else() {
         assert_eq!((receiver, front, tail), ("arm@crex", 8 + 8 + 300, 1));
         let memory = Memory(vec![0; len]);
         places.push(memory.0.as_ptr());
-        let room = Rooms::default().take(len, len)?;
-        Some(Place::new(Box::new(memory), room))
+        let loan = Rooms::default().lend(len, len)?;
+        Some(Place::new(Box::new(memory), loan))
     };
     let run = [&large[..], &large, &large].concat();
     let first = read_into(&mut reader, &run, &[usize::MAX], &mut memory).unwrap();

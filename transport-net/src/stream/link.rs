@@ -25,7 +25,7 @@ use super::endpoint::Endpoint;
 use super::frame::{FrameReader, Placed};
 use super::place::Place;
 use super::proof::Proof;
-use super::source::Source;
+use super::source::{Account, Source};
 use super::wire::{Beside, Reading, Writing};
 use crate::end::End;
 use crate::ration::Ration;
@@ -308,6 +308,11 @@ impl Running {
         let writer = Arc::new(writer);
         self.link.proved(&proof);
         self.ration = self.endpoint.ration(from.home());
+        let account = Account::of(from, proof.principal().as_ref());
+        reader.count_with(self.endpoint.meter(&account));
+        if let Some(letters) = beside.reader() {
+            letters.count_with(self.endpoint.meter(&account));
+        }
         self.link.state.lock().writer = Some(writer.clone());
         let mut greeted = Some(greeted);
         let exchange = self.exchange(
@@ -322,7 +327,7 @@ impl Running {
             end = proof.withdrawn() => end,
         };
         self.end = end;
-        drop((writer, beside));
+        drop((writer, beside, reader));
         let (link, patience) = (self.link.clone(), self.endpoint.limits().handshake_timeout);
         let orderly = self.end.is_orderly();
         drop(self);
@@ -343,13 +348,26 @@ impl Running {
     ) -> End {
         let timer = sleep_until(Instant::now().into());
         tokio::pin!(timer);
-        let link = self.link.clone();
+        let (link, rooms) = (self.link.clone(), self.endpoint.rooms.clone());
         if let Err(end) = self.take_frames(reader, 0, false, from, greeted).await {
             return end;
         }
         loop {
+            let freed = rooms.freed();
+            tokio::pin!(freed);
+            let mut blocked = (reader.is_blocked(), beside.is_blocked());
+            if blocked != (false, false) {
+                // Before the next look at whether there is room, so that none is missed.
+                freed.as_mut().enable();
+                let retried = self.retry((reader, beside), blocked, from, greeted).await;
+                if let Err(end) = retried {
+                    return end;
+                }
+                blocked = (reader.is_blocked(), beside.is_blocked());
+            }
             let (flushed, due) = {
                 let mut state = link.state.lock();
+                state.connection.pause(blocked.0, Instant::now());
                 let flushed = state.flush();
                 self.endpoint
                     .tally()
@@ -372,7 +390,7 @@ impl Running {
             }
             let mut space = reader.space();
             tokio::select! {
-                arrived = read.read(&mut space), if reads => {
+                arrived = read.read(&mut space), if reads && !blocked.0 => {
                     let arrived = match arrived {
                         Ok(0) => return End::Hangup,
                         Ok(bytes) => bytes,
@@ -384,7 +402,7 @@ impl Running {
                     }
                 }
                 // What the peer sends after its hello may overtake it.
-                arrived = beside.read(), if reads && self.peer.is_some() => {
+                arrived = beside.read(), if reads && !blocked.1 && self.peer.is_some() => {
                     let arrived = match arrived {
                         Ok(bytes) => bytes,
                         Err(error) => return End::Nonsense(error.to_string()),
@@ -402,13 +420,35 @@ impl Running {
                     }
                 }
                 () = link.wake.notified() => {}
+                () = &mut freed, if blocked != (false, false) => {}
                 () = &mut timer => {
+                    let least = reader.least_progress();
+                    let least = least.max(beside.reader().map_or(0, |it| it.least_progress()));
                     let mut state = link.state.lock();
-                    if let Err(end) = state.connection.handle_timeout(Instant::now()) {
+                    if let Err(end) = state.connection.handle_timeout(Instant::now(), least) {
                         return end;
                     }
                 }
             }
+        }
+    }
+
+    /// Tries again to get memory for the letters that wait for it.
+    async fn retry(
+        &mut self,
+        (reader, beside): (&mut FrameReader, &mut Beside),
+        blocked: (bool, bool),
+        from: Source,
+        greeted: &mut Option<impl FnOnce() + Send>,
+    ) -> Result<(), End> {
+        if blocked.0 {
+            let other = beside.is_partial();
+            self.take_frames(reader, 0, other, from, greeted).await?;
+        }
+        let other = reader.is_partial();
+        match beside.reader() {
+            Some(letters) if blocked.1 => self.take_frames(letters, 0, other, from, greeted).await,
+            _ => Ok(()),
         }
     }
 
@@ -467,7 +507,10 @@ impl Running {
         }
         let mut state = link.state.lock();
         let partial = reader.is_partial() || other_partial;
-        state.connection.received(arrived, partial, now);
+        // A letter that waits for memory is no sign of life.
+        if arrived > 0 || !reader.is_blocked() {
+            state.connection.received(arrived, partial, now);
+        }
         Ok(())
     }
 
@@ -475,9 +518,9 @@ impl Running {
     fn place_for(&self, arriving: &Arriving<'_>) -> Option<Place> {
         self.peer.as_ref()?;
         let most = self.endpoint.limits().max_arriving;
-        let room = self.endpoint.rooms.take(arriving.len, most)?;
+        let loan = self.endpoint.rooms.lend(arriving.len, most)?;
         let memory = self.sink.memory_for(arriving)?;
-        Some(Place::new(memory, room))
+        Some(Place::new(memory, loan))
     }
 
     async fn handle_event(
@@ -493,8 +536,7 @@ impl Running {
                     (connection.peer().cloned(), connection.proved_principal())
                 };
                 if let Some(peer) = peer {
-                    let mut hop = self.endpoint.enter(&self.link, &peer, from).await?;
-                    hop.principal = proved.unwrap_or(hop.principal);
+                    let hop = self.endpoint.enter(&self.link, &peer, proved, from).await?;
                     self.peer = Some(Introduction {
                         name: peer.identity.name.into(),
                         hop,

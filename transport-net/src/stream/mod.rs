@@ -17,7 +17,7 @@ pub(crate) mod endpoint;
 pub(crate) mod frame;
 pub(crate) mod link;
 mod outbox;
-mod place;
+pub(crate) mod place;
 pub(crate) mod proof;
 pub(crate) mod source;
 pub(crate) mod wire;

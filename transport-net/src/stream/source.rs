@@ -4,8 +4,29 @@ use std::fmt;
 #[cfg(feature = "ip")]
 use std::net::{IpAddr, SocketAddr};
 
+use fipa_transport::Principal;
+
 #[cfg(feature = "ip")]
 use crate::ration::whose;
+
+/// The party that the places and the memory of an accepted connection are counted for.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(crate) enum Account {
+    /// The peers at one [whole](Home::whole) home, which have proved nothing.
+    Unproved(Home),
+    /// The peers with the key of the certificate with this fingerprint, wherever they are.
+    Certificate([u8; 32]),
+}
+
+impl Account {
+    /// The account of a connection from there whose peer has proved this, if anything.
+    pub(crate) fn of(from: Source, proved: Option<&Principal>) -> Self {
+        match proved {
+            Some(Principal::Certificate(fingerprint)) => Self::Certificate(*fingerprint),
+            _ => Self::Unproved(from.home().whole()),
+        }
+    }
+}
 
 /// The other end of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

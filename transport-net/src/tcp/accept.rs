@@ -26,7 +26,7 @@ use crate::stream::endpoint::{Endpoint, Stranger};
 use crate::stream::frame::{FrameReader, MAGIC};
 use crate::stream::link::Running;
 use crate::stream::proof::Proof;
-use crate::stream::source::{Home, Source};
+use crate::stream::source::{Account, Home, Source};
 use crate::stream::wire;
 
 /// Connections that the system holds until they are accepted: the letters of a legacy peer wait there
@@ -79,15 +79,12 @@ pub(crate) async fn accept(endpoint: Arc<Endpoint>, listener: TcpListener) {
         match listener.accept().await {
             Ok((stream, from)) => {
                 let stream = Arc::new(stream);
-                match endpoint
-                    .legacy
-                    .accept_queue
-                    .admit(&endpoint, from.ip(), &stream)
-                {
-                    Ok(place) => serve(&endpoint, place, stream, from),
-                    Err(Full::Closed) => return,
-                    Err(full) => reset(&endpoint, stream, from, full),
+                let queue = &endpoint.legacy.accept_queue;
+                let place = queue.admit(&endpoint, from.ip(), &stream);
+                if matches!(place, Err(Full::Closed)) {
+                    return;
                 }
+                serve(&endpoint, place, stream, from);
                 let (waiting, left) = endpoint.legacy.accept_queue.progress();
                 if pace.pauses(waiting, left) {
                     sleep(Pace::PAUSE).await;
@@ -132,7 +129,12 @@ impl Pace {
 }
 
 /// Starts the task of an accepted connection.
-fn serve(endpoint: &Arc<Endpoint>, place: Place, stream: Arc<TcpStream>, from: SocketAddr) {
+fn serve(
+    endpoint: &Arc<Endpoint>,
+    place: Result<Place, Full>,
+    stream: Arc<TcpStream>,
+    from: SocketAddr,
+) {
     // The task ends itself when others push it out, so it begins when it has its own handle.
     let (handle, own) = oneshot::channel();
     let receiving = receive(endpoint.clone(), place, stream, from, own);
@@ -151,6 +153,9 @@ enum Waiting {
     InTurn(Place),
     /// Among those that have not introduced themselves.
     Late(Stranger),
+    /// The same, because the accept queue was full: letters of legacy peers do not keep out a peer
+    /// that is going to introduce itself.
+    Beside(Stranger, Full),
 }
 
 /// The first byte of a connection.
@@ -165,7 +170,7 @@ enum First {
 
 async fn receive(
     endpoint: Arc<Endpoint>,
-    place: Place,
+    place: Result<Place, Full>,
     stream: Arc<TcpStream>,
     from: SocketAddr,
     own: oneshot::Receiver<AbortHandle>,
@@ -173,14 +178,19 @@ async fn receive(
     let Ok(task) = own.await else {
         return;
     };
-    if !place.started(task.clone()) {
-        return;
-    }
+    let waiting = match place {
+        Ok(place) if !place.started(task.clone()) => return,
+        Ok(place) => Waiting::InTurn(place),
+        Err(full) => match stranger(&endpoint, from, task.clone()) {
+            Some(place) => Waiting::Beside(place, full),
+            None => return,
+        },
+    };
     if let Err(error) = prepare(&stream, endpoint.limits()) {
         tracing::debug!(%from, "connection broke at once: {error}");
         return;
     }
-    let Some((waiting, first)) = first_byte(&endpoint, place, &stream, from, &task).await else {
+    let Some((waiting, first)) = first_byte(&endpoint, waiting, &stream, from, &task).await else {
         return;
     };
     #[cfg(feature = "secure")]
@@ -237,7 +247,7 @@ async fn receive(
 /// turn. Returns `None` when the endpoint has been closed.
 async fn first_byte(
     endpoint: &Arc<Endpoint>,
-    place: Place,
+    mut waiting: Waiting,
     stream: &TcpStream,
     from: SocketAddr,
     task: &AbortHandle,
@@ -245,11 +255,12 @@ async fn first_byte(
     let patience = endpoint.limits().handshake_timeout;
     let turn = TURN.min(patience);
     let mut byte = [0];
-    let mut waiting = Waiting::InTurn(place);
     let mut peeked = timeout(turn, stream.peek(&mut byte)).await;
     if peeked.is_err() && accept_queue::is_silent(stream) {
-        drop(waiting);
-        waiting = Waiting::Late(stranger(endpoint, from, task.clone())?);
+        if let Waiting::InTurn(place) = waiting {
+            drop(place);
+            waiting = Waiting::Late(stranger(endpoint, from, task.clone())?);
+        }
         peeked = timeout(patience - turn, stream.peek(&mut byte)).await;
     } else if peeked.is_err() {
         peeked = Ok(stream.peek(&mut byte).await);
@@ -289,11 +300,12 @@ impl Waiting {
                 drop(place);
                 stranger(endpoint, from, task)
             }
-            Self::Late(place) => Some(place),
+            Self::Late(place) | Self::Beside(place, _) => Some(place),
         }
     }
 
-    /// Goes back to the accept queue, behind all others, when the turn has been lost.
+    /// Goes back to the accept queue, behind all others, when the turn has been lost. A connection
+    /// that found no room does not: later ones of its address may have.
     fn takes_turn(
         self,
         endpoint: &Arc<Endpoint>,
@@ -303,6 +315,7 @@ impl Waiting {
     ) -> Result<Place, Full> {
         match self {
             Self::InTurn(place) => Ok(place),
+            Self::Beside(_, full) => Err(full),
             Self::Late(stranger) => {
                 drop(stranger);
                 let place = endpoint
@@ -332,16 +345,17 @@ async fn receive_letter(
     let Some(mut stream) = Arc::into_inner(stream) else {
         return Ok(());
     };
-    let letter = unframed::read(endpoint, &mut stream, || place.stalled()).await?;
+    let account = Account::of(Source::Address(from), None);
+    let read = unframed::read(endpoint, &place, &account, &mut stream).await?;
     drop(stream);
     place.is_first().await;
     if let Some(ration) = endpoint.ration(Home::Address(from.ip()))
-        && let Some(until) = ration.spend(1, letter.len(), Instant::now())
+        && let Some(until) = ration.spend(1, read.letter.len(), Instant::now())
     {
         count(&endpoint.tally().held_back);
         sleep_until(until.into()).await;
     }
-    unframed::hand_on(endpoint, letter, from.ip());
+    unframed::hand_on(endpoint, read.letter, from.ip());
     Ok(())
 }
 

@@ -9,13 +9,18 @@ use fipa_transport::Kind;
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::time::{Instant, timeout_at};
 
-use super::accept_queue::TURN;
+use super::accept_queue::{Place, TURN};
 use crate::stream::config::Limits;
 use crate::stream::counters::count;
 use crate::stream::endpoint::Endpoint;
+use crate::stream::place::Room;
+use crate::stream::source::Account;
 
 /// Bytes read at first.
 const FIRST_READ: usize = 4096;
+
+/// From this length on, the memory of a letter is taken from the budget of the endpoint.
+const COUNTED_FROM: usize = 64 * 1024;
 
 /// Why an old peer's letter is not taken.
 #[derive(Debug, thiserror::Error)]
@@ -25,6 +30,8 @@ pub(crate) enum UnframedError {
     TooLarge(usize),
     #[error("a letter stopped arriving half way")]
     TooSlow,
+    #[error("a letter waited too long for memory (max_incoming)")]
+    NoRoom,
     #[error("a letter broke off: {0}")]
     Broken(#[from] std::io::Error),
     #[error("its envelope cannot be read: {0}")]
@@ -33,18 +40,29 @@ pub(crate) enum UnframedError {
     Standard(#[from] EncodeError),
 }
 
-/// Reads a letter to its end. Its envelope is brought into the standard dialect; the message behind
-/// it is not touched. Calls `stalled` whenever no byte has come for [`TURN`].
+/// A letter that has been read, and the room that its bytes take.
+pub(crate) struct Read {
+    pub(crate) letter: Letter,
+    pub(crate) _room: Option<Room>,
+}
+
+/// Reads a letter from this account to its end. Its envelope is brought into the standard dialect;
+/// the message behind it is not touched. The connection at `place` loses its turn when no byte has
+/// come for [`TURN`], and needs its turn to get much memory.
 pub(crate) async fn read(
     endpoint: &Endpoint,
+    place: &Place,
+    account: &Account,
     source: &mut (impl AsyncRead + Unpin),
-    stalled: impl FnMut(),
-) -> Result<Letter, UnframedError> {
-    let whole = read_to_end(endpoint.limits(), source, stalled).await?;
+) -> Result<Read, UnframedError> {
+    let (whole, room) = read_to_end(endpoint, place, account, source).await?;
     let (envelope, length) = Envelope::decode(&whole)?;
     let message = whole.slice(length.min(whole.len())..);
     let envelope = with_stamped_extensions(envelope).encode_standard()?;
-    Ok(Letter::new(envelope, message))
+    Ok(Read {
+        letter: Letter::new(envelope, message),
+        _room: room,
+    })
 }
 
 /// The same envelope with stamped extensions only, as FIPA00088 wants them: fipa_services narrows
@@ -104,33 +122,78 @@ pub(crate) fn hand_on(endpoint: &Endpoint, letter: Letter, from: IpAddr) {
 }
 
 async fn read_to_end(
-    limits: &Limits,
+    endpoint: &Endpoint,
+    place: &Place,
+    account: &Account,
     source: &mut (impl AsyncRead + Unpin),
-    mut stalled: impl FnMut(),
-) -> Result<Bytes, UnframedError> {
+) -> Result<(Bytes, Option<Room>), UnframedError> {
+    let limits = endpoint.limits();
     let mut bytes = BytesMut::with_capacity(FIRST_READ);
+    let mut room = None;
     let mut window = (Instant::now() + limits.stall_timeout, bytes.len());
     loop {
         if bytes.len() > limits.max_letter {
             return Err(UnframedError::TooLarge(limits.max_letter));
         }
         if bytes.len() == bytes.capacity() {
-            bytes.reserve(bytes.len().max(4096));
+            let more = bytes.len().max(FIRST_READ);
+            if bytes.len() >= COUNTED_FROM {
+                // A letter that has memory waits for none of a later one, so letters are not waited
+                // for in a circle.
+                place.is_first().await;
+                let patience = limits.stall_timeout.saturating_mul(2);
+                let taken = take_room(endpoint, account, &mut room, bytes.len(), more);
+                let in_time = timeout_at(Instant::now() + patience, taken).await;
+                in_time.map_err(|_| UnframedError::NoRoom)?;
+                window = (Instant::now() + limits.stall_timeout, bytes.len());
+            }
+            bytes.reserve(more);
         }
         let turn = Instant::now() + TURN;
         match timeout_at(window.0.min(turn), source.read_buf(&mut bytes)).await {
-            Ok(Ok(0)) => return Ok(bytes.freeze()),
+            Ok(Ok(0)) => return Ok((bytes.freeze(), room)),
             Ok(Ok(_)) => {}
             Ok(Err(error)) => return Err(error.into()),
-            Err(_) if turn < window.0 => stalled(),
+            Err(_) if turn < window.0 => place.stalled(),
             Err(_) => {
                 let progress = (bytes.len() - window.1) as u64;
-                if progress < Limits::MIN_PROGRESS {
+                let least = room.as_ref().map_or(0, Room::least_progress);
+                if progress < least.max(Limits::MIN_PROGRESS) {
                     return Err(UnframedError::TooSlow);
                 }
                 window = (Instant::now() + limits.stall_timeout, bytes.len());
             }
         }
+    }
+}
+
+/// Waits until there is room for so much more of a letter of which `there` has arrived.
+async fn take_room(
+    endpoint: &Endpoint,
+    account: &Account,
+    room: &mut Option<Room>,
+    there: usize,
+    more: usize,
+) {
+    let mut meter = endpoint.meter(account);
+    loop {
+        let freed = endpoint.rooms.freed();
+        tokio::pin!(freed);
+        freed.as_mut().enable();
+        match room {
+            Some(room) => {
+                if meter.grow(room, more) {
+                    return;
+                }
+            }
+            None => {
+                *room = meter.take(there.saturating_add(more));
+                if room.is_some() {
+                    return;
+                }
+            }
+        }
+        freed.await;
     }
 }
 

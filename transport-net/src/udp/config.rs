@@ -1,10 +1,12 @@
 //! What the owner of a UDP endpoint chooses.
 
+use std::net::IpAddr;
 use std::time::Duration;
 
 use super::packet::{BASE, LARGEST};
 use crate::Identity;
-use crate::ration::Rates;
+use crate::ration::{Rates, is_one_peer};
+use crate::stream::place::Budget;
 
 /// Configuration of a [`UdpTransport`](crate::UdpTransport).
 #[derive(Debug, Clone)]
@@ -20,18 +22,19 @@ pub struct UdpConfig {
     pub limits: UdpLimits,
 }
 
-/// Bounds of a UDP endpoint. Memory is at most about `max_connections` × `max_queued_bytes` in
-/// each direction.
+/// Bounds of a UDP endpoint. Memory is at most about `max_incoming` for what arrives, and
+/// `max_connections` × `max_queued_bytes` for what is sent.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct UdpLimits {
     /// Largest datagram sent, in bytes without the headers of IP and UDP: [`UdpLimits::BASE`] to
     /// [`UdpLimits::LARGEST`]. What the path to a peer carries counts as well; it begins as
     /// `BASE` and is found out when a letter needs more. Default `LARGEST`.
     pub max_datagram: usize,
-    /// Most connections. Default 256.
+    /// Maximum number of connections. Default 256. The peers at one address (with IPv6, in one network
+    /// of 64 bits), and those at all loopback addresses together, open at most half of them.
     pub max_connections: usize,
-    /// Most connections that the peers at one address open. Default 64. This and the next two are not
-    /// for loopback addresses.
+    /// Maximum number of connections that the peers at one address open. Default 64. This and the next
+    /// two are not for loopback addresses.
     pub max_per_address: usize,
     /// Letters a second that are taken from one address, as many of which may come at once; what is
     /// more is taken when the peer sends it again. 0: any number. Default 20,000.
@@ -43,6 +46,12 @@ pub struct UdpLimits {
     /// Most bytes per connection and direction that wait to be sent, or for an earlier parcel that
     /// was lost; a single letter is always let in. Default 4 MiB.
     pub max_queued_bytes: usize,
+    /// Maximum number of bytes of parcels that wait for an earlier one, on all connections together;
+    /// a parcel for which there is no room is taken when the peer sends it again. Default 64 MiB.
+    pub max_incoming: usize,
+    /// The same for one source: one address (with IPv6, one network of 64 bits), and with twice as much
+    /// all loopback addresses together. Default 16 MiB.
+    pub max_incoming_per_source: usize,
     /// How long opening a connection may take. Default 2 s.
     pub connect_timeout: Duration,
     /// After this long without a packet from a peer that has something to acknowledge or to
@@ -57,6 +66,28 @@ impl UdpLimits {
     pub const BASE: usize = BASE;
     /// Largest datagram there is: 65,487 bytes.
     pub const LARGEST: usize = LARGEST;
+
+    /// How many connections the peers at this address may open. No address, and not all of loopback
+    /// together, has more than half of all places.
+    pub(super) fn places_of(&self, home: IpAddr) -> usize {
+        let half = (self.max_connections / 2).max(1);
+        match is_one_peer(home) {
+            true => self.max_per_address.min(half),
+            false => half,
+        }
+    }
+
+    /// How many bytes of the peers at this address may wait for earlier ones, and of all.
+    pub(super) fn budget_of(&self, home: IpAddr) -> Budget {
+        let each = self.max_incoming_per_source;
+        Budget {
+            total: self.max_incoming,
+            each: match is_one_peer(home) {
+                true => each,
+                false => each.saturating_mul(2),
+            },
+        }
+    }
 
     pub(super) fn rates(&self) -> Rates {
         Rates {
@@ -76,6 +107,8 @@ impl Default for UdpLimits {
             peer_bytes: 256 << 20,
             max_in_flight: 1024,
             max_queued_bytes: 4 << 20,
+            max_incoming: 64 << 20,
+            max_incoming_per_source: 16 << 20,
             connect_timeout: Duration::from_secs(2),
             silence: Duration::from_secs(2),
             idle_close: Duration::from_secs(60),

@@ -30,6 +30,7 @@ use crate::answer;
 use crate::end::End;
 use crate::hello::Hello;
 use crate::ration::Ration;
+use crate::stream::place::{Meter, Room};
 
 /// Numbers of parcels stay below this, so that a ticket has room for the connection's number too.
 pub(crate) const MAX_ID: u64 = 1 << 40;
@@ -62,6 +63,13 @@ pub(crate) enum Event {
     Concluded(AttemptId, Conclusion),
 }
 
+/// What has arrived before its turn: a parcel, or that there never is one.
+#[derive(Debug)]
+struct Held {
+    parcel: Option<Box<Parcel>>,
+    _room: Option<Room>,
+}
+
 #[derive(Debug)]
 pub(crate) struct Connection {
     limits: UdpLimits,
@@ -88,8 +96,10 @@ pub(crate) struct Connection {
     answers: HashMap<u64, Bytes>,
     /// The parcel to be handed on next, and what arrived before its turn.
     next_arrival: u64,
-    held: BTreeMap<u64, Option<Box<Parcel>>>,
+    held: BTreeMap<u64, Held>,
     held_bytes: usize,
+    /// Takes the memory for those, once the peer is known.
+    pub(super) meter: Option<Meter>,
     /// Parcels handed on and not answered.
     arrivals: HashSet<u64>,
     /// The last parcel that the sink has really been told of.
@@ -163,9 +173,13 @@ impl Connection {
         }
     }
 
-    /// The same, of a peer that may send so much.
-    pub(crate) fn rationed(self, ration: Option<Arc<Ration>>) -> Self {
-        Self { ration, ..self }
+    /// The same, of a peer that may send so much, and whose parcels wait in memory from this meter.
+    pub(crate) fn bounded(self, ration: Option<Arc<Ration>>, meter: Meter) -> Self {
+        Self {
+            ration,
+            meter: Some(meter),
+            ..self
+        }
     }
 
     fn new(limits: UdpLimits, id: u64, now: Instant) -> Self {
@@ -187,6 +201,7 @@ impl Connection {
             next_arrival: 1,
             held: BTreeMap::new(),
             held_bytes: 0,
+            meter: None,
             arrivals: HashSet::new(),
             told: 0,
             ration: None,

@@ -29,8 +29,10 @@ use super::counters::UdpCounters;
 use super::packet::{self, Datagram};
 use crate::Identity;
 use crate::end::End;
-use crate::ration::{Ration, Rations, is_one_peer};
+use crate::ration::{Ration, Rations, is_one_peer, whose};
 use crate::seldom::warn_seldom;
+use crate::stream::place::{Meter, Rooms};
+use crate::stream::source::{Account, Home};
 
 /// Numbers of connections stay below this (see [`Core::ticket`]).
 const MAX_CONNECTIONS: u32 = 1 << 24;
@@ -92,6 +94,8 @@ pub(crate) struct Core {
     gone: Vec<u32>,
     /// What peers may still send.
     rations: Rations,
+    /// What is taken for parcels that wait for earlier ones.
+    rooms: Rooms,
     counters: UdpCounters,
     last_number: u32,
     last_serial: u64,
@@ -147,6 +151,7 @@ impl Core {
             notes: VecDeque::new(),
             gone: Vec::new(),
             rations: Rations::default(),
+            rooms: Rooms::default(),
             counters: UdpCounters::default(),
             last_number: 0,
             last_serial: 0,
@@ -160,6 +165,13 @@ impl Core {
     /// What whoever is at this address may still send, if that is limited.
     fn ration(&self, ip: IpAddr, now: Instant) -> Option<Arc<Ration>> {
         is_one_peer(ip).then(|| self.rations.of(ip, self.limits.rates(), now))?
+    }
+
+    /// Takes memory for parcels of the peers at this address.
+    fn meter(&self, ip: IpAddr) -> Meter {
+        let home = whose(ip);
+        let account = Account::Unproved(Home::Address(home));
+        self.rooms.meter(account, self.limits.budget_of(home))
     }
 
     /// Takes a parcel for sending. When the connection has just been made up, its number is

@@ -16,7 +16,7 @@ use fipa_transport::Arriving;
 use fipa_transport::wire::{HEADER_LEN as PARCEL_HEADER_LEN, ParcelHeader};
 use zerocopy::FromBytes;
 
-use super::super::place::Place;
+use super::super::place::{Meter, Place, Room};
 use super::{Frame, FrameError, FrameHeader, HEADER_LEN, MAGIC, PARCEL, PARCEL_ALLOWANCE};
 
 /// Bytes of the buffer that headers and small bodies are read into.
@@ -93,6 +93,10 @@ pub(crate) struct FrameReader {
     /// Whether the letter before was a large one.
     careful: bool,
     placed: Placed,
+    /// Takes the memory for large bodies, if that is counted.
+    meter: Option<Meter>,
+    /// The header of a frame for whose body there is no room yet.
+    blocked: Option<FrameHeader>,
 }
 
 #[derive(Debug)]
@@ -103,6 +107,8 @@ pub(super) struct PartialBody {
     /// Length of the whole body.
     len: usize,
     content: Content,
+    /// Until the body is complete.
+    room: Option<Room>,
 }
 
 /// Where the content of a body lies.
@@ -134,7 +140,26 @@ impl FrameReader {
             body: None,
             careful: false,
             placed: Placed::default(),
+            meter: None,
+            blocked: None,
         }
+    }
+
+    /// Large bodies get memory from this meter from now on.
+    pub(crate) fn count_with(&mut self, meter: Meter) {
+        self.meter = Some(meter);
+    }
+
+    /// Whether a body waits for memory: nothing is to be read until [`next`](Self::next) has got it.
+    pub(crate) fn is_blocked(&self) -> bool {
+        self.blocked.is_some()
+    }
+
+    /// How many bytes of the body that is arriving have to arrive in each period in which progress
+    /// is measured; see [`Room::least_progress`].
+    pub(crate) fn least_progress(&self) -> u64 {
+        let room = self.body.as_ref().and_then(|body| body.room.as_ref());
+        room.map_or(0, Room::least_progress)
     }
 
     /// Where the next bytes are to be put. Each time bytes were put there, [`put`](Self::put) is to
@@ -212,9 +237,9 @@ impl FrameReader {
         body.finish().map(Some)
     }
 
-    /// Whether a frame has begun to arrive and is not complete.
+    /// Whether a frame has begun to arrive, is not complete, and is read.
     pub(crate) fn is_partial(&self) -> bool {
-        self.body.is_some() || !self.chunk.is_empty()
+        self.body.is_some() || !self.chunk.is_empty() && !self.is_blocked()
     }
 
     /// What has been read into memory of the sink's since this was last asked.
@@ -223,6 +248,39 @@ impl FrameReader {
     }
 
     fn begin(&mut self) -> Result<Option<PartialBody>, FrameError> {
+        let header = match self.blocked.take() {
+            Some(header) => header,
+            None => match self.take_header()? {
+                Some(header) => header,
+                None => return Ok(None),
+            },
+        };
+        let len = header.checked_body_len(self.max_parcel)?;
+        let large = header.kind == PARCEL && len as u64 >= APART_FROM;
+        let mut room = None;
+        if let Some(meter) = self.meter.as_mut().filter(|_| large) {
+            room = meter.take(len);
+            if room.is_none() {
+                self.blocked = Some(header);
+                return Ok(None);
+            }
+        }
+        let (content, capacity) = if large {
+            (Content::Undecided, HEADERS)
+        } else {
+            (Content::Along, len.min(FIRST_STEP))
+        };
+        Ok(Some(PartialBody {
+            header,
+            bytes: BytesMut::with_capacity(capacity),
+            len,
+            content,
+            room,
+        }))
+    }
+
+    /// Takes the header of the next frame, if it has arrived.
+    fn take_header(&mut self) -> Result<Option<FrameHeader>, FrameError> {
         // Nonsense is recognised by its first bytes, not only once there is enough of it.
         let begun = self.chunk.len().min(MAGIC.len());
         if self.chunk[..begun] != MAGIC[..begun] {
@@ -233,20 +291,9 @@ impl FrameReader {
         let Ok((header, _)) = FrameHeader::read_from_prefix(&self.chunk) else {
             return Ok(None);
         };
-        let len = header.checked_body_len(self.max_parcel)?;
+        header.checked_body_len(self.max_parcel)?;
         self.chunk.advance(HEADER_LEN);
-        let large = header.kind == PARCEL && len as u64 >= APART_FROM;
-        let (content, room) = if large {
-            (Content::Undecided, HEADERS)
-        } else {
-            (Content::Along, len.min(FIRST_STEP))
-        };
-        Ok(Some(PartialBody {
-            header,
-            bytes: BytesMut::with_capacity(room),
-            len,
-            content,
-        }))
+        Ok(Some(header))
     }
 }
 

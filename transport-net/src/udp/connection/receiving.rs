@@ -7,7 +7,7 @@ use fipa_transport::{Answer, Conclusion, Parcel};
 
 use super::super::counters::UdpCounters;
 use super::super::packet::{Frame, Frames, split_parcel};
-use super::{Connection, Event, MAX_ID};
+use super::{Connection, Event, Held, MAX_ID};
 use crate::end::End;
 
 impl Connection {
@@ -126,15 +126,27 @@ impl Connection {
         }
         let crowded = self.held.len() >= max
             || self.held_bytes.saturating_add(len) > self.limits.max_queued_bytes;
-        if id > self.next_arrival && crowded {
+        let waits = id > self.next_arrival;
+        if waits && crowded {
             return Ok(false);
         }
+        let mut room = None;
+        if let Some(meter) = self.meter.as_mut().filter(|_| waits && len > 0) {
+            room = meter.take_now(len);
+            if room.is_none() {
+                return Ok(false);
+            }
+        }
         self.held_bytes += len;
-        self.held.insert(id, parcel);
+        let held = Held {
+            parcel,
+            _room: room,
+        };
+        self.held.insert(id, held);
         while let Some(next) = self.held.remove(&self.next_arrival) {
             let id = self.next_arrival;
             self.next_arrival += 1;
-            if let Some(parcel) = next {
+            if let Some(parcel) = next.parcel {
                 self.arrivals.insert(id);
                 self.events.push_back(Event::Arrived { id, parcel });
             }

@@ -11,7 +11,7 @@ use super::{Core, Inbound, MAX_OUTBOX};
 use crate::address;
 use crate::end::End;
 use crate::hello::Hello;
-use crate::ration::{is_one_peer, whose};
+use crate::ration::whose;
 
 impl Core {
     /// A stranger says hello.
@@ -59,7 +59,7 @@ impl Core {
         }
         let home = whose(from.ip());
         let same_address = self.greeted.keys().filter(|(a, _)| whose(a.ip()) == home);
-        let greedy = is_one_peer(home) && same_address.count() >= self.limits.max_per_address;
+        let greedy = same_address.count() >= self.limits.places_of(home);
         if greedy || self.connections.len() >= self.limits.max_connections {
             self.counters.refused_crowd += 1;
             self.reply(path, packet::refused(initiator));
@@ -74,7 +74,7 @@ impl Core {
         let name = peer.identity.name.as_str().into();
         let limits = self.limits.clone();
         let connection = Connection::accepted(limits, id, initiator, peer, path, now)
-            .rationed(self.ration(from.ip(), now));
+            .bounded(self.ration(from.ip(), now), self.meter(from.ip()));
         let number = self.insert(connection, None, Some((from, initiator)));
         self.greeted.insert((from, initiator), number);
         self.inbound.insert(inbound, (serial, number));
@@ -100,11 +100,13 @@ impl Core {
         };
         let hop = self.hop(&peer, path.remote);
         let ration = self.ration(path.remote.ip(), now);
+        let meter = self.meter(path.remote.ip());
         let mut greeted = None;
         self.of_dialling(to, path, |number, connection| {
             let name = peer.identity.name.as_str().into();
             connection.welcomed(path, acceptor, peer, now)?;
             connection.ration = ration;
+            connection.meter = Some(meter);
             greeted = Some((number, name));
             Ok(())
         });

@@ -1,0 +1,145 @@
+//! The registry of connections, without sockets: which connections get a place.
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+use std::net::SocketAddr;
+
+use fipa_transport::{Answer, Arrival, Conclusion, Verdict};
+
+use super::*;
+use crate::Identity;
+
+struct Ignores;
+
+impl Sink for Ignores {
+    fn arrived(&self, _: Arrival) -> Verdict {
+        Verdict::Now(Answer::Accepted)
+    }
+
+    fn arrived_unframed(&self, _: fipa_acl::Letter, _: Kind, _: std::net::IpAddr) {}
+
+    fn concluded(&self, _: AttemptId, _: Conclusion) {}
+}
+
+fn identity(incarnation: u64) -> Identity {
+    Identity {
+        name: "test-mts".into(),
+        incarnation: Incarnation::from_u64(incarnation),
+        domain: "test".into(),
+        host: incarnation.to_string(),
+    }
+}
+
+/// An endpoint that listens nowhere, to be used within a runtime.
+fn endpoint(limits: Limits) -> Arc<Endpoint> {
+    let config = StreamConfig {
+        identity: identity(1 << 40),
+        limits,
+        processes: false,
+        #[cfg(feature = "secure")]
+        security: None,
+    };
+    let endpoint = Endpoint::new(Kind::Tcp, config, Handle::current());
+    let mut registry = endpoint.registry.lock();
+    registry.phase = Phase::Open;
+    registry.sink = Some(Arc::new(Ignores));
+    drop(registry);
+    endpoint
+}
+
+fn at(text: &str) -> Source {
+    let address: SocketAddr = text.parse().unwrap();
+    Source::Address(address)
+}
+
+fn certificate(number: u8) -> Option<Principal> {
+    Some(Principal::Certificate([number; 32]))
+}
+
+/// A connection accepted from there, whose peer says hello.
+struct Greeting {
+    incarnation: u64,
+    serial: u64,
+    dialled: &'static str,
+    proved: Option<Principal>,
+    from: Source,
+}
+
+fn greeting(incarnation: u64, proved: Option<Principal>, from: &str) -> Greeting {
+    Greeting {
+        incarnation,
+        serial: 1,
+        dialled: "tcp://10.0.0.1:7788",
+        proved,
+        from: at(from),
+    }
+}
+
+async fn enters(endpoint: &Endpoint, greeting: Greeting) -> Result<(Arc<Link>, Hop), End> {
+    let (link, _) = endpoint.accepted().unwrap();
+    let peer = Hello {
+        identity: identity(greeting.incarnation),
+        max_letter: 1 << 20,
+        max_in_flight: 8,
+        serial: greeting.serial,
+        dialled: greeting.dialled.into(),
+        listening: Vec::new(),
+    };
+    let entered = endpoint.enter(&link, &peer, greeting.proved, greeting.from);
+    Ok((link.clone(), entered.await?))
+}
+
+#[tokio::test]
+async fn no_source_has_more_than_half_of_the_places() {
+    let endpoint = endpoint(Limits {
+        max_connections: 16,
+        max_per_address: 4,
+        ..Limits::default()
+    });
+    let mut number = 0;
+    let mut get_in = async |proved: Option<Principal>, from: &dyn Fn(u64) -> String| {
+        let mut entered = 0;
+        for _ in 0..10 {
+            number += 1;
+            let greeting = greeting(number, proved, &from(number));
+            entered += usize::from(enters(&endpoint, greeting).await.is_ok());
+        }
+        entered
+    };
+    // Every local user has all of 127.0.0.0/8.
+    assert_eq!(get_in(None, &|n| format!("127.0.0.{n}:1")).await, 8);
+    // Peers with keys are counted by certificate, also when they come from there.
+    assert_eq!(get_in(certificate(1), &|_| "[::1]:1".into()).await, 4);
+    assert_eq!(get_in(None, &|n| format!("[2001:db8::{n}]:1")).await, 4);
+    assert_eq!(
+        get_in(None, &|_| "10.0.0.1:1".into()).await,
+        0,
+        "all are taken"
+    );
+    assert_eq!(endpoint.tally().read().refused_crowd, 2 + 6 + 6 + 10);
+}
+
+#[tokio::test]
+async fn strangers_of_one_source_push_out_each_other() {
+    let limits = Limits::default();
+    let endpoint = endpoint(limits.clone());
+    let stranger = |from: &str| {
+        let place = endpoint.receive_stranger(at(from)).unwrap();
+        let task = tokio::spawn(std::future::pending::<()>());
+        endpoint.stranger_started(place.number, task.abort_handle());
+        (place, task)
+    };
+    let slow = stranger("10.0.0.7:1");
+    let crowd: Vec<_> = (0..4 * limits.max_strangers)
+        .map(|n| stranger(&format!("127.0.{}.{}:1", n / 250, n % 250 + 1)))
+        .collect();
+    let networks: Vec<_> = (0..4 * limits.max_strangers)
+        .map(|n| stranger(&format!("[2001:db8::{n:x}]:1")))
+        .collect();
+    let registry = endpoint.registry.lock();
+    let has =
+        |(place, _): &(Stranger, JoinHandle<()>)| registry.strangers.contains_key(&place.number);
+    assert!(has(&slow));
+    let left = [&crowd, &networks].map(|crowd| crowd.iter().filter(|it| has(it)).count());
+    assert_eq!(1 + left[0] + left[1], limits.max_strangers);
+    drop(registry);
+}
