@@ -32,6 +32,8 @@ pub(crate) enum End {
     Distrusted,
     /// The peer opened another connection in place of this one.
     Superseded,
+    /// The service that the peer says it is has a connection already, for this reason not with it.
+    Impostor(&'static str),
     /// This endpoint closes.
     Closed,
 }
@@ -47,7 +49,11 @@ impl End {
     pub(crate) fn is_orderly(&self) -> bool {
         matches!(
             self,
-            Self::WrongIncarnation { .. } | Self::Idle | Self::Crowd | Self::Closed
+            Self::WrongIncarnation { .. }
+                | Self::Idle
+                | Self::Crowd
+                | Self::Impostor(_)
+                | Self::Closed
         )
     }
 
@@ -68,7 +74,8 @@ impl End {
             Self::Nonsense(what) => WayError::new(WayFault::Incompatible, what),
             Self::Goodbye { .. } if !greeted => WayError::new(
                 WayFault::Refused,
-                "the peer takes no more connections (its max_connections)",
+                "the peer takes no more connections (its max_connections), \
+                 or has one with another service of this incarnation",
             ),
             Self::Hangup if !greeted => WayError::new(
                 WayFault::Incompatible,
@@ -99,6 +106,7 @@ impl End {
                 "too many connections (max_connections)",
             ),
             Self::Distrusted => (WayFault::Refused, "the peer is not trusted any more"),
+            Self::Impostor(why) => (WayFault::Refused, *why),
             Self::Superseded => (WayFault::Broken, "the peer opened another connection"),
             Self::Closed => (WayFault::Closed, "this endpoint has been closed"),
         };
