@@ -198,13 +198,13 @@ impl Link {
     }
 
     /// Why the task is to end the connection, if it is.
-    #[cfg(test)]
+    #[cfg(all(test, feature = "ip"))]
     pub(crate) fn ending(&self) -> Option<End> {
         self.state.lock().ending.clone()
     }
 
     /// The task has ended.
-    #[cfg(test)]
+    #[cfg(all(test, feature = "ip"))]
     pub(crate) fn is_over(&self) {
         self.over.send_replace(true);
     }
