@@ -36,6 +36,8 @@ pub(crate) enum End {
     Expired,
     /// The peer opened another connection in place of this one.
     Superseded,
+    /// The service that the peer says it is has a connection already, for this reason not with it.
+    Impostor(&'static str),
     /// This endpoint closes.
     Closed,
 }
@@ -51,7 +53,11 @@ impl End {
     pub(crate) fn is_orderly(&self) -> bool {
         matches!(
             self,
-            Self::WrongIncarnation { .. } | Self::Idle | Self::Crowd | Self::Closed
+            Self::WrongIncarnation { .. }
+                | Self::Idle
+                | Self::Crowd
+                | Self::Impostor(_)
+                | Self::Closed
         )
     }
 
@@ -72,7 +78,8 @@ impl End {
             Self::Nonsense(what) => WayError::new(WayFault::Incompatible, what),
             Self::Goodbye { .. } if !greeted => WayError::new(
                 WayFault::Refused,
-                "the peer takes no more connections (its max_connections)",
+                "the peer takes no more connections (its max_connections), \
+                 or has one with another service of this incarnation",
             ),
             Self::Hangup if !greeted => WayError::new(
                 WayFault::Incompatible,
@@ -109,6 +116,7 @@ impl End {
                 WayFault::Refused,
                 "the peer's certificate has expired: `fipa keys renew` there",
             ),
+            Self::Impostor(why) => (WayFault::Refused, *why),
             Self::Superseded => (WayFault::Broken, "the peer opened another connection"),
             Self::Closed => (WayFault::Closed, "this endpoint has been closed"),
         };

@@ -161,6 +161,8 @@ mod tls {
         fn endpoint(&self) -> Arc<dyn Transport> {
             let mut config = common::config(&[self.tcp.address]);
             config.security = Some(self.host.security(&[&self.host]));
+            // The gateways of several domains of a host have one certificate.
+            config.identity.domain = config.identity.incarnation.to_string();
             Arc::new(TcpTransport::new(config, self.tcp.runtime.handle().clone()))
         }
 
@@ -208,7 +210,8 @@ mod quic {
     impl Fixture for Quic {
         fn endpoint(&self) -> Arc<dyn Transport> {
             let security = self.host.security(&[&self.host]);
-            let config = common::quic_config(&[self.address], security);
+            let mut config = common::quic_config(&[self.address], security);
+            config.identity.domain = config.identity.incarnation.to_string();
             Arc::new(QuicTransport::new(config, self.runtime.handle().clone()))
         }
 

@@ -7,7 +7,7 @@
 mod common;
 
 use std::io::{Read, Write};
-use std::net::{Shutdown, TcpStream};
+use std::net::{Shutdown, SocketAddr, TcpStream};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -16,6 +16,7 @@ use fipa_acl::Envelope;
 use fipa_testbed::frame_header;
 use fipa_transport::{Conclusion, Kind, Location, Parcel, Transport as _, Verdict, WayFault};
 use fipa_transport_net::{Counters, Limits};
+use socket2::{Domain, Socket, Type};
 
 /// A letter as a fipa_services peer sent it.
 const TCP_LETTER: &[u8] = include_bytes!("data/tcp_letter.bin");
@@ -482,4 +483,59 @@ fn the_address_of_a_third_party_in_a_hello_is_never_dialed() {
     third.set_nonblocking(true).unwrap();
     let dialed = third.accept().unwrap_err();
     assert_eq!(dialed.kind(), std::io::ErrorKind::WouldBlock);
+}
+
+/// A connection from this loopback address.
+fn connect_from(ip: [u8; 4], to: &Party) -> TcpStream {
+    let socket = Socket::new(Domain::IPV4, Type::STREAM, None).unwrap();
+    socket.bind(&SocketAddr::from((ip, 0)).into()).unwrap();
+    let at: SocketAddr = to.location().address().parse().unwrap();
+    socket.connect(&at.into()).unwrap();
+    let stream = TcpStream::from(socket);
+    // A watchdog for reads that never end.
+    stream
+        .set_read_timeout(Some(Duration::from_secs(60)))
+        .unwrap();
+    stream
+}
+
+#[test]
+fn a_stranger_that_says_it_is_a_connected_service_is_refused_while_that_lives() {
+    let party = Party::new();
+    let service = Party::new();
+    service.assert_reaches(1, &party);
+    let incarnation = service.location().incarnation().as_u64();
+    for ip in [[127, 0, 0, 2], [127, 0, 0, 3]] {
+        let mut stranger = connect_from(ip, &party);
+        let mut said = hello(incarnation);
+        said.extend(frame(1, &parcel(1, "I am the service")));
+        stranger.write_all(&said).unwrap();
+        assert_shut_out(&mut stranger);
+    }
+    let counters = party.transport.counters();
+    assert_eq!((counters.connections, counters.refused_unproved), (1, 2));
+    service.assert_reaches(2, &party);
+    assert_eq!(service.transport.counters().dialled, 1);
+    assert_eq!(party.arrivals(), 2);
+}
+
+#[test]
+fn a_service_that_moved_is_served_when_its_older_connection_gives_no_sign_of_life() {
+    let party = Party::new();
+    for (ip, arrivals) in [([127, 0, 0, 1], 1), ([127, 0, 0, 2], 2)] {
+        let mut older = connect_from(ip, &party);
+        older.write_all(&hello(77)).unwrap();
+        counted(&party, |c| c.accepted, 2 * arrivals - 1);
+        let mut moved = connect_from([127, 0, 0, 3], &party);
+        let mut said = hello(77);
+        said.extend(frame(1, &parcel(1, "I am here now")));
+        moved.write_all(&said).unwrap();
+        until("its letter", || {
+            (party.arrivals() as u64 == arrivals).then_some(())
+        });
+        assert_shut_out(&mut older);
+        drop(moved);
+        counted(&party, |c| c.connections, 0);
+    }
+    assert_eq!(party.transport.counters().refused_unproved, 0);
 }

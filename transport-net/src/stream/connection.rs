@@ -330,6 +330,18 @@ impl Connection {
         true
     }
 
+    /// Asks the peer for a sign of life, of which nothing follows here.
+    pub(crate) fn ask(&mut self) {
+        if !self.ended && self.control_waiting < MAX_CONTROL {
+            self.push_control(frame::ping());
+        }
+    }
+
+    /// Whether the peer has been heard since, or would not have been because nothing is read.
+    pub(crate) fn is_heard_since(&self, since: Instant) -> bool {
+        !self.ended && (self.paused || self.clock.received > since)
+    }
+
     /// How long a peer in doubt has to give a sign of life.
     pub(crate) fn doubt_patience(&self) -> Duration {
         self.limits.keep_alive / 4

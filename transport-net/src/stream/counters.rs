@@ -52,7 +52,8 @@ counters! {
     refused_nonsense,
     /// Letters refused because the peer's certificate does not speak for their senders.
     refused_senders,
-    /// Connections that had to prove who is there, and did not.
+    /// Connections that had to prove who is there, and did not, or whose peer said that it is a service
+    /// that is connected.
     refused_unproved,
     /// Connections refused or pushed out because there were too many.
     refused_crowd,

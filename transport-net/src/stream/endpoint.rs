@@ -33,6 +33,7 @@ use super::counters::{Tally, count};
 use super::link::{Link, MAX_LINKS, of_ticket};
 use super::place::{Meter, Rooms};
 use super::source::{Account, Home, Source};
+use crate::Identity;
 #[cfg(feature = "ip")]
 use crate::address::{self, Listening};
 use crate::end::End;
@@ -45,6 +46,13 @@ use crate::ration::Rations;
 use crate::seldom::warn_seldom;
 #[cfg(feature = "ip")]
 use crate::tcp::Legacy;
+
+/// How long a service that is connected has to give a sign of life when a stranger says that it is the
+/// service.
+const SIGN_OF_LIFE: Duration = Duration::from_secs(1);
+
+/// After so many silent connections, a stranger is refused when there are others to ask.
+const MAX_ASKED: usize = 4;
 
 /// How long accepting rests when the system has no descriptors left.
 const REST: Duration = Duration::from_millis(100);
@@ -83,8 +91,8 @@ struct Registry {
     inbound: HashMap<Inbound, (u64, Arc<Link>)>,
     /// The accounts of the accepted ones.
     accounts: HashMap<u32, Account>,
-    /// Where the peer of a link was when it introduced itself.
-    places: HashMap<u32, Home>,
+    /// The peers of the links, as they introduced themselves.
+    peers: HashMap<u32, Peer>,
     /// Accepted connections that have not introduced themselves, oldest first, and whose they are.
     strangers: BTreeMap<u64, (Home, Option<AbortHandle>)>,
     last_stranger: u64,
@@ -123,6 +131,29 @@ impl Reached {
     }
 }
 
+/// The peer of a link, as it introduced itself.
+#[derive(Debug, Clone)]
+struct Peer {
+    identity: Identity,
+    /// What it has proved about itself, if anything.
+    proved: Option<Principal>,
+    /// Where it was.
+    home: Home,
+    /// What it dialled, if it opened the connection, and the number that it gave to that.
+    dialled: Option<(String, u64)>,
+}
+
+/// What follows for other connections from a peer's introduction.
+#[derive(Default)]
+struct Rivals {
+    /// This one takes their place.
+    superseded: Vec<Arc<Link>>,
+    /// This one takes their place unless their peers give a sign of life.
+    asked: Vec<Arc<Link>>,
+    /// Their peer may have moved here.
+    doubted: Vec<Arc<Link>>,
+}
+
 /// What tells a peer's connections for one location from others. With the address, so that a
 /// stranger elsewhere cannot push out somebody's connection by using its incarnation.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -130,6 +161,27 @@ struct Inbound {
     incarnation: Incarnation,
     home: Home,
     dialled: String,
+}
+
+impl Peer {
+    /// Whether this connection takes the place of that one, if both are of the same service: that
+    /// service was restarted, or it opened this one after that one, from another address or for the
+    /// same location. Connections that cross each other stay, and so do those for several locations.
+    fn replaces(&self, before: &Self) -> bool {
+        if self.identity.incarnation != before.identity.incarnation {
+            let (this, that) = (&self.identity, &before.identity);
+            return (&this.name, &this.domain, &this.host)
+                == (&that.name, &that.domain, &that.host);
+        }
+        match (&self.dialled, &before.dialled) {
+            (Some((this, serial)), Some((that, earlier))) => {
+                serial >= earlier && (self.home != before.home || this == that)
+            }
+            // A stranger at another address may be the service or not.
+            (Some(_), None) => self.proved.is_none() && self.home != before.home,
+            (None, _) => false,
+        }
+    }
 }
 
 /// The connection for a location.
@@ -540,57 +592,58 @@ impl Endpoint {
             home: from.home(),
             dialled: peer.dialled.clone(),
         };
-        let mut superseded = None;
-        let mut others: Vec<Arc<Link>>;
-        {
-            let mut registry = self.registry.lock();
-            if registry.phase != Phase::Open {
-                return Err(End::Closed);
-            }
-            if !registry.links.contains_key(&link.number) {
-                let account = Account::of(from, proved.as_ref());
-                let taken = registry.accounts.values().filter(|it| **it == account);
-                if registry.links.len() >= self.limits().max_connections
-                    || taken.count() >= self.config.places_of(&account)
-                {
-                    count(&self.tally.refused_crowd);
-                    return Err(End::Crowd);
+        let this = Peer {
+            identity: peer.identity.clone(),
+            proved,
+            home: from.home(),
+            dialled: (!peer.dialled.is_empty()).then(|| (peer.dialled.clone(), peer.serial)),
+        };
+        let mut silent: Vec<u32> = Vec::new();
+        let rivals = loop {
+            let asked = {
+                let mut registry = self.registry.lock();
+                if registry.phase != Phase::Open {
+                    return Err(End::Closed);
                 }
-                registry.accounts.insert(link.number, account);
-                registry.links.insert(link.number, link.clone());
-            }
-            if peer.dialled.is_empty() {
-                count(&self.tally.dialled);
-            } else {
-                count(&self.tally.accepted);
-                match registry.inbound.get(&inbound) {
-                    Some((serial, _)) if *serial > peer.serial => return Err(End::Superseded),
-                    Some((_, before)) => superseded = Some(before.clone()),
-                    None => {}
+                let rivals = registry.rivals(link, &this);
+                let mut rivals = rivals.map_err(|why| self.refuse(from, why))?;
+                let (gone, asked): (Vec<_>, Vec<_>) = std::mem::take(&mut rivals.asked)
+                    .into_iter()
+                    .partition(|rival| silent.contains(&rival.number));
+                if asked.is_empty() {
+                    rivals.superseded.extend(gone);
+                    self.admit(&mut registry, link, &this, &rivals.superseded, from)?;
+                    count(match this.dialled {
+                        Some(_) => &self.tally.accepted,
+                        None => &self.tally.dialled,
+                    });
+                    registry.note(link, this, inbound)?;
+                    count(&self.tally.connections);
+                    break rivals;
                 }
-                let this = (peer.serial, link.clone());
-                registry.inbound.insert(inbound, this);
-            }
-            registry.places.insert(link.number, from.home());
-            let known = registry.known.entry(incarnation).or_default();
-            others = known.clone();
-            known.push(link.clone());
-            count(&self.tally.connections);
-            let elsewhere = |other: &Arc<Link>| {
-                let place = registry.places.get(&other.number);
-                place.is_some_and(|place| *place != from.home())
+                asked
             };
-            others.retain(elsewhere);
-        }
-        // The peer may have moved here. Asked, because a stranger must not end the connections of
-        // the service that it claims to be.
-        for other in others {
+            if silent.len() > MAX_ASKED {
+                return Err(End::Crowd);
+            }
+            let now = Instant::now();
+            asked.iter().for_each(|rival| rival.ask());
+            for rival in asked {
+                if rival.answers(now, SIGN_OF_LIFE).await {
+                    return Err(self.refuse(from, "its incarnation has a connection that is alive"));
+                }
+                silent.push(rival.number);
+            }
+        };
+        for other in rivals.doubted {
             other.doubt();
         }
-        if let Some(superseded) = superseded {
+        for superseded in &rivals.superseded {
+            superseded.leave(End::Superseded);
+        }
+        for superseded in rivals.superseded {
             // What the peer sent on its connection before this one must not arrive after what it
             // sends now.
-            superseded.leave(End::Superseded);
             superseded.over().await;
         }
         let (principal, back) = match from {
@@ -609,6 +662,44 @@ impl Endpoint {
             location,
             principal: proved.unwrap_or(principal),
         })
+    }
+
+    /// Gives a place to a connection whose peer has introduced itself, in place of others.
+    ///
+    /// # Errors
+    /// When there is none.
+    fn admit(
+        &self,
+        registry: &mut Registry,
+        link: &Arc<Link>,
+        peer: &Peer,
+        superseded: &[Arc<Link>],
+        from: Source,
+    ) -> Result<(), End> {
+        if registry.links.contains_key(&link.number) {
+            return Ok(());
+        }
+        let goes = |number: &u32| superseded.iter().any(|other| other.number == *number);
+        let account = Account::of(from, peer.proved.as_ref());
+        let accounts = registry.accounts.iter();
+        let of_account = accounts
+            .filter(|(number, it)| **it == account && !goes(number))
+            .count();
+        let all = registry.links.len() - registry.links.keys().filter(|it| goes(it)).count();
+        if all >= self.limits().max_connections || of_account >= self.config.places_of(&account) {
+            count(&self.tally.refused_crowd);
+            return Err(End::Crowd);
+        }
+        registry.accounts.insert(link.number, account);
+        registry.links.insert(link.number, link.clone());
+        Ok(())
+    }
+
+    /// Says why a peer is not the service that it says it is.
+    fn refuse(&self, from: Source, why: &'static str) -> End {
+        let before = self.tally.refused_unproved.fetch_add(1, Ordering::Relaxed);
+        warn_seldom(before, format_args!("{from}: connection refused: {why}"));
+        End::Impostor(why)
     }
 
     /// A connection has ended: nothing leads there any more.
@@ -635,7 +726,7 @@ impl Endpoint {
         {
             registry.links.remove(&link.number);
             registry.accounts.remove(&link.number);
-            registry.places.remove(&link.number);
+            registry.peers.remove(&link.number);
         }
         let is_other = |other: &Arc<Link>| !Arc::ptr_eq(other, link);
         registry.dialled.retain(|_, other| is_other(other));
@@ -709,6 +800,60 @@ impl Endpoint {
 }
 
 impl Registry {
+    /// What follows for others when this peer introduces itself on this link.
+    ///
+    /// # Errors
+    /// When its incarnation is connected with another principal that has proved more.
+    fn rivals(&self, link: &Arc<Link>, this: &Peer) -> Result<Rivals, &'static str> {
+        let mut rivals = Rivals::default();
+        let incarnation = this.identity.incarnation;
+        let others = self.links.values().filter(|it| it.number != link.number);
+        for (other, peer) in others.filter_map(|it| Some((it, self.peers.get(&it.number)?))) {
+            let is_same = peer.identity.incarnation == incarnation;
+            let list = match (this.proved, peer.proved) {
+                (Some(proved), Some(other)) if proved != other && is_same => {
+                    return Err("its incarnation is connected with another certificate");
+                }
+                (None, Some(_)) if is_same => {
+                    return Err("its incarnation is connected with a certificate");
+                }
+                // It was only claimed.
+                (Some(_), None) if is_same => &mut rivals.superseded,
+                (Some(proved), Some(before)) if proved == before && this.replaces(peer) => {
+                    &mut rivals.superseded
+                }
+                (None, None) if is_same && this.replaces(peer) => match this.home {
+                    // The kernel proves the process.
+                    Home::Process(_) => &mut rivals.superseded,
+                    // A stranger must not end the connections of the service that it claims to be.
+                    #[cfg(feature = "ip")]
+                    Home::Address(_) => &mut rivals.asked,
+                },
+                _ if is_same && peer.home != this.home => &mut rivals.doubted,
+                _ => continue,
+            };
+            list.push(other.clone());
+        }
+        Ok(rivals)
+    }
+
+    /// Enters a connection that has a place into the other tables.
+    ///
+    /// # Errors
+    /// When the peer has opened a later one.
+    fn note(&mut self, link: &Arc<Link>, peer: Peer, inbound: Inbound) -> Result<(), End> {
+        if let Some((_, serial)) = &peer.dialled {
+            match self.inbound.get(&inbound) {
+                Some((later, _)) if later > serial => return Err(End::Superseded),
+                _ => self.inbound.insert(inbound, (*serial, link.clone())),
+            };
+        }
+        let known = self.known.entry(peer.identity.incarnation).or_default();
+        known.push(link.clone());
+        self.peers.insert(link.number, peer);
+        Ok(())
+    }
+
     /// Which stranger goes when another one comes from this home: the oldest of those from the home
     /// that has the most places then. So those who knock often push out each other, and somebody with
     /// a slow link gets in beside them.

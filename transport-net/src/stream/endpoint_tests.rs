@@ -143,3 +143,79 @@ async fn strangers_of_one_source_push_out_each_other() {
     assert_eq!(1 + left[0] + left[1], limits.max_strangers);
     drop(registry);
 }
+
+/// A certificate or none, an incarnation, where from, the serial, and what was dialled.
+fn comes(
+    proved: Option<Principal>,
+    incarnation: u64,
+    from: &str,
+    serial: u64,
+    dialled: &'static str,
+) -> Greeting {
+    Greeting {
+        serial,
+        dialled,
+        ..greeting(incarnation, proved, from)
+    }
+}
+
+const X: &str = "tcp://10.0.0.1:7788";
+const Y: &str = "tcp://10.0.0.2:7788";
+
+/// The peer of the link that is asked. The tests have no sockets, so this stands for its task.
+async fn ends_when_asked_to(link: Arc<Link>) {
+    let end = link.leaving().await;
+    assert_eq!(end, End::Superseded);
+    link.is_over();
+}
+
+#[tokio::test]
+async fn an_incarnation_belongs_to_the_certificate_it_is_connected_with() {
+    let endpoint = endpoint(Limits::default());
+    let refused = |why| Err(End::Impostor(why));
+    enters(&endpoint, comes(certificate(1), 7, "10.0.0.7:1", 1, X))
+        .await
+        .unwrap();
+    for from in ["10.0.0.7:2", "10.0.0.8:2"] {
+        let entered = enters(&endpoint, comes(certificate(2), 7, from, 2, X)).await;
+        let another = "its incarnation is connected with another certificate";
+        assert_eq!(entered.map(|_| ()), refused(another));
+        let entered = enters(&endpoint, comes(None, 7, from, 2, X)).await;
+        let proved = "its incarnation is connected with a certificate";
+        assert_eq!(entered.map(|_| ()), refused(proved));
+    }
+    // What was only claimed gives way.
+    let (claimed, _) = enters(&endpoint, comes(None, 9, "10.0.0.8:1", 1, X))
+        .await
+        .unwrap();
+    tokio::spawn(ends_when_asked_to(claimed));
+    enters(&endpoint, comes(certificate(2), 9, "10.0.0.9:1", 1, X))
+        .await
+        .unwrap();
+}
+
+#[tokio::test]
+async fn a_moved_peer_with_keys_takes_the_place_of_its_older_connections_and_its_other_connections_stay()
+ {
+    let endpoint = endpoint(Limits::default());
+    let proved = certificate(1);
+    let (first, _) = enters(&endpoint, comes(proved, 7, "10.0.0.7:1", 1, X))
+        .await
+        .unwrap();
+    // For another location, and one that this side has opened.
+    let (second, _) = enters(&endpoint, comes(proved, 7, "10.0.0.7:2", 2, Y))
+        .await
+        .unwrap();
+    let (crossing, _) = enters(&endpoint, comes(proved, 7, "10.0.0.7:7788", 0, ""))
+        .await
+        .unwrap();
+    for link in [&first, &second, &crossing] {
+        assert_eq!(link.ending(), None);
+    }
+    tokio::spawn(ends_when_asked_to(first));
+    tokio::spawn(ends_when_asked_to(second));
+    enters(&endpoint, comes(proved, 7, "10.0.0.8:1", 3, X))
+        .await
+        .unwrap();
+    assert_eq!(crossing.ending(), None);
+}

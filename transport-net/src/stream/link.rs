@@ -47,6 +47,8 @@ pub(crate) struct Link {
     state: Mutex<State>,
     /// Wakes the task: there is something to write, or an end.
     wake: Notify,
+    /// Tells that something has arrived.
+    heard: Notify,
     over: watch::Sender<bool>,
     begun: AtomicBool,
 }
@@ -81,6 +83,7 @@ impl Link {
                 leads_to: None,
             }),
             wake: Notify::new(),
+            heard: Notify::new(),
             over: watch::Sender::new(false),
             begun: AtomicBool::new(false),
         })
@@ -147,6 +150,31 @@ impl Link {
         self.wake.notify_one();
     }
 
+    /// Asks the peer for a sign of life.
+    pub(crate) fn ask(&self) {
+        let mut state = self.state.lock();
+        state.connection.ask();
+        self.flush(&mut state);
+    }
+
+    /// Returns whether the peer that was asked at this time gives a sign of life within `patience`.
+    pub(crate) async fn answers(&self, asked: Instant, patience: Duration) -> bool {
+        let due = tokio::time::Instant::from_std(asked + patience);
+        loop {
+            let heard = self.heard.notified();
+            tokio::pin!(heard);
+            heard.as_mut().enable();
+            if self.state.lock().connection.is_heard_since(asked) {
+                return true;
+            }
+            tokio::select! {
+                () = heard => {}
+                () = self.over() => return false,
+                () = sleep_until(due) => return false,
+            }
+        }
+    }
+
     /// Asks the task to end the connection.
     pub(crate) fn leave(&self, end: End) {
         self.state.lock().ending.get_or_insert(end);
@@ -167,6 +195,18 @@ impl Link {
             }
             self.wake.notified().await;
         }
+    }
+
+    /// Why the task is to end the connection, if it is.
+    #[cfg(all(test, feature = "ip"))]
+    pub(crate) fn ending(&self) -> Option<End> {
+        self.state.lock().ending.clone()
+    }
+
+    /// The task has ended.
+    #[cfg(all(test, feature = "ip"))]
+    pub(crate) fn is_over(&self) {
+        self.over.send_replace(true);
     }
 
     /// Waits until the last parcel of this connection has been handed to the sink.
@@ -510,6 +550,10 @@ impl Running {
         // A letter that waits for memory is no sign of life.
         if arrived > 0 || !reader.is_blocked() {
             state.connection.received(arrived, partial, now);
+        }
+        drop(state);
+        if arrived > 0 {
+            link.heard.notify_waiters();
         }
         Ok(())
     }

@@ -195,7 +195,7 @@ impl Meter {
 
     /// Takes more for a letter that has a room from such a meter. It goes before letters that wait for
     /// a room. When there is none, this meter waits.
-    #[cfg(feature = "ip")]
+    #[cfg(any(feature = "ip", test))]
     pub(crate) fn grow(&mut self, room: &mut Room, more: usize) -> bool {
         let rooms = self.rooms.clone();
         let mut state = rooms.0.state.lock();
