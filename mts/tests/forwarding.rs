@@ -11,11 +11,19 @@ use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission, Unframed};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
-    Outcome, Parcel, Report, Stream, Ticket, Verdict,
+    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind,
+    LegacySource, Location, Outcome, Parcel, Report, Signature, Stream, Ticket, Verdict,
 };
 
 const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
+
+/// What an agent of fipa_services sends comes from this address.
+fn legacy(address: IpAddr) -> LegacySource {
+    LegacySource {
+        address,
+        signature: Signature::FipaServices,
+    }
+}
 const GATEWAY: Incarnation = Incarnation::from_u64(0x6a7e);
 const ROVER: Incarnation = Incarnation::from_u64(0x50e4);
 const ARM: Incarnation = Incarnation::from_u64(0xa53);
@@ -339,7 +347,7 @@ fn an_old_peers_letter_is_for_whom_its_envelope_names() {
     gateway.core.handle_unframed(
         now,
         Duration::from_secs(2),
-        Unframed::read(letter(), Kind::Tcp, HERE),
+        Unframed::read(letter(), Kind::Tcp, legacy(HERE)),
     );
     let (attempt, location, parcel) = gateway.dispatched();
     assert_eq!(location, shm(0x9));

@@ -16,8 +16,8 @@ use fipa_sds::{
     StaticDirectory,
 };
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
-    Outcome, Parcel, Ticket, Verdict, WayError, WayFault,
+    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind,
+    LegacySource, Location, Outcome, Parcel, Signature, Ticket, Verdict, WayError, WayFault,
 };
 
 /// What a fipa_services agent, `cpp-sender`, sent to an agent `echo`.
@@ -27,6 +27,14 @@ const FAILURE: &[u8] = include_bytes!("../../acl/tests/vectors/failure_letter.bi
 
 /// Where that letter came from.
 const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
+
+/// What an agent of fipa_services sends comes from this address.
+fn legacy(address: IpAddr) -> LegacySource {
+    LegacySource {
+        address,
+        signature: Signature::FipaServices,
+    }
+}
 
 const OLD_PEER: &str = "tcp://10.0.0.3:6789;fipa-services";
 
@@ -101,7 +109,7 @@ fn who_sent_a_recorded_letter_to_nobody_is_told_in_its_own_words() {
     core.handle_unframed(
         now(),
         Duration::from_secs(5),
-        Unframed::read(recorded(LETTER), Kind::Tcp, HERE),
+        Unframed::read(recorded(LETTER), Kind::Tcp, legacy(HERE)),
     );
     let (attempt, location, parcel) = dispatched(&mut core).unwrap();
     assert_eq!(location.to_string(), "tcp://127.0.0.1:45615;fipa-services");
@@ -160,7 +168,7 @@ fn each_receiver_is_told_of_once_and_failures_never() {
     core.handle_unframed(
         now(),
         deadline,
-        Unframed::read(letter(Performative::Request), Kind::Tcp, HERE),
+        Unframed::read(letter(Performative::Request), Kind::Tcp, legacy(HERE)),
     );
     let mut told = Vec::new();
     while let Some((_, location, parcel)) = dispatched(&mut core) {
@@ -172,7 +180,7 @@ fn each_receiver_is_told_of_once_and_failures_never() {
     core.handle_unframed(
         now(),
         deadline,
-        Unframed::read(letter(Performative::Failure), Kind::Tcp, HERE),
+        Unframed::read(letter(Performative::Failure), Kind::Tcp, legacy(HERE)),
     );
     assert!(core.poll_action().is_none());
 }
@@ -185,7 +193,7 @@ fn nobody_is_told_where_somebody_elses_letter_says_it_is() {
     core.handle_unframed(
         now(),
         deadline,
-        Unframed::read(recorded(LETTER), Kind::Tcp, elsewhere),
+        Unframed::read(recorded(LETTER), Kind::Tcp, legacy(elsewhere)),
     );
     assert!(core.poll_action().is_none(), "it came from {elsewhere}");
 }
@@ -223,7 +231,7 @@ fn who_is_refused_is_told_in_its_own_words_and_not_without_end() {
         core.handle_unframed(
             then,
             deadline,
-            Unframed::read(recorded(LETTER), Kind::Tcp, HERE),
+            Unframed::read(recorded(LETTER), Kind::Tcp, legacy(HERE)),
         );
     }
     let mut told = 0;
@@ -270,7 +278,7 @@ fn the_sender_of_a_recorded_letter_becomes_known_at_the_address_that_it_gives() 
         Core::new(config, host_of("echo"))
     };
     let arrives = |core: &mut Core, letter, from| {
-        let unframed = Unframed::read(letter, Kind::Tcp, from);
+        let unframed = Unframed::read(letter, Kind::Tcp, legacy(from));
         core.handle_unframed(now(), Duration::from_secs(5), unframed);
     };
     let known = |at: &str| vec![("cpp-sender".to_owned(), at.to_owned())];
@@ -313,7 +321,7 @@ fn agents_become_known_by_letters_at_a_limited_rate() {
             .build()
             .unwrap();
         let letter = letter_for(&message, then.utc).unwrap();
-        let unframed = Unframed::read(letter, Kind::Tcp, HERE);
+        let unframed = Unframed::read(letter, Kind::Tcp, legacy(HERE));
         core.handle_unframed(then, Duration::from_secs(5), unframed);
     }
     assert_eq!(heard(&mut core).len(), 20);
@@ -347,7 +355,7 @@ fn an_agent_that_became_known_by_a_letter_keeps_its_name_while_it_writes() {
             instant: start.instant + since,
             utc: start.utc + since,
         };
-        let unframed = Unframed::read(letter, Kind::Tcp, from);
+        let unframed = Unframed::read(letter, Kind::Tcp, legacy(from));
         core.handle_unframed(then, Duration::from_secs(5), unframed);
         let heard = heard(&mut core);
         for (name, at) in &heard {
@@ -386,7 +394,7 @@ fn the_sender_of_a_recorded_letter_that_cannot_be_decoded_is_told() {
     let mut core = Core::new(config, host_of("echo"));
     let letter = without_end(&recorded(LETTER));
     let deadline = Duration::from_secs(5);
-    let unframed = Unframed::read(letter.clone(), Kind::Tcp, HERE);
+    let unframed = Unframed::read(letter.clone(), Kind::Tcp, legacy(HERE));
     core.handle_unframed(now(), deadline, unframed);
     let (_, location, parcel) = dispatched(&mut core).unwrap();
     // The envelope says where the sender is, as the message of another letter does.
@@ -404,7 +412,7 @@ fn the_sender_of_a_recorded_letter_that_cannot_be_decoded_is_told() {
     assert!(core.poll_action().is_none());
 
     // An address of another host is not believed.
-    let unframed = Unframed::read(letter, Kind::Tcp, IpAddr::from([10, 0, 0, 66]));
+    let unframed = Unframed::read(letter, Kind::Tcp, legacy(IpAddr::from([10, 0, 0, 66])));
     core.handle_unframed(now(), deadline, unframed);
     assert!(core.poll_action().is_none());
 }
@@ -474,7 +482,7 @@ fn a_name_with_a_dot_is_reached_as_legacy_peers_write_it() {
     core.handle_unframed(
         now(),
         deadline,
-        Unframed::read(recorded_to("arm?left"), Kind::Tcp, HERE),
+        Unframed::read(recorded_to("arm?left"), Kind::Tcp, legacy(HERE)),
     );
     let (_, location, parcel) = dispatched(&mut core).unwrap();
     assert_eq!(location.kind(), Kind::Shm);
@@ -498,7 +506,7 @@ fn a_sender_whose_letters_all_fail_keeps_no_failure_message_from_another() {
     };
     let then = now();
     let told = |core: &mut Core, name: &str| {
-        let unframed = Unframed::read(letter_of(name), Kind::Tcp, HERE);
+        let unframed = Unframed::read(letter_of(name), Kind::Tcp, legacy(HERE));
         core.handle_unframed(then, deadline, unframed);
         dispatched(core).is_some_and(|(attempt, _, parcel)| {
             assert_eq!(&*parcel.receiver, name);

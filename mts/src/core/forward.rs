@@ -4,11 +4,11 @@ use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_acl::{Letter, Message, Representation};
+use fipa_acl::{Letter, Message};
 use fipa_sds::{Entry, Reach, Resolution, Role, Source};
 use fipa_transport::{
-    Answer, FailureReason, Hop, Incarnation, Kind, Location, Outcome, Parcel, Signature, Stream,
-    Ticket, Verdict,
+    Answer, FailureReason, Hop, Incarnation, Kind, LegacySource, Location, Outcome, Parcel,
+    Signature, Stream, Ticket, Verdict,
 };
 
 use super::desk::{Action, Author, Origin, Undelivered, Upstream};
@@ -42,7 +42,7 @@ const HEARD_AGAIN_AFTER: Duration = Duration::from_secs(15);
 pub struct Unframed {
     letter: Letter,
     via: Kind,
-    from: IpAddr,
+    from: LegacySource,
     /// The name of the sender, and a location that it gives as its own.
     sender: Option<(String, Location)>,
     /// Why the message cannot be decoded, if it cannot.
@@ -50,9 +50,9 @@ pub struct Unframed {
 }
 
 impl Unframed {
-    /// Reads the letter, which came from this address.
+    /// Reads the letter, which came from this source.
     #[must_use]
-    pub fn read(letter: Letter, via: Kind, from: IpAddr) -> Self {
+    pub fn read(letter: Letter, via: Kind, from: LegacySource) -> Self {
         let (sender, fault) = match Message::decode(letter.payload()) {
             Ok(message) => (locate(&message, &letter, from), None),
             Err(error) => (None, Some(cannot_be_decoded(&error))),
@@ -68,11 +68,10 @@ impl Unframed {
 }
 
 /// The name of the sender, and the first location that it gives as its own.
-fn locate(message: &Message, letter: &Letter, from: IpAddr) -> Option<(String, Location)> {
+fn locate(message: &Message, letter: &Letter, from: LegacySource) -> Option<(String, Location)> {
     let sender = sender_of(message, letter)?;
     let addresses = sender.addresses().iter().map(|address| &**address);
-    let representation = Representation::detect(&letter.payload().head);
-    let mut locations = locations_given(addresses, representation, from).into_iter();
+    let mut locations = locations_given(addresses, from).into_iter();
     Some((sender.name().to_owned(), locations.next()?))
 }
 
@@ -320,7 +319,7 @@ impl Core {
             }
         };
         if let Some(fault) = fault {
-            tracing::info!(%from, "refused a letter of a legacy peer: {fault}");
+            tracing::info!(from = %from.address, "refused a letter of a legacy peer: {fault}");
             for receiver in receivers {
                 let why = (FailureReason::Refused, fault.clone());
                 self.unframed_failed(&receiver.into(), &letter, (via, from), why);
@@ -355,7 +354,7 @@ impl Core {
             let nobody = here.clone().next().is_none() && missing.is_empty();
             let receiver: Arc<str> = receiver.as_str().into();
             for name in missing.into_iter().chain(nobody.then_some(receiver)) {
-                tracing::info!(receiver = %name, %from, "an unframed letter names nobody of this host");
+                tracing::info!(receiver = %name, from = %from.address, "an unframed letter names nobody of this host");
                 let why = (FailureReason::NoSuchAgent, String::new());
                 self.unframed_failed(&name, &letter, (via, from), why);
             }
@@ -366,7 +365,7 @@ impl Core {
                     continue;
                 }
                 if let Some(located) = located.take() {
-                    self.hear_unframed(now, located, from);
+                    self.hear_unframed(now, located, from.address);
                 }
                 let stream = Stream {
                     sender: stream_sender,
@@ -423,7 +422,7 @@ impl Core {
         &mut self,
         receiver: &Arc<str>,
         letter: &Letter,
-        (via, from): (Kind, IpAddr),
+        (via, from): (Kind, LegacySource),
         (reason, detail): (FailureReason, String),
     ) {
         let own = self.desk.config.incarnation;

@@ -7,7 +7,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use bytes::BytesMut;
-use fipa_transport::ListenError;
+use fipa_transport::{LegacySource, ListenError};
 use socket2::{Domain, Protocol, SockRef, Socket, Type};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
@@ -332,7 +332,7 @@ async fn receive_letter(
     let Some(mut stream) = Arc::into_inner(stream) else {
         return Ok(());
     };
-    let letter = unframed::read(endpoint, &mut stream, || place.stalled()).await?;
+    let (letter, signature) = unframed::read(endpoint, &mut stream, || place.stalled()).await?;
     drop(stream);
     place.is_first().await;
     if let Some(ration) = endpoint.ration(Home::Address(from.ip()))
@@ -341,7 +341,11 @@ async fn receive_letter(
         count(&endpoint.tally().held_back);
         sleep_until(until.into()).await;
     }
-    unframed::hand_on(endpoint, letter, from.ip());
+    let source = LegacySource {
+        address: from.ip().to_canonical(),
+        signature,
+    };
+    unframed::hand_on(endpoint, letter, source);
     Ok(())
 }
 

@@ -1,11 +1,9 @@
 //! Letters of old peers (fipa_services, and JADE over its raw TCP extension): one per connection,
 //! without a header, until end of stream. Their envelopes are bit-efficient or XML.
 
-use std::net::IpAddr;
-
 use bytes::{Bytes, BytesMut};
 use fipa_acl::{DecodeError, EncodeError, Envelope, EnvelopeParams, Letter};
-use fipa_transport::Kind;
+use fipa_transport::{Kind, LegacySource, Signature};
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::time::{Instant, timeout_at};
 
@@ -34,17 +32,36 @@ pub(crate) enum UnframedError {
 }
 
 /// Reads a letter to its end. Its envelope is brought into the standard dialect; the message behind
-/// it is not touched. Calls `stalled` whenever no byte has come for [`TURN`].
+/// it is not touched. Returns what the writer of the envelope understands, too. Calls `stalled` whenever no byte has come for [`TURN`].
 pub(crate) async fn read(
     endpoint: &Endpoint,
     source: &mut (impl AsyncRead + Unpin),
     stalled: impl FnMut(),
-) -> Result<Letter, UnframedError> {
+) -> Result<(Letter, Signature), UnframedError> {
     let whole = read_to_end(endpoint.limits(), source, stalled).await?;
     let (envelope, length) = Envelope::decode(&whole)?;
-    let message = whole.slice(length.min(whole.len())..);
+    let length = length.min(whole.len());
+    let signature = signature_of(&whole[..length]);
+    let message = whole.slice(length..);
     let envelope = with_stamped_extensions(envelope).encode_standard()?;
-    Ok(Letter::new(envelope, message))
+    Ok((Letter::new(envelope, message), signature))
+}
+
+/// What the writer of this envelope understands. JADE writes XML, and `Z` between date and time.
+/// The encoding of the message says nothing: fipa_services sends string messages, too, but does not
+/// read such dates.
+fn signature_of(envelope: &[u8]) -> Signature {
+    const BEFORE: &[u8] = b"<date>";
+    const DAY: usize = "20261120".len();
+    let found = match envelope.first() {
+        Some(b'<') => envelope.windows(BEFORE.len()).position(|it| it == BEFORE),
+        _ => None,
+    };
+    let between = found.and_then(|at| envelope.get(at + BEFORE.len() + DAY));
+    match between {
+        Some(b'Z') => Signature::JadeProxy,
+        _ => Signature::FipaServices,
+    }
 }
 
 /// The same envelope with stamped extensions only, as FIPA00088 wants them: fipa_services narrows
@@ -95,11 +112,11 @@ fn overrule(older: &mut EnvelopeParams, newer: EnvelopeParams) {
     older.user_defined.extend(newer.user_defined);
 }
 
-/// Hands a letter that came from this address to the sink, unless the endpoint has been closed.
-pub(crate) fn hand_on(endpoint: &Endpoint, letter: Letter, from: IpAddr) {
+/// Hands a letter that came from this source to the sink, unless the endpoint has been closed.
+pub(crate) fn hand_on(endpoint: &Endpoint, letter: Letter, from: LegacySource) {
     if let Some(sink) = endpoint.sink() {
         count(&endpoint.tally().unframed_in);
-        sink.arrived_unframed(letter, Kind::Tcp, from.to_canonical());
+        sink.arrived_unframed(letter, Kind::Tcp, from);
     }
 }
 
@@ -142,6 +159,22 @@ mod tests {
 
     /// A letter as a fipa_services peer sent it.
     const TCP_LETTER: &[u8] = include_bytes!("../../tests/data/tcp_letter.bin");
+
+    #[test]
+    fn the_envelope_tells_what_its_writer_understands() {
+        let for_jade = include_bytes!("../../tests/data/tcp_letter_jade.bin");
+        let of_jade = include_bytes!("../../../acl/tests/vectors/jade_tcp_reply.xml");
+        let cases: [(&[u8], _); 3] = [
+            (TCP_LETTER, Signature::FipaServices),
+            (for_jade, Signature::FipaServices),
+            (of_jade, Signature::JadeProxy),
+        ];
+        for (letter, signature) in cases {
+            let whole = Bytes::copy_from_slice(letter);
+            let (_, length) = Envelope::decode(&whole).unwrap();
+            assert_eq!(signature_of(&letter[..length]), signature);
+        }
+    }
 
     #[test]
     fn extensions_without_a_stamp_are_folded_and_count_as_before() {
