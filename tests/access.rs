@@ -3,7 +3,6 @@
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
-use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant, SystemTime};
@@ -15,7 +14,7 @@ use fipa::{
 };
 use fipa_mts::letter_for;
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Parcel, Sink, Stream,
+    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, LegacySource, Parcel, Sink, Stream,
     Transport as _, Verdict,
 };
 use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport};
@@ -160,7 +159,7 @@ impl Sink for Told {
         Verdict::Now(Answer::Accepted)
     }
 
-    fn arrived_unframed(&self, _: fipa::Letter, _: Kind, _: IpAddr) {}
+    fn arrived_unframed(&self, _: fipa::Letter, _: Kind, _: LegacySource) {}
 
     fn concluded(&self, _: AttemptId, conclusion: Conclusion) {
         *self.0.lock() = Some(conclusion);

@@ -12,7 +12,7 @@ use fipa::{
     Agent, AgentId, Config, Domain, Envelope, EnvelopeParams, FailureReason, Gateway, Kind, Letter,
     Message, Outcome, Performative,
 };
-use fipa_acl::{AclRepresentation, Dialect, Representation};
+use fipa_acl::{Dialect, Representation};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::timeout;
@@ -217,11 +217,22 @@ async fn fipa_services_is_told_that_its_letter_cannot_be_decoded() {
     host.gateway.close().await;
 }
 
-/// A letter of an agent of fipa_services to bob, which gives this address as its own.
-fn letter_from(name: &str, address: &str) -> Vec<u8> {
+/// A letter of an agent of fipa_services to bob, which gives this address as its own. Envelope and
+/// message are encoded so.
+fn letter_from(name: &str, address: &str, encoded: [Representation; 2]) -> Vec<u8> {
+    letter_to("bob", name, address, encoded)
+}
+
+/// The same to another agent.
+fn letter_to(
+    receiver: &str,
+    name: &str,
+    address: &str,
+    [envelope_as, message_as]: [Representation; 2],
+) -> Vec<u8> {
     let sender = AgentId::new(name).unwrap().with_address(address).unwrap();
-    let bob = AgentId::new("bob").unwrap();
-    let (representation, dialect) = (Representation::BitEfficient, Dialect::FipaServices);
+    let bob = AgentId::new(receiver).unwrap();
+    let dialect = Dialect::FipaServices;
     let message = Message::builder(Performative::Request)
         .sender(sender.clone())
         .receiver(bob.clone())
@@ -232,7 +243,7 @@ fn letter_from(name: &str, address: &str) -> Vec<u8> {
     let base = EnvelopeParams {
         to: vec![bob.clone()],
         from: Some(sender),
-        acl_representation: Some(AclRepresentation::BitEfficient),
+        acl_representation: Some(message_as.into()),
         date: Some("20261120T112644481".parse().unwrap()),
         intended_receivers: vec![bob],
         ..EnvelopeParams::default()
@@ -241,18 +252,55 @@ fn letter_from(name: &str, address: &str) -> Vec<u8> {
         base,
         extensions: Vec::new(),
     };
-    let mut letter = envelope.encode(representation, dialect).unwrap().to_vec();
-    letter.extend_from_slice(&message.encode(representation, dialect).unwrap());
+    let mut letter = envelope.encode(envelope_as, dialect).unwrap().to_vec();
+    letter.extend_from_slice(&message.encode(message_as, dialect).unwrap());
     letter
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn an_agent_that_nothing_announces_is_answered_in_its_hand_however_it_encodes() {
+    use Representation::{BitEfficient, String, Xml};
+    let host = Host::new("alice", "fipa-services").await;
+    let bob = host.domain.register("bob").unwrap();
+    let at = format!("tcp://{}", host.peer.local_addr().unwrap());
+    let encodings = [
+        [BitEfficient, String],
+        [BitEfficient, Xml],
+        [Xml, String],
+        [Xml, Xml],
+    ];
+    for (number, encoded) in encodings.into_iter().enumerate() {
+        let name = format!("carol-{number}");
+        throw(&letter_from(&name, &at, encoded), &host.address()).await;
+        let asked = receive(&bob).await;
+        let answer = bob.reply(&asked, Performative::Agree).build().unwrap();
+        let (delivered, answer) =
+            tokio::join!(bob.send(answer), timeout(PATIENCE, host.read_by_peer()));
+        assert!(delivered.unwrap().all_succeeded());
+        let (_, letter, message) = read(&answer.unwrap());
+        let theirs = message.encode(BitEfficient, Dialect::FipaServices);
+        assert_eq!(letter.payload().to_bytes(), theirs.unwrap(), "{encoded:?}");
+        // The failure message about a letter to an agent that does not exist, too.
+        let stranger = format!("dave-{number}");
+        let lost = letter_to("nobody", &stranger, &at, encoded);
+        throw(&lost, &host.address()).await;
+        let (_, letter, failure) = read(&timeout(PATIENCE, host.read_by_peer()).await.unwrap());
+        assert_eq!(*failure.performative(), Performative::Failure);
+        assert_eq!(failure.receivers()[0].name(), stranger);
+        let theirs = failure.encode(BitEfficient, Dialect::FipaServices);
+        assert_eq!(letter.payload().to_bytes(), theirs.unwrap(), "{encoded:?}");
+    }
+    host.gateway.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn an_agent_that_nothing_announces_is_answered_where_its_letter_says() {
+    let plain = [Representation::BitEfficient; 2];
     // The directory knows another agent at the peer only.
     let host = Host::new("alice", "fipa-services").await;
     let bob = host.domain.register("bob").unwrap();
     let at = format!("tcp://{}", host.peer.local_addr().unwrap());
-    throw(&letter_from("carol", &at), &host.address()).await;
+    throw(&letter_from("carol", &at, plain), &host.address()).await;
     let asked = receive(&bob).await;
     assert_eq!(asked.content().unwrap(), "lift");
     let answer = bob.reply(&asked, Performative::Agree).content("done");
@@ -272,7 +320,7 @@ async fn an_agent_that_nothing_announces_is_answered_where_its_letter_says() {
 
     // The address of another host is never dialled.
     throw(
-        &letter_from("mallory", "tcp://192.0.2.66:6789"),
+        &letter_from("mallory", "tcp://192.0.2.66:6789", plain),
         &host.address(),
     )
     .await;

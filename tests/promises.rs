@@ -13,7 +13,6 @@
 mod services;
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
-use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
@@ -23,8 +22,8 @@ use fipa::{AgentId, FailureReason, Kind, Letter, Message, Outcome, Performative}
 use fipa_mts::core::Submission;
 use fipa_mts::{Gate, Sending, letter_for};
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Parcel, Sink, Stream, Transport,
-    Verdict,
+    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, LegacySource, Parcel, Sink, Stream,
+    Transport, Verdict,
 };
 use fipa_transport_net::{Identity, Limits, QuicConfig, QuicTransport, TcpConfig, TcpTransport};
 use parking_lot::Mutex;
@@ -462,7 +461,7 @@ impl Sink for Conclusions {
         Verdict::Now(Answer::Accepted)
     }
 
-    fn arrived_unframed(&self, _: Letter, _: Kind, _: IpAddr) {}
+    fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {}
 
     fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {
         self.0.lock().insert(attempt, conclusion);

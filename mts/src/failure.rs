@@ -18,8 +18,7 @@ use std::error::Error;
 use std::time::SystemTime;
 
 use fipa_acl::{
-    AclRepresentation, AgentId, Dialect, EnvelopeView, Letter, Message, Performative,
-    Representation, escape,
+    AgentId, Dialect, EnvelopeView, Letter, Message, Performative, Representation, escape,
 };
 use fipa_transport::FailureReason;
 use fipa_transport::wire::truncated;
@@ -33,8 +32,6 @@ pub(crate) struct Failure<'a> {
     pub(crate) sender: AgentId,
     /// Whom the letter was for.
     pub(crate) receiver: &'a str,
-    /// How its message was encoded, which the sender understands.
-    pub(crate) representation: Option<Representation>,
     /// The message, unless it cannot be decoded.
     message: Option<Message>,
     reason: FailureReason,
@@ -52,23 +49,14 @@ impl<'a> Failure<'a> {
         reason: FailureReason,
         detail: &'a str,
     ) -> Option<Self> {
-        let detected = Representation::detect(&letter.payload().head);
-        let (sender, representation, message) = match Message::decode(letter.payload()) {
+        let (sender, message) = match Message::decode(letter.payload()) {
             Ok(message) if *message.performative() == Performative::Failure => return None,
-            Ok(message) => (sender_of(&message, letter)?, detected, Some(message)),
-            Err(_) => {
-                let envelope = letter.parse_envelope().ok()?.effective();
-                let announced = match envelope.acl_representation {
-                    Some(AclRepresentation::String) => Some(Representation::String),
-                    _ => detected,
-                };
-                (envelope.from?, announced, None)
-            }
+            Ok(message) => (sender_of(&message, letter)?, Some(message)),
+            Err(_) => (letter.parse_envelope().ok()?.effective().from?, None),
         };
         Some(Self {
             sender,
             receiver,
-            representation,
             message,
             reason,
             detail,

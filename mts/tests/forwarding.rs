@@ -11,11 +11,19 @@ use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission, Unframed};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
-    Outcome, Parcel, Principal, Report, Stream, Ticket, Verdict,
+    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind,
+    LegacySource, Location, Outcome, Parcel, Principal, Report, Signature, Stream, Ticket, Verdict,
 };
 
 const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
+
+/// What an agent of fipa_services sends comes from this address.
+fn legacy(address: IpAddr) -> LegacySource {
+    LegacySource {
+        address,
+        signature: Signature::FipaServices,
+    }
+}
 const GATEWAY: Incarnation = Incarnation::from_u64(0x6a7e);
 const ROVER: Incarnation = Incarnation::from_u64(0x50e4);
 const ARM: Incarnation = Incarnation::from_u64(0xa53);
@@ -587,5 +595,5 @@ fn a_note_lowers_the_predecessor_of_a_held_letter() {
 
 /// The letter as it is read for this core.
 fn read(core: &Core, letter: Letter, via: Kind, from: IpAddr) -> Unframed {
-    Unframed::read(letter, via, from, &**core.directory()).unwrap()
+    Unframed::read(letter, via, legacy(from), &**core.directory()).unwrap()
 }

@@ -16,8 +16,9 @@ use fipa_sds::{
     StaticDirectory,
 };
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
-    Outcome, Parcel, Principal, Ticket, Verdict, WayError, WayFault,
+    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind,
+    LegacySource, Location, Outcome, Parcel, Principal, Signature, Ticket, Verdict, WayError,
+    WayFault,
 };
 
 /// What a fipa_services agent, `cpp-sender`, sent to an agent `echo`.
@@ -27,6 +28,14 @@ const FAILURE: &[u8] = include_bytes!("../../acl/tests/vectors/failure_letter.bi
 
 /// Where that letter came from.
 const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
+
+/// What an agent of fipa_services sends comes from this address.
+fn legacy(address: IpAddr) -> LegacySource {
+    LegacySource {
+        address,
+        signature: Signature::FipaServices,
+    }
+}
 
 const OLD_PEER: &str = "tcp://10.0.0.3:6789;fipa-services";
 
@@ -665,5 +674,5 @@ fn an_old_peer_that_cannot_be_reached_fails_like_anybody() {
 
 /// The letter as it is read for this core.
 fn read(core: &Core, letter: Letter, via: Kind, from: IpAddr) -> Unframed {
-    Unframed::read(letter, via, from, &**core.directory()).unwrap()
+    Unframed::read(letter, via, legacy(from), &**core.directory()).unwrap()
 }

@@ -7,7 +7,6 @@
 
 use std::hint::black_box;
 use std::io;
-use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
@@ -16,8 +15,8 @@ use bytes::Bytes;
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use fipa_acl::{Letter, Payload};
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Kind, Location, Parcel, Sink,
-    Stream, Transport, Verdict,
+    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Kind, LegacySource, Location,
+    Parcel, Sink, Stream, Transport, Verdict,
 };
 use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport};
 use parking_lot::Mutex;
@@ -41,7 +40,7 @@ impl Sink for Accepting {
         Verdict::Now(Answer::Accepted)
     }
 
-    fn arrived_unframed(&self, letter: Letter, _: Kind, _: IpAddr) {
+    fn arrived_unframed(&self, letter: Letter, _: Kind, _: LegacySource) {
         black_box(letter);
     }
 

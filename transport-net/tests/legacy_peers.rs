@@ -15,7 +15,9 @@ use std::time::Duration;
 use bytes::Bytes;
 use common::{Party, Threads, config, runtime, until};
 use fipa_acl::{Dialect, Envelope, Letter, Message, Performative, Representation};
-use fipa_transport::{Answer, Arrival, AttemptId, Conclusion, Kind, Sink, Transport as _, Verdict};
+use fipa_transport::{
+    Answer, Arrival, AttemptId, Conclusion, Kind, LegacySource, Sink, Transport as _, Verdict,
+};
 use fipa_transport_net::{Limits, TcpTransport};
 use parking_lot::{Condvar, Mutex};
 use socket2::{Domain, Socket, Type};
@@ -65,7 +67,7 @@ impl Sink for Recorder {
         Verdict::Now(Answer::Accepted)
     }
 
-    fn arrived_unframed(&self, letter: Letter, via: Kind, from: IpAddr) {
+    fn arrived_unframed(&self, letter: Letter, via: Kind, from: LegacySource) {
         assert_eq!(via, Kind::Tcp);
         let (envelope, _) = Envelope::decode(&letter.envelope()).unwrap();
         assert_eq!(envelope.effective().intended_receivers[0].name(), "echo");
@@ -73,7 +75,7 @@ impl Sink for Recorder {
         let content = message.content().unwrap().to_vec();
         let number = String::from_utf8(content).unwrap();
         let number = number.trim_end_matches('.').parse().unwrap();
-        if from == IpAddr::from(HERE) {
+        if from.address == IpAddr::from(HERE) {
             // Other tasks of this thread go on.
             tokio::task::block_in_place(|| {
                 let mut held = self.held.lock();
@@ -82,7 +84,7 @@ impl Sink for Recorder {
                 }
             });
         }
-        self.arrived.lock().push((from, number));
+        self.arrived.lock().push((from.address, number));
     }
 
     fn concluded(&self, _: AttemptId, _: Conclusion) {}

@@ -17,7 +17,6 @@
 
 use std::collections::VecDeque;
 use std::hint::{black_box, spin_loop};
-use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -25,8 +24,8 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use fipa_acl::{Letter, Payload};
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Kind, Location, Parcel, Sink,
-    Stream, Transport, Verdict,
+    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Kind, LegacySource, Location,
+    Parcel, Sink, Stream, Transport, Verdict,
 };
 use fipa_transport_shm::{ShmConfig, ShmTransport};
 use iceoryx2::pending_response::PendingResponse;
@@ -199,7 +198,7 @@ impl Sink for Count {
         Verdict::Now(Answer::Accepted)
     }
 
-    fn arrived_unframed(&self, _letter: Letter, _via: Kind, _from: IpAddr) {}
+    fn arrived_unframed(&self, _letter: Letter, _via: Kind, _from: LegacySource) {}
 
     fn concluded(&self, _attempt: AttemptId, conclusion: Conclusion) {
         assert_eq!(conclusion, Conclusion::Answered(Answer::Accepted));

@@ -1,7 +1,6 @@
 //! A transport that fails on purpose.
 
 use std::collections::HashMap;
-use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -11,8 +10,8 @@ use parking_lot::Mutex;
 
 use crate::transport::LoanedContent;
 use crate::{
-    Abandoned, Answer, Arrival, Arriving, AttemptId, Conclusion, Introduction, Kind, ListenError,
-    Location, Parcel, Sink, Ticket, Transport, Verdict, WayError, WayFault,
+    Abandoned, Answer, Arrival, Arriving, AttemptId, Conclusion, Introduction, Kind, LegacySource,
+    ListenError, Location, Parcel, Sink, Ticket, Transport, Verdict, WayError, WayFault,
 };
 
 /// A way of failing.
@@ -216,7 +215,7 @@ impl Sink for Filter {
         self.sink.arrived(arrival)
     }
 
-    fn arrived_unframed(&self, letter: Letter, via: Kind, from: IpAddr) {
+    fn arrived_unframed(&self, letter: Letter, via: Kind, from: LegacySource) {
         self.sink.arrived_unframed(letter, via, from);
     }
 

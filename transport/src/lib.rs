@@ -32,6 +32,6 @@ pub use outcome::{Attempt, FailureReason, Outcome};
 pub use owner::{Forked, OwnerProcess};
 pub use parcel::{Body, Parcel, Report, Stream};
 pub use transport::{
-    Abandoned, Answer, Arrival, Arriving, AttemptId, Conclusion, Hop, Introduction, ListenError,
-    LoanedContent, Principal, Sink, Ticket, Transport, Verdict, WayError, WayFault,
+    Abandoned, Answer, Arrival, Arriving, AttemptId, Conclusion, Hop, Introduction, LegacySource,
+    ListenError, LoanedContent, Principal, Sink, Ticket, Transport, Verdict, WayError, WayFault,
 };

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use fipa_acl::{Letter, escape};
 use serde::Serialize;
 
-use crate::{FailureReason, Kind, Location, Parcel, Stream};
+use crate::{FailureReason, Kind, Location, Parcel, Signature, Stream};
 
 /// One way of moving letters.
 ///
@@ -125,14 +125,23 @@ pub trait LoanedContent: Send {
     fn freeze(self: Box<Self>) -> Bytes;
 }
 
+/// Where an old peer's letter came from, and what can be sent there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct LegacySource {
+    /// The address of the connection.
+    pub address: IpAddr,
+    /// What the writer of the envelope understands. Never [`Signature::Frames`].
+    pub signature: Signature,
+}
+
 /// Who is told what arrives and what became of attempts: the delivery core.
 pub trait Sink: Send + Sync {
     /// A parcel arrived. The verdict is what the sender is told.
     fn arrived(&self, arrival: Arrival) -> Verdict;
 
-    /// An old peer's letter arrived from this address, without a header; it gets no answer. Its
+    /// An old peer's letter arrived from this source, without a header; it gets no answer. Its
     /// envelope has been brought into the standard dialect; whom it is for stands in there.
-    fn arrived_unframed(&self, letter: Letter, via: Kind, from: IpAddr);
+    fn arrived_unframed(&self, letter: Letter, via: Kind, from: LegacySource);
 
     /// An attempt came to its end.
     fn concluded(&self, attempt: AttemptId, conclusion: Conclusion);

@@ -235,7 +235,7 @@ mod faults {
             Verdict::Now(Answer::Accepted)
         }
 
-        fn arrived_unframed(&self, _: fipa_acl::Letter, _: Kind, _: std::net::IpAddr) {}
+        fn arrived_unframed(&self, _: fipa_acl::Letter, _: Kind, _: fipa_transport::LegacySource) {}
 
         fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {
             self.concluded.lock().push((attempt, conclusion));

@@ -2,15 +2,14 @@
 //! the ways.
 
 use std::collections::VecDeque;
-use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::Letter;
 use fipa_sds::{Directory, Entry};
 use fipa_transport::{
-    Answer, AttemptId, Body, FailureReason, Incarnation, Kind, Location, Outcome, Parcel, Report,
-    Stream, Ticket, WayError, WayFault,
+    Answer, AttemptId, Body, FailureReason, Incarnation, Kind, LegacySource, Location, Outcome,
+    Parcel, Report, Stream, Ticket, WayError, WayFault,
 };
 use smallvec::SmallVec;
 
@@ -95,8 +94,8 @@ pub(crate) enum Origin {
     Local { send: SendId },
     /// Other message transport services, which are told by a late answer or by a report.
     Forwarded { upstreams: SmallVec<[Upstream; 1]> },
-    /// An old peer, which has sent it from this address, and is told by a failure message.
-    OldPeer { from: IpAddr },
+    /// An old peer, which has sent it from this source, and is told by a failure message.
+    OldPeer { from: LegacySource },
     /// Nobody is told: it is a failure message.
     Nobody,
 }
@@ -128,8 +127,8 @@ pub(crate) enum Settlement {
 pub(crate) enum Author {
     /// This agent of this process.
     Ours(Incarnation),
-    /// An agent of another service. A legacy peer's letter came from this address.
-    Remote { from: Option<IpAddr> },
+    /// An agent of another service. A legacy peer's letter came from this source.
+    Remote { from: Option<LegacySource> },
 }
 
 /// A delivery that did not succeed, for the failure message.

@@ -1,12 +1,12 @@
 //! Failure messages: which senders are told of which failures, and how often.
 
-use std::net::{IpAddr, SocketAddr};
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use fipa_acl::{Dialect, Representation};
+use fipa_acl::Dialect;
 use fipa_sds::{Entry, Mts, Reach, Role, Source};
-use fipa_transport::{FailureReason, Incarnation, Location, Signature, Stream};
+use fipa_transport::{FailureReason, Incarnation, LegacySource, Location, Signature, Stream};
 
 use super::desk::{Action, Author, Origin, Undelivered, life_of};
 use super::inbox::Received;
@@ -72,7 +72,8 @@ impl Core {
                 Author::Remote { from } => {
                     // Before the message is decoded, by the name that the envelope gives.
                     let named = stamp::sender(&letter).unwrap_or_default();
-                    if !self.failure_limit.allows(now.instant, from, &named) {
+                    let address = from.map(|from| from.address);
+                    if !self.failure_limit.allows(now.instant, address, &named) {
                         continue;
                     }
                     from
@@ -130,7 +131,11 @@ impl Core {
                     continue;
                 }
             };
-            if !self.failure_limit.has_paid(now.instant, from, letter.len()) {
+            if !self.failure_limit.has_paid(
+                now.instant,
+                from.map(|from| from.address),
+                letter.len(),
+            ) {
                 continue;
             }
             let stream = Stream {
@@ -171,29 +176,24 @@ pub(super) fn cannot_be_decoded(why: &dyn std::fmt::Display) -> String {
 /// a third party.
 pub(super) fn locations_given<'a>(
     addresses: impl IntoIterator<Item = &'a str>,
-    representation: Option<Representation>,
-    from: IpAddr,
+    from: LegacySource,
 ) -> Vec<Location> {
-    let signature = match representation {
-        Some(Representation::String) => Signature::JadeProxy,
-        _ => Signature::FipaServices,
-    };
     let locations = addresses.into_iter().filter_map(|address| {
         let location: Location = address.parse().ok()?;
         let claimed: SocketAddr = location.address().parse().ok()?;
-        if claimed.ip().to_canonical() != from || !location.kind().is_supported() {
+        if claimed.ip().to_canonical() != from.address || !location.kind().is_supported() {
             return None;
         }
-        location.with_signature(signature).ok()
+        location.with_signature(from.signature).ok()
     });
     locations.take(Entry::MAX_LOCATIONS).collect()
 }
 
 /// An agent that the directory does not know, with the locations that it gives as its own.
-fn said_of_itself(report: &Failure<'_>, from: IpAddr) -> Option<Arc<Entry>> {
+fn said_of_itself(report: &Failure<'_>, from: LegacySource) -> Option<Arc<Entry>> {
     let agent = &report.sender;
     let addresses = agent.addresses().iter().map(|address| &**address);
-    let locations = locations_given(addresses, report.representation, from);
+    let locations = locations_given(addresses, from);
     if locations.is_empty() {
         return None;
     }

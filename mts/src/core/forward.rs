@@ -4,11 +4,11 @@ use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use fipa_acl::{DecodeError, Letter, Message, Representation};
+use fipa_acl::{DecodeError, Letter, Message};
 use fipa_sds::{Directory, Entry, Reach, Resolution, Role, Source};
 use fipa_transport::{
-    Answer, FailureReason, Hop, Incarnation, Kind, Location, Outcome, Parcel, Signature, Stream,
-    Ticket, Verdict,
+    Answer, FailureReason, Hop, Incarnation, Kind, LegacySource, Location, Outcome, Parcel,
+    Signature, Stream, Ticket, Verdict,
 };
 
 use super::desk::{Action, Author, Origin, Undelivered, Upstream};
@@ -49,7 +49,7 @@ const MAX_UNFRAMED_PATTERN: usize = 128;
 pub struct Unframed {
     letter: Letter,
     via: Kind,
-    from: IpAddr,
+    from: LegacySource,
     /// The receivers that the envelope names, and the entries meant.
     receivers: Vec<(Arc<str>, Resolution)>,
     /// The name of the sender, and a location that it gives as its own.
@@ -59,14 +59,14 @@ pub struct Unframed {
 }
 
 impl Unframed {
-    /// Reads the letter, which came from this address, and looks up its receivers.
+    /// Reads the letter, which came from this source, and looks up its receivers.
     ///
     /// # Errors
     /// When the envelope cannot be read.
     pub fn read(
         letter: Letter,
         via: Kind,
-        from: IpAddr,
+        from: LegacySource,
         directory: &dyn Directory,
     ) -> Result<Self, DecodeError> {
         let mut names = stamp::receivers(&letter, MAX_UNFRAMED_RECEIVERS + 1)?;
@@ -117,11 +117,10 @@ fn too_many(names: &[String]) -> Option<String> {
 }
 
 /// The name of the sender, and the first location that it gives as its own.
-fn locate(message: &Message, letter: &Letter, from: IpAddr) -> Option<(String, Location)> {
+fn locate(message: &Message, letter: &Letter, from: LegacySource) -> Option<(String, Location)> {
     let sender = sender_of(message, letter)?;
     let addresses = sender.addresses().iter().map(|address| &**address);
-    let representation = Representation::detect(&letter.payload().head);
-    let mut locations = locations_given(addresses, representation, from).into_iter();
+    let mut locations = locations_given(addresses, from).into_iter();
     Some((sender.name().to_owned(), locations.next()?))
 }
 
@@ -362,9 +361,10 @@ impl Core {
             sender: mut located,
             fault,
         } = unframed;
-        self.failure_limit.came(now.instant, from, letter.len());
+        self.failure_limit
+            .came(now.instant, from.address, letter.len());
         if let Some(fault) = fault {
-            tracing::info!(%from, "refused a letter of a legacy peer: {fault}");
+            tracing::info!(from = %from.address, "refused a letter of a legacy peer: {fault}");
             for (receiver, _) in receivers {
                 let why = (FailureReason::Refused, fault.clone());
                 self.unframed_failed(&receiver, &letter, (via, from), why);
@@ -395,7 +395,7 @@ impl Core {
             let here = entries.iter().filter(|entry| entry.reach == Reach::Local);
             let nobody = here.clone().next().is_none() && missing.is_empty();
             for name in missing.into_iter().chain(nobody.then_some(receiver)) {
-                tracing::info!(receiver = %name, %from, "an unframed letter names nobody of this host");
+                tracing::info!(receiver = %name, from = %from.address, "an unframed letter names nobody of this host");
                 let why = (FailureReason::NoSuchAgent, String::new());
                 self.unframed_failed(&name, &letter, (via, from), why);
             }
@@ -406,7 +406,7 @@ impl Core {
                     continue;
                 }
                 if let Some(located) = located.take() {
-                    self.hear_unframed(now, located, from);
+                    self.hear_unframed(now, located, from.address);
                 }
                 let stream = Stream {
                     sender: stream_sender,
@@ -463,7 +463,7 @@ impl Core {
         &mut self,
         receiver: &Arc<str>,
         letter: &Letter,
-        (via, from): (Kind, IpAddr),
+        (via, from): (Kind, LegacySource),
         (reason, detail): (FailureReason, String),
     ) {
         let own = self.desk.config.incarnation;

@@ -1,13 +1,12 @@
 //! The side of the runtime that transports see: what they tell is handed to the core.
 
-use std::net::IpAddr;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Weak};
 
 use fipa_acl::Letter;
 use fipa_transport::{
     Answer, Arrival, Arriving, AttemptId, Conclusion, FailureReason, Introduction, Kind,
-    LoanedContent, Location, Sink, Verdict,
+    LegacySource, LoanedContent, Location, Sink, Verdict,
 };
 
 use super::Shared;
@@ -37,7 +36,7 @@ impl Sink for Receiving {
         verdict
     }
 
-    fn arrived_unframed(&self, letter: Letter, via: Kind, from: IpAddr) {
+    fn arrived_unframed(&self, letter: Letter, via: Kind, from: LegacySource) {
         let Some(shared) = self.shared.upgrade() else {
             return;
         };

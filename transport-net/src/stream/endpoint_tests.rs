@@ -15,7 +15,7 @@ impl Sink for Ignores {
         Verdict::Now(Answer::Accepted)
     }
 
-    fn arrived_unframed(&self, _: fipa_acl::Letter, _: Kind, _: std::net::IpAddr) {}
+    fn arrived_unframed(&self, _: fipa_acl::Letter, _: Kind, _: fipa_transport::LegacySource) {}
 
     fn concluded(&self, _: AttemptId, _: Conclusion) {}
 }

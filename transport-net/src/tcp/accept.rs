@@ -7,7 +7,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use bytes::BytesMut;
-use fipa_transport::ListenError;
+use fipa_transport::{LegacySource, ListenError};
 use socket2::{Domain, Protocol, SockRef, Socket, Type};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
@@ -355,7 +355,11 @@ async fn receive_letter(
         count(&endpoint.tally().held_back);
         sleep_until(until.into()).await;
     }
-    unframed::hand_on(endpoint, read.letter, from.ip());
+    let source = LegacySource {
+        address: from.ip().to_canonical(),
+        signature: read.signature,
+    };
+    unframed::hand_on(endpoint, read.letter, source);
     Ok(())
 }
 

@@ -1,11 +1,9 @@
 //! Letters of old peers (fipa_services, and JADE over its raw TCP extension): one per connection,
 //! without a header, until end of stream. Their envelopes are bit-efficient or XML.
 
-use std::net::IpAddr;
-
 use bytes::{Bytes, BytesMut};
 use fipa_acl::{DecodeError, EncodeError, Envelope, EnvelopeParams, Letter};
-use fipa_transport::Kind;
+use fipa_transport::{Kind, LegacySource, Signature};
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::time::{Instant, timeout_at};
 
@@ -40,9 +38,11 @@ pub(crate) enum UnframedError {
     Standard(#[from] EncodeError),
 }
 
-/// A letter that has been read, and the room that its bytes take.
+/// A letter that has been read, what the writer of its envelope understands, and the room that its bytes
+/// take.
 pub(crate) struct Read {
     pub(crate) letter: Letter,
+    pub(crate) signature: Signature,
     pub(crate) _room: Option<Room>,
 }
 
@@ -57,12 +57,32 @@ pub(crate) async fn read(
 ) -> Result<Read, UnframedError> {
     let (whole, room) = read_to_end(endpoint, place, account, source).await?;
     let (envelope, length) = Envelope::decode(&whole)?;
-    let message = whole.slice(length.min(whole.len())..);
+    let length = length.min(whole.len());
+    let signature = signature_of(&whole[..length]);
+    let message = whole.slice(length..);
     let envelope = with_stamped_extensions(envelope).encode_standard()?;
     Ok(Read {
         letter: Letter::new(envelope, message),
+        signature,
         _room: room,
     })
+}
+
+/// What the writer of this envelope understands. JADE writes XML, and `Z` between date and time.
+/// The encoding of the message says nothing: fipa_services sends string messages, too, but does not
+/// read such dates.
+fn signature_of(envelope: &[u8]) -> Signature {
+    const BEFORE: &[u8] = b"<date>";
+    const DAY: usize = "20261120".len();
+    let found = match envelope.first() {
+        Some(b'<') => envelope.windows(BEFORE.len()).position(|it| it == BEFORE),
+        _ => None,
+    };
+    let between = found.and_then(|at| envelope.get(at + BEFORE.len() + DAY));
+    match between {
+        Some(b'Z') => Signature::JadeProxy,
+        _ => Signature::FipaServices,
+    }
 }
 
 /// The same envelope with stamped extensions only, as FIPA00088 wants them: fipa_services narrows
@@ -113,11 +133,11 @@ fn overrule(older: &mut EnvelopeParams, newer: EnvelopeParams) {
     older.user_defined.extend(newer.user_defined);
 }
 
-/// Hands a letter that came from this address to the sink, unless the endpoint has been closed.
-pub(crate) fn hand_on(endpoint: &Endpoint, letter: Letter, from: IpAddr) {
+/// Hands a letter that came from this source to the sink, unless the endpoint has been closed.
+pub(crate) fn hand_on(endpoint: &Endpoint, letter: Letter, from: LegacySource) {
     if let Some(sink) = endpoint.sink() {
         count(&endpoint.tally().unframed_in);
-        sink.arrived_unframed(letter, Kind::Tcp, from.to_canonical());
+        sink.arrived_unframed(letter, Kind::Tcp, from);
     }
 }
 
@@ -205,6 +225,22 @@ mod tests {
 
     /// A letter as a fipa_services peer sent it.
     const TCP_LETTER: &[u8] = include_bytes!("../../tests/data/tcp_letter.bin");
+
+    #[test]
+    fn the_envelope_tells_what_its_writer_understands() {
+        let for_jade = include_bytes!("../../tests/data/tcp_letter_jade.bin");
+        let of_jade = include_bytes!("../../../acl/tests/vectors/jade_tcp_reply.xml");
+        let cases: [(&[u8], _); 3] = [
+            (TCP_LETTER, Signature::FipaServices),
+            (for_jade, Signature::FipaServices),
+            (of_jade, Signature::JadeProxy),
+        ];
+        for (letter, signature) in cases {
+            let whole = Bytes::copy_from_slice(letter);
+            let (_, length) = Envelope::decode(&whole).unwrap();
+            assert_eq!(signature_of(&letter[..length]), signature);
+        }
+    }
 
     #[test]
     fn extensions_without_a_stamp_are_folded_and_count_as_before() {

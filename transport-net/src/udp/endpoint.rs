@@ -481,10 +481,9 @@ impl Drop for Running {
 
 #[cfg(test)]
 mod tests {
-    use std::net::IpAddr;
 
     use fipa_acl::Letter;
-    use fipa_transport::{Conclusion, Incarnation};
+    use fipa_transport::{Conclusion, Incarnation, LegacySource};
 
     use super::*;
     use crate::{Identity, UdpLimits};
@@ -496,7 +495,7 @@ mod tests {
             Verdict::Later
         }
 
-        fn arrived_unframed(&self, _: Letter, _: Kind, _: IpAddr) {}
+        fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {}
 
         fn concluded(&self, _: AttemptId, _: Conclusion) {}
     }

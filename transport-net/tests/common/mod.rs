@@ -8,7 +8,6 @@ pub(crate) mod certificates;
 pub(crate) mod intruder;
 
 use std::collections::HashMap;
-use std::net::IpAddr;
 use std::ops::Deref;
 use std::path::Path;
 use std::sync::Arc;
@@ -18,8 +17,8 @@ use bytes::Bytes;
 use fipa_acl::{Letter, Payload};
 use fipa_transport::wire::ParcelHeader;
 use fipa_transport::{
-    Answer, Arrival, Arriving, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, LoanedContent,
-    Location, Parcel, Sink, Stream, Ticket, Transport, Verdict, WayError,
+    Answer, Arrival, Arriving, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, LegacySource,
+    LoanedContent, Location, Parcel, Sink, Stream, Ticket, Transport, Verdict, WayError,
 };
 use fipa_transport_net::{
     Identity, Limits, TcpConfig, TcpTransport, UdpConfig, UdpLimits, UnixConfig,
@@ -207,10 +206,10 @@ impl Sink for Recorder {
         self.also_at.lock().clone()
     }
 
-    fn arrived_unframed(&self, letter: Letter, via: Kind, from: IpAddr) {
+    fn arrived_unframed(&self, letter: Letter, via: Kind, from: LegacySource) {
         assert!(
-            from.is_loopback(),
-            "the tests' peers are here, not at {from}"
+            from.address.is_loopback(),
+            "the tests' peers are here, not at {from:?}"
         );
         self.record.lock().unframed.push((letter, via));
     }

@@ -4,7 +4,6 @@
 #![allow(dead_code)]
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on says so")]
 
-use std::net::IpAddr;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -13,8 +12,8 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use fipa_acl::{Letter, Payload};
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel, Sink,
-    Stream, Transport, Verdict,
+    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, LegacySource, Location,
+    Parcel, Sink, Stream, Transport, Verdict,
 };
 use fipa_transport_shm::{ShmConfig, ShmTransport};
 use std::sync::Mutex;
@@ -119,7 +118,7 @@ impl Sink for Told {
         Verdict::Now(Answer::Accepted)
     }
 
-    fn arrived_unframed(&self, _letter: Letter, _via: Kind, _from: IpAddr) {
+    fn arrived_unframed(&self, _letter: Letter, _via: Kind, _from: LegacySource) {
         panic!("shared memory has no letters without a frame");
     }
 

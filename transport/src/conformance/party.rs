@@ -1,7 +1,6 @@
 //! Endpoints under test, and what their sinks have heard.
 
 use std::collections::HashMap;
-use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -11,8 +10,8 @@ use parking_lot::Mutex;
 
 use super::Fixture;
 use crate::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel, Sink,
-    Stream, Ticket, Transport, Verdict,
+    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, LegacySource, Location,
+    Parcel, Sink, Stream, Ticket, Transport, Verdict,
 };
 
 /// How long the suite waits before it calls a transport broken.
@@ -43,7 +42,7 @@ impl Sink for Recorder {
         verdict
     }
 
-    fn arrived_unframed(&self, _: Letter, _: Kind, _: IpAddr) {
+    fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {
         panic!("nobody sent an unframed letter");
     }
 

@@ -2,7 +2,6 @@
 //! delivery core, no agents. What it costs to be acknowledged, and bounded, and crash-safe.
 
 use std::collections::HashMap;
-use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -10,8 +9,8 @@ use bytes::Bytes;
 use fipa::Config;
 use fipa_acl::{Letter, Payload};
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Kind, Location, Parcel, Sink,
-    Stream, Transport, Verdict,
+    Answer, Arrival, AttemptId, Body, Conclusion, Incarnation, Kind, LegacySource, Location,
+    Parcel, Sink, Stream, Transport, Verdict,
 };
 use fipa_transport_shm::ShmTransport;
 use parking_lot::Mutex;
@@ -73,7 +72,7 @@ impl Sink for Heard {
         Verdict::Now(Answer::Accepted)
     }
 
-    fn arrived_unframed(&self, _letter: Letter, _via: Kind, _from: IpAddr) {}
+    fn arrived_unframed(&self, _letter: Letter, _via: Kind, _from: LegacySource) {}
 
     fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {
         self.concluded.lock().push((now_ns(), attempt, conclusion));
