@@ -200,7 +200,7 @@ proptest! {
         ] {
             let start = format!("{what}: '{}", text.unwrap_or_default());
             let found = of_message.spans.iter().find(|span| span.meaning.starts_with(&start));
-            let plain = text.is_some_and(|text| text.len() < 60 && !text.contains(char::is_control));
+            let plain = text.is_some_and(|text| text.len() < 60 && !text.contains(fipa_acl::is_unprintable));
             prop_assert!(found.is_some() || !plain, "{start}");
             prop_assert!(found.is_none() || text.is_some(), "{start}");
         }
