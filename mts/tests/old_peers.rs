@@ -437,7 +437,8 @@ fn the_sender_of_a_framed_letter_that_cannot_be_decoded_is_told() {
         letter: without_end(&letter_for(&message, now().utc).unwrap()),
         sender,
         via: Some(Kind::Shm),
-        from: None,
+        service: Incarnation::UNKNOWN,
+        remote: false,
     };
     core.handle_undecodable(now(), &arm, &received(rover), "for a test".to_owned());
     let (_, location, parcel) = dispatched(&mut core).unwrap();

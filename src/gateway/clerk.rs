@@ -12,7 +12,7 @@ use fipa_acl::{AgentId, Message, Performative};
 use fipa_mts::core::{Received, Submission};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Entry, Matcher, Query};
-use fipa_transport::{Hop, Incarnation};
+use fipa_transport::Incarnation;
 
 use super::exchange::Exchanging;
 use super::neighbours::Neighbours;
@@ -44,12 +44,12 @@ impl Clerk {
     }
 
     fn handle(&self, message: &Message, received: &Received) {
-        let (sender, from) = (received.sender, received.from.as_ref());
+        let sender = received.sender;
         if message.ontology() == Some(EXCHANGE_ONTOLOGY)
             && *message.performative() == Performative::Inform
         {
             // A gateway speaks for itself, on its own connections.
-            if from.is_none_or(|from| from.location.incarnation() != sender) {
+            if received.service != sender {
                 tracing::info!(
                     "what a gateway tells was not used: it came over another's connection"
                 );
@@ -71,7 +71,7 @@ impl Clerk {
         }
         match message.ontology() {
             // Routes name the incarnations of agents and gateways, and are for this host only.
-            Some(routes::ONTOLOGY) if from.is_some_and(Hop::is_remote) => {
+            Some(routes::ONTOLOGY) if received.remote => {
                 self.answer(message, sender, Performative::Refuse, |answer| {
                     answer.content("routes are told to agents of the gateway's host only")
                 });

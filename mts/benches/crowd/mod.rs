@@ -116,7 +116,7 @@ impl Crowd {
         };
         let from = Hop {
             location: self.peer.clone(),
-            principal: Principal::Unproved,
+            principal: Principal::Host,
         };
         let arrival = Arrival {
             parcel,

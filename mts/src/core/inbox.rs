@@ -23,9 +23,11 @@ pub struct Received {
     pub sender: Incarnation,
     /// How it came, on its last stretch; none for what this process told the agent itself.
     pub via: Option<Kind>,
-    /// The service that handed it over; none for what this process told the agent itself, and for a
-    /// letter of a legacy peer.
-    pub from: Option<Hop>,
+    /// The service that handed it over, as it introduced itself; unknown for what this process told the
+    /// agent itself, and for a letter of a legacy peer.
+    pub service: Incarnation,
+    /// Whether that service is on another host, as far as its link proves; see [`Hop::is_remote`].
+    pub remote: bool,
 }
 
 /// An agent of this process.
@@ -127,7 +129,8 @@ impl Inbox {
             letter,
             sender: stream.sender,
             via: Some(via),
-            from: Some(from.clone()),
+            service: from.location.incarnation(),
+            remote: from.is_remote(),
         });
         Answer::Accepted
     }
@@ -149,7 +152,8 @@ impl Inbox {
             letter,
             sender: Incarnation::UNKNOWN,
             via: Some(via),
-            from: None,
+            service: Incarnation::UNKNOWN,
+            remote: true,
         });
         true
     }
@@ -165,7 +169,8 @@ impl Inbox {
             letter,
             sender: Incarnation::UNKNOWN,
             via: None,
-            from: None,
+            service: Incarnation::UNKNOWN,
+            remote: false,
         });
         true
     }
