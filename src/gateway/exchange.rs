@@ -3,7 +3,7 @@
 //! Its letters are those of the gateway itself, to the neighbour itself, so they go by whatever
 //! transport leads there, in order and acknowledged. The clerk hands over what comes in.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -130,11 +130,11 @@ impl Exchanging {
         let now = Instant::now();
         let neighbours = means.neighbours.all();
         let announced = means.network.clone().map(Network::directory);
-        let announced_at = locations_by_gateway(announced.as_deref());
+        let announced_at = announced_by(&neighbours, announced.as_deref());
         let located = |neighbour: &Neighbour| {
             let entry = &neighbour.entry;
             let others = announced_at.get(&entry.incarnation);
-            let others = others.into_iter().flatten();
+            let others = others.into_iter().flat_map(|other| &other.locations);
             (entry.mts.clone(), with_others(&entry.locations, others))
         };
         let present: Vec<(Mts, Vec<Location>)> = neighbours.iter().map(located).collect();
@@ -190,12 +190,19 @@ impl Exchanging {
     }
 }
 
-/// Where gateways announce that they take letters.
-fn locations_by_gateway(announced: Option<&dyn Directory>) -> HashMap<Incarnation, Vec<Location>> {
+/// An entry that each neighbour announces, with the locations of the neighbour.
+fn announced_by(
+    neighbours: &[Neighbour],
+    announced: Option<&dyn Directory>,
+) -> HashMap<Incarnation, Arc<Entry>> {
+    let gateways = neighbours.iter().map(|it| it.entry.incarnation);
+    let gateways: HashSet<Incarnation> = gateways.collect();
     let entries = announced.map(Directory::entries);
     let entries = entries.iter().flat_map(|entries| entries.iter());
-    let by_gateway = |entry: &Arc<Entry>| (entry.mts.incarnation, entry.locations.clone());
-    entries.map(by_gateway).collect()
+    entries
+        .filter(|entry| gateways.contains(&entry.mts.incarnation))
+        .map(|entry| (entry.mts.incarnation, Arc::clone(entry)))
+        .collect()
 }
 
 /// These locations, and others of kinds that are not among them.
