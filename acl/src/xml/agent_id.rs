@@ -280,8 +280,9 @@ pub(super) fn write(
     for (name, value) in agent.user_defined() {
         match dialect {
             Dialect::Standard => out.user_defined(name, value, false)?,
-            // It reads no `<X-name>`, and `user-defined` with a type only.
-            Dialect::FipaServices => out.user_defined(name, value, true)?,
+            // Inside an identifier it reads elements whose own name begins with `X-` only, and
+            // takes name and type from their attributes.
+            Dialect::FipaServices => out.user_element_with_name(name, value)?,
             Dialect::Jade => out.user_element(name, value)?,
         }
     }

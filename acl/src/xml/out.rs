@@ -175,29 +175,49 @@ impl<'a> Out<'a> {
             let shown = name.chars().take(60).collect();
             return Err(EncodeError::UserDefinedName(shown));
         }
-        let what = "user-defined parameter";
-        if self.guards_space && value.is_empty() {
-            let why = "fipa_services does not read an empty one in XML";
-            return Err(EncodeError::Unrepresentable { what, why });
-        }
+        self.check_guarded(value)?;
         self.raw("<user-defined");
-        self.attribute("href", what, &format!("X-{name}"))?;
+        self.attribute("href", USER_DEFINED, &format!("X-{name}"))?;
         self.raw(if typed { " type=\"string\">" } else { ">" });
-        self.text(what, value)?;
+        self.text(USER_DEFINED, value)?;
         self.close("user-defined");
         Ok(())
     }
 
     /// A user-defined parameter as an element of its own name.
     pub(super) fn user_element(&mut self, name: &str, value: &str) -> Result<(), EncodeError> {
-        let allowed = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
-        if name.is_empty() || !name.bytes().all(allowed) {
+        check_element_name(name)?;
+        self.element(&format!("X-{name}"), USER_DEFINED, value)
+    }
+
+    /// A user-defined parameter as an element of its own name that repeats the name as `href`:
+    /// `<X-role href="X-role" type="string">lifts</X-role>`.
+    pub(super) fn user_element_with_name(
+        &mut self,
+        name: &str,
+        value: &str,
+    ) -> Result<(), EncodeError> {
+        check_element_name(name)?;
+        self.check_guarded(value)?;
+        let element = format!("X-{name}");
+        self.raw("<");
+        self.raw(&element);
+        self.attribute("href", USER_DEFINED, &element)?;
+        self.raw(" type=\"string\">");
+        self.text(USER_DEFINED, value)?;
+        self.close(&element);
+        Ok(())
+    }
+
+    /// Refuses an empty user-defined parameter if its reader loses it.
+    fn check_guarded(&self, value: &str) -> Result<(), EncodeError> {
+        if self.guards_space && value.is_empty() {
             return Err(EncodeError::Unrepresentable {
-                what: "user-defined parameter",
-                why: "its reader needs a name of letters, digits, '-', '_' and '.'",
+                what: USER_DEFINED,
+                why: "fipa_services does not read an empty one in XML",
             });
         }
-        self.element(&format!("X-{name}"), "user-defined parameter", value)
+        Ok(())
     }
 
     fn escaped(
@@ -252,6 +272,21 @@ impl<'a> Out<'a> {
         self.raw(text.get(plain..).unwrap_or_default());
         Ok(())
     }
+}
+
+/// How errors name a user-defined parameter.
+const USER_DEFINED: &str = "user-defined parameter";
+
+/// Refuses a name of a user-defined parameter that no reader takes for that of an element.
+fn check_element_name(name: &str) -> Result<(), EncodeError> {
+    let allowed = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
+    if name.is_empty() || !name.bytes().all(allowed) {
+        return Err(EncodeError::Unrepresentable {
+            what: USER_DEFINED,
+            why: "its reader needs a name of letters, digits, '-', '_' and '.'",
+        });
+    }
+    Ok(())
 }
 
 /// Bytes of content that are copied and checked at a time. A copy stays in the processor's cache until
