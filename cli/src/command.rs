@@ -1,6 +1,7 @@
 //! The commands, one per file: its arguments, with the help that documents it, and `run`.
 
 mod agents;
+#[cfg(feature = "bench")]
 mod bench;
 mod coalition;
 mod config;
@@ -33,6 +34,7 @@ pub(crate) enum Command {
     Watch(Box<watch::Arguments>),
     Demo(demo::Arguments),
     Doctor(doctor::Arguments),
+    #[cfg(feature = "bench")]
     Bench(bench::Arguments),
     Decode(decode::Arguments),
     Encode(encode::Arguments),
@@ -53,6 +55,7 @@ pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
         Command::Watch(arguments) => watch::run(*arguments, global),
         Command::Demo(arguments) => demo::run(arguments, global),
         Command::Doctor(arguments) => doctor::run(arguments, global),
+        #[cfg(feature = "bench")]
         Command::Bench(arguments) => bench::run(arguments, global),
         Command::Decode(arguments) => decode::run(arguments, global),
         Command::Encode(arguments) => encode::run(arguments, global),

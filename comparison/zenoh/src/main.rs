@@ -17,14 +17,14 @@ use zenoh::shm::{
 };
 use zenoh::{Config, Session, Wait as _};
 
-#[path = "../../../cli/src/command/bench/part/orders.rs"]
+#[path = "../../../benches/src/part/orders.rs"]
 mod orders;
 
 /// Play one end of `fipa bench --zenoh` (which starts this program)
 #[derive(Debug, Parser)]
 struct Arguments {
-    /// Which end
-    #[arg(long, value_enum)]
+    /// Which end: sender or receiver
+    #[arg(long)]
     end: End,
     /// Use zenoh's shared memory
     #[arg(long)]

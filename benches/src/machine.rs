@@ -13,9 +13,9 @@ const BUSY: f64 = 0.10;
 /// How long the machine is looked at.
 const LOOK: Duration = Duration::from_millis(500);
 
-/// The machine, as it is told with every figure.
+/// The machine that a measurement runs on.
 #[derive(Debug, Clone, Serialize)]
-pub(super) struct Machine {
+pub struct Machine {
     pub(super) processor: String,
     pub(super) cores: usize,
     pub(super) memory_bytes: u64,
@@ -50,8 +50,8 @@ impl fmt::Display for Machine {
 }
 
 impl Machine {
-    /// Looks at this machine for half a second, in which nothing of ours should be running.
-    pub(super) async fn look() -> Self {
+    /// Observes this machine for half a second, in which the caller should start nothing.
+    pub async fn observe() -> Self {
         let before = Jiffies::read();
         tokio::time::sleep(LOOK).await;
         let busy = Jiffies::read().busy_since(before);
@@ -71,8 +71,8 @@ impl Machine {
         }
     }
 
-    /// Why times should not be trusted, if so.
-    pub(super) fn warnings(&self) -> Vec<String> {
+    /// Reasons not to trust the times that are measured on this machine now.
+    pub fn warnings(&self) -> Vec<String> {
         let mut warnings = Vec::new();
         if self.busy > BUSY {
             warnings.push(format!(

@@ -15,6 +15,9 @@ use fipa::Config;
 use fipa_transport_shm::raw::Wait as RawWait;
 use serde::{Deserialize, Serialize};
 
+use crate::error::PartError;
+use crate::machine;
+
 pub(super) use self::orders::{End, Event, Fill, Letters, Order, Spread};
 
 /// What a process is in a measurement; the argument of `--part`.
@@ -76,8 +79,22 @@ impl From<Wait> for RawWait {
     }
 }
 
-/// Plays a part until standard input ends.
-pub(super) fn play(part: Part, config: &Config) -> Result<(), String> {
+/// Plays the part of one process in a measurement, until its standard input ends.
+///
+/// `part` is the JSON text of the option `--part` that a [`Program`](crate::Program) gets, `core` the
+/// number of `--core`: the processor that this process keeps to.
+///
+/// # Errors
+///
+/// If `part` is not such a text, the processor is not available, or the part could not be played.
+pub fn play(part: &str, core: Option<usize>, config: &Config) -> Result<(), PartError> {
+    let pinned = core.map_or(Ok(()), machine::keep_to);
+    let part = serde_json::from_str(part).map_err(|error| error.to_string());
+    let played = pinned.and(part).and_then(|part| play_part(part, config));
+    played.map_err(PartError)
+}
+
+fn play_part(part: Part, config: &Config) -> Result<(), String> {
     match part {
         Part::Agent { name, .. } => agent::Agent::play(config, &[&name], &name),
         Part::Crowd { count } => {

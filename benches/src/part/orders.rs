@@ -6,16 +6,27 @@
 
 use std::io::Write as _;
 
-use clap::ValueEnum;
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 
 /// Which end of a way.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum End {
     Sender,
     Receiver,
+}
+
+impl std::str::FromStr for End {
+    type Err = &'static str;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        match text {
+            "sender" => Ok(Self::Sender),
+            "receiver" => Ok(Self::Receiver),
+            _ => Err("an end is sender or receiver"),
+        }
+    }
 }
 
 /// Where content comes from.

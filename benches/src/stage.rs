@@ -8,7 +8,8 @@ use fipa::keys::{Keys, KeysError, VALID};
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, Lines};
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 
-use super::part::{End, Event, Order, Part};
+use crate::comparison::Program;
+use crate::part::{End, Event, Order, Part};
 
 /// How long something may take that usually takes less than a second.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -21,7 +22,7 @@ const ENDING: Duration = Duration::from_secs(5);
 /// When it is dropped, everybody is ended and all traces are removed: also when the measurement
 /// was interrupted.
 pub(super) struct Stage {
-    program: PathBuf,
+    program: Program,
     /// The program with ends that go through zenoh, if they are to be measured too.
     zenoh: Option<PathBuf>,
     place: PathBuf,
@@ -42,8 +43,7 @@ struct Process {
 }
 
 impl Stage {
-    pub(super) fn new(zenoh: Option<PathBuf>) -> Result<Self, String> {
-        let program = std::env::current_exe().map_err(|error| error.to_string())?;
+    pub(super) fn new(program: Program, zenoh: Option<PathBuf>) -> Result<Self, String> {
         let place = std::env::temp_dir().join(format!("fipa-bench-{}", std::process::id()));
         let mut private = std::fs::DirBuilder::new();
         std::os::unix::fs::DirBuilderExt::mode(&mut private, 0o700);
@@ -99,9 +99,10 @@ impl Stage {
     ) -> Result<(Who, String), String> {
         let core = part.end().and_then(|end| self.core_of(end));
         let described = serde_json::to_string(part).map_err(|error| error.to_string())?;
-        let mut command = Command::new(&self.program);
+        let mut command = Command::new(&self.program.path);
         command
-            .args(["bench", "--part", &described])
+            .args(&self.program.arguments)
+            .args(["--part", &described])
             .args(["--set", &format!("domain={}", Self::domain(domain))])
             // Nothing leaves this machine.
             .args(["--set", "discovery.interfaces=lo"])

@@ -17,17 +17,18 @@ use serde::Serialize;
 use super::bars::{self, Bar, Group};
 use super::machine::Machine;
 use super::report;
+use crate::error::BenchError;
 
 /// Cycles for one figure, as in the paper.
-pub(super) const CYCLES: usize = 1000;
+const CYCLES: usize = 1000;
 /// Cycles for one figure when there is no time.
-pub(super) const QUICK_CYCLES: usize = 20;
+const QUICK_CYCLES: usize = 20;
 /// Cycles before that, which do not count.
 const WARMING: usize = 20;
 /// Cycles after which others get their turn: a signal is heard.
 const BREATH: usize = 10;
-/// Figures there are: messages without and in each envelope, at every size.
-pub(super) const STEPS: usize = MESSAGES.len() * (1 + ENVELOPES.len()) * SIZES.len();
+/// Number of figures: messages without and in each envelope, at every size.
+const STEPS: usize = MESSAGES.len() * (1 + ENVELOPES.len()) * SIZES.len();
 /// What all other fields of the message have together, in bytes.
 const HEADER: usize = 99;
 
@@ -39,9 +40,11 @@ const MESSAGES: [Representation; 3] = [
 const ENVELOPES: [Representation; 2] = [Representation::BitEfficient, Representation::Xml];
 const SIZES: [usize; 3] = [1, 1 << 10, 1 << 20];
 
-/// All of it.
+/// The repeated evaluation: encoded lengths, and times of encoding and decoding.
+///
+/// Serialized as one object: `machine`, `cycles`, `sizes` and `times`, with times in microseconds.
 #[derive(Debug, Serialize)]
-pub(super) struct Paper {
+pub struct Paper {
     pub(super) machine: Machine,
     /// Cycles of encoding and decoding for every figure.
     pub(super) cycles: usize,
@@ -116,39 +119,6 @@ fn cpp_us(
     };
     let ([encode, decode], [around, off]) = (of_message.get(at)?, of_envelope.get(at)?);
     Some([encode + around, decode + off])
-}
-
-/// Measures all of it. `told` hears of every step.
-pub(super) async fn measure(
-    machine: Machine,
-    cycles: usize,
-    told: &impl Fn(&str),
-) -> Result<Paper, String> {
-    let mut paper = Paper {
-        machine,
-        cycles,
-        sizes: Vec::new(),
-        times: Vec::new(),
-    };
-    let envelopes = [None].into_iter().chain(ENVELOPES.map(Some));
-    for envelope in envelopes {
-        for message in MESSAGES {
-            let bytes = encode(&a_message(1)?, message, envelope)?.len();
-            paper.sizes.push(Size {
-                message: name(message),
-                envelope: envelope.map(name),
-                bytes,
-                cpp_bytes: cpp_bytes(message, envelope),
-            });
-            for content in SIZES {
-                let what = label(name(message), envelope.map(name));
-                told(&format!("{what}, {}", report::size(content)));
-                let times = times(message, envelope, content, cycles).await?;
-                paper.times.push(times);
-            }
-        }
-    }
-    Ok(paper)
 }
 
 /// A message with all fields, of which those beside the content have [`HEADER`] bytes together.
@@ -303,19 +273,77 @@ fn name_in_envelope(representation: Representation) -> &'static str {
 }
 
 impl Paper {
-    /// Writes the tables and the pictures into a directory.
-    pub(super) fn write(&self, directory: &Path) -> Result<(), String> {
+    /// Number of steps that a measurement reports.
+    pub const STEPS: usize = STEPS;
+
+    /// Cycles of each figure in the paper.
+    pub const CYCLES: usize = CYCLES;
+
+    /// Cycles of each figure in a measurement of a few seconds.
+    pub const QUICK_CYCLES: usize = QUICK_CYCLES;
+
+    /// Measures all encodings. `progress` is called with the name of each step as it begins.
+    ///
+    /// # Errors
+    ///
+    /// [`BenchError::Encoding`] if a message cannot be encoded or decoded.
+    pub async fn measure(
+        machine: Machine,
+        cycles: usize,
+        progress: impl Fn(&str),
+    ) -> Result<Self, BenchError> {
+        let mut paper = Self {
+            machine,
+            cycles,
+            sizes: Vec::new(),
+            times: Vec::new(),
+        };
+        let measured = paper.measure_all(&progress).await;
+        measured.map_err(BenchError::Encoding)?;
+        Ok(paper)
+    }
+
+    async fn measure_all(&mut self, progress: &impl Fn(&str)) -> Result<(), String> {
+        let envelopes = [None].into_iter().chain(ENVELOPES.map(Some));
+        for envelope in envelopes {
+            for message in MESSAGES {
+                let bytes = encode(&a_message(1)?, message, envelope)?.len();
+                self.sizes.push(Size {
+                    message: name(message),
+                    envelope: envelope.map(name),
+                    bytes,
+                    cpp_bytes: cpp_bytes(message, envelope),
+                });
+                for content in SIZES {
+                    let what = label(name(message), envelope.map(name));
+                    progress(&format!("{what}, {}", report::size(content)));
+                    let times = times(message, envelope, content, self.cycles).await?;
+                    self.times.push(times);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes `paper.md`, `paper-sizes.svg` and `paper-times.svg` into a directory.
+    ///
+    /// # Errors
+    ///
+    /// If a diagram cannot be drawn or a file cannot be written.
+    pub fn write(&self, directory: &Path) -> Result<(), BenchError> {
         let write = |name: &str, text: String| {
             let path = directory.join(name);
-            std::fs::write(&path, text).map_err(|error| format!("{}: {error}", path.display()))
+            let written = std::fs::write(&path, text);
+            written.map_err(|source| BenchError::Write { path, source })
         };
-        write("paper.md", self.text())?;
-        write("paper-sizes.svg", self.picture_of_sizes()?)?;
-        write("paper-times.svg", self.picture_of_times()?)
+        let drawn = |picture: Result<String, String>| picture.map_err(BenchError::Draw);
+        write("paper.md", self.to_text())?;
+        write("paper-sizes.svg", drawn(self.picture_of_sizes())?)?;
+        write("paper-times.svg", drawn(self.picture_of_times())?)
     }
 
     /// The tables, in Markdown.
-    pub(super) fn text(&self) -> String {
+    pub fn to_text(&self) -> String {
         let mut text = format!(
             "# The paper's evaluation again\n\n\
              Written by `fipa bench paper` on {}; others used {:.0} % of the processors before.\n\

@@ -10,10 +10,11 @@ use super::many::Many;
 use super::part::{Fill, Letters, Wait};
 use super::stage::Stage;
 use super::way::{Sort, Turn, Way};
+use crate::error::BenchError;
 
-/// How much is measured.
+/// The extent of a measurement.
 #[derive(Debug, Clone)]
-pub(super) struct Effort {
+pub struct Effort {
     pub(super) sizes: Vec<usize>,
     /// Turns of every way with letters of one sort.
     pub(super) rounds: usize,
@@ -24,23 +25,50 @@ pub(super) struct Effort {
 }
 
 impl Effort {
-    pub(super) fn full(sizes: Vec<usize>) -> Self {
-        Self {
-            sizes,
+    /// Largest content that can be measured, in bytes.
+    pub const MAX_SIZE: u64 = 32 << 20;
+
+    /// A thorough measurement of content of these sizes, in bytes: about 80 seconds for five sizes.
+    ///
+    /// # Errors
+    ///
+    /// [`BenchError::Size`] for a size that cannot be measured.
+    pub fn full(sizes: impl IntoIterator<Item = u64>) -> Result<Self, BenchError> {
+        Ok(Self {
+            sizes: checked(sizes)?,
             rounds: 15,
             turn: Duration::from_millis(25),
             rate_rounds: 3,
-        }
+        })
     }
 
-    pub(super) fn quick(sizes: Vec<usize>) -> Self {
-        Self {
-            sizes,
+    /// A measurement of a few seconds, whose figures scatter more.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`full`](Self::full).
+    pub fn quick(sizes: impl IntoIterator<Item = u64>) -> Result<Self, BenchError> {
+        Ok(Self {
+            sizes: checked(sizes)?,
             rounds: 5,
             turn: Duration::from_millis(8),
             rate_rounds: 1,
-        }
+        })
     }
+}
+
+/// The sizes in order, each once.
+fn checked(sizes: impl IntoIterator<Item = u64>) -> Result<Vec<usize>, BenchError> {
+    let mut checked = Vec::new();
+    for size in sizes {
+        if !(1..=Effort::MAX_SIZE).contains(&size) {
+            return Err(BenchError::Size(size));
+        }
+        checked.push(usize::try_from(size).map_err(|_| BenchError::Size(size))?);
+    }
+    checked.sort_unstable();
+    checked.dedup();
+    Ok(checked)
 }
 
 /// Letters of a turn, at least and at most.

@@ -1,0 +1,39 @@
+//! Errors of a measurement.
+
+use std::path::PathBuf;
+
+use thiserror::Error;
+
+/// A measurement that could not be made or shown.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum BenchError {
+    /// A size of content outside of 1 byte to [`Effort::MAX_SIZE`](crate::Effort::MAX_SIZE).
+    #[error("content of {0} bytes cannot be measured")]
+    Size(u64),
+    /// The directory and the processes of the measurement could not be prepared.
+    #[error("cannot prepare the measurement: {0}")]
+    Prepare(String),
+    /// No path could be measured; one reason for each.
+    #[error("no path could be measured: {}", .0.join("; "))]
+    NothingMeasured(Vec<String>),
+    /// An encoding failed on the message of the paper.
+    #[error("cannot measure the encodings: {0}")]
+    Encoding(String),
+    /// A diagram could not be drawn.
+    #[error("cannot draw the diagram: {0}")]
+    Draw(String),
+    /// A file could not be written.
+    #[error("cannot write {}", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+    },
+}
+
+/// A process that could not play its part in a measurement.
+#[derive(Debug, Error)]
+#[error("{0}")]
+pub struct PartError(pub(crate) String);

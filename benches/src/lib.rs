@@ -1,0 +1,33 @@
+//! Measures how fast letters go on this machine, beside the bare mechanisms in the same rounds.
+//!
+//! Each measured path is a set of real processes: the calling program starts itself again as their
+//! ends, in a directory of their own, so no domain of the user is touched. All paths are kept ready
+//! and take turns of a few milliseconds, so that other load of the machine affects a path and its
+//! limit alike.
+//!
+//! * [`Comparison`] measures agents, gateways and the bare mechanisms; [`play`] is the part of one
+//!   process in it.
+//! * [`Paper`] repeats the evaluation of the C++ libraries: lengths and times of all encodings.
+//! * [`Machine`] describes the machine that was measured.
+//!
+//! The crate has no argument parser and prints nothing; `fipa bench` is its shell.
+
+mod bars;
+mod comparison;
+mod error;
+mod machine;
+mod many;
+mod measure;
+mod paper;
+mod part;
+mod plot;
+mod report;
+mod stage;
+mod way;
+
+pub use comparison::{Comparison, Measurement, Program, Selection};
+pub use error::{BenchError, PartError};
+pub use machine::Machine;
+pub use measure::Effort;
+pub use paper::Paper;
+pub use part::play;

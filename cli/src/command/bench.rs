@@ -1,0 +1,262 @@
+//! `fipa bench`: the shell of the crate `fipa-bench`, which measures.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use bytesize::ByteSize;
+use clap::{Args, ValueEnum};
+use fipa_bench::{BenchError, Comparison, Effort, Machine, Measurement, Paper, Program, Selection};
+use indicatif::{ProgressBar, ProgressStyle};
+
+use crate::options::Global;
+use crate::report::{Failure, warn};
+use crate::{membership, output};
+
+/// Measure how fast letters go on this machine, beside what the bare mechanisms can do
+///
+/// Compares every configured transport: latency one way and round trip, throughput and processor
+/// time, for content from 100 bytes to 4 MB, each beside its limit (bare iceoryx2, Unix
+/// domain socket, a bare relay) measured in the same rounds, with the ratio. Gateways also speak TCP with
+/// TLS, and QUIC, with keys made for the measurement, beside TCP without. All traffic stays on this
+/// machine, and nothing is left behind.
+///
+/// Times are worth little on a busy machine; ratios more.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  fipa bench
+  fipa bench shm --quick
+  fipa bench net --json | jq '.rows[] | {path, size, p50: .one_way_us.p50, ratio}'
+  fipa bench --svg latency.svg
+  fipa bench --zenoh comparison/zenoh/target/release/fipa-comparison-zenoh
+  fipa bench paper --dir docs")]
+pub(crate) struct Arguments {
+    /// What to compare; everything unless given
+    #[arg(value_enum)]
+    what: Option<What>,
+    /// Print JSON instead of a table
+    #[arg(long)]
+    json: bool,
+    /// Draw latency over size into this file too
+    #[arg(long, value_name = "FILE")]
+    svg: Option<PathBuf>,
+    /// Measure less, in a few seconds: figures scatter more
+    #[arg(long)]
+    quick: bool,
+    /// Sizes of content; `paper` has its own
+    #[arg(
+        long,
+        value_delimiter = ',',
+        value_name = "SIZE",
+        value_parser = size,
+        default_value = "100B,1KiB,64KiB,1MiB,4MiB"
+    )]
+    sizes: Vec<ByteSize>,
+    /// Where `paper` writes its tables and pictures [default: docs]
+    #[arg(long, value_name = "DIRECTORY")]
+    dir: Option<PathBuf>,
+    /// Measure zenoh in the same rounds, through this program (see comparison/zenoh)
+    #[arg(long, value_name = "PROGRAM")]
+    zenoh: Option<PathBuf>,
+    /// Plays a part in the measurement of another process
+    #[arg(long, hide = true)]
+    part: Option<String>,
+    /// Processor to play it on
+    #[arg(long, hide = true, requires = "part")]
+    core: Option<usize>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum What {
+    /// Two agents on one host, through shared memory
+    Shm,
+    /// Through sockets: two agents directly, and through a gateway on either side
+    Net,
+    /// Encodings, as in the evaluation of the C++ libraries; writes tables and pictures
+    Paper,
+}
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
+    let config = global.config()?;
+    if let Some(part) = &arguments.part {
+        let played = fipa_bench::play(part, arguments.core, &config);
+        let advice = "see the report of the measurement that started this process";
+        return played
+            .map_err(|error| Failure::failed(error.to_string(), "a part of fipa bench", advice));
+    }
+    if arguments.what == Some(What::Paper) {
+        return measure_paper(&arguments);
+    }
+    if arguments.dir.is_some() {
+        return Err(Failure::wrong_usage(
+            "only `fipa bench paper` writes into a directory",
+            "--dir",
+            "leave it out, or use --svg FILE for a picture",
+        ));
+    }
+    let mut comparison = Comparison::new(
+        config.mts.transports.clone(),
+        effort(&arguments)?,
+        this_program()?,
+    );
+    comparison.selection = match arguments.what {
+        Some(What::Shm) => Selection::Shm,
+        Some(What::Net) => Selection::Net,
+        _ => Selection::All,
+    };
+    comparison.zenoh = arguments.zenoh.as_deref().map(program).transpose()?;
+    let measurement = membership::run(measure(comparison))?;
+    for note in measurement.notes() {
+        tracing::info!("{note}");
+    }
+    if let Some(file) = &arguments.svg {
+        let drawn = measurement.to_svg().and_then(|picture| {
+            let path = file.clone();
+            std::fs::write(file, picture).map_err(|source| BenchError::Write { path, source })
+        });
+        drawn.map_err(failed)?;
+    }
+    if arguments.json {
+        return output::json(&measurement.to_json());
+    }
+    output::text(&measurement.to_text())
+}
+
+async fn measure(comparison: Comparison) -> Result<Measurement, Failure> {
+    let machine = observe().await;
+    let progress = progress(comparison.steps());
+    let measured = comparison.run(machine, |step| advance(&progress, step));
+    let measured = measured.await;
+    progress.finish_and_clear();
+    measured.map_err(failed)
+}
+
+/// Repeats the evaluation of the paper.
+fn measure_paper(arguments: &Arguments) -> Result<(), Failure> {
+    if arguments.svg.is_some() {
+        return Err(Failure::wrong_usage(
+            "`fipa bench paper` draws pictures of its own",
+            "--svg",
+            "leave it out, and name with --dir where the pictures go",
+        ));
+    }
+    if arguments.zenoh.is_some() {
+        return Err(Failure::wrong_usage(
+            "`fipa bench paper` is about encodings, which zenoh has none of",
+            "--zenoh",
+            "leave it out, or leave out `paper`",
+        ));
+    }
+    let directory = arguments.dir.as_deref().unwrap_or(Path::new("docs"));
+    if !directory.is_dir() {
+        return Err(Failure::wrong_usage(
+            format!("{} is no directory", directory.display()),
+            "--dir",
+            "run it where the sources are, or name the directory to write into",
+        ));
+    }
+    let cycles = if arguments.quick {
+        Paper::QUICK_CYCLES
+    } else {
+        Paper::CYCLES
+    };
+    let paper = membership::run(async {
+        let machine = observe().await;
+        let progress = progress(Paper::STEPS);
+        let paper = Paper::measure(machine, cycles, |step| advance(&progress, step)).await;
+        progress.finish_and_clear();
+        paper.map_err(failed)
+    })?;
+    paper.write(directory).map_err(failed)?;
+    if arguments.json {
+        return output::json(&paper);
+    }
+    output::text(&paper.to_text())
+}
+
+/// Observes the machine and warns of conditions that spoil a measurement.
+async fn observe() -> Machine {
+    let machine = Machine::observe().await;
+    for warning in machine.warnings() {
+        warn(&warning);
+    }
+    machine
+}
+
+fn failed(error: BenchError) -> Failure {
+    let place = match &error {
+        BenchError::Write { path, .. } => path.display().to_string(),
+        _ => "fipa bench".to_owned(),
+    };
+    let advice = match &error {
+        BenchError::Prepare(_) => "check that this user can write to $TMPDIR",
+        BenchError::NothingMeasured(_) => {
+            "see `fipa config show` for mts.transports, and run it with -v for the logs"
+        }
+        BenchError::Write { .. } => "check that this user can write there",
+        _ => "report it as a bug of fipa, with this text",
+    };
+    let text = match std::error::Error::source(&error) {
+        Some(source) => format!("{error}: {source}"),
+        None => error.to_string(),
+    };
+    Failure::failed(text, place, advice)
+}
+
+fn size(text: &str) -> Result<ByteSize, String> {
+    let size = text.parse();
+    size.map_err(|_| "use a size such as 100B, 64KiB or 1MiB".to_owned())
+}
+
+fn effort(arguments: &Arguments) -> Result<Effort, Failure> {
+    let sizes = arguments.sizes.iter().map(ByteSize::as_u64);
+    let effort = if arguments.quick {
+        Effort::quick(sizes)
+    } else {
+        Effort::full(sizes)
+    };
+    effort.map_err(|error| {
+        let what = match &error {
+            BenchError::Size(size) => format!("content of {} cannot be measured", ByteSize(*size)),
+            other => other.to_string(),
+        };
+        let most = ByteSize(Effort::MAX_SIZE);
+        Failure::wrong_usage(what, "--sizes", format!("use 1 byte to {most}"))
+    })
+}
+
+/// This command, which plays the parts of a measurement too.
+fn this_program() -> Result<Program, Failure> {
+    let path = std::env::current_exe().map_err(|error| {
+        let advice = "check that /proc is mounted and the command was not removed";
+        Failure::failed(error.to_string(), "/proc/self/exe", advice)
+    })?;
+    Ok(Program {
+        path,
+        arguments: vec!["bench".to_owned()],
+    })
+}
+
+/// A bar that is not drawn when standard error is no terminal.
+fn progress(steps: usize) -> ProgressBar {
+    let progress = ProgressBar::new(steps as u64);
+    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} {elapsed} {msg}");
+    progress.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+    progress.enable_steady_tick(Duration::from_millis(200));
+    progress
+}
+
+fn advance(progress: &ProgressBar, step: &str) {
+    progress.inc(1);
+    progress.set_message(step.to_owned());
+}
+
+/// The absolute path of a program, because its processes run in another directory.
+fn program(given: &Path) -> Result<PathBuf, Failure> {
+    given.canonicalize().map_err(|error| {
+        Failure::wrong_usage(
+            format!("{}: {error}", given.display()),
+            "--zenoh",
+            "build it: cargo build --release --manifest-path comparison/zenoh/Cargo.toml",
+        )
+    })
+}
