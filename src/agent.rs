@@ -1,99 +1,119 @@
 //! An agent: a name that sends and receives messages.
 
-use std::fmt;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
-use fipa_acl::{AgentId, DecodeError, Letter, Message, MessageBuilder, Performative, escape};
-use fipa_mts::core::Submission;
-use fipa_mts::{PostError, Sending, letter_around, letter_for};
-use fipa_sds::{DeregisterError, Directory};
-use fipa_transport::{Forked, Incarnation, Kind, LoanedContent, Outcome};
+use fipa_acl::{AgentId, AgentIdError, Letter, Message, MessageBuilder, Performative};
+use fipa_mts::{PostError, letter_around, letter_for};
+use fipa_sds::{DeregisterError, Directory, RegisterError, Registration};
+use fipa_transport::{Incarnation, LoanedContent};
 
-use crate::domain::Domain;
+use crate::delivery::{Deliveries, deliveries};
+use crate::demultiplexer::Demultiplexer;
+use crate::domain::{Domain, RegisterOptions, warn_of_name};
+use crate::endpoint::Endpoint;
+use crate::error::{ReceiveError, SendError};
+use crate::incoming::Incoming;
 
 /// An agent of this process. Deregistered when dropped.
 pub struct Agent {
-    domain: Domain,
-    id: AgentId,
-    name: Arc<str>,
-    incarnation: Incarnation,
-    /// How many unique texts were given out.
-    given_out: AtomicU64,
+    pub(crate) endpoint: Endpoint,
+    pub(crate) demultiplexer: Demultiplexer,
     registered: bool,
-    #[cfg(feature = "monitor")]
-    checks: Option<crate::checks::Checks>,
-    #[cfg(feature = "monitor")]
-    pub(crate) desk: crate::protocol::Desk,
+}
+
+impl Domain {
+    /// Registers an agent with nothing but a name.
+    ///
+    /// # Errors
+    /// See [`register_with`](Self::register_with).
+    pub fn register(&self, name: &str) -> Result<Agent, RegisterError> {
+        self.register_with(name, RegisterOptions::default())
+    }
+
+    /// Registers an agent. From now on it is found by its name, here and, when a gateway is
+    /// running, on other hosts; its letters wait in its queue until it receives them.
+    ///
+    /// # Errors
+    /// When somebody else has the name, or it is no name.
+    pub fn register_with(
+        &self,
+        name: &str,
+        options: RegisterOptions,
+    ) -> Result<Agent, RegisterError> {
+        self.inner.owner.check()?;
+        let service = &self.inner.service;
+        let id = AgentId::new(name)
+            .map_err(|error: AgentIdError| RegisterError::Failed(Arc::new(error)))?;
+        let incarnation = Incarnation::random();
+        let name: Arc<str> = name.into();
+        // The queue first: once the name is known, letters come.
+        service.mts.register(Arc::clone(&name), incarnation);
+        let registration = Registration {
+            agent_type: options.agent_type,
+            description: options.description,
+            ..Registration::new(Arc::clone(&name), incarnation, service.locations())
+        };
+        match service.host.register(registration) {
+            Ok(_) => {
+                warn_of_name(&id);
+                Ok(Agent {
+                    endpoint: Endpoint::new(self.clone(), id, name, incarnation),
+                    demultiplexer: Demultiplexer::default(),
+                    registered: true,
+                })
+            }
+            Err(error) => {
+                // Nobody can have written to it.
+                drop(service.mts.deregister(incarnation));
+                Err(error)
+            }
+        }
+    }
 }
 
 impl Agent {
-    pub(crate) fn new(
-        domain: Domain,
-        id: AgentId,
-        name: Arc<str>,
-        incarnation: Incarnation,
-    ) -> Self {
-        Self {
-            #[cfg(feature = "monitor")]
-            checks: domain.inner.rules.checks(&name),
-            #[cfg(feature = "monitor")]
-            desk: crate::protocol::Desk::default(),
-            domain,
-            id,
-            name,
-            incarnation,
-            given_out: AtomicU64::new(0),
-            registered: true,
-        }
-    }
-
     /// The agent's name.
     #[must_use]
     pub fn name(&self) -> &str {
-        &self.name
+        &self.endpoint.name
     }
 
     /// The agent identifier under which it sends.
     #[must_use]
     pub fn id(&self) -> &AgentId {
-        &self.id
+        &self.endpoint.id
     }
 
     /// This registration.
     #[must_use]
     pub fn incarnation(&self) -> Incarnation {
-        self.incarnation
+        self.endpoint.incarnation
     }
 
     /// The domain it is registered in.
     #[must_use]
     pub fn domain(&self) -> &Domain {
-        &self.domain
+        &self.endpoint.domain
     }
 
     /// A text that nobody has used before, for a `conversation-id` or a `reply-with`: one word, made
     /// of the random number of this registration and one that rises.
     #[must_use]
     pub fn unique_id(&self) -> String {
-        let number = self.given_out.fetch_add(1, Ordering::Relaxed);
-        // With a letter in front: JADE takes text that begins with a digit for a number.
-        format!("c{}-{number}", self.incarnation)
+        self.endpoint.unique_id()
     }
 
     /// A message from this agent, to be filled in.
     pub fn message(&self, performative: Performative) -> MessageBuilder {
-        Message::builder(performative).sender(self.id.clone())
+        Message::builder(performative).sender(self.endpoint.id.clone())
     }
 
     /// An answer from this agent, as FIPA00037 has it: to whom the message wants answers, in the
     /// same conversation, with a new `reply-with` of its own.
     pub fn reply(&self, to: &Message, performative: Performative) -> MessageBuilder {
-        to.reply(performative)
-            .sender(self.id.clone())
-            .reply_with(self.unique_id())
+        self.endpoint.reply(to, performative)
     }
 
     /// Sends a message to its receivers, each an agent's name or a pattern of names, and waits
@@ -108,7 +128,7 @@ impl Agent {
         &self,
         message: Message,
     ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
-        self.send_within(message, self.domain.inner.deadline)
+        self.send_within(message, self.endpoint.domain.inner.deadline)
     }
 
     /// Sends a message with a deadline of its own.
@@ -135,15 +155,18 @@ impl Agent {
     /// # Errors
     /// When the message cannot be sent at all.
     pub fn loan(&self, message: Message, len: usize) -> Result<Loan, SendError> {
-        self.check(&message)?;
+        self.endpoint.check(&message)?;
         // The lengths of all that stands around the content do not depend on when it is sent.
         let empty = letter_around(&message, Bytes::new(), SystemTime::now())?;
         let (head, tail) = message.around_content(len).map_err(PostError::from)?;
         let receivers: Vec<&str> = message.receivers().iter().map(AgentId::name).collect();
         let name = receivers.iter().map(|name| name.len()).max();
         let head_room = name.unwrap_or(0) + longest_envelope(&empty) + head.len();
-        let mts = &self.domain.inner.service.mts;
-        let content = mts.loan(self.incarnation, &receivers, head_room, len, tail.len());
+        let incarnation = self.endpoint.incarnation;
+        let content = self
+            .endpoint
+            .mts()
+            .loan(incarnation, &receivers, head_room, len, tail.len());
         Ok(Loan { message, content })
     }
 
@@ -157,7 +180,7 @@ impl Agent {
     ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
         let Loan { message, content } = loan;
         let letter = letter_around(&message, content.freeze(), SystemTime::now());
-        self.post(&message, letter, self.domain.inner.deadline)
+        self.post(&message, letter, self.endpoint.domain.inner.deadline)
     }
 
     /// The letter is on its way when this returns.
@@ -167,69 +190,8 @@ impl Agent {
         letter: Result<Letter, PostError>,
         deadline: Duration,
     ) -> impl Future<Output = Result<Deliveries, SendError>> + Send + use<> {
-        let sending = self.begin(message, letter, deadline);
+        let sending = self.endpoint.send(message, letter, deadline);
         async move { Ok(deliveries(sending?).await) }
-    }
-
-    /// Sends a message whose outcomes are asked for later, with [`deliveries`], or never.
-    #[cfg(feature = "monitor")]
-    pub(crate) fn send_off(
-        &self,
-        message: &Message,
-        deadline: Duration,
-    ) -> Result<Sending, SendError> {
-        let letter = letter_for(message, SystemTime::now());
-        self.begin(message, letter, deadline)
-    }
-
-    fn begin(
-        &self,
-        message: &Message,
-        letter: Result<Letter, PostError>,
-        deadline: Duration,
-    ) -> Result<Sending, SendError> {
-        self.check(message)?;
-        let letter = letter?;
-        #[cfg(feature = "monitor")]
-        if let Some(checks) = &self.checks {
-            checks.leaving(message)?;
-        }
-        Ok(self.submit(message, letter, deadline))
-    }
-
-    fn submit(&self, message: &Message, letter: Letter, deadline: Duration) -> Sending {
-        let receivers = message.receivers().iter();
-        self.domain.inner.service.mts.send(Submission {
-            sender: self.incarnation,
-            letter,
-            receivers: receivers.map(|id| id.name().into()).collect(),
-            deadline,
-        })
-    }
-
-    /// Sends a message that is not checked, and whose outcomes nobody waits for.
-    #[cfg(feature = "monitor")]
-    pub(crate) fn post_aside(&self, message: &Message) -> Result<(), SendError> {
-        self.check(message)?;
-        let letter = letter_for(message, SystemTime::now())?;
-        // Dropping the future does not stop the letter.
-        drop(self.submit(message, letter, self.domain.inner.deadline));
-        Ok(())
-    }
-
-    fn check(&self, message: &Message) -> Result<(), SendError> {
-        self.domain.inner.owner.check()?;
-        if message.receivers().is_empty() {
-            return Err(SendError::NoReceiver);
-        }
-        match message.sender() {
-            Some(sender) if sender.name() == &*self.name => Ok(()),
-            Some(sender) => Err(SendError::NotTheSender {
-                agent: self.name.to_string(),
-                sender: sender.name().to_owned(),
-            }),
-            None => Err(SendError::NoSender),
-        }
     }
 
     /// The next message for this agent; waits until there is one. Dropping the future loses
@@ -238,11 +200,8 @@ impl Agent {
     /// # Errors
     /// When the domain was closed, or the letter that came holds no message that can be decoded.
     pub async fn receive(&self) -> Result<Incoming, ReceiveError> {
-        self.domain.inner.owner.check()?;
-        #[cfg(feature = "monitor")]
-        return self.desk.next_other(self).await;
-        #[cfg(not(feature = "monitor"))]
-        self.next_letter().await
+        self.endpoint.domain.inner.owner.check()?;
+        self.demultiplexer.next_other(&self.endpoint).await
     }
 
     /// The next message for this agent, if there is one now.
@@ -250,56 +209,9 @@ impl Agent {
     /// # Errors
     /// When the letter that came holds no message that can be decoded.
     pub fn try_receive(&self) -> Result<Option<Incoming>, ReceiveError> {
-        self.domain.inner.owner.check()?;
-        self.domain.inner.service.mts.drive();
-        #[cfg(feature = "monitor")]
-        return self.desk.other_now(self);
-        #[cfg(not(feature = "monitor"))]
-        self.letter_now().transpose()
-    }
-
-    /// The next message, whatever conversation it belongs to.
-    pub(crate) async fn next_letter(&self) -> Result<Incoming, ReceiveError> {
-        self.domain.inner.owner.check()?;
-        let mts = &self.domain.inner.service.mts;
-        match mts.receive(self.incarnation).await {
-            Some(received) => self.taken(received),
-            None => Err(ReceiveError::Closed),
-        }
-    }
-
-    /// Waits until the domain is closed.
-    #[cfg(feature = "monitor")]
-    pub(crate) async fn closed(&self) {
-        self.domain.inner.service.mts.gone(self.incarnation).await;
-    }
-
-    pub(crate) fn letter_now(&self) -> Option<Result<Incoming, ReceiveError>> {
-        let received = self.domain.inner.service.mts.try_receive(self.incarnation);
-        received.map(|received| self.taken(received))
-    }
-
-    fn taken(&self, received: fipa_mts::core::Received) -> Result<Incoming, ReceiveError> {
-        let message = Message::decode(received.letter.payload()).map_err(|source| {
-            let mts = &self.domain.inner.service.mts;
-            mts.handle_undecodable(&self.name, &received, source.to_string());
-            ReceiveError::Malformed {
-                source,
-                letter: Box::new(received.letter.clone()),
-            }
-        })?;
-        let incoming = Incoming {
-            message,
-            letter: received.letter,
-            via: received.via,
-            #[cfg(feature = "monitor")]
-            violation: None,
-        };
-        #[cfg(feature = "monitor")]
-        if let Some(checks) = &self.checks {
-            return checks.arrived(self, incoming);
-        }
-        Ok(incoming)
+        self.endpoint.domain.inner.owner.check()?;
+        self.endpoint.mts().drive();
+        self.demultiplexer.other_now(&self.endpoint)
     }
 
     /// Takes the name out of the directory, and returns the messages that have been delivered and
@@ -310,22 +222,12 @@ impl Agent {
     /// When the directory cannot be written; the agent receives nothing any more all the same, and
     /// what was not received is dropped.
     pub fn deregister(mut self) -> Result<Unread, DeregisterError> {
-        let unread = self.leave()?;
-        #[cfg(feature = "monitor")]
-        let mut all = self.desk.drain();
-        #[cfg(not(feature = "monitor"))]
-        let mut all = Unread::new();
-        all.extend(unread.into_iter().map(|received| self.taken(received)));
-        Ok(all)
-    }
-
-    fn leave(&mut self) -> Result<Vec<fipa_mts::core::Received>, DeregisterError> {
-        self.domain.inner.owner.check()?;
         self.registered = false;
-        let service = &self.domain.inner.service;
-        let left = service.host.deregister(&self.name, self.incarnation);
-        let unread = service.mts.deregister(self.incarnation);
-        left.map(|()| unread)
+        let unread = self.endpoint.deregister()?;
+        let mut all = self.demultiplexer.drain();
+        let unread = unread.into_iter();
+        all.extend(unread.map(|received| self.endpoint.decode(received)));
+        Ok(all)
     }
 }
 
@@ -335,21 +237,16 @@ pub type Unread = Vec<Result<Incoming, ReceiveError>>;
 impl Drop for Agent {
     fn drop(&mut self) {
         // In a forked child it stays registered for the parent.
-        if self.registered && self.domain.inner.owner.is_this() {
-            match self.leave() {
+        if self.registered && self.endpoint.domain.inner.owner.is_this() {
+            match self.endpoint.deregister() {
                 // The domain was closed before, and has taken the name with it.
                 Ok(_) | Err(DeregisterError::Closed) => {}
-                Err(error) => tracing::warn!(%error, agent = %self.name, "not deregistered"),
+                Err(error) => {
+                    tracing::warn!(%error, agent = %self.endpoint.name, "not deregistered")
+                }
             }
         }
     }
-}
-
-/// Waits until every receiver has an outcome.
-pub(crate) async fn deliveries(sending: Sending) -> Deliveries {
-    let outcomes = sending.outcomes().await.into_iter();
-    let delivered = outcomes.map(|(receiver, outcome)| Delivery { receiver, outcome });
-    Deliveries(delivered.collect())
 }
 
 /// The digits of the payload's length are the one thing in an envelope that depends on the
@@ -369,109 +266,4 @@ impl Loan {
     pub fn content_mut(&mut self) -> &mut [u8] {
         self.content.content_mut()
     }
-}
-
-/// What became of a message, one [`Delivery`] per receiver.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Deliveries(pub Vec<Delivery>);
-
-/// What became of a message at one receiver.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Delivery {
-    /// The receiver's name, or the name or pattern that matched nobody.
-    pub receiver: Arc<str>,
-    /// What became of it.
-    pub outcome: Outcome,
-}
-
-impl Deliveries {
-    /// Whether every receiver has got it, or it was handed to a peer that cannot confirm.
-    #[must_use]
-    pub fn all_succeeded(&self) -> bool {
-        self.0.iter().all(|delivery| delivery.outcome.is_success())
-    }
-}
-
-impl fmt::Display for Deliveries {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for (index, Delivery { receiver, outcome }) in self.0.iter().enumerate() {
-            let newline = if index > 0 { "\n" } else { "" };
-            write!(f, "{newline}{}: {outcome}", escape(receiver))?;
-        }
-        Ok(())
-    }
-}
-
-/// A message that came.
-#[derive(Debug, Clone)]
-pub struct Incoming {
-    /// The message. Its content may lie in the sender's shared memory: it stays readable for as
-    /// long as it is held, and assumes an honest sender of the same user.
-    pub message: Message,
-    /// The letter it came in.
-    pub letter: Letter,
-    /// How it came on its last stretch; none for what this process itself told the agent.
-    pub via: Option<Kind>,
-    /// How it violates its protocol, where that is checked and the configuration says `warn`.
-    #[cfg(feature = "monitor")]
-    pub violation: Option<Box<fipa_monitor::Violation>>,
-}
-
-/// Why a message was not sent.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum SendError {
-    /// It names no receiver.
-    #[error("the message has no receiver; give it one with MessageBuilder::receiver")]
-    NoReceiver,
-    /// It names no sender.
-    #[error("the message has no sender; begin it with Agent::message")]
-    NoSender,
-    /// It says that it is from somebody else.
-    #[error("the message is from {sender:?}, and {agent:?} sends only its own")]
-    NotTheSender {
-        /// The agent that was to send it.
-        agent: String,
-        /// Whom the message names.
-        sender: String,
-    },
-    /// It violates its protocol, and the configuration says `enforce`.
-    #[cfg(feature = "monitor")]
-    #[error("not sent: {0}")]
-    Violation(Box<fipa_monitor::Violation>),
-    /// It cannot be encoded.
-    #[error(transparent)]
-    Post(#[from] PostError),
-    /// This process is a forked child of the one that registered the agent.
-    #[error(transparent)]
-    Forked(#[from] Forked),
-}
-
-/// Why no message was received.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum ReceiveError {
-    /// The domain was closed.
-    #[error("the domain was closed")]
-    Closed,
-    /// This process is a forked child of the one that registered the agent.
-    #[error(transparent)]
-    Forked(#[from] Forked),
-    /// A letter came whose message cannot be decoded. Its sender gets a failure message.
-    #[error("a letter with a message that cannot be decoded: {source}")]
-    Malformed {
-        /// Why not.
-        source: DecodeError,
-        /// The letter.
-        letter: Box<Letter>,
-    },
-    /// A message came that violates its protocol, and the configuration says `enforce`.
-    #[cfg(feature = "monitor")]
-    #[error("{violation}")]
-    Violation {
-        /// In which way.
-        violation: Box<fipa_monitor::Violation>,
-        /// The message.
-        incoming: Box<Incoming>,
-    },
 }

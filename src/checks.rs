@@ -3,17 +3,16 @@
 //!
 //! What must not live here: what is right and wrong (that is `fipa-monitor`).
 
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::SystemTime;
 
 use fipa_acl::{Message, Performative};
-use fipa_monitor::scxml::ScxmlError;
 use fipa_monitor::{Header, Library, LibraryError, LibraryFull, Monitor, Verdict, Violation};
 use parking_lot::Mutex;
 
-use crate::agent::{Agent, Incoming, ReceiveError, SendError};
 use crate::config::{self, Check};
+use crate::error::{ProtocolError, ReceiveError, SendError};
+use crate::incoming::Incoming;
 
 /// What the configuration wants of all agents of this process.
 pub(crate) struct Rules {
@@ -47,49 +46,66 @@ impl Rules {
         &self.library
     }
 
-    /// What an agent of this name needs, if anything is checked.
-    pub(crate) fn checks(&self, agent: &str) -> Option<Checks> {
-        (self.check != Check::Off).then(|| Checks {
+    /// The checks of an agent of this name.
+    pub(crate) fn checks(&self, agent: &str) -> Checks {
+        let monitored = (self.check != Check::Off).then(|| Monitored {
             monitor: Mutex::new(Monitor::agent(Arc::clone(&self.library), agent)),
             enforce: self.check == Check::Enforce,
             answer: self.answer,
-        })
+        });
+        Checks(monitored)
     }
 }
 
-/// An agent's monitor.
-pub(crate) struct Checks {
+/// The checks of one agent; empty if the configuration turns them off.
+pub(crate) struct Checks(Option<Monitored>);
+
+/// The monitor of one agent.
+struct Monitored {
     monitor: Mutex<Monitor>,
     enforce: bool,
     answer: bool,
 }
 
 impl Checks {
-    /// Checks what is about to be sent.
+    /// Checks a message that is about to be sent.
     pub(crate) fn leaving(&self, message: &Message) -> Result<(), SendError> {
-        match self.violation(message) {
-            Some(violation) if self.enforce => Err(SendError::Violation(violation)),
+        let Some(monitored) = &self.0 else {
+            return Ok(());
+        };
+        match monitored.violation(message) {
+            Some(violation) if monitored.enforce => Err(SendError::Violation(violation)),
             Some(violation) => {
-                tracing::warn!("sent all the same: {violation}");
+                tracing::warn!("sent although it breaks the protocol: {violation}");
                 Ok(())
             }
             None => Ok(()),
         }
     }
 
-    /// Checks what has come.
+    /// Checks a received message. `answer` is called with the text of a violation that is to be
+    /// answered with not-understood, and returns that answer if one was sent.
     pub(crate) fn arrived(
         &self,
-        agent: &Agent,
         mut incoming: Incoming,
+        answer: impl FnOnce(&Message, String) -> Option<Message>,
     ) -> Result<Incoming, ReceiveError> {
-        let Some(violation) = self.violation(&incoming.message) else {
+        let Some(monitored) = &self.0 else {
             return Ok(incoming);
         };
-        if self.answer {
-            self.say_not_understood(agent, &incoming.message, &violation);
+        let Some(violation) = monitored.violation(&incoming.message) else {
+            return Ok(incoming);
+        };
+        // Two agents that do not understand each other must not go on answering so.
+        let last_word = [Performative::NotUnderstood, Performative::Failure];
+        if monitored.answer
+            && !last_word.contains(incoming.message.performative())
+            && let Some(answer) = answer(&incoming.message, violation.to_string())
+        {
+            // For the monitor it ends the conversation, where the sender takes part in one.
+            let _ = monitored.violation(&answer);
         }
-        if self.enforce {
+        if monitored.enforce {
             let incoming = Box::new(incoming);
             return Err(ReceiveError::Violation {
                 violation,
@@ -100,7 +116,9 @@ impl Checks {
         incoming.violation = Some(violation);
         Ok(incoming)
     }
+}
 
+impl Monitored {
     fn violation(&self, message: &Message) -> Option<Box<Violation>> {
         let now = SystemTime::now();
         let mut monitor = self.monitor.lock();
@@ -121,46 +139,4 @@ impl Checks {
             _ => None,
         }
     }
-
-    fn say_not_understood(&self, agent: &Agent, message: &Message, violation: &Violation) {
-        // Two who do not understand each other must not go on telling so.
-        let last_word = [Performative::NotUnderstood, Performative::Failure];
-        if last_word.contains(message.performative()) {
-            return;
-        }
-        let answer = agent
-            .reply(message, Performative::NotUnderstood)
-            .content(violation.to_string())
-            .build();
-        let posted = answer
-            .map_err(|error| error.to_string())
-            .and_then(|answer| {
-                // For the monitor it ends the conversation, where the sender takes part in one.
-                let _ = self.violation(&answer);
-                agent.post_aside(&answer).map_err(|error| error.to_string())
-            });
-        if let Err(error) = posted {
-            tracing::warn!(error, "a violation was not answered");
-        }
-    }
-}
-
-/// Why a protocol that the configuration names cannot be used.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum ProtocolError {
-    /// The file cannot be read.
-    #[error("monitor.protocols: cannot read {}: {source}", path.display())]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// Why not.
-        source: std::io::Error,
-    },
-    /// The file has mistakes.
-    #[error("monitor.protocols: {0}; see `fipa protocol check`")]
-    Scxml(#[from] ScxmlError),
-    /// There are too many.
-    #[error("monitor.protocols: {0}")]
-    Full(#[from] LibraryFull),
 }

@@ -30,7 +30,7 @@ pub use self::neighbours::Neighbour;
 use self::neighbours::{Neighbours, View};
 use self::publisher::{Keeper, Publisher};
 use crate::config::ConfigError;
-use crate::domain::OpenError;
+use crate::error::OpenError;
 use crate::owner::Owner;
 use crate::service::{Role, Service};
 use crate::{AgentId, Config};

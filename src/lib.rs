@@ -40,13 +40,26 @@ mod agent;
 pub mod blocking;
 #[cfg(feature = "monitor")]
 mod checks;
+#[cfg(not(feature = "monitor"))]
+#[path = "checks_disabled.rs"]
+mod checks;
 mod coalition;
 pub mod config;
+mod delivery;
+#[cfg(feature = "monitor")]
+mod demultiplexer;
+#[cfg(not(feature = "monitor"))]
+#[path = "demultiplexer_disabled.rs"]
+mod demultiplexer;
 pub mod doctor;
 mod domain;
+mod endpoint;
+mod error;
 mod gate;
 #[cfg(feature = "net")]
 mod gateway;
+mod host_directory;
+mod incoming;
 mod keeper;
 #[cfg(feature = "secure")]
 pub mod keys;
@@ -58,12 +71,14 @@ pub mod routes;
 mod service;
 pub mod watch;
 
-pub use agent::{Agent, Deliveries, Delivery, Incoming, Loan, ReceiveError, SendError, Unread};
-#[cfg(feature = "monitor")]
-pub use checks::ProtocolError;
+pub use agent::{Agent, Loan, Unread};
 pub use coalition::{Coalition, CoalitionError};
 pub use config::Config;
-pub use domain::{Domain, OpenError, RegisterOptions};
+pub use delivery::{Deliveries, Delivery};
+pub use domain::{Domain, RegisterOptions};
+#[cfg(feature = "monitor")]
+pub use error::ProtocolError;
+pub use error::{OpenError, ReceiveError, SendError};
 pub use fipa_acl::{
     AgentId, AgentIdError, BuildError, DecodeError, Envelope, EnvelopeParams, Letter, Message,
     MessageBuilder, Payload, Performative, Time,
@@ -81,4 +96,5 @@ pub use fipa_transport::{
 };
 #[cfg(feature = "net")]
 pub use gateway::{Gateway, Neighbour};
+pub use incoming::Incoming;
 pub use place::PlaceError;

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use fipa_mts::core::CoreConfig;
 use fipa_mts::{Contacts, Gate, Mts, RuntimeConfig, Started};
-use fipa_sds::{Directory, Entry, HostConfig, HostDirectory, HostError, Pattern};
+use fipa_sds::{Directory, Entry, HostDirectory, Pattern};
 use fipa_transport::{Incarnation, Kind, Location, Transport};
 use tokio::runtime::Handle;
 use tokio::sync::watch;
@@ -14,10 +14,11 @@ use tokio::task::JoinHandle;
 
 use crate::Config;
 use crate::access::Access;
-use crate::domain::OpenError;
+use crate::error::OpenError;
 use crate::gate::{Door, Of};
+use crate::host_directory;
 use crate::keeper::Keeper;
-use crate::place::{Place, RETRIES};
+use crate::place::Place;
 use crate::routes::Report;
 use crate::watch::Taps;
 
@@ -68,7 +69,7 @@ impl Service {
         let handle = Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
         let incarnation = Incarnation::random();
         let own = fipa_sds::Mts::new(Arc::clone(&role.name), incarnation);
-        let (place, host) = enter(&config.domain, &own, role.gateway)?;
+        let (place, host) = host_directory::join(&config.domain, &own, role.gateway)?;
         let view = (role.view)(Arc::clone(&host), &own).inspect_err(|_| place.leave())?;
         let gate = gate(config, &role, &host).inspect_err(|_| place.leave())?;
         let taps = Arc::new(Taps::new(&own, role.gateway));
@@ -198,45 +199,6 @@ fn gate(
     let access =
         Access::new(&config.access).map_err(|error| OpenError::Access(error.to_string()))?;
     Ok(access.map(|access| Arc::new(Door::new(access, of)) as Arc<dyn Gate>))
-}
-
-/// Makes the domain's place and joins the directory there.
-pub(crate) fn enter(
-    domain: &str,
-    own: &fipa_sds::Mts,
-    gateway: bool,
-) -> Result<(Place, Arc<HostDirectory>), OpenError> {
-    let mut tries = 0;
-    loop {
-        tries += 1;
-        let mut place = Place::prepare(domain)?;
-        let joined = HostDirectory::open(HostConfig {
-            dir: place.part("directory"),
-            mts: own.clone(),
-            gateway,
-        });
-        match joined {
-            Ok(host) => {
-                // Not before: an empty directory may still be removed by a process that leaves.
-                place.hold()?;
-                return Ok((place, Arc::new(host)));
-            }
-            Err(error) if was_removed(&error) && tries < RETRIES => {}
-            Err(error) => {
-                place.leave();
-                return Err(error.into());
-            }
-        }
-    }
-}
-
-/// Whoever left last has removed the place, between its being made and being joined.
-fn was_removed(error: &HostError) -> bool {
-    match error {
-        HostError::Io { source, .. } => source.kind() == std::io::ErrorKind::NotFound,
-        HostError::Removed { .. } => true,
-        _ => false,
-    }
 }
 
 fn told(config: &Config, refused: &[(Kind, String)]) -> String {

@@ -5,7 +5,7 @@ use std::time::Duration;
 use fipa_transport_net::secure::{Credentials, Rules, Security};
 
 use crate::config;
-use crate::domain::OpenError;
+use crate::error::OpenError;
 use crate::keys::{Holding, Keys, Stamp};
 
 /// How often the directory is looked at. Looking is three calls to the system.

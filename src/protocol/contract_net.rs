@@ -7,7 +7,8 @@ use fipa_mts::Sending;
 
 use super::bids::Bids;
 use super::dialogue::{Dialogue, DialogueError, after, name_of, only_delivered, settle, unreached};
-use crate::agent::{Agent, deliveries};
+use crate::agent::Agent;
+use crate::delivery::deliveries;
 
 impl Agent {
     /// Calls for proposals (`cfp`, FIPA00029) and collects those that come within `patience`; it

@@ -5,10 +5,12 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, BuildError, Message, MessageBuilder, Performative, Time, escape};
 use fipa_monitor::{Header, Monitor, Unchecked, Verdict, Violation};
-use fipa_mts::Sending;
+use fipa_mts::{Sending, letter_for};
 use fipa_transport::{FailureReason, Incarnation, Outcome};
 
-use crate::agent::{Agent, Deliveries, Delivery, ReceiveError, SendError, deliveries};
+use crate::agent::Agent;
+use crate::delivery::{Deliveries, Delivery, deliveries};
+use crate::error::{ReceiveError, SendError};
 
 /// Why a protocol did not yield what it was begun for.
 #[derive(Debug, thiserror::Error)]
@@ -137,7 +139,7 @@ impl<'a> Dialogue<'a> {
     }
 
     fn led(agent: &'a Agent, protocol: &str, id: String) -> Self {
-        agent.desk.begin(&id);
+        agent.demultiplexer.begin(&id);
         let library = Arc::clone(agent.domain().inner.rules.library());
         Self {
             agent,
@@ -189,7 +191,8 @@ impl<'a> Dialogue<'a> {
         }
         let message = message.build()?;
         self.check(&message).map_err(Wrong::of_ours)?;
-        Ok(self.agent.send_off(&message, deadline)?)
+        let letter = letter_for(&message, SystemTime::now());
+        Ok(self.agent.endpoint.send(&message, letter, deadline)?)
     }
 
     /// Answers a message of this conversation.
@@ -232,7 +235,10 @@ impl<'a> Dialogue<'a> {
     /// The next message, or none by then. What does not fit the protocol is an error, and so is what
     /// ends it for reasons of no protocol of its own.
     pub(super) async fn hear(&mut self, due: Option<Instant>) -> Result<Heard, DialogueError> {
-        let next = self.agent.desk.next_of(self.agent, &self.id);
+        let next = self
+            .agent
+            .demultiplexer
+            .next_of(&self.agent.endpoint, &self.id);
         let received = match due {
             None => next.await,
             Some(due) => tokio::time::timeout_at(due.into(), next)
@@ -357,7 +363,7 @@ impl<'a> Dialogue<'a> {
 
 impl Drop for Dialogue<'_> {
     fn drop(&mut self) {
-        self.agent.desk.end(&self.id);
+        self.agent.demultiplexer.end(&self.id);
     }
 }
 

@@ -13,14 +13,12 @@
 //!   configuration has agents checked or not.
 //! * `initiator.rs`, `subscription.rs`, `contract_net.rs`, `auction.rs` and `proxied.rs` are what
 //!   initiators hold, `bids.rs` what comes of a call; `participant.rs` is what participants do.
-//! * `desk.rs` gives messages to the conversations that wait for them, and all others to `receive`.
 //!
 //! What must not live here: what a protocol allows (that is `fipa-monitor`).
 
 mod auction;
 mod bids;
 mod contract_net;
-mod desk;
 mod dialogue;
 mod initiator;
 mod participant;
@@ -30,7 +28,6 @@ mod subscription;
 pub use auction::Auction;
 pub use bids::Bids;
 pub use contract_net::{Awarded, ContractNet};
-pub(crate) use desk::Desk;
 pub use dialogue::DialogueError;
 pub use initiator::{Decision, Request};
 pub use participant::{Reply, Task};

@@ -6,7 +6,8 @@ use bytes::Bytes;
 use fipa_acl::{Message, MessageBuilder, Performative};
 
 use super::dialogue::{Dialogue, DialogueError, after, name_of, only_delivered, unreached};
-use crate::agent::{Agent, deliveries};
+use crate::agent::Agent;
+use crate::delivery::deliveries;
 
 /// How a participant answers in the end.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -28,11 +28,12 @@ use tokio::task::JoinHandle;
 
 use self::listening::Told;
 pub(crate) use self::taps::Taps;
-use crate::domain::OpenError;
+use crate::Config;
+use crate::error::OpenError;
+use crate::host_directory;
 use crate::keeper::Keeper;
 use crate::owner::Owner;
 use crate::place::Place;
-use crate::{Config, service};
 
 /// What is to be seen.
 #[derive(Debug, Clone, Copy, Default)]
@@ -72,7 +73,7 @@ impl Watcher {
         tokio::runtime::Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
         let name = format!("fipa-watch-{}", std::process::id());
         let own = fipa_sds::Mts::new(name, Incarnation::random());
-        let (place, host) = service::enter(&config.domain, &own, false)?;
+        let (place, host) = host_directory::join(&config.domain, &own, false)?;
         let socket = host.listen().inspect_err(|_| leave(&host, &place))?;
         let listener = socket::listening(socket).map_err(|source| {
             leave(&host, &place);

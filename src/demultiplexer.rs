@@ -1,46 +1,49 @@
-//! Which message is for whom: for a conversation that is led by a call, or for whoever receives.
+//! Hands received messages to their readers: a call that leads a conversation, or `receive`.
 
 use std::collections::{HashMap, VecDeque};
 
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 
-use crate::agent::{Agent, Incoming, ReceiveError};
+use crate::endpoint::Endpoint;
+use crate::error::ReceiveError;
+use crate::incoming::Incoming;
 
-/// Most messages that are put aside for one reader while another one takes messages in. When there
-/// are as many, letters stay in the agent's queue, and their senders are held back.
-const MAX_ASIDE: usize = 1_024;
+/// Maximum number of messages that are set aside for one reader while another reader receives.
+/// Beyond it letters stay in the agent's queue, and their senders wait.
+const MAX_SET_ASIDE: usize = 1_024;
 
 type Received = Result<Incoming, ReceiveError>;
 
-/// The messages that were taken in by somebody else than they are for.
+/// The messages that one reader received for another.
 #[derive(Default)]
-pub(crate) struct Desk {
+pub(crate) struct Demultiplexer {
     state: Mutex<State>,
     changed: Notify,
 }
 
 #[derive(Default)]
 struct State {
-    /// Of conversations that are led, by id.
+    /// Messages of the led conversations, by conversation id.
     led: HashMap<String, VecDeque<Received>>,
     others: VecDeque<Received>,
 }
 
-/// For whom somebody waits.
+/// A reader that waits for a message.
 #[derive(Clone, Copy)]
 enum Reader<'a> {
     Conversation(&'a str),
     Others,
 }
 
-impl Desk {
+impl Demultiplexer {
+    /// Starts a queue for a conversation that a call leads.
     pub(crate) fn begin(&self, id: &str) {
         let queues = &mut self.state.lock().led;
         queues.insert(id.to_owned(), VecDeque::new());
     }
 
-    /// The conversation is over; what it has not read goes to whoever receives.
+    /// Ends a conversation. Its unread messages go to `receive`.
     pub(crate) fn end(&self, id: &str) {
         let mut state = self.state.lock();
         let left = state.led.remove(id).unwrap_or_default();
@@ -49,29 +52,30 @@ impl Desk {
         self.changed.notify_waiters();
     }
 
-    /// The next message of a conversation.
-    pub(crate) async fn next_of(&self, agent: &Agent, id: &str) -> Received {
-        self.next(agent, Reader::Conversation(id)).await
+    /// Waits for the next message of a conversation.
+    pub(crate) async fn next_of(&self, endpoint: &Endpoint, id: &str) -> Received {
+        self.next(endpoint, Reader::Conversation(id)).await
     }
 
-    /// The next message of no conversation that is led.
-    pub(crate) async fn next_other(&self, agent: &Agent) -> Received {
-        self.next(agent, Reader::Others).await
+    /// Waits for the next message of no led conversation.
+    pub(crate) async fn next_other(&self, endpoint: &Endpoint) -> Received {
+        self.next(endpoint, Reader::Others).await
     }
 
-    pub(crate) fn other_now(&self, agent: &Agent) -> Result<Option<Incoming>, ReceiveError> {
+    /// The next message of no led conversation, if there is one now.
+    pub(crate) fn other_now(&self, endpoint: &Endpoint) -> Result<Option<Incoming>, ReceiveError> {
         loop {
-            if let Some(put_aside) = self.state.lock().take(Reader::Others) {
-                return put_aside.map(Some);
+            if let Some(set_aside) = self.state.lock().take(Reader::Others) {
+                return set_aside.map(Some);
             }
-            match agent.letter_now() {
+            match endpoint.letter_now() {
                 None => return Ok(None),
                 Some(received) => self.put(received),
             }
         }
     }
 
-    /// Everything that was put aside, for nobody will read it any more.
+    /// Removes and returns all messages that were set aside.
     pub(crate) fn drain(&self) -> Vec<Received> {
         let mut state = self.state.lock();
         let mut all: Vec<Received> = state.others.drain(..).collect();
@@ -79,30 +83,30 @@ impl Desk {
         all
     }
 
-    async fn next(&self, agent: &Agent, reader: Reader<'_>) -> Received {
+    async fn next(&self, endpoint: &Endpoint, reader: Reader<'_>) -> Received {
         loop {
-            // Before looking, so that what changes afterwards is noticed.
+            // Before the check, so that a later change is noticed.
             let changed = self.changed.notified();
             let room = {
                 let mut state = self.state.lock();
-                if let Some(put_aside) = state.take(reader) {
+                if let Some(set_aside) = state.take(reader) {
                     drop(state);
-                    // There is room again for those who take letters in.
+                    // Readers that wait for room may receive again.
                     self.changed.notify_waiters();
-                    return put_aside;
+                    return set_aside;
                 }
                 state.has_room()
             };
             tokio::select! {
                 biased;
                 () = changed => {}
-                received = agent.next_letter(), if room => {
+                received = endpoint.next_letter(), if room => {
                     if let Err(ReceiveError::Closed) = received {
                         return received;
                     }
                     self.put(received);
                 }
-                () = agent.closed(), if !room => return Err(ReceiveError::Closed),
+                () = endpoint.closed(), if !room => return Err(ReceiveError::Closed),
             }
         }
     }
@@ -123,7 +127,7 @@ impl State {
 
     fn has_room(&self) -> bool {
         let led = self.led.values().map(VecDeque::len).max().unwrap_or(0);
-        self.others.len().max(led) < MAX_ASIDE
+        self.others.len().max(led) < MAX_SET_ASIDE
     }
 
     fn put(&mut self, received: Received) {

@@ -1,0 +1,186 @@
+//! The sending and receiving end of one registration: what an [`Agent`](crate::Agent) does without
+//! regard to the conversations that its calls lead.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, SystemTime};
+
+use fipa_acl::{AgentId, Letter, Message, MessageBuilder, Performative};
+use fipa_mts::core::{Received, Submission};
+use fipa_mts::{Mts, PostError, Sending, letter_for};
+use fipa_sds::{DeregisterError, Directory};
+use fipa_transport::Incarnation;
+
+use crate::checks::Checks;
+use crate::domain::Domain;
+use crate::error::{ReceiveError, SendError};
+use crate::incoming::Incoming;
+
+/// One registration of an agent of this process.
+pub(crate) struct Endpoint {
+    pub(crate) domain: Domain,
+    pub(crate) id: AgentId,
+    pub(crate) name: Arc<str>,
+    pub(crate) incarnation: Incarnation,
+    /// Number of unique texts that were given out.
+    unique_ids: AtomicU64,
+    checks: Checks,
+}
+
+/// Whether a message is checked against its protocol before it is sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Checked {
+    Yes,
+    /// An answer that the checks themselves cause.
+    No,
+}
+
+impl Endpoint {
+    pub(crate) fn new(
+        domain: Domain,
+        id: AgentId,
+        name: Arc<str>,
+        incarnation: Incarnation,
+    ) -> Self {
+        Self {
+            checks: domain.inner.rules.checks(&name),
+            domain,
+            id,
+            name,
+            incarnation,
+            unique_ids: AtomicU64::new(0),
+        }
+    }
+
+    pub(crate) fn mts(&self) -> &Mts {
+        &self.domain.inner.service.mts
+    }
+
+    pub(crate) fn unique_id(&self) -> String {
+        let number = self.unique_ids.fetch_add(1, Ordering::Relaxed);
+        // With a letter in front: JADE takes text that begins with a digit for a number.
+        format!("c{}-{number}", self.incarnation)
+    }
+
+    pub(crate) fn reply(&self, to: &Message, performative: Performative) -> MessageBuilder {
+        to.reply(performative)
+            .sender(self.id.clone())
+            .reply_with(self.unique_id())
+    }
+
+    /// Checks that this agent may send a message.
+    pub(crate) fn check(&self, message: &Message) -> Result<(), SendError> {
+        self.domain.inner.owner.check()?;
+        if message.receivers().is_empty() {
+            return Err(SendError::NoReceiver);
+        }
+        match message.sender() {
+            Some(sender) if sender.name() == &*self.name => Ok(()),
+            Some(sender) => Err(SendError::NotTheSender {
+                agent: self.name.to_string(),
+                sender: sender.name().to_owned(),
+            }),
+            None => Err(SendError::NoSender),
+        }
+    }
+
+    /// Sends a message. Its letter is on its way when this returns; dropping the result does not
+    /// stop it.
+    pub(crate) fn send(
+        &self,
+        message: &Message,
+        letter: Result<Letter, PostError>,
+        deadline: Duration,
+    ) -> Result<Sending, SendError> {
+        self.submit(message, letter, deadline, Checked::Yes)
+    }
+
+    fn submit(
+        &self,
+        message: &Message,
+        letter: Result<Letter, PostError>,
+        deadline: Duration,
+        checked: Checked,
+    ) -> Result<Sending, SendError> {
+        self.check(message)?;
+        let letter = letter?;
+        if checked == Checked::Yes {
+            self.checks.leaving(message)?;
+        }
+        let receivers = message.receivers().iter();
+        Ok(self.mts().send(Submission {
+            sender: self.incarnation,
+            letter,
+            receivers: receivers.map(|id| id.name().into()).collect(),
+            deadline,
+        }))
+    }
+
+    /// Waits for the next message, whatever conversation it belongs to.
+    pub(crate) async fn next_letter(&self) -> Result<Incoming, ReceiveError> {
+        self.domain.inner.owner.check()?;
+        match self.mts().receive(self.incarnation).await {
+            Some(received) => self.decode(received),
+            None => Err(ReceiveError::Closed),
+        }
+    }
+
+    /// The next message, if there is one now.
+    pub(crate) fn letter_now(&self) -> Option<Result<Incoming, ReceiveError>> {
+        let received = self.mts().try_receive(self.incarnation);
+        received.map(|received| self.decode(received))
+    }
+
+    /// Waits until the domain is closed.
+    #[cfg(feature = "monitor")]
+    pub(crate) async fn closed(&self) {
+        self.mts().gone(self.incarnation).await;
+    }
+
+    /// Decodes and checks a received letter.
+    pub(crate) fn decode(&self, received: Received) -> Result<Incoming, ReceiveError> {
+        let message = Message::decode(received.letter.payload()).map_err(|source| {
+            self.mts()
+                .handle_undecodable(&self.name, &received, source.to_string());
+            ReceiveError::Malformed {
+                source,
+                letter: Box::new(received.letter.clone()),
+            }
+        })?;
+        let incoming = Incoming::new(message, received.letter, received.via);
+        self.checks.arrived(incoming, |message, reason| {
+            self.not_understood(message, reason)
+        })
+    }
+
+    /// Answers a message that violates its protocol. Returns the answer if it was sent.
+    fn not_understood(&self, message: &Message, reason: String) -> Option<Message> {
+        let answer = self
+            .reply(message, Performative::NotUnderstood)
+            .content(reason)
+            .build();
+        let sent = answer
+            .map_err(|error| error.to_string())
+            .and_then(|answer| {
+                let letter = letter_for(&answer, SystemTime::now());
+                let deadline = self.domain.inner.deadline;
+                let sending = self
+                    .submit(&answer, letter, deadline, Checked::No)
+                    .map_err(|error| error.to_string())?;
+                // Its outcomes concern no caller.
+                drop(sending);
+                Ok(answer)
+            });
+        sent.inspect_err(|error| tracing::warn!(%error, "a violation was not answered"))
+            .ok()
+    }
+
+    /// Ends the registration and returns the letters that were not received.
+    pub(crate) fn deregister(&self) -> Result<Vec<Received>, DeregisterError> {
+        self.domain.inner.owner.check()?;
+        let service = &self.domain.inner.service;
+        let left = service.host.deregister(&self.name, self.incarnation);
+        let unread = service.mts.deregister(self.incarnation);
+        left.map(|()| unread)
+    }
+}
