@@ -1,7 +1,6 @@
-//! What it costs that agents check themselves: a request and its inform through shared memory,
-//! between threads that block, with `monitor.check = "enforce"`, and with rules under `[access]`, beside the
-//! same without. All take turns of some milliseconds, so that other work on the machine hits all alike; a
-//! ratio is the median of those of the turns.
+//! Benchmarks the cost of `monitor.check = "enforce"` and of rules under `[access]`: a request and its
+//! inform through shared memory between blocking threads, beside the same without. The variants take turns
+//! of some milliseconds, so other load affects them alike. A ratio is the median of the ratios of turns.
 //!
 //! ```console
 //! $ cargo bench --features monitor --bench enforcing
@@ -18,11 +17,11 @@ use fipa::{Agent, AgentId, Config, Domain, Performative};
 use tokio::runtime::{Builder, Runtime};
 
 const TURNS: usize = 300;
-/// Of a turn, which takes some ten milliseconds; the first few wake what has slept meanwhile.
+/// Rounds of a turn of about ten milliseconds; the first ones wake sleeping threads.
 const ROUNDS: usize = 150;
 const FIRST: usize = 10;
 
-/// What is compared, with its settings; first that with nothing.
+/// The variants with their settings; the first has none.
 const KINDS: [(&str, &[&str]); 3] = [
     ("nothing checked", &[]),
     ("protocols enforced", &["monitor.check=enforce"]),
@@ -43,7 +42,7 @@ fn main() {
     }
     let mut times = KINDS.map(|_| Vec::with_capacity(TURNS));
     for turn in 0..TURNS {
-        // Who is first has no advantage.
+        // The order changes, so no variant has an advantage.
         for number in 0..pairs.len() {
             let which = (turn + number) % pairs.len();
             times[which].push(pairs[which].turn());
@@ -70,13 +69,13 @@ fn main() {
     }
 }
 
-/// One of the quartiles.
+/// A quartile.
 fn middle(all: &mut [f64], quarter: usize) -> f64 {
     all.sort_by(f64::total_cmp);
     all[all.len() * quarter / 4]
 }
 
-/// A rover and an arm, each a process of its own as far as the domain knows.
+/// A rover and an arm, each with a membership of its own.
 struct Pair {
     runtime: Runtime,
     domain: Domain,
@@ -124,7 +123,7 @@ impl Pair {
         }
     }
 
-    /// The median of a turn, in microseconds.
+    /// Median of a turn, in microseconds.
     fn turn(&mut self) -> f64 {
         let mut times = Vec::with_capacity(ROUNDS);
         for round in 0..ROUNDS {
@@ -167,7 +166,7 @@ impl Pair {
     }
 }
 
-/// Does what it is asked for, until a cancel comes that belongs to nothing.
+/// Answers requests until a cancel without a conversation arrives.
 async fn answer(arm: &Agent) {
     loop {
         let asked = arm.receive().await.unwrap().message;

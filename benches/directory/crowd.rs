@@ -1,5 +1,5 @@
-//! Two hosts with 500 agents each that start at the same moment: how long until everybody sees
-//! everybody, and what the gateways cost when nothing happens any more.
+//! Two hosts with 500 agents each that start at the same moment: the time until all processes see all
+//! agents, and the idle load of the gateways afterwards.
 
 use std::fs;
 use std::path::PathBuf;
@@ -13,14 +13,14 @@ use tokio::runtime::{Builder, Runtime};
 const AGENTS: usize = 500;
 /// Announcements are repeated for some seconds.
 const SETTLING: Duration = Duration::from_secs(15);
-/// Records are asked for again before their two minutes are over, so each window is longer than
-/// that; later, questions for everything become rarer.
+/// Records are refreshed before their two minutes end, so each window is longer than that. Full
+/// questions become rarer later.
 const IDLE: Duration = Duration::from_secs(130);
-/// The peak is that of parts this long.
+/// Interval of the maximum.
 const PART: Duration = Duration::from_secs(5);
 const WATCHDOG: Duration = Duration::from_secs(120);
 
-/// Measures, within namespaces of its own, and prints.
+/// Measures in namespaces of its own, and prints the results.
 pub(crate) fn measure() {
     fipa_testbed::enter();
     fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
@@ -42,7 +42,7 @@ pub(crate) fn measure() {
     }
 }
 
-/// What the hosts use when nothing happens.
+/// Idle load of the hosts.
 fn idle(network: &Network, window: u32) {
     let look = || -> Vec<Spent> { network.hosts().iter().map(Spent::of).collect() };
     let (before, since) = (look(), Instant::now());
@@ -77,7 +77,7 @@ struct Robot {
     gateway: Gateway,
     domain: Domain,
     _agents: Vec<Agent>,
-    /// Its threads are in the host's namespace, and bear its name.
+    /// Starts it with threads in the host's namespace that have its name.
     _runtime: Runtime,
 }
 

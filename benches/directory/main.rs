@@ -1,9 +1,9 @@
-//! The service directory: with 10,000 entries, looking up, searching, watching, each beside the
-//! standard library's map or the bare channel that it stands on; looking up and searching among the
-//! 1,000 agents of a host, as each of its processes does; then two hosts with 500 agents each on a
-//! network of their own, which takes root and five minutes (`crowd`).
+//! Benchmarks the service directory: lookup, search and subscription with 10,000 entries, beside a map of
+//! the standard library or a bare channel; lookup and search among the 1,000 agents of a host, as each of
+//! its processes does; then two hosts with 500 agents each on a network of their own, which needs root
+//! and five minutes (`crowd`).
 //!
-//! `-- two-hosts` is that last part alone, and any other filter leaves it out.
+//! `-- two-hosts` runs that last part alone; any other filter omits it.
 #![allow(
     clippy::unwrap_used,
     clippy::print_stdout,
@@ -25,7 +25,7 @@ use fipa_transport::Incarnation;
 
 const ENTRIES: usize = 10_000;
 const ON_ONE_HOST: usize = 1000;
-/// The filter that means the hosts on a network of their own.
+/// The filter that selects the two hosts.
 const TWO_HOSTS: &str = "two-hosts";
 
 fn name(number: usize) -> String {
@@ -45,7 +45,7 @@ fn registration(number: usize) -> Registration {
     }
 }
 
-/// As a gateway sees it: several back ends, of which one has all the entries.
+/// The view of a gateway: several back ends, one of which has all entries.
 fn directory() -> (Arc<MemoryDirectory>, MergedDirectory) {
     let memory = MemoryDirectory::new(Mts::new("mts", Incarnation::random()));
     for number in 0..ENTRIES {
@@ -94,7 +94,7 @@ fn searching(criterion: &mut Criterion) {
     });
 }
 
-/// What a process knows of another one's agents on the same host.
+/// Agents of another process of the host, as a process sees them.
 fn on_one_host(criterion: &mut Criterion) {
     let place = tempfile::tempdir().unwrap();
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -152,7 +152,7 @@ fn watching(criterion: &mut Criterion) {
             raw.try_recv().unwrap()
         });
     });
-    // Goes on from one sample to the next, so that every registration is a change.
+    // Counts on across samples, so each registration is a change.
     let mut number = 0_u64;
     group.bench_function("registered and told by the merged view", |bench| {
         bench.iter(|| {
@@ -170,7 +170,7 @@ fn watching(criterion: &mut Criterion) {
 criterion_group!(benches, looking_up, searching, on_one_host, watching);
 
 fn main() {
-    // The same program again, in namespaces of its own.
+    // Starts this program again in namespaces of its own.
     if std::env::args().any(|argument| argument == "crowd_in_namespaces") {
         return crowd::measure();
     }

@@ -1,4 +1,4 @@
-//! Horizontal bars with a mark beside each, as an SVG picture.
+//! A diagram of horizontal bars with marks, as an SVG document.
 
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
@@ -14,19 +14,19 @@ const FAINT: RGBColor = RGBColor(0xdd, 0xe1, 0xe6);
 const COLOURS: [RGBColor; 2] = [RGBColor(0x1f, 0x6f, 0xd1), RGBColor(0x0b, 0x7a, 0x75)];
 const MARK: RGBColor = RGBColor(0xc9, 0x5d, 0x12);
 
-/// What is drawn.
+/// The contents of a diagram.
 pub(super) struct Picture<'a> {
     pub(super) title: &'a str,
     pub(super) series: &'a [&'a str],
-    /// What the marks mean.
+    /// Legend of the marks.
     pub(super) mark: &'a str,
     pub(super) groups: Vec<Group>,
-    /// How a value is said.
+    /// Formats a value with its unit.
     pub(super) unit: fn(f64) -> String,
     pub(super) logarithmic: bool,
 }
 
-/// Bars that belong together.
+/// Bars under one name.
 pub(super) struct Group {
     pub(super) name: String,
     pub(super) bars: Vec<Bar>,
@@ -36,23 +36,23 @@ pub(super) struct Group {
 pub(super) struct Bar {
     pub(super) series: usize,
     pub(super) value: f64,
-    /// How far to either side the value scatters.
+    /// Standard deviation, in the unit of the value.
     pub(super) deviation: f64,
     pub(super) mark: Option<f64>,
 }
 
-/// The picture as SVG text.
+/// Draws the diagram as an SVG document.
 pub(super) fn svg(picture: &Picture<'_>) -> Result<String, String> {
     let mut text = String::new();
     draw(picture, &mut text).map_err(|error| error.to_string())?;
     Ok(text)
 }
 
-/// From a value to its place.
+/// Maps a value to its position.
 struct Scale {
     from: f64,
     until: f64,
-    /// From one line of a scale that is not logarithmic to the next.
+    /// Distance of the lines of a linear scale.
     step: f64,
     logarithmic: bool,
 }

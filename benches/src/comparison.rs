@@ -9,8 +9,8 @@ use crate::error::BenchError;
 use crate::machine::Machine;
 use crate::measure::{self, Effort, Measured};
 use crate::part::{Socket, Wait};
+use crate::path::{BenchPath, Mechanism};
 use crate::stage::Stage;
-use crate::way::{Sort, Way};
 use crate::{many, plot, report};
 
 /// The paths that a comparison measures.
@@ -89,19 +89,19 @@ impl Comparison {
         machine: Machine,
         progress: impl Fn(&str),
     ) -> Result<Measurement, BenchError> {
-        let paths = self.paths();
-        let many = has_many(&paths);
+        let selected = self.paths();
+        let many = has_many(&selected);
         let mut stage = Stage::new(self.program, self.zenoh).map_err(BenchError::Prepare)?;
-        let mut ways = Vec::new();
+        let mut paths = Vec::new();
         let mut notes = Vec::new();
-        for (sort, wait) in paths {
-            progress(&format!("starting {}", sort.name()));
-            match Way::open(&mut stage, sort, wait).await {
-                Ok(way) => ways.push(way),
-                Err(why) => notes.push(format!("{}: cannot be measured: {why}", sort.name())),
+        for (mechanism, wait) in selected {
+            progress(&format!("starting {}", mechanism.name()));
+            match BenchPath::open(&mut stage, mechanism, wait).await {
+                Ok(path) => paths.push(path),
+                Err(why) => notes.push(format!("{}: cannot be measured: {why}", mechanism.name())),
             }
         }
-        let mut measured = measure::all(&mut stage, &mut ways, &self.effort, &progress).await;
+        let mut measured = measure::all(&mut stage, &mut paths, &self.effort, &progress).await;
         if many {
             progress("content for many");
             match many::measure(&mut stage, &self.effort).await {
@@ -124,41 +124,41 @@ impl Comparison {
     }
 
     /// The paths to measure, each followed by its limit.
-    fn paths(&self) -> Vec<(Sort, Wait)> {
+    fn paths(&self) -> Vec<(Mechanism, Wait)> {
         let mut paths = Vec::new();
-        let mut add = |sort: Sort, wait: Wait| {
-            let all = [Some(sort), sort.plain(), sort.limit()];
-            for sort in all.into_iter().flatten() {
-                if !paths.contains(&(sort, wait)) {
-                    paths.push((sort, wait));
+        let mut add = |mechanism: Mechanism, wait: Wait| {
+            let all = [Some(mechanism), mechanism.plain(), mechanism.limit()];
+            for mechanism in all.into_iter().flatten() {
+                if !paths.contains(&(mechanism, wait)) {
+                    paths.push((mechanism, wait));
                 }
             }
         };
         let shm = self.selection != Selection::Net;
         let net = self.selection != Selection::Shm;
         if shm && self.transports.contains(&Kind::Shm) {
-            add(Sort::Agents(Kind::Shm), Wait::Spin);
-            add(Sort::Letters, Wait::Spin);
-            add(Sort::Agents(Kind::Shm), Wait::Block);
+            add(Mechanism::Agents(Kind::Shm), Wait::Spin);
+            add(Mechanism::Letters, Wait::Spin);
+            add(Mechanism::Agents(Kind::Shm), Wait::Block);
         }
         if net {
             for kind in &self.transports {
                 match kind {
-                    Kind::Unix => add(Sort::Agents(Kind::Unix), Wait::Block),
-                    Kind::Tcp | Kind::Udp => add(Sort::Gateways(*kind), Wait::Block),
+                    Kind::Unix => add(Mechanism::Agents(Kind::Unix), Wait::Block),
+                    Kind::Tcp | Kind::Udp => add(Mechanism::Gateways(*kind), Wait::Block),
                     _ => {}
                 }
             }
             // Measured whatever is configured, because the measurement makes keys of its own.
-            add(Sort::Secured(Kind::Tcp), Wait::Block);
-            add(Sort::Secured(Kind::Quic), Wait::Block);
+            add(Mechanism::Secured(Kind::Tcp), Wait::Block);
+            add(Mechanism::Secured(Kind::Quic), Wait::Block);
         }
-        add(Sort::Socket(Socket::Unix), Wait::Block);
-        add(Sort::Socket(Socket::Tcp), Wait::Block);
+        add(Mechanism::Socket(Socket::Unix), Wait::Block);
+        add(Mechanism::Socket(Socket::Tcp), Wait::Block);
         if self.zenoh.is_some() {
             for (selected, shared_memory) in [(shm, true), (net, false)] {
                 if selected {
-                    paths.push((Sort::Zenoh { shared_memory }, Wait::Block));
+                    paths.push((Mechanism::Zenoh { shared_memory }, Wait::Block));
                 }
             }
         }
@@ -166,8 +166,8 @@ impl Comparison {
     }
 }
 
-fn has_many(paths: &[(Sort, Wait)]) -> bool {
-    paths.contains(&(Sort::Agents(Kind::Shm), Wait::Spin))
+fn has_many(paths: &[(Mechanism, Wait)]) -> bool {
+    paths.contains(&(Mechanism::Agents(Kind::Shm), Wait::Spin))
 }
 
 impl Measurement {

@@ -20,10 +20,10 @@ mod many;
 mod measure;
 mod paper;
 mod part;
+mod path;
 mod plot;
 mod report;
 mod stage;
-mod way;
 
 pub use comparison::{Comparison, Measurement, Program, Selection};
 pub use error::{BenchError, PartError};

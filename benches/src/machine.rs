@@ -1,4 +1,4 @@
-//! The machine that something is measured on, and whether it has anything else to do.
+//! The machine that runs a measurement, and its other load.
 
 use std::fmt;
 use std::fs;
@@ -7,10 +7,10 @@ use std::time::Duration;
 use rustix::thread::CpuSet;
 use serde::Serialize;
 
-/// More than this share of the processors in use by others makes times doubtful.
+/// Share of the processors in use by other processes beyond which a warning is due.
 const BUSY: f64 = 0.10;
 
-/// How long the machine is looked at.
+/// Duration of the observation.
 const LOOK: Duration = Duration::from_millis(500);
 
 /// The machine that a measurement runs on.
@@ -21,9 +21,10 @@ pub struct Machine {
     pub(super) memory_bytes: u64,
     pub(super) system: String,
     pub(super) fipa: &'static str,
-    /// Whether the command was built with optimisation.
-    pub(super) optimised: bool,
-    /// The share of all processors that others used just before.
+    /// Whether the program was built with optimization.
+    #[serde(rename = "optimised")]
+    pub(super) optimized: bool,
+    /// Share of all processors that other processes used just before, 0 to 1.
     pub(super) busy: f64,
 }
 
@@ -41,10 +42,10 @@ impl fmt::Display for Machine {
             f,
             "{processor}, {cores} cores, {gibibytes:.0} GiB, {system}, fipa {fipa}"
         )?;
-        if self.optimised {
+        if self.optimized {
             Ok(())
         } else {
-            f.write_str(" without optimisation")
+            f.write_str(" without optimization")
         }
     }
 }
@@ -66,7 +67,7 @@ impl Machine {
                 system.release().to_string_lossy()
             ),
             fipa: env!("CARGO_PKG_VERSION"),
-            optimised: !cfg!(debug_assertions),
+            optimized: !cfg!(debug_assertions),
             busy,
         }
     }
@@ -76,21 +77,21 @@ impl Machine {
         let mut warnings = Vec::new();
         if self.busy > BUSY {
             warnings.push(format!(
-                "the machine is busy: others use {:.0} % of its processors. Times will be too \
-                 long and scattered; ratios suffer less",
+                "the machine is busy: other processes use {:.0} % of its processors. Times are too \
+                 long and scatter; ratios are affected less",
                 self.busy * 100.0
             ));
         }
-        if !self.optimised {
+        if !self.optimized {
             warnings.push(
-                "this command was built without optimisation: cargo run --release -- bench"
+                "this command was built without optimization: cargo run --release -- bench"
                     .to_owned(),
             );
         }
         if self.cores < 2 {
             warnings.push(
-                "with one processor, both ends of a way take turns on it, and whoever spins \
-                 keeps the other from working"
+                "with one processor both ends of a path share it, and an end that spins \
+                 delays the other"
                     .to_owned(),
             );
         }
@@ -107,12 +108,12 @@ pub(super) fn cores() -> Vec<usize> {
         .collect()
 }
 
-/// This process works on one processor from now on.
-pub(super) fn keep_to(core: usize) -> Result<(), String> {
+/// Pins this process to one processor.
+pub(super) fn pin_to(core: usize) -> Result<(), String> {
     let mut only = CpuSet::new();
     only.set(core);
     rustix::thread::sched_setaffinity(None, &only)
-        .map_err(|error| format!("cannot keep to processor {core}: {error}"))
+        .map_err(|error| format!("cannot use processor {core}: {error}"))
 }
 
 fn processor() -> String {
@@ -133,7 +134,7 @@ fn memory() -> u64 {
     kibibytes.unwrap_or(0) * 1024
 }
 
-/// Time of all processors so far, in units of the kernel.
+/// Accumulated time of all processors, in clock ticks.
 #[derive(Debug, Clone, Copy)]
 struct Jiffies {
     all: u64,

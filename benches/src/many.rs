@@ -1,27 +1,27 @@
-//! A large content for many receivers, beside what it should cost: being written once, and a small
-//! letter to each.
+//! Large content for many receivers, beside its limit: the content written once, and a small letter to
+//! each receiver.
 
 use serde::Serialize;
 
 use super::measure::{Effort, WARMING, median, quantile, times};
 use super::part::{End, Event, Fill, Letters, Order, Part, Spread};
-use super::stage::{Stage, Who};
+use super::stage::{ProcessIndex, Stage};
 
-/// How many agents there are to receive.
+/// Number of receiving agents.
 const RECEIVERS: usize = 32;
-/// How long the content is.
+/// Length of the content, in bytes.
 const SIZE: usize = 1 << 20;
-/// What a small letter has.
+/// Length of the content of a small letter, in bytes.
 const SMALL: usize = 100;
-/// How many times each is done in a round.
+/// Repetitions in a round.
 const TIMES: usize = 8;
 
-/// What it cost, in microseconds, until the sender has all outcomes; medians.
+/// Median times in microseconds, until the sender has all outcomes.
 #[derive(Debug, Clone, Serialize)]
 pub(super) struct Many {
     pub(super) receivers: usize,
     pub(super) size: usize,
-    /// The memory loaned, written and given back.
+    /// Memory loaned, written and returned.
     pub(super) fill_us: f64,
     /// One small message to all.
     pub(super) small_us: f64,
@@ -29,15 +29,15 @@ pub(super) struct Many {
     pub(super) together_us: f64,
     /// The same content in a message of its own for each.
     pub(super) copies_us: f64,
-    /// `together` to the sum of the first two: the median over all rounds.
+    /// Ratio of `together` to the sum of the first two: the median over all rounds.
     pub(super) ratio: f64,
-    /// The middle half of those.
+    /// Middle half of these ratios.
     pub(super) ratio_spread: [f64; 2],
-    /// `copies` to `together`, the same way.
+    /// Ratio of `copies` to `together`: the median over all rounds.
     pub(super) copies_ratio: f64,
 }
 
-/// Measures it, through shared memory between two processes that spin.
+/// Measures through shared memory between two processes that spin.
 pub(super) async fn measure(stage: &mut Stage, effort: &Effort) -> Result<Many, String> {
     let settings = [
         "transport.shm.spin=1s",
@@ -91,7 +91,7 @@ pub(super) async fn measure(stage: &mut Stage, effort: &Effort) -> Result<Many, 
 /// The median of one turn, in nanoseconds.
 async fn turn(
     stage: &mut Stage,
-    (sender, receiver): (Who, Who),
+    (sender, receiver): (ProcessIndex, ProcessIndex),
     what: Spread,
     size: usize,
 ) -> Result<f64, String> {
@@ -113,6 +113,6 @@ async fn turn(
     }
     match sent {
         Event::Sent { began, ended, .. } => Ok(median(&times(&began, &ended))),
-        other => Err(format!("instead of times there was {other:?}")),
+        other => Err(format!("expected times, received {other:?}")),
     }
 }

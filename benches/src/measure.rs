@@ -1,4 +1,4 @@
-//! Measuring: all ways in turns, so that whatever else the machine does hits them alike.
+//! The course of a measurement: all paths take turns, so other load affects them alike.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -8,19 +8,19 @@ use serde::Serialize;
 
 use super::many::Many;
 use super::part::{Fill, Letters, Wait};
+use super::path::{BenchPath, Mechanism, Turn};
 use super::stage::Stage;
-use super::way::{Sort, Turn, Way};
 use crate::error::BenchError;
 
 /// The extent of a measurement.
 #[derive(Debug, Clone)]
 pub struct Effort {
     pub(super) sizes: Vec<usize>,
-    /// Turns of every way with letters of one sort.
+    /// Turns of each path with one kind of letter.
     pub(super) rounds: usize,
-    /// How long a turn may take.
+    /// Duration of a turn.
     pub(super) turn: Duration,
-    /// Turns for throughput.
+    /// Turns that measure the rate.
     pub(super) rate_rounds: usize,
 }
 
@@ -71,12 +71,12 @@ fn checked(sizes: impl IntoIterator<Item = u64>) -> Result<Vec<usize>, BenchErro
     Ok(checked)
 }
 
-/// Letters of a turn, at least and at most.
+/// Minimum and maximum number of letters in a turn.
 const LEAST: usize = 8;
 const MOST: usize = 2000;
-/// Letters at the beginning of a turn that do not count: whoever slept is awake after them.
+/// Letters at the beginning of a turn that do not count: they wake sleeping processes.
 pub(super) const WARMING: usize = 3;
-/// A throughput turn takes this many times as long.
+/// Length of a turn that measures the rate, in turns.
 const RATE_TURN: u32 = 3;
 
 /// Percentiles of a time, in microseconds.
@@ -87,7 +87,7 @@ pub(super) struct Percentiles {
     pub(super) p999: f64,
 }
 
-/// What one way did with letters of one sort.
+/// Result of one path with one kind of letter.
 #[derive(Debug, Clone, Serialize)]
 pub(super) struct Row {
     pub(super) path: String,
@@ -95,29 +95,29 @@ pub(super) struct Row {
     pub(super) size: usize,
     pub(super) fill: Fill,
     pub(super) samples: u64,
-    /// From before sending until the receiver has the letter, decoded.
+    /// From before sending until the receiver has the decoded letter.
     pub(super) one_way_us: Percentiles,
     /// From before sending until the sender knows that it has arrived.
     pub(super) round_trip_us: Percentiles,
-    /// Letters a second with a window of letters under way.
+    /// Letters a second with a window of letters under path.
     pub(super) rate_per_s: Option<f64>,
-    /// Of all processes of the way together, one letter at a time.
+    /// Processor time of all processes of the path, one letter at a time.
     pub(super) cpu_us_per_letter: f64,
     pub(super) limit: Option<Limit>,
-    /// One way, to the limit's: the median over all rounds of the ratio of medians.
+    /// Ratio of the one-path time to the limit's: the median over all rounds of the ratio of medians.
     pub(super) ratio: Option<f64>,
-    /// The middle half of those ratios.
+    /// Middle half of these ratios.
     pub(super) ratio_spread: Option<[f64; 2]>,
     pub(super) round_trip_ratio: Option<f64>,
     pub(super) rate_ratio: Option<f64>,
     pub(super) cpu_ratio: Option<f64>,
-    /// What a way that is encrypted costs beside the same without.
+    /// Cost of encryption, beside the same path without.
     pub(super) plain: Option<Plain>,
     #[serde(skip)]
-    pub(super) sort: Sort,
+    pub(super) mechanism: Mechanism,
 }
 
-/// What the same bytes need at least.
+/// The bare mechanism that moves the same bytes.
 #[derive(Debug, Clone, Serialize)]
 pub(super) struct Limit {
     pub(super) name: String,
@@ -127,20 +127,20 @@ pub(super) struct Limit {
     pub(super) cpu_us_per_letter: f64,
 }
 
-/// A way that is encrypted, in units of one that is not: medians over all rounds of the ratio of
-/// medians, the rate's apart.
+/// An encrypted path in units of one that is not: medians over all rounds of the ratio of medians;
+/// the ratio of rates is one of medians.
 #[derive(Debug, Clone, Serialize)]
 pub(super) struct Plain {
     pub(super) name: String,
     pub(super) ratio: f64,
     pub(super) round_trip_ratio: f64,
-    /// The middle half of the rounds.
+    /// Middle half of the rounds.
     pub(super) round_trip_ratio_spread: [f64; 2],
     pub(super) rate_ratio: Option<f64>,
     pub(super) cpu_ratio: f64,
 }
 
-/// What all ways did, and what could not be measured.
+/// Results of all paths, and the reasons for those that are missing.
 #[derive(Debug, Default)]
 pub(super) struct Measured {
     pub(super) rows: Vec<Row>,
@@ -148,41 +148,41 @@ pub(super) struct Measured {
     pub(super) notes: Vec<String>,
 }
 
-/// Measures all ways with letters of all sorts. `told` hears of every step.
+/// Measures all paths with all kinds of letters. `progress` is called with the name of each step.
 pub(super) async fn all(
     stage: &mut Stage,
-    ways: &mut Vec<Way>,
+    paths: &mut Vec<BenchPath>,
     effort: &Effort,
-    told: &impl Fn(&str),
+    progress: &impl Fn(&str),
 ) -> Measured {
     let mut measured = Measured::default();
     for &size in &effort.sizes {
         let mut able = Vec::new();
-        for (index, way) in ways.iter().enumerate() {
-            match way.takes(stage, size).await {
+        for (index, path) in paths.iter().enumerate() {
+            match path.takes(stage, size).await {
                 Ok(()) => able.push(index),
                 Err(why) => {
-                    let name = way.sort.name();
+                    let name = path.mechanism.name();
                     measured.notes.push(format!("{name}: {size} bytes: {why}"));
                 }
             }
         }
         for fill in [Fill::Loaned, Fill::Filled, Fill::Copied] {
-            told(&format!("{} {}", super::report::size(size), name_of(fill)));
+            progress(&format!("{} {}", super::report::size(size), name_of(fill)));
             let mut cells = HashMap::new();
             for index in able.clone() {
-                let sort = ways[index].sort;
-                if fill != Fill::Loaned || sort.loans() {
+                let mechanism = paths[index].mechanism;
+                if fill != Fill::Loaned || mechanism.loans() {
                     cells.insert(index, Cell::default());
                 }
             }
-            let failed = cell(stage, ways, size, fill, effort, &mut cells).await;
-            measured.rows.extend(rows(ways, size, fill, &cells));
-            // Where something went wrong, the processes wait for what will not come.
+            let failed = cell(stage, paths, size, fill, effort, &mut cells).await;
+            measured.rows.extend(rows(paths, size, fill, &cells));
+            // After a failure the processes of a path wait for letters that never arrive.
             for (index, why) in failed.into_iter().rev() {
-                let way = ways.remove(index);
-                let name = way.sort.name();
-                measured.notes.push(format!("{name}: given up: {why}"));
+                let path = paths.remove(index);
+                let name = path.mechanism.name();
+                measured.notes.push(format!("{name}: abandoned: {why}"));
                 able.retain(|other| *other != index);
                 for other in &mut able {
                     *other -= usize::from(*other > index);
@@ -201,12 +201,12 @@ pub(super) fn name_of(fill: Fill) -> &'static str {
     }
 }
 
-/// What is known of one way with letters of one sort.
+/// Measured values of one path with one kind of letter.
 struct Cell {
     letters: usize,
     one_way: Histogram<u64>,
     round_trip: Histogram<u64>,
-    /// By round.
+    /// Medians, one per round.
     one_way_medians: Vec<f64>,
     round_trip_medians: Vec<f64>,
     cpu: Vec<f64>,
@@ -232,10 +232,10 @@ impl Default for Cell {
     }
 }
 
-/// Measures letters of one sort, and returns which ways have failed, in order.
+/// Measures one kind of letter. Returns the indices of the paths that failed, in order, with reasons.
 async fn cell(
     stage: &mut Stage,
-    ways: &[Way],
+    paths: &[BenchPath],
     size: usize,
     fill: Fill,
     effort: &Effort,
@@ -249,18 +249,18 @@ async fn cell(
         window,
     };
     for round in 0..=effort.rounds + effort.rate_rounds {
-        for (index, way) in ways.iter().enumerate() {
+        for (index, path) in paths.iter().enumerate() {
             let Some(cell) = cells.get_mut(&index) else {
                 continue;
             };
             let is_rate = round > effort.rounds;
-            let window = if is_rate { Sort::window(fill) } else { 1 };
+            let window = if is_rate { Mechanism::window(fill) } else { 1 };
             let count = match is_rate {
                 true => (cell.letters * RATE_TURN as usize).max(4 * window),
                 false => cell.letters + WARMING,
             };
-            match way.turn(stage, letters(count, window)).await {
-                // The first is for finding out how many make a turn.
+            match path.turn(stage, letters(count, window)).await {
+                // The first turn finds the number of letters that fill a turn.
                 Ok(turn) if round == 0 => cell.letters = letters_for(&turn, effort.turn),
                 Ok(turn) if is_rate => cell.rates.push(rate(&turn)),
                 Ok(turn) => cell.add(&turn),
@@ -281,7 +281,7 @@ fn letters_for(turn: &Turn, time: Duration) -> usize {
     (fit as usize).clamp(LEAST, MOST)
 }
 
-/// Letters a second, without those at the beginning.
+/// Letters per second, without those that warm up.
 fn rate(turn: &Turn) -> f64 {
     let from = turn.began.get(WARMING).copied().unwrap_or(0);
     let until = turn.ended.last().copied().unwrap_or(0);
@@ -314,7 +314,7 @@ impl Cell {
     }
 }
 
-/// In nanoseconds. What counts begins after the warming letters.
+/// Durations in nanoseconds, without the letters that warm up.
 pub(super) fn times(from: &[u64], until: &[u64]) -> Vec<f64> {
     let pairs = from.iter().zip(until).skip(WARMING);
     pairs
@@ -334,26 +334,26 @@ pub(super) fn quantile(values: &[f64], at: f64) -> f64 {
     values.get(index).copied().unwrap_or(f64::NAN)
 }
 
-fn rows(ways: &[Way], size: usize, fill: Fill, cells: &HashMap<usize, Cell>) -> Vec<Row> {
+fn rows(paths: &[BenchPath], size: usize, fill: Fill, cells: &HashMap<usize, Cell>) -> Vec<Row> {
     let mut rows = Vec::new();
-    for (index, way) in ways.iter().enumerate() {
+    for (index, path) in paths.iter().enumerate() {
         let Some(cell) = cells.get(&index) else {
             continue;
         };
-        let found = |sort: Sort| {
-            let is_it = |other: &Way| other.sort == sort && other.wait == way.wait;
-            let index = ways.iter().position(is_it)?;
-            Some((sort, cells.get(&index)?))
+        let found = |mechanism: Mechanism| {
+            let is_it = |other: &BenchPath| other.mechanism == mechanism && other.wait == path.wait;
+            let index = paths.iter().position(is_it)?;
+            Some((mechanism, cells.get(&index)?))
         };
-        let limit = way.sort.limit().and_then(found);
-        let plain = way.sort.plain().and_then(found);
-        let plain = plain.map(|(sort, plain)| beside(cell, sort, plain));
-        rows.push(row(way, size, fill, cell, limit, plain));
+        let limit = path.mechanism.limit().and_then(found);
+        let plain = path.mechanism.plain().and_then(found);
+        let plain = plain.map(|(mechanism, plain)| beside(cell, mechanism, plain));
+        rows.push(row(path, size, fill, cell, limit, plain));
     }
     rows
 }
 
-/// Of a round each.
+/// Ratios, one per round.
 struct Ratios {
     one_way: Vec<f64>,
     round_trip: Vec<f64>,
@@ -378,15 +378,15 @@ fn rate_ratio(cell: &Cell, other: &Cell) -> Option<f64> {
     Some(cell.rate()? / other.rate()?)
 }
 
-/// The middle half.
+/// Lower and upper quartile.
 fn spread(ratios: &[f64]) -> [f64; 2] {
     [0.25, 0.75].map(|at| quantile(ratios, at))
 }
 
-fn beside(cell: &Cell, sort: Sort, plain: &Cell) -> Plain {
+fn beside(cell: &Cell, mechanism: Mechanism, plain: &Cell) -> Plain {
     let ratios = Ratios::new(cell, plain);
     Plain {
-        name: sort.name(),
+        name: mechanism.name(),
         ratio: median(&ratios.one_way),
         round_trip_ratio: median(&ratios.round_trip),
         round_trip_ratio_spread: spread(&ratios.round_trip),
@@ -396,17 +396,17 @@ fn beside(cell: &Cell, sort: Sort, plain: &Cell) -> Plain {
 }
 
 fn row(
-    way: &Way,
+    path: &BenchPath,
     size: usize,
     fill: Fill,
     cell: &Cell,
-    limit: Option<(Sort, &Cell)>,
+    limit: Option<(Mechanism, &Cell)>,
     plain: Option<Plain>,
 ) -> Row {
     let ratios = limit.map(|(_, limit)| Ratios::new(cell, limit));
     Row {
-        path: way.sort.name(),
-        wait: way.wait,
+        path: path.mechanism.name(),
+        wait: path.wait,
         size,
         fill,
         samples: cell.one_way.len(),
@@ -414,8 +414,8 @@ fn row(
         round_trip_us: percentiles(&cell.round_trip),
         rate_per_s: cell.rate(),
         cpu_us_per_letter: cell.cpu_us(),
-        limit: limit.map(|(sort, limit)| Limit {
-            name: sort.name(),
+        limit: limit.map(|(mechanism, limit)| Limit {
+            name: mechanism.name(),
             p50_us: percentiles(&limit.one_way).p50,
             round_trip_p50_us: percentiles(&limit.round_trip).p50,
             rate_per_s: limit.rate(),
@@ -427,7 +427,7 @@ fn row(
         rate_ratio: limit.and_then(|(_, limit)| rate_ratio(cell, limit)),
         cpu_ratio: ratios.map(|it| median(&it.cpu)),
         plain,
-        sort: way.sort,
+        mechanism: path.mechanism,
     }
 }
 

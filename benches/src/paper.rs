@@ -1,10 +1,8 @@
-//! `fipa bench paper`: the evaluation that people in this field know, again.
-//!
-//! Two figures of the paper on the C++ libraries `fipa_acl` and `fipa_services`: how long encoded
-//! messages are for one byte of content and 99 bytes in all other fields (its figure 7), and how
-//! long 1,000 cycles of encoding and decoding take for messages and for all pairs of envelope and
-//! message (its figure 9). Beside them the figures of those libraries, as they were measured on
-//! another machine: not in the same run, so there is no ratio.
+//! Repeats two figures of the paper on the C++ libraries `fipa_acl` and `fipa_services`: the lengths of
+//! encoded messages with one byte of content and 99 bytes in all other fields (its figure 7), and the
+//! times of 1,000 cycles of encoding and decoding, for messages and for all pairs of envelope and
+//! message (its figure 9). The published figures stand beside them. They were measured on another
+//! machine, so no ratio is given.
 
 use std::hint::black_box;
 use std::path::Path;
@@ -21,15 +19,15 @@ use crate::error::BenchError;
 
 /// Cycles for one figure, as in the paper.
 const CYCLES: usize = 1000;
-/// Cycles for one figure when there is no time.
+/// Cycles for one figure in a quick measurement.
 const QUICK_CYCLES: usize = 20;
-/// Cycles before that, which do not count.
+/// Cycles before the measurement, which do not count.
 const WARMING: usize = 20;
-/// Cycles after which others get their turn: a signal is heard.
+/// Cycles after which other tasks run, so that a signal is handled.
 const BREATH: usize = 10;
 /// Number of figures: messages without and in each envelope, at every size.
 const STEPS: usize = MESSAGES.len() * (1 + ENVELOPES.len()) * SIZES.len();
-/// What all other fields of the message have together, in bytes.
+/// Length of all other fields of the message together, in bytes.
 const HEADER: usize = 99;
 
 const MESSAGES: [Representation; 3] = [
@@ -54,17 +52,17 @@ pub struct Paper {
     pub(super) times: Vec<Times>,
 }
 
-/// How long something is when encoded, in bytes.
+/// Encoded length of a message or a letter, in bytes.
 #[derive(Debug, Serialize)]
 pub(super) struct Size {
     pub(super) message: &'static str,
     pub(super) envelope: Option<&'static str>,
     pub(super) bytes: usize,
-    /// Of the C++ library, measured elsewhere.
+    /// Length of the C++ library, measured elsewhere.
     pub(super) cpp_bytes: Option<usize>,
 }
 
-/// How long encoding and decoding takes.
+/// Times of encoding and decoding.
 #[derive(Debug, Serialize)]
 pub(super) struct Times {
     pub(super) message: &'static str,
@@ -72,7 +70,7 @@ pub(super) struct Times {
     pub(super) content: usize,
     pub(super) encode_us: Spread,
     pub(super) decode_us: Spread,
-    /// Of the C++ library, measured elsewhere: encoding and decoding.
+    /// Times of the C++ library, measured elsewhere: encoding and decoding.
     pub(super) cpp_us: Option<[f64; 2]>,
 }
 
@@ -95,9 +93,8 @@ fn cpp_bytes(message: Representation, envelope: Option<Representation>) -> Optio
     }
 }
 
-/// Times of the C++ library in microseconds, measured elsewhere: encoding and decoding. It was
-/// measured for messages and for the envelope around a bit-efficient message that was there
-/// already; a letter takes both.
+/// Times of the C++ library in microseconds, measured elsewhere: encoding and decoding. They are
+/// for messages and for the envelope around an encoded bit-efficient message; a letter needs both.
 fn cpp_us(
     message: Representation,
     envelope: Option<Representation>,
@@ -121,7 +118,7 @@ fn cpp_us(
     Some([encode + around, decode + off])
 }
 
-/// A message with all fields, of which those beside the content have [`HEADER`] bytes together.
+/// A message with all fields; those beside the content have [`HEADER`] bytes together.
 fn a_message(content: usize) -> Result<Message, String> {
     let agent = |name: &str| AgentId::new(name).map_err(|error| error.to_string());
     let texts = [
@@ -346,7 +343,7 @@ impl Paper {
     pub fn to_text(&self) -> String {
         let mut text = format!(
             "# The paper's evaluation again\n\n\
-             Written by `fipa bench paper` on {}; others used {:.0} % of the processors before.\n\
+             Written by `fipa bench paper` on {}; other processes used {:.0} % of the processors before.\n\
              The columns *C++* are `fipa_acl` and `fipa_services`, **measured elsewhere** (two shared \
              cores, -O3,\nanother machine at another time); they are for orientation, and no ratio is \
              claimed.\n\n\

@@ -1,8 +1,8 @@
-//! A part in a measurement: one process that is one end of a way, or something in between.
+//! The part of one process in a measurement: an end of a path, or a process between the ends.
 //!
-//! It does what it is told on standard input and says on standard output what came of it, one
-//! JSON document per line each way, and ends when its standard input does. Between two orders it
-//! sleeps, so that many ways can be kept ready and measured in turns.
+//! A part reads orders from standard input and writes events to standard output, one JSON document per
+//! line, and ends with its standard input. Between two orders it sleeps, so many paths can be kept
+//! ready and take turns.
 
 mod agent;
 mod iceoryx;
@@ -20,13 +20,13 @@ use crate::machine;
 
 pub(super) use self::orders::{End, Event, Fill, Letters, Order, Spread};
 
-/// What a process is in a measurement; the argument of `--part`.
+/// The part of a process; the argument of `--part`.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum Part {
-    /// An agent of this name; the configuration says in which domain.
+    /// An agent of this name in the configured domain.
     Agent { end: End, name: String },
-    /// So many agents that receive; their address is a pattern.
+    /// A number of receiving agents; their address is a pattern.
     Crowd { count: usize },
     /// The gateway of the configured domain.
     Gateway,
@@ -41,7 +41,7 @@ pub(super) enum Part {
 }
 
 impl Part {
-    /// Which end it is; none for what lies in between.
+    /// The end of the path that the part is; `None` for a part between the ends.
     pub(super) fn end(&self) -> Option<End> {
         match self {
             Self::Agent { end, .. }
@@ -62,11 +62,13 @@ pub(super) enum Socket {
     Unix,
 }
 
-/// What whoever waits does meanwhile.
+/// Behavior of a waiting process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum Wait {
+    /// It polls.
     Spin,
+    /// It sleeps until it is woken.
     Block,
 }
 
@@ -82,13 +84,13 @@ impl From<Wait> for RawWait {
 /// Plays the part of one process in a measurement, until its standard input ends.
 ///
 /// `part` is the JSON text of the option `--part` that a [`Program`](crate::Program) gets, `core` the
-/// number of `--core`: the processor that this process keeps to.
+/// number of `--core`: the processor that this process is pinned to.
 ///
 /// # Errors
 ///
 /// If `part` is not such a text, the processor is not available, or the part could not be played.
 pub fn play(part: &str, core: Option<usize>, config: &Config) -> Result<(), PartError> {
-    let pinned = core.map_or(Ok(()), machine::keep_to);
+    let pinned = core.map_or(Ok(()), machine::pin_to);
     let part = serde_json::from_str(part).map_err(|error| error.to_string());
     let played = pinned.and(part).and_then(|part| play_part(part, config));
     played.map_err(PartError)

@@ -1,4 +1,4 @@
-//! Latency over size, both logarithmic, as an SVG picture.
+//! A diagram of latency over size, both logarithmic, as an SVG document.
 
 use std::collections::BTreeMap;
 
@@ -7,26 +7,26 @@ use plotters::prelude::*;
 
 use super::measure::Row;
 use super::part::{Fill, Socket, Wait};
-use super::way::Sort;
+use super::path::Mechanism;
 use fipa::Kind;
 
 const WIDTH: u32 = 960;
 const HEIGHT: u32 = 560;
-/// Room for the names at the right.
+/// Width for the names at the right.
 const NAMES: u32 = 250;
 const INK: RGBColor = RGBColor(0x33, 0x3a, 0x44);
 const FAINT: RGBColor = RGBColor(0xdd, 0xe1, 0xe6);
 
-/// One line of the picture.
+/// One line of the diagram.
 struct Line {
     name: String,
     colour: RGBColor,
-    /// What is compared with is drawn thin.
+    /// Whether the line is a limit, which is drawn thin.
     is_limit: bool,
     points: Vec<(f64, f64)>,
 }
 
-/// Draws what was measured. The picture is SVG text.
+/// Draws the results as an SVG document.
 pub(super) fn svg(rows: &[Row], subtitle: &str) -> Result<String, String> {
     let lines = lines(rows);
     if lines.is_empty() {
@@ -37,26 +37,25 @@ pub(super) fn svg(rows: &[Row], subtitle: &str) -> Result<String, String> {
     Ok(text)
 }
 
-/// What is worth a line: of shared memory what is loaned and what is filled, of the network what
-/// lies in the application's memory; spinning where that was measured. Letters that nobody decodes
-/// have none.
+/// The lines of a diagram: loaned and filled content over shared memory, copied content over the
+/// network; spinning where it was measured. Letters that are not decoded have no line.
 fn lines(rows: &[Row]) -> Vec<Line> {
-    let spinning = |sort: Sort| {
+    let spinning = |mechanism: Mechanism| {
         rows.iter()
-            .any(|row| row.sort == sort && row.wait == Wait::Spin)
+            .any(|row| row.mechanism == mechanism && row.wait == Wait::Spin)
     };
     let mut lines: BTreeMap<(usize, Fill), Line> = BTreeMap::new();
     for row in rows {
-        let wanted = if row.sort.loans() {
-            row.fill != Fill::Copied && (row.wait == Wait::Spin || !spinning(row.sort))
+        let wanted = if row.mechanism.loans() {
+            row.fill != Fill::Copied && (row.wait == Wait::Spin || !spinning(row.mechanism))
         } else {
             row.fill == Fill::Filled
         };
-        if !wanted || row.sort == Sort::Letters {
+        if !wanted || row.mechanism == Mechanism::Letters {
             continue;
         }
-        let (order, colour) = look(row.sort, row.fill);
-        let name = match (row.sort.loans(), row.fill) {
+        let (order, colour) = look(row.mechanism, row.fill);
+        let name = match (row.mechanism.loans(), row.fill) {
             (true, Fill::Loaned) => format!("{}, loaned", row.path),
             (true, _) => format!("{}, filled", row.path),
             (false, _) => row.path.clone(),
@@ -64,7 +63,7 @@ fn lines(rows: &[Row]) -> Vec<Line> {
         let line = lines.entry((order, row.fill)).or_insert_with(|| Line {
             name,
             colour,
-            is_limit: row.sort.limit().is_none(),
+            is_limit: row.mechanism.limit().is_none(),
             points: Vec::new(),
         });
         line.points.push((row.size as f64, row.one_way_us.p50));
@@ -76,24 +75,24 @@ fn lines(rows: &[Row]) -> Vec<Line> {
     lines
 }
 
-/// The place among the lines, and the colour, which a way and what it is compared with share.
-fn look(sort: Sort, fill: Fill) -> (usize, RGBColor) {
+/// Order and color of a line; a path and its limit share them.
+fn look(mechanism: Mechanism, fill: Fill) -> (usize, RGBColor) {
     let shm = match fill {
         Fill::Loaned => RGBColor(0x0b, 0x7a, 0x75),
         _ => RGBColor(0x1f, 0x6f, 0xd1),
     };
-    match sort {
-        Sort::Agents(Kind::Shm) | Sort::Letters => (0, shm),
-        Sort::Iceoryx => (1, shm),
-        Sort::Agents(_) => (2, RGBColor(0xc9, 0x5d, 0x12)),
-        Sort::Socket(Socket::Unix) => (3, RGBColor(0xc9, 0x5d, 0x12)),
-        Sort::Socket(Socket::Tcp) => (4, RGBColor(0x7a, 0x83, 0x8f)),
-        Sort::Gateways(Kind::Udp) => (7, RGBColor(0xb0, 0x3a, 0x7a)),
-        Sort::Gateways(_) => (8, RGBColor(0x7b, 0x3f, 0xb5)),
-        Sort::Relay => (9, RGBColor(0x7b, 0x3f, 0xb5)),
-        Sort::Secured(Kind::Tcp) => (10, RGBColor(0x2f, 0x8f, 0x3f)),
-        Sort::Secured(_) => (11, RGBColor(0x4a, 0x4f, 0xc9)),
-        Sort::Zenoh { shared_memory } => {
+    match mechanism {
+        Mechanism::Agents(Kind::Shm) | Mechanism::Letters => (0, shm),
+        Mechanism::Iceoryx => (1, shm),
+        Mechanism::Agents(_) => (2, RGBColor(0xc9, 0x5d, 0x12)),
+        Mechanism::Socket(Socket::Unix) => (3, RGBColor(0xc9, 0x5d, 0x12)),
+        Mechanism::Socket(Socket::Tcp) => (4, RGBColor(0x7a, 0x83, 0x8f)),
+        Mechanism::Gateways(Kind::Udp) => (7, RGBColor(0xb0, 0x3a, 0x7a)),
+        Mechanism::Gateways(_) => (8, RGBColor(0x7b, 0x3f, 0xb5)),
+        Mechanism::Relay => (9, RGBColor(0x7b, 0x3f, 0xb5)),
+        Mechanism::Secured(Kind::Tcp) => (10, RGBColor(0x2f, 0x8f, 0x3f)),
+        Mechanism::Secured(_) => (11, RGBColor(0x4a, 0x4f, 0xc9)),
+        Mechanism::Zenoh { shared_memory } => {
             let order = if shared_memory { 12 } else { 13 };
             (order, RGBColor(0x9a, 0x2a, 0x2a))
         }
@@ -157,7 +156,7 @@ fn draw(
     Ok(())
 }
 
-/// Where the names go: beside the ends of the lines, one below the other.
+/// Positions of the names: beside the ends of the lines, without overlap.
 fn heights<DB: DrawingBackend>(
     chart: &ChartContext<'_, DB, Cartesian2d<Decades, Decades>>,
     lines: &[Line],
@@ -181,7 +180,7 @@ fn heights<DB: DrawingBackend>(
     heights
 }
 
-/// The smallest and the largest.
+/// Minimum and maximum.
 fn span(lines: &[Line], of: impl Fn(&(f64, f64)) -> f64) -> (f64, f64) {
     let values = lines.iter().flat_map(|line| line.points.iter().map(&of));
     values.fold((f64::INFINITY, 0.0), |(least, most), value| {
@@ -189,7 +188,7 @@ fn span(lines: &[Line], of: impl Fn(&(f64, f64)) -> f64) -> (f64, f64) {
     })
 }
 
-/// A time in microseconds as it is said.
+/// Formats a time in microseconds.
 pub(super) fn duration(micros: f64) -> String {
     match micros {
         micros if micros >= 1e6 => format!("{} s", round(micros / 1e6)),
@@ -198,12 +197,12 @@ pub(super) fn duration(micros: f64) -> String {
     }
 }
 
-/// Without what a power of ten leaves behind the digits that count.
+/// Rounds away the error of a power of ten.
 fn round(value: f64) -> f64 {
     (value * 1e4).round() / 1e4
 }
 
-/// A logarithmic axis that is labelled at the sizes that were measured, or at powers of ten.
+/// A logarithmic axis with labels at the measured sizes, or at powers of ten.
 struct Decades {
     from: f64,
     until: f64,

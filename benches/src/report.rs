@@ -1,4 +1,4 @@
-//! What was measured, as a table and as JSON.
+//! The results as a table and as JSON.
 
 use comfy_table::{CellAlignment, Table, presets};
 use serde_json::{Value, json};
@@ -8,7 +8,7 @@ use super::many::Many;
 use super::measure::{Effort, Measured, Row, name_of};
 use super::part::Wait;
 
-/// The whole as JSON.
+/// All results as JSON.
 pub(super) fn json(machine: &Machine, effort: &Effort, measured: &Measured) -> Value {
     json!({
         "machine": machine,
@@ -22,15 +22,15 @@ pub(super) fn json(machine: &Machine, effort: &Effort, measured: &Measured) -> V
     })
 }
 
-/// The whole for people.
+/// All results as a table with a legend.
 pub(super) fn text(machine: &Machine, effort: &Effort, measured: &Measured) -> String {
     let mut text = format!(
-        "{machine}; others used {:.0} % of the processors before\n",
+        "{machine}; other processes used {:.0} % of the processors before\n",
         machine.busy * 100.0,
     );
     text.push_str(&format!(
-        "{} rounds, all ways in turns within each; sender and receiver on processors of their own \
-         where there are two; times in microseconds\n\n",
+        "{} rounds, in each of which all paths take turns; sender and receiver on different \
+         processors where there are two; times in microseconds\n\n",
         effort.rounds
     ));
     text.push_str(&table(&measured.rows).to_string());
@@ -46,18 +46,18 @@ pub(super) fn text(machine: &Machine, effort: &Effort, measured: &Measured) -> S
 }
 
 const LEGEND: &str = "
-wait     spin: who waits looks again and again; block: it sleeps until it is woken
+wait     spin: a waiting process polls; block: it sleeps until it is woken
 content  loaned: memory loaned and not written; filled: loaned and written by the application, which
-         counts; copied: in the application's own memory
-encoded  letters that are encoded already, through the transport alone, and not decoded
+         is part of the time; copied: from the application's own memory
+encoded  encoded letters through the transport alone, not decoded
 one way  from before sending until the receiver has the decoded message; round trip: until the
-         sender knows that it has arrived; rate: with 16 letters under way (8 when loaned)
-cpu      of all processes of the way together, one letter at a time
-x limit  the one way, in units of the same bytes through the bare mechanism in the same rounds (the
-         middle half of the rounds), and the same of round trip, rate and cpu
+         sender has the acknowledgment; rate: letters per second with 16 under way (8 when loaned)
+cpu      of all processes of the path together, one letter at a time
+x limit  ratio of the one-way time to that of the same bytes through the bare mechanism in the same
+         rounds (middle half of the rounds); then the ratios of round trip, rate and cpu
 ";
 
-/// What encryption costs, a line for each way and content.
+/// Cost of encryption, one line per path and content.
 fn encrypted(rows: &[Row]) -> String {
     let mut text = String::new();
     for row in rows {
@@ -105,7 +105,7 @@ fn table(rows: &[Row]) -> Table {
     table.load_style(presets::NOTHING);
     let head = [
         "content",
-        "way",
+        "path",
         "wait",
         "n",
         "p50",
@@ -176,7 +176,7 @@ pub(super) fn wait(wait: Wait) -> &'static str {
     }
 }
 
-/// A size as it is said.
+/// Formats a size in bytes.
 pub(super) fn size(bytes: usize) -> String {
     const KIB: usize = 1 << 10;
     const MIB: usize = 1 << 20;

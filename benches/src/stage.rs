@@ -1,4 +1,4 @@
-//! The processes of a measurement: started, spoken with, ended, and nothing of them left behind.
+//! The processes of a measurement: start, orders, end and cleanup.
 
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -11,19 +11,18 @@ use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 use crate::comparison::Program;
 use crate::part::{End, Event, Order, Part};
 
-/// How long something may take that usually takes less than a second.
+/// Timeout of an answer, which usually takes less than a second.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// How long a process may take to end when it was told to.
+/// Time that a process has to end after its orders end.
 const ENDING: Duration = Duration::from_secs(5);
 
-/// All processes of a measurement, and the place where they meet, away from this user's domains.
+/// All processes of a measurement, and their directory, apart from the domains of this user.
 ///
-/// When it is dropped, everybody is ended and all traces are removed: also when the measurement
-/// was interrupted.
+/// Dropping it ends all processes and removes all files, also after an interruption.
 pub(super) struct Stage {
     program: Program,
-    /// The program with ends that go through zenoh, if they are to be measured too.
+    /// The program of the ends that use zenoh, if zenoh is measured.
     zenoh: Option<PathBuf>,
     place: PathBuf,
     processes: Vec<Process>,
@@ -31,9 +30,9 @@ pub(super) struct Stage {
     cores: Vec<usize>,
 }
 
-/// A process on stage.
+/// Index of a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Who(usize);
+pub(super) struct ProcessIndex(usize);
 
 struct Process {
     name: String,
@@ -58,20 +57,21 @@ impl Stage {
         })
     }
 
-    /// The name of one of the measurement's domains.
+    /// Name of a domain of the measurement.
     pub(super) fn domain(which: &str) -> String {
         format!("bench-{}-{which}", std::process::id())
     }
 
-    /// Makes keys for the gateways of these domains, who trust each other. Returns the setting that
-    /// names them, for each.
+    /// Makes keys for the gateways of these domains, which trust each other. Returns the setting with
+    /// the keys for each.
     pub(super) fn keys(&self, domains: &[String]) -> Result<Vec<String>, String> {
-        let told = |error: KeysError| error.to_string();
+        let to_text = |error: KeysError| error.to_string();
         let of = |domain: &String| Keys::at(self.place.join(format!("keys-{domain}")));
         let all: Vec<Keys> = domains.iter().map(of).collect();
         let mut certificates = Vec::new();
         for (keys, domain) in all.iter().zip(domains) {
-            keys.init(&Self::domain(domain), &[], VALID).map_err(told)?;
+            keys.init(&Self::domain(domain), &[], VALID)
+                .map_err(to_text)?;
             let file = keys.own_file();
             let read = std::fs::read(&file);
             certificates.push(read.map_err(|error| format!("{}: {error}", file.display()))?);
@@ -83,20 +83,20 @@ impl Stage {
                 .enumerate()
                 .filter(|(it, _)| *it != number)
             {
-                keys.trust(certificate).map_err(told)?;
+                keys.trust(certificate).map_err(to_text)?;
             }
             settings.push(format!("security.keys={}", keys.dir().display()));
         }
         Ok(settings)
     }
 
-    /// Starts a process and waits until it is there. Returns its address too.
+    /// Starts a process, waits until it is ready and returns its address.
     pub(super) async fn start(
         &mut self,
         part: &Part,
         domain: &str,
         settings: &[String],
-    ) -> Result<(Who, String), String> {
+    ) -> Result<(ProcessIndex, String), String> {
         let core = part.end().and_then(|end| self.core_of(end));
         let described = serde_json::to_string(part).map_err(|error| error.to_string())?;
         let mut command = Command::new(&self.program.path);
@@ -104,7 +104,7 @@ impl Stage {
             .args(&self.program.arguments)
             .args(["--part", &described])
             .args(["--set", &format!("domain={}", Self::domain(domain))])
-            // Nothing leaves this machine.
+            // No packet leaves this machine.
             .args(["--set", "discovery.interfaces=lo"])
             .args(["--set", "transport.tcp.listen=127.0.0.1:0"])
             .args(["--set", "transport.udp.listen=127.0.0.1:0"])
@@ -118,13 +118,16 @@ impl Stage {
         self.spawn(command, format!("{part:?} in {domain}")).await
     }
 
-    /// Starts an end that goes through zenoh. Its threads run where they like.
+    /// Starts an end that uses zenoh. Its threads are not pinned.
     pub(super) async fn start_zenoh(
         &mut self,
         end: End,
         shared_memory: bool,
-    ) -> Result<(Who, String), String> {
-        let program = self.zenoh.as_ref().ok_or("there is no program for it")?;
+    ) -> Result<(ProcessIndex, String), String> {
+        let program = self
+            .zenoh
+            .as_ref()
+            .ok_or("no program was given for zenoh")?;
         let mut command = Command::new(program);
         command.args(match end {
             End::Sender => ["--end", "sender"],
@@ -136,7 +139,11 @@ impl Stage {
         self.spawn(command, format!("the {end:?} of zenoh")).await
     }
 
-    async fn spawn(&mut self, mut command: Command, name: String) -> Result<(Who, String), String> {
+    async fn spawn(
+        &mut self,
+        mut command: Command,
+        name: String,
+    ) -> Result<(ProcessIndex, String), String> {
         let program = command.as_std().get_program().to_owned();
         let mut child = command
             .env("FIPA_RUNTIME_DIR", &self.place)
@@ -145,7 +152,7 @@ impl Stage {
             .current_dir("/")
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
-            // A Ctrl-C is for the measurement, which ends its parts in order.
+            // Ctrl-C reaches the measurement only, which ends its processes in order.
             .process_group(0)
             .kill_on_drop(true)
             .spawn()
@@ -153,7 +160,7 @@ impl Stage {
         let orders = child.stdin.take();
         let stdout = child.stdout.take();
         let stdout = stdout.ok_or("a process without standard output")?;
-        let who = Who(self.processes.len());
+        let who = ProcessIndex(self.processes.len());
         self.processes.push(Process {
             name,
             child,
@@ -162,11 +169,11 @@ impl Stage {
         });
         match self.event(who).await? {
             Event::Ready { address } => Ok((who, address)),
-            other => Err(format!("a process began with {other:?}")),
+            other => Err(format!("the first line of a process was {other:?}")),
         }
     }
 
-    /// The processor of an end, where there are enough.
+    /// The processor of an end, if there are two.
     fn core_of(&self, end: End) -> Option<usize> {
         match (self.cores.as_slice(), end) {
             ([sender, _, ..], End::Sender) => Some(*sender),
@@ -175,37 +182,37 @@ impl Stage {
         }
     }
 
-    /// Tells a process to do something. What comes of it is the next event.
-    pub(super) async fn tell(&mut self, who: Who, order: &Order) -> Result<(), String> {
+    /// Sends an order to a process. Its result is the next event.
+    pub(super) async fn tell(&mut self, who: ProcessIndex, order: &Order) -> Result<(), String> {
         let process = self.process(who)?;
         let mut line = serde_json::to_string(order).map_err(|error| error.to_string())?;
         line.push('\n');
-        let orders = process.orders.as_mut().ok_or("it was told to end")?;
+        let orders = process.orders.as_mut().ok_or("its orders have ended")?;
         let written = orders.write_all(line.as_bytes()).await;
         written.map_err(|error| format!("{}: {error}", process.name))
     }
 
-    /// What a process says next.
-    pub(super) async fn event(&mut self, who: Who) -> Result<Event, String> {
+    /// Waits for the next event of a process.
+    pub(super) async fn event(&mut self, who: ProcessIndex) -> Result<Event, String> {
         let process = self.process(who)?;
         let name = &process.name;
         let line = tokio::time::timeout(PATIENCE, process.events.next_line()).await;
-        let line = line.map_err(|_| format!("{name} said nothing for {PATIENCE:?}"))?;
+        let line = line.map_err(|_| format!("{name} sent no line for {PATIENCE:?}"))?;
         let line = line.map_err(|error| format!("{name}: {error}"))?;
         let line = line.ok_or_else(|| format!("{name} ended unexpectedly"))?;
         match serde_json::from_str(&line) {
             Ok(Event::Failed { what }) => Err(what),
             Ok(event) => Ok(event),
-            Err(error) => Err(format!("{name} said {line:?}: {error}")),
+            Err(error) => Err(format!("{name} sent {line:?}: {error}")),
         }
     }
 
-    fn process(&mut self, who: Who) -> Result<&mut Process, String> {
+    fn process(&mut self, who: ProcessIndex) -> Result<&mut Process, String> {
         let process = self.processes.get_mut(who.0);
-        process.ok_or_else(|| "nobody of this number is on stage".to_owned())
+        process.ok_or_else(|| "no process has this index".to_owned())
     }
 
-    /// The measurement's shared memory.
+    /// Files of the measurement in shared memory.
     fn shared_memory() -> impl Iterator<Item = PathBuf> {
         let mark = format!("fipa_bench-{}-", std::process::id());
         let files = std::fs::read_dir("/dev/shm");
@@ -243,6 +250,6 @@ impl Drop for Stage {
 
 fn remove(place: &Path) {
     if let Err(error) = std::fs::remove_dir_all(place) {
-        tracing::warn!(%error, place = %place.display(), "left behind");
+        tracing::warn!(%error, directory = %place.display(), "could not be removed");
     }
 }

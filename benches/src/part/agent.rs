@@ -1,7 +1,7 @@
-//! Agents, and the gateways between them: what is measured.
+//! Agents and the gateways between them.
 //!
-//! An agent's process has one thread, with tokio's current-thread runtime, and sends and receives
-//! in a task, as an application would: tasks get their turn before the future of `block_on` does.
+//! An agent's process has one thread with tokio's current-thread runtime. It sends and receives in a
+//! task, as an application does: tasks run before the future of `block_on`.
 
 use std::collections::VecDeque;
 use std::pin::Pin;
@@ -14,24 +14,26 @@ use fipa::{
 use tokio::io::{AsyncBufReadExt, BufReader, Lines, Stdin};
 use tokio::runtime::{Builder, Runtime};
 
-use super::orders::{Fill, Letters, Peer, Sent, Spread, byte_of, check, now_ns, obey, told};
+use super::orders::{
+    Fill, Letters, Peer, Sent, Spread, byte_of, check, execute_orders, now_ns, to_text,
+};
 
-/// One agent, or several that only receive.
+/// One agent, or several agents that only receive.
 pub(super) struct Agent {
     agent: fipa::Agent,
     others: Vec<fipa::Agent>,
     /// A message to the other end, without content.
     message: Option<MessageBuilder>,
-    /// The same to each that the other end consists of.
+    /// A message to each agent of the other end, without content.
     each: Vec<MessageBuilder>,
     orders: Lines<BufReader<Stdin>>,
-    /// Content that is ready to be sent, used again and again.
+    /// Content that is used for several letters.
     ready: Bytes,
 }
 
 type Sending = Pin<Box<dyn Future<Output = Result<Deliveries, SendError>> + Send>>;
 
-/// An agent with what runs it. The agent is there whenever no task of it is running.
+/// An agent and its runtime. The agent is absent while a task uses it.
 struct Running {
     agent: Option<Agent>,
     runtime: Runtime,
@@ -40,10 +42,10 @@ struct Running {
 impl Agent {
     pub(super) fn play(config: &Config, names: &[&str], address: &str) -> Result<(), String> {
         let runtime = runtime()?;
-        let domain = runtime.block_on(Domain::open(config)).map_err(told)?;
+        let domain = runtime.block_on(Domain::open(config)).map_err(to_text)?;
         let agents = names.iter().map(|name| domain.register(name));
-        let mut agents = agents.collect::<Result<Vec<_>, _>>().map_err(told)?;
-        let agent = agents.pop().ok_or("nobody to play")?;
+        let mut agents = agents.collect::<Result<Vec<_>, _>>().map_err(to_text)?;
+        let agent = agents.pop().ok_or("no agent was registered")?;
         let orders = runtime.block_on(async { orders() });
         let agent = Self {
             agent,
@@ -57,21 +59,21 @@ impl Agent {
             agent: Some(agent),
             runtime,
         };
-        obey(&mut running, address.to_owned());
+        execute_orders(&mut running, address.to_owned());
         let Running { agent, runtime } = running;
         drop(agent);
         runtime.block_on(domain.close());
-        // Whoever reads standard input is not waited for.
+        // The thread that reads standard input may block.
         runtime.shutdown_background();
         Ok(())
     }
 
     async fn find(&mut self, to: &str) -> Result<(), String> {
-        let all = Query::by_name(Matcher::parse(to).map_err(told)?);
+        let all = Query::by_name(Matcher::parse(to).map_err(to_text)?);
         let directory = self.agent.domain().directory();
         let mut changes = directory.watch();
         let found = loop {
-            // Has what is new looked for, which a search does not.
+            // A lookup reads changes of the directory; a search does not.
             let _one = directory.lookup(to);
             let found = directory.search(&all);
             if !found.is_empty() {
@@ -81,7 +83,7 @@ impl Agent {
         };
         let message = |to: &str| {
             let message = self.agent.message(Performative::Inform);
-            Ok::<_, String>(message.receiver(AgentId::new(to).map_err(told)?))
+            Ok::<_, String>(message.receiver(AgentId::new(to).map_err(to_text)?))
         };
         let each = found.iter().map(|entry| message(&entry.name));
         let each = each.collect::<Result<_, _>>()?;
@@ -94,11 +96,11 @@ impl Agent {
         let mut at = Vec::with_capacity(letters.count);
         for number in 0..letters.count {
             for other in &self.others {
-                let incoming = other.receive().await.map_err(told)?;
+                let incoming = other.receive().await.map_err(to_text)?;
                 let content = incoming.message.content().ok_or("no content")?;
                 check(content, letters, number)?;
             }
-            let incoming = self.agent.receive().await.map_err(told)?;
+            let incoming = self.agent.receive().await.map_err(to_text)?;
             at.push(now_ns());
             let content = incoming.message.content().ok_or("no content")?;
             check(content, letters, number)?;
@@ -114,7 +116,7 @@ impl Agent {
                 let content = self.content(letters.size, byte);
                 let each = self.each.iter().cloned();
                 let messages = each.map(|message| message.content(content.clone()).build());
-                let messages = messages.collect::<Result<Vec<_>, _>>().map_err(told)?;
+                let messages = messages.collect::<Result<Vec<_>, _>>().map_err(to_text)?;
                 sent.began.push(now_ns());
                 let sending = messages.into_iter().map(|one| self.agent.send(one));
                 let sending: Vec<_> = sending.collect();
@@ -122,10 +124,13 @@ impl Agent {
                     delivered(one.await)?;
                 }
             } else {
-                let message = self.message.clone().ok_or("nobody to send to")?;
-                let message = message.build().map_err(told)?;
+                let message = self
+                    .message
+                    .clone()
+                    .ok_or("the other end was not found yet")?;
+                let message = message.build().map_err(to_text)?;
                 sent.began.push(now_ns());
-                let mut loan = self.agent.loan(message, letters.size).map_err(told)?;
+                let mut loan = self.agent.loan(message, letters.size).map_err(to_text)?;
                 loan.content_mut().fill(byte);
                 if what == Spread::Together {
                     delivered(self.agent.send_loan(loan).await)?;
@@ -161,25 +166,28 @@ impl Agent {
         number: usize,
         sent: &mut Sent,
     ) -> Result<Sending, String> {
-        let message = self.message.clone().ok_or("nobody to send to")?;
+        let message = self
+            .message
+            .clone()
+            .ok_or("the other end was not found yet")?;
         let byte = byte_of(number);
         if letters.fill == Fill::Copied {
             let content = self.content(letters.size, byte);
-            let message = message.content(content).build().map_err(told)?;
+            let message = message.content(content).build().map_err(to_text)?;
             sent.began.push(now_ns());
             return Ok(Box::pin(self.agent.send(message)));
         }
-        let message = message.build().map_err(told)?;
+        let message = message.build().map_err(to_text)?;
         sent.began.push(now_ns());
-        let mut loan = self.agent.loan(message, letters.size).map_err(told)?;
+        let mut loan = self.agent.loan(message, letters.size).map_err(to_text)?;
         if letters.fill == Fill::Filled {
             loan.content_mut().fill(byte);
         }
         Ok(Box::pin(self.agent.send_loan(loan)))
     }
 
-    /// Content whose first and last byte are this one. Only what no letter refers to any more is
-    /// used again.
+    /// Content with this first and last byte. The previous content is reused if no letter refers to
+    /// it.
     fn content(&mut self, size: usize, byte: u8) -> Bytes {
         let before = std::mem::take(&mut self.ready);
         let mut content = match before.try_into_mut() {
@@ -198,7 +206,7 @@ impl Agent {
 }
 
 impl Running {
-    /// Does something in a task.
+    /// Runs work with the agent in a task.
     fn run<T: Send + 'static, F>(
         &mut self,
         work: impl FnOnce(Agent) -> F + Send + 'static,
@@ -208,14 +216,14 @@ impl Running {
     {
         let agent = self.agent.take().ok_or("the agent is gone")?;
         let task = self.runtime.spawn(async move { work(agent).await });
-        let (agent, done) = self.runtime.block_on(task).map_err(told)?;
+        let (agent, done) = self.runtime.block_on(task).map_err(to_text)?;
         self.agent = Some(agent);
         Ok(done)
     }
 }
 
 impl Peer for Running {
-    /// The runtime goes on meanwhile: an agent answers for itself at any time.
+    /// The runtime runs meanwhile, so the agent answers at any time.
     fn next_order(&mut self) -> Option<String> {
         self.run(|mut agent| async move {
             let line = agent.orders.next_line().await;
@@ -258,7 +266,7 @@ impl Peer for Running {
     }
 }
 
-/// A gateway, which only answers how much processor time it took.
+/// A gateway, which answers only with its processor time.
 struct Forwarding {
     orders: Lines<BufReader<Stdin>>,
     runtime: Runtime,
@@ -273,10 +281,10 @@ impl Peer for Forwarding {
 
 pub(super) fn gateway(config: &Config) -> Result<(), String> {
     let runtime = runtime()?;
-    let gateway = runtime.block_on(Gateway::open(config)).map_err(told)?;
+    let gateway = runtime.block_on(Gateway::open(config)).map_err(to_text)?;
     let orders = runtime.block_on(async { orders() });
     let mut forwarding = Forwarding { orders, runtime };
-    obey(&mut forwarding, String::new());
+    execute_orders(&mut forwarding, String::new());
     let runtime = forwarding.runtime;
     runtime.block_on(gateway.close());
     runtime.shutdown_background();
@@ -293,7 +301,7 @@ fn orders() -> Lines<BufReader<Stdin>> {
 }
 
 fn delivered(result: Result<Deliveries, SendError>) -> Result<(), String> {
-    let deliveries = result.map_err(told)?;
+    let deliveries = result.map_err(to_text)?;
     if deliveries.all_succeeded() {
         return Ok(());
     }

@@ -1,4 +1,4 @@
-//! Bare iceoryx2: a request, and its response as the acknowledgement.
+//! Bare iceoryx2: a request, and its response as the acknowledgment.
 
 use std::collections::VecDeque;
 use std::ffi::OsStr;
@@ -9,7 +9,9 @@ use fipa_transport::Incarnation;
 use fipa_transport_shm::ShmConfig;
 use fipa_transport_shm::raw::{RawClient, RawNode, RawPending, RawServer, Wait};
 
-use super::orders::{End, Fill, Letters, Peer, Sent, byte_of, check, now_ns, obey, told};
+use super::orders::{
+    End, Fill, Letters, Peer, Sent, byte_of, check, execute_orders, now_ns, to_text,
+};
 
 /// The name of the service between the two.
 const NAME: &str = "raw";
@@ -18,29 +20,29 @@ pub(super) fn play(config: &Config, end: End, wait: Wait) -> Result<(), String> 
     let node = node(config)?;
     match end {
         End::Receiver => {
-            let server = node.serve(NAME).map_err(told)?;
-            obey(&mut Receiver { server, wait }, String::new());
+            let server = node.serve(NAME).map_err(to_text)?;
+            execute_orders(&mut Receiver { server, wait }, String::new());
         }
         End::Sender => {
-            let client = node.connect(NAME).map_err(told)?;
+            let client = node.connect(NAME).map_err(to_text)?;
             let ready = Vec::new();
             let mut sender = Sender {
                 client,
                 wait,
                 ready,
             };
-            obey(&mut sender, String::new());
+            execute_orders(&mut sender, String::new());
         }
     }
     Ok(())
 }
 
-/// A node in a place of its own.
+/// A node with a directory of its own.
 pub(super) fn node(config: &Config) -> Result<RawNode, String> {
-    RawNode::open(&place(config, "raw")?).map_err(told)
+    RawNode::open(&place(config, "raw")?).map_err(to_text)
 }
 
-/// Shared memory of a way's own, below the place of the measurement.
+/// Shared memory for one path, below the directory of the measurement.
 pub(super) fn place(config: &Config, what: &str) -> Result<ShmConfig, String> {
     let place = std::env::var_os("FIPA_RUNTIME_DIR")
         .filter(|place| place != OsStr::new(""))
@@ -49,7 +51,7 @@ pub(super) fn place(config: &Config, what: &str) -> Result<ShmConfig, String> {
     let shm = &config.transport.shm;
     Ok(ShmConfig {
         capacity: shm.capacity,
-        // A mark that those of real domains have too.
+        // The prefix of the files of real domains.
         ..ShmConfig::new(
             root,
             format!("fipa_{}_{what}", config.domain),
@@ -67,10 +69,10 @@ impl Peer for Receiver {
     fn receive(&mut self, letters: &Letters) -> Result<Vec<u64>, String> {
         let mut at = Vec::with_capacity(letters.count);
         for number in 0..letters.count {
-            let request = self.server.receive(self.wait).map_err(told)?;
+            let request = self.server.receive(self.wait).map_err(to_text)?;
             at.push(now_ns());
             check(request.payload(), letters, number)?;
-            self.server.answer(request, self.wait).map_err(told)?;
+            self.server.answer(request, self.wait).map_err(to_text)?;
         }
         Ok(at)
     }
@@ -94,17 +96,17 @@ impl Sender<'_> {
             make_ready(&mut self.ready, letters.size, byte);
         }
         sent.began.push(now_ns());
-        let mut loan = self.client.loan(letters.size).map_err(told)?;
+        let mut loan = self.client.loan(letters.size).map_err(to_text)?;
         match letters.fill {
             Fill::Loaned => {}
             Fill::Filled => loan.content_mut().fill(byte),
             Fill::Copied => loan.content_mut().copy_from_slice(&self.ready),
         }
-        self.client.send(loan, self.wait).map_err(told)
+        self.client.send(loan, self.wait).map_err(to_text)
     }
 
     fn end(&self, pending: &RawPending, sent: &mut Sent) -> Result<(), String> {
-        self.client.answered(pending, self.wait).map_err(told)?;
+        self.client.answered(pending, self.wait).map_err(to_text)?;
         sent.ended.push(now_ns());
         Ok(())
     }
@@ -129,7 +131,7 @@ impl Peer for Sender<'_> {
     }
 }
 
-/// Content that begins and ends with this byte.
+/// Makes content that begins and ends with this byte.
 pub(super) fn make_ready(content: &mut Vec<u8>, size: usize, byte: u8) {
     content.resize(size, 0);
     for at in [0, size.saturating_sub(1)] {

@@ -1,5 +1,5 @@
-//! Letters that are encoded already, through the shared memory transport alone: no directory, no
-//! delivery core, no agents. What it costs to be acknowledged, and bounded, and crash-safe.
+//! Encoded letters through the shared memory transport alone, without directory, delivery core or
+//! agents. The difference to bare iceoryx2 is the cost of acknowledgments, bounds and crash safety.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -17,15 +17,17 @@ use parking_lot::Mutex;
 use tokio::runtime::{Builder, Runtime};
 
 use super::iceoryx::{make_ready, place};
-use super::orders::{End, Fill, Glimpse, Letters, Peer, Sent, byte_of, now_ns, obey, told};
+use super::orders::{
+    ContentProbe, End, Fill, Letters, Peer, Sent, byte_of, execute_orders, now_ns, to_text,
+};
 
-/// What stands in front of the content and behind it, as long as agents' messages have it.
+/// The bytes before and behind the content, as long as in messages of agents.
 const ENVELOPE: &[u8] = &[2; 80];
 const HEAD: &[u8] = &[1; 120];
 const TAIL: &[u8] = &[1; 1];
-/// Whom they are for.
+/// Name of the receiver.
 const NAME: &str = "arm_left";
-/// How long they may take.
+/// Deadline of a letter.
 const REMAINING: Duration = Duration::from_secs(5);
 
 pub(super) fn play(config: &Config, end: End) -> Result<(), String> {
@@ -33,11 +35,11 @@ pub(super) fn play(config: &Config, end: End) -> Result<(), String> {
         .worker_threads(1)
         .enable_all()
         .build()
-        .map_err(told)?;
+        .map_err(to_text)?;
     let config = place(config, "letters")?;
-    let endpoint = ShmTransport::new(config, runtime.handle().clone()).map_err(told)?;
-    let heard = Arc::new(Heard::default());
-    endpoint.listen(heard.clone()).map_err(told)?;
+    let endpoint = ShmTransport::new(config, runtime.handle().clone()).map_err(to_text)?;
+    let heard = Arc::new(ReceivedLetters::default());
+    endpoint.listen(heard.clone()).map_err(to_text)?;
     let mut both = Both {
         endpoint,
         heard,
@@ -50,23 +52,23 @@ pub(super) fn play(config: &Config, end: End) -> Result<(), String> {
         End::Receiver => both.endpoint.location().to_string(),
         End::Sender => String::new(),
     };
-    obey(&mut both, address);
+    execute_orders(&mut both, address);
     both.endpoint.close();
     Ok(())
 }
 
-/// What has come, and when, until it is looked at.
+/// Arrived letters with their times, until they are checked.
 #[derive(Default)]
-struct Heard {
-    // Not the content, which nobody needs: what is held is lent, and little is.
-    arrived: Mutex<Vec<(u64, Glimpse)>>,
+struct ReceivedLetters {
+    // Only a probe of the content: held content occupies a slot of the sender.
+    arrived: Mutex<Vec<(u64, ContentProbe)>>,
     concluded: Mutex<Vec<(u64, AttemptId, Conclusion)>>,
 }
 
-impl Sink for Heard {
+impl Sink for ReceivedLetters {
     fn arrived(&self, arrival: Arrival) -> Verdict {
         if let Body::Letter(letter) = &arrival.parcel.body {
-            let seen = Glimpse::of(&letter.payload().content);
+            let seen = ContentProbe::of(&letter.payload().content);
             self.arrived.lock().push((now_ns(), seen));
         }
         Verdict::Now(Answer::Accepted)
@@ -79,21 +81,21 @@ impl Sink for Heard {
     }
 }
 
-/// Either end.
+/// One end of the path.
 struct Both {
     endpoint: ShmTransport,
-    heard: Arc<Heard>,
+    heard: Arc<ReceivedLetters>,
     to: Option<Location>,
-    /// Content of the application's.
+    /// Content in the application's memory.
     ready: Vec<u8>,
-    /// Of the next attempt.
+    /// Number of the next attempt.
     next: u64,
-    // After the endpoint, which has tasks there.
+    // Dropped after the endpoint, whose tasks run on it.
     _runtime: Runtime,
 }
 
 impl Both {
-    /// Dispatches one, and says when it was begun.
+    /// Dispatches a letter and returns the time before.
     fn begin(&mut self, letters: &Letters, number: usize) -> Result<(AttemptId, u64), String> {
         let to = self.to.as_ref().ok_or("no other end was found")?;
         let byte = byte_of(number);
@@ -107,7 +109,7 @@ impl Both {
             None => {
                 let front = NAME.len() + ENVELOPE.len() + HEAD.len();
                 let loan = self.endpoint.loan(to, front, letters.size, TAIL.len());
-                let mut loan = loan.map_err(told)?.ok_or("no memory is loaned")?;
+                let mut loan = loan.map_err(to_text)?.ok_or("no memory is loaned")?;
                 if letters.fill == Fill::Filled {
                     loan.content_mut().fill(byte);
                 }
@@ -117,11 +119,11 @@ impl Both {
         self.next += 1;
         let attempt = AttemptId(self.next);
         let dispatched = self.endpoint.dispatch(attempt, to, parcel(content));
-        dispatched.map_err(told)?;
+        dispatched.map_err(to_text)?;
         Ok((attempt, began))
     }
 
-    /// Looks for conclusions once.
+    /// Polls for conclusions once.
     fn collect(
         &self,
         open: &mut HashMap<AttemptId, usize>,
@@ -141,7 +143,7 @@ impl Both {
 
 impl Peer for Both {
     fn find(&mut self, to: &str) -> Result<(), String> {
-        self.to = Some(to.parse().map_err(told)?);
+        self.to = Some(to.parse().map_err(to_text)?);
         Ok(())
     }
 

@@ -1,15 +1,15 @@
-//! What the ends of a measurement are told and what they say, one JSON document per line each way,
-//! and the loop in which they obey.
+//! Orders to and events from the parts of a measurement, one JSON document per line, and the loop that
+//! executes orders.
 //!
-//! Nothing of `fipa` is used here: a program with an end of its own to be measured beside ours is
-//! built with this file too (`comparison/zenoh`).
+//! The file uses nothing of `fipa`: programs that measure another middleware include it
+//! (`comparison/zenoh`).
 
 use std::io::Write as _;
 
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 
-/// Which end of a way.
+/// An end of a path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum End {
@@ -29,33 +29,33 @@ impl std::str::FromStr for End {
     }
 }
 
-/// Where content comes from.
+/// Origin of the content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Fill {
     /// The memory is loaned and not written.
     Loaned,
-    /// The memory is loaned and all of it written, which counts.
+    /// The memory is loaned and written completely, which is part of the time.
     Filled,
-    /// It lies in memory of the application.
+    /// The content is in memory of the application.
     Copied,
 }
 
-/// Letters of one sort.
+/// A number of letters of one kind.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub(crate) struct Letters {
     pub(crate) count: usize,
     pub(crate) size: usize,
     pub(crate) fill: Fill,
-    /// How many may be without an answer.
+    /// Maximum number of letters without an acknowledgment.
     pub(crate) window: usize,
 }
 
-/// What of a multicast is done.
+/// A step of sending to many receivers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Spread {
-    /// Memory for all receivers is loaned, written and given back.
+    /// Memory for all receivers is loaned, written and returned.
     Fill,
     /// It is loaned, written and sent to all.
     Together,
@@ -63,7 +63,7 @@ pub(crate) enum Spread {
     Copies,
 }
 
-/// What a part is told to do.
+/// An order to a part.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(tag = "do", rename_all = "snake_case")]
 pub(crate) enum Order {
@@ -73,25 +73,25 @@ pub(crate) enum Order {
     Receive(Letters),
     /// Send letters.
     Send(Letters),
-    /// Send letters to all that were found, one after the other.
+    /// Send letters to all found receivers, one letter after the other.
     Spread { what: Spread, letters: Letters },
-    /// Say how much processor time this process has used.
+    /// Report the processor time of this process.
     Cpu,
 }
 
-/// What a part saw. Times are in nanoseconds, of the clock that all processes share.
+/// An event of a part. Times are nanoseconds of the clock that all processes share.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub(crate) enum Event {
-    /// It is there, and can be found under this address.
+    /// The part is ready at this address.
     Ready { address: String },
-    /// It has found the other end.
+    /// The part has found the other end.
     Found,
-    /// It is about to receive.
+    /// The part is ready to receive.
     Receiving,
-    /// When each letter was there, decoded.
+    /// Arrival times of the decoded letters.
     Received { at: Vec<u64>, cpu_ns: u64 },
-    /// When each letter was begun, and when its sender knew that it had arrived.
+    /// Start and acknowledgment times of the letters.
     Sent {
         began: Vec<u64>,
         ended: Vec<u64>,
@@ -99,11 +99,11 @@ pub(crate) enum Event {
     },
     /// Processor time used so far.
     Cpu { ns: u64 },
-    /// It could not do what it was told.
+    /// An order failed.
     Failed { what: String },
 }
 
-/// When letters were begun, and when their senders knew that they had arrived.
+/// Start and acknowledgment times of letters.
 #[derive(Debug, Default)]
 pub(crate) struct Sent {
     pub(crate) began: Vec<u64>,
@@ -119,9 +119,9 @@ impl Sent {
     }
 }
 
-/// One sort of process.
+/// A part that executes orders.
 pub(crate) trait Peer {
-    /// The next order; none when there will be none.
+    /// Reads the next order; `None` at the end of the orders.
     fn next_order(&mut self) -> Option<String> {
         let mut line = String::new();
         let read = std::io::stdin().read_line(&mut line);
@@ -129,11 +129,11 @@ pub(crate) trait Peer {
     }
 
     fn find(&mut self, _to: &str) -> Result<(), String> {
-        Err("this part looks for nobody".to_owned())
+        Err("this part does not connect".to_owned())
     }
 
     fn receive(&mut self, _letters: &Letters) -> Result<Vec<u64>, String> {
-        Err("this part receives nothing".to_owned())
+        Err("this part does not receive".to_owned())
     }
 
     fn send(&mut self, _letters: &Letters) -> Result<Sent, String> {
@@ -141,12 +141,12 @@ pub(crate) trait Peer {
     }
 
     fn spread(&mut self, _what: Spread, _letters: &Letters) -> Result<Sent, String> {
-        Err("this part sends to one only".to_owned())
+        Err("this part sends to one receiver only".to_owned())
     }
 }
 
-/// Obeys until there are no more orders.
-pub(crate) fn obey(peer: &mut impl Peer, address: String) {
+/// Executes orders until they end.
+pub(crate) fn execute_orders(peer: &mut impl Peer, address: String) {
     say(&Event::Ready { address });
     while let Some(line) = peer.next_order() {
         let event = follow(peer, &line);
@@ -155,7 +155,7 @@ pub(crate) fn obey(peer: &mut impl Peer, address: String) {
 }
 
 fn follow(peer: &mut impl Peer, line: &str) -> Result<Event, String> {
-    let order: Order = serde_json::from_str(line).map_err(told)?;
+    let order: Order = serde_json::from_str(line).map_err(to_text)?;
     let before = cpu_ns();
     Ok(match order {
         Order::Find { to } => {
@@ -184,23 +184,23 @@ fn sent(sent: Sent, cpu_before: u64) -> Event {
 }
 
 pub(crate) fn say(event: &Event) {
-    // Who listens may be gone; then standard input ends too.
+    // If the measurement has ended, standard input ends too.
     if let Ok(line) = serde_json::to_string(event) {
         let mut out = std::io::stdout().lock();
         let _ = writeln!(out, "{line}").and_then(|()| out.flush());
     }
 }
 
-pub(crate) fn told(error: impl std::fmt::Display) -> String {
+pub(crate) fn to_text(error: impl std::fmt::Display) -> String {
     error.to_string()
 }
 
-/// The time that all processes of this machine share.
+/// The monotonic clock of the machine, in nanoseconds.
 pub(crate) fn now_ns() -> u64 {
     nanoseconds(ClockId::Monotonic)
 }
 
-/// The processor time of this process, all its threads together.
+/// Processor time of all threads of this process, in nanoseconds.
 fn cpu_ns() -> u64 {
     nanoseconds(ClockId::ProcessCPUTime)
 }
@@ -211,25 +211,25 @@ fn nanoseconds(clock: ClockId) -> u64 {
     whole * 1_000_000_000 + u64::try_from(time.tv_nsec).unwrap_or(0)
 }
 
-/// What the content of the letter with this number consists of.
+/// The byte that fills the content of the letter with this number.
 pub(crate) fn byte_of(number: usize) -> u8 {
     number.to_le_bytes()[0]
 }
 
-/// Whether content is what was sent, as far as that can be seen without reading all of it.
+/// Checks length, first and last byte of received content.
 pub(crate) fn check(content: &[u8], letters: &Letters, number: usize) -> Result<(), String> {
-    Glimpse::of(content).check(letters, number)
+    ContentProbe::of(content).check(letters, number)
 }
 
-/// What can be seen of content without reading all of it, or keeping it.
+/// Length, first and last byte of content.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Glimpse {
+pub(crate) struct ContentProbe {
     len: usize,
     first: Option<u8>,
     last: Option<u8>,
 }
 
-impl Glimpse {
+impl ContentProbe {
     pub(crate) fn of(content: &[u8]) -> Self {
         Self {
             len: content.len(),
@@ -238,7 +238,7 @@ impl Glimpse {
         }
     }
 
-    /// Whether that is what was sent.
+    /// Compares with the content that was sent.
     pub(crate) fn check(self, letters: &Letters, number: usize) -> Result<(), String> {
         let Self { len, first, last } = self;
         let byte = Some(byte_of(number));
@@ -247,7 +247,7 @@ impl Glimpse {
             return Ok(());
         }
         Err(format!(
-            "letter {number} of {} bytes came as {len} bytes of {first:?}",
+            "letter {number} of {} bytes arrived with {len} bytes that begin with {first:?}",
             letters.size
         ))
     }

@@ -1,8 +1,7 @@
-//! Half of a bare relay, iceoryx2 to TCP to iceoryx2: what the way through two gateways is
-//! compared with. The same bytes go through as many processes, and the acknowledgement comes back
-//! from the last one; there is no envelope, no directory and no promise.
+//! Half of a bare relay iceoryx2 → TCP → iceoryx2, the limit of two gateways. The same bytes pass through
+//! as many processes, and the last one acknowledges. There is no envelope, no directory and no promise.
 //!
-//! Everything in order, so the acknowledgement needs no number: one byte of TCP.
+//! All letters stay in order, so an acknowledgment is one byte without a number.
 
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -12,13 +11,13 @@ use fipa::Config;
 use fipa_transport_shm::raw::{RawClient, RawNode, RawPending, RawRequest, RawServer, Wait};
 
 use super::iceoryx::node;
-use super::orders::{End, Event, Peer, obey, say, told};
+use super::orders::{End, Event, Peer, execute_orders, say, to_text};
 
-/// The name of the service on either side.
+/// Name of the service on both sides.
 const NAME: &str = "raw";
 
-/// `Sender`: the half on the sender's side, with a server that the sender writes to, and a
-/// connection to the other half. `Receiver`: the other half.
+/// Plays the half on the sender's side (`Sender`), with a server for the sender and a connection to
+/// the other half, or that other half (`Receiver`).
 pub(super) fn play(config: &Config, end: End) -> Result<(), String> {
     let node = node(config)?;
     match end {
@@ -28,38 +27,38 @@ pub(super) fn play(config: &Config, end: End) -> Result<(), String> {
 }
 
 fn near(node: &RawNode) -> Result<(), String> {
-    let server = node.serve(NAME).map_err(told)?;
+    let server = node.serve(NAME).map_err(to_text)?;
     let server = &server;
     std::thread::scope(|scope| {
         let start = |stream: TcpStream| {
             let (to_answer, answers) = channel();
-            let back = stream.try_clone().map_err(told)?;
+            let back = stream.try_clone().map_err(to_text)?;
             scope.spawn(move || ended(send_on(server, stream, &to_answer)));
             scope.spawn(move || ended(answer(server, back, &answers)));
             Ok(())
         };
-        obey(&mut Half { start }, String::new());
-        // The threads wait for the other processes, which may be gone; they end with this one.
+        execute_orders(&mut Half { start }, String::new());
+        // The threads may wait for processes that have ended, so they are not joined.
         std::process::exit(0)
     })
 }
 
-/// From shared memory to the socket.
+/// Copies requests from shared memory to the socket.
 fn send_on(
     server: &RawServer,
     mut stream: TcpStream,
     to_answer: &Sender<RawRequest>,
 ) -> Result<(), String> {
     loop {
-        let request = server.receive(Wait::Block).map_err(told)?;
+        let request = server.receive(Wait::Block).map_err(to_text)?;
         let payload = request.payload();
-        let len = u64::try_from(payload.len()).map_err(told)?.to_le_bytes();
-        write_both(&mut stream, &len, payload).map_err(told)?;
-        to_answer.send(request).map_err(told)?;
+        let len = u64::try_from(payload.len()).map_err(to_text)?.to_le_bytes();
+        write_both(&mut stream, &len, payload).map_err(to_text)?;
+        to_answer.send(request).map_err(to_text)?;
     }
 }
 
-/// In one system call where the kernel takes it.
+/// Writes both slices, in one system call where the kernel accepts it.
 fn write_both(stream: &mut TcpStream, first: &[u8], second: &[u8]) -> std::io::Result<()> {
     let mut slices = [std::io::IoSlice::new(first), std::io::IoSlice::new(second)];
     let mut slices = &mut slices[..];
@@ -70,7 +69,7 @@ fn write_both(stream: &mut TcpStream, first: &[u8], second: &[u8]) -> std::io::R
     Ok(())
 }
 
-/// From the socket's acknowledgements to the sender.
+/// Turns acknowledgments from the socket into responses to the sender.
 fn answer(
     server: &RawServer,
     mut stream: TcpStream,
@@ -78,21 +77,21 @@ fn answer(
 ) -> Result<(), String> {
     let mut bytes = [0; 64];
     loop {
-        let acknowledged = stream.read(&mut bytes).map_err(told)?;
+        let acknowledged = stream.read(&mut bytes).map_err(to_text)?;
         if acknowledged == 0 {
             return Ok(());
         }
         for _ in 0..acknowledged {
-            let request = answers.recv().map_err(told)?;
-            server.answer(request, Wait::Block).map_err(told)?;
+            let request = answers.recv().map_err(to_text)?;
+            server.answer(request, Wait::Block).map_err(to_text)?;
         }
     }
 }
 
 fn far(node: &RawNode) -> Result<(), String> {
-    let listener = TcpListener::bind("127.0.0.1:0").map_err(told)?;
-    let address = listener.local_addr().map_err(told)?.to_string();
-    let client = node.connect(NAME).map_err(told)?;
+    let listener = TcpListener::bind("127.0.0.1:0").map_err(to_text)?;
+    let address = listener.local_addr().map_err(to_text)?.to_string();
+    let client = node.connect(NAME).map_err(to_text)?;
     let client = &client;
     std::thread::scope(|scope| {
         scope.spawn(move || {
@@ -106,44 +105,44 @@ fn far(node: &RawNode) -> Result<(), String> {
                     scope.spawn(move || ended(take_in(client, stream, &to_await)));
                     ended(acknowledge(client, back, &pending));
                 }
-                Err(error) => ended(Err(told(error))),
+                Err(error) => ended(Err(to_text(error))),
             }
         });
-        let nobody = |_| Err("this half is connected to".to_owned());
-        obey(&mut Half { start: nobody }, address);
+        let refuse = |_| Err("this half accepts the connection".to_owned());
+        execute_orders(&mut Half { start: refuse }, address);
         std::process::exit(0)
     })
 }
 
-/// From the socket into shared memory, without a buffer in between.
+/// Reads from the socket into shared memory, without a buffer in between.
 fn take_in(
     client: &RawClient<'_>,
     mut stream: TcpStream,
     to_await: &Sender<RawPending>,
 ) -> Result<(), String> {
     let mut len = [0; 8];
-    // How many may be on their way to the receiver is the sender's business.
+    // The sender bounds the number of letters under path.
     while stream.read_exact(&mut len).is_ok() {
-        let len = usize::try_from(u64::from_le_bytes(len)).map_err(told)?;
-        let mut loan = client.loan(len).map_err(told)?;
-        stream.read_exact(loan.content_mut()).map_err(told)?;
-        let pending = client.send(loan, Wait::Block).map_err(told)?;
-        to_await.send(pending).map_err(told)?;
+        let len = usize::try_from(u64::from_le_bytes(len)).map_err(to_text)?;
+        let mut loan = client.loan(len).map_err(to_text)?;
+        stream.read_exact(loan.content_mut()).map_err(to_text)?;
+        let pending = client.send(loan, Wait::Block).map_err(to_text)?;
+        to_await.send(pending).map_err(to_text)?;
     }
     Ok(())
 }
 
-/// From the receiver's answers to the socket.
+/// Turns responses of the receiver into acknowledgments on the socket.
 fn acknowledge(
     client: &RawClient<'_>,
     mut stream: TcpStream,
     pending: &Receiver<RawPending>,
 ) -> Result<(), String> {
     while let Ok(pending) = pending.recv() {
-        client.answered(&pending, Wait::Block).map_err(told)?;
-        // Makes room for the next one before that is called for.
+        client.answered(&pending, Wait::Block).map_err(to_text)?;
+        // Frees the slot before the sender needs it for the next letter.
         drop(pending);
-        stream.write_all(&[1]).map_err(told)?;
+        stream.write_all(&[1]).map_err(to_text)?;
     }
     Ok(())
 }
@@ -154,15 +153,15 @@ fn ended(result: Result<(), String>) {
     }
 }
 
-/// What is told to a half: where the other one is, and how much time it took.
+/// A half as a part: it connects to the other half and reports its processor time.
 struct Half<S> {
     start: S,
 }
 
 impl<S: FnMut(TcpStream) -> Result<(), String>> Peer for Half<S> {
     fn find(&mut self, to: &str) -> Result<(), String> {
-        let stream = TcpStream::connect(to).map_err(told)?;
-        stream.set_nodelay(true).map_err(told)?;
+        let stream = TcpStream::connect(to).map_err(to_text)?;
+        stream.set_nodelay(true).map_err(to_text)?;
         (self.start)(stream)
     }
 }

@@ -8,7 +8,7 @@ use std::sync::mpsc::{Receiver as Queue, Sender as Into, channel};
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-use orders::{End, Fill, Letters, Peer, Sent, byte_of, check, now_ns, obey, told};
+use orders::{End, Fill, Letters, Peer, Sent, byte_of, check, now_ns, execute_orders, to_text};
 use zenoh::bytes::ZBytes;
 use zenoh::pubsub::{Publisher, Subscriber};
 use zenoh::qos::{CongestionControl, Priority};
@@ -51,7 +51,7 @@ fn main() -> Result<(), String> {
                 shared_memory,
                 connected: None,
             };
-            obey(&mut sender, String::new());
+            execute_orders(&mut sender, String::new());
         }
         End::Receiver => {
             let session = open("listen", "tcp/127.0.0.1:0", shared_memory)?;
@@ -59,7 +59,7 @@ fn main() -> Result<(), String> {
             let address = locators.first().ok_or("zenoh listens nowhere")?;
             let address = address.to_string();
             let mut receiver = Receiver::new(session)?;
-            obey(&mut receiver, address);
+            execute_orders(&mut receiver, address);
         }
     }
     Ok(())
@@ -76,9 +76,9 @@ fn open(how: &str, address: &str, shared_memory: bool) -> Result<Session, String
         (&format!("{other}/endpoints"), "[]".to_owned()),
         ("transport/shared_memory/enabled", shared_memory.to_string()),
     ] {
-        config.insert_json5(key, &value).map_err(told)?;
+        config.insert_json5(key, &value).map_err(to_text)?;
     }
-    zenoh::open(config).wait().map_err(told)
+    zenoh::open(config).wait().map_err(to_text)
 }
 
 /// A publisher that sends each publication at once, and blocks rather than drops it.
@@ -88,7 +88,7 @@ fn publisher(session: &Session, key: &'static str) -> Result<Publisher<'static>,
         .congestion_control(CongestionControl::Block)
         .priority(Priority::RealTime)
         .express(true);
-    publisher.wait().map_err(told)
+    publisher.wait().map_err(to_text)
 }
 
 struct Receiver {
@@ -114,7 +114,7 @@ impl Receiver {
                 }
             })
             .wait()
-            .map_err(told)?;
+            .map_err(to_text)?;
         Ok(Self {
             arrived,
             _letters: letters,
@@ -127,7 +127,7 @@ impl Peer for Receiver {
     fn receive(&mut self, letters: &Letters) -> Result<Vec<u64>, String> {
         let mut at = Vec::with_capacity(letters.count);
         for number in 0..letters.count {
-            let (arrived, content) = self.arrived.recv_timeout(PATIENCE).map_err(told)?;
+            let (arrived, content) = self.arrived.recv_timeout(PATIENCE).map_err(to_text)?;
             check(&content.to_bytes(), letters, number)?;
             at.push(arrived);
         }
@@ -158,10 +158,10 @@ impl Connected {
                 let _taken = into.send(now_ns());
             })
             .wait()
-            .map_err(told)?;
+            .map_err(to_text)?;
         let memory = if shared_memory {
             let backend = PosixShmProviderBackend::builder(CAPACITY).wait();
-            let backend = backend.map_err(told)?;
+            let backend = backend.map_err(to_text)?;
             Some(ShmProviderBuilder::backend(backend).wait())
         } else {
             None
@@ -181,7 +181,7 @@ impl Connected {
     fn greet(&self) -> Result<(), String> {
         let until = Instant::now() + PATIENCE;
         while Instant::now() < until {
-            self.letters.put(ZBytes::new()).wait().map_err(told)?;
+            self.letters.put(ZBytes::new()).wait().map_err(to_text)?;
             if self.answered.recv_timeout(GREETING).is_ok() {
                 // Greetings that were answered late.
                 while self.answered.recv_timeout(GREETING * 4).is_ok() {}
@@ -214,7 +214,7 @@ impl Connected {
         began.push(now_ns());
         let loan = memory.alloc(letters.size);
         let loan = loan.with_policy::<BlockOn<GarbageCollect>>().wait();
-        let mut loan = loan.map_err(told)?;
+        let mut loan = loan.map_err(to_text)?;
         if letters.fill == Fill::Filled {
             loan.fill(byte);
         }
@@ -222,7 +222,7 @@ impl Connected {
     }
 
     fn answer(&self) -> Result<u64, String> {
-        self.answered.recv_timeout(PATIENCE).map_err(told)
+        self.answered.recv_timeout(PATIENCE).map_err(to_text)
     }
 }
 
@@ -240,7 +240,7 @@ impl Peer for Sender {
                 sent.ended.push(connected.answer()?);
             }
             let content = connected.content(letters, number, &mut sent.began)?;
-            connected.letters.put(content).wait().map_err(told)?;
+            connected.letters.put(content).wait().map_err(to_text)?;
         }
         while sent.ended.len() < sent.began.len() {
             sent.ended.push(connected.answer()?);

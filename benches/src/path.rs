@@ -1,20 +1,20 @@
-//! The ways that are measured, and what each of them is compared with.
+//! The measured paths and their limits.
 
 use fipa::Kind;
 
 use super::part::{End, Event, Fill, Letters, Order, Part, Socket, Wait};
-use super::stage::{Stage, Who};
+use super::stage::{ProcessIndex, Stage};
 
-/// What letters go through.
+/// The mechanism of a path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Sort {
+pub(super) enum Mechanism {
     /// Two agents on one host.
     Agents(Kind),
     /// Two agents on two hosts, and a gateway on each.
     Gateways(Kind),
-    /// The same between gateways that have proved to each other who they are: TCP with TLS, or QUIC.
+    /// The same with gateways that have authenticated each other: TCP with TLS, or QUIC.
     Secured(Kind),
-    /// Letters that are encoded already, through the shared memory transport alone.
+    /// Encoded letters through the shared memory transport alone.
     Letters,
     /// Bare iceoryx2.
     Iceoryx,
@@ -26,8 +26,8 @@ pub(super) enum Sort {
     Relay,
 }
 
-impl Sort {
-    /// What this is compared with: the least that moving the bytes so can cost.
+impl Mechanism {
+    /// The limit: the bare mechanism that moves the same bytes.
     pub(super) fn limit(self) -> Option<Self> {
         match self {
             Self::Agents(Kind::Shm) | Self::Letters => Some(Self::Iceoryx),
@@ -41,7 +41,7 @@ impl Sort {
         }
     }
 
-    /// What this is the safer way of: what encryption costs is told by both in the same rounds.
+    /// The same path without encryption, measured in the same rounds.
     pub(super) fn plain(self) -> Option<Self> {
         matches!(self, Self::Secured(_)).then_some(Self::Gateways(Kind::Tcp))
     }
@@ -64,7 +64,7 @@ impl Sort {
         }
     }
 
-    /// Whether there is memory to loan, which makes a difference between filling it and not.
+    /// Whether the path loans memory, so that loaned and filled content differ.
     pub(super) fn loans(self) -> bool {
         matches!(
             self,
@@ -77,47 +77,53 @@ impl Sort {
         )
     }
 
-    /// What may be too large is tried before.
+    /// Whether a size may be too large for the path, so that it is tried first.
     fn is_ours(self) -> bool {
         matches!(self, Self::Agents(_) | Self::Gateways(_) | Self::Secured(_))
     }
 
-    /// How many letters are under way when throughput is measured.
+    /// Number of letters under path when the rate is measured.
     pub(super) fn window(fill: Fill) -> usize {
         match fill {
             Fill::Copied => 16,
-            // As many loans as a process may have.
+            // The maximum number of loans of a process.
             _ => 8,
         }
     }
 }
 
-/// One way, ready to be used.
+/// A path whose processes run.
 #[derive(Debug)]
-pub(super) struct Way {
-    pub(super) sort: Sort,
+pub(super) struct BenchPath {
+    pub(super) mechanism: Mechanism,
     pub(super) wait: Wait,
-    sender: Who,
-    receiver: Who,
-    between: Vec<Who>,
+    sender: ProcessIndex,
+    receiver: ProcessIndex,
+    between: Vec<ProcessIndex>,
 }
 
-/// One turn of a way.
+/// Times of one turn, in nanoseconds of the shared clock.
 #[derive(Debug)]
 pub(super) struct Turn {
-    /// When each letter was begun, was there, and was known to be there.
+    /// Start of each letter.
     pub(super) began: Vec<u64>,
+    /// Arrival of each letter, decoded.
     pub(super) arrived: Vec<u64>,
+    /// Acknowledgment of each letter.
     pub(super) ended: Vec<u64>,
-    /// Of all processes together.
+    /// Processor time of all processes together.
     pub(super) cpu_ns: u64,
 }
 
-impl Way {
-    /// Starts the processes of a way.
-    pub(super) async fn open(stage: &mut Stage, sort: Sort, wait: Wait) -> Result<Self, String> {
+impl BenchPath {
+    /// Starts the processes of a path.
+    pub(super) async fn open(
+        stage: &mut Stage,
+        mechanism: Mechanism,
+        wait: Wait,
+    ) -> Result<Self, String> {
         let ends = [End::Sender, End::Receiver];
-        let own = |part: &str| format!("{}{part}", short(sort, wait));
+        let own = |part: &str| format!("{}{part}", short(mechanism, wait));
         let spin = match wait {
             Wait::Spin => "transport.shm.spin=1s",
             Wait::Block => "transport.shm.spin=0s",
@@ -134,24 +140,24 @@ impl Way {
             (agent(End::Sender, from), agent(End::Receiver, to))
         };
         let mut between = Vec::new();
-        let (sender, receiver, address) = match sort {
-            Sort::Agents(kind) => {
+        let (sender, receiver, address) = match mechanism {
+            Mechanism::Agents(kind) => {
                 let settings = settings(kind.name());
                 let (from, to) = agents(["a", "b"].map(str::to_owned));
                 let (receiver, name) = stage.start(&to, &own(""), &settings).await?;
                 let (sender, _) = stage.start(&from, &own(""), &settings).await?;
                 (sender, receiver, Some(name))
             }
-            Sort::Gateways(kind) | Sort::Secured(kind) => {
+            Mechanism::Gateways(kind) | Mechanism::Secured(kind) => {
                 let mut settings = settings(&format!("shm,{kind}"));
                 let hosts = ["1", "2"].map(own);
                 let mut keys = Vec::new();
-                if let Sort::Secured(_) = sort {
-                    // Without a key quic is refused; which one it is matters to gateways only.
+                if let Mechanism::Secured(_) = mechanism {
+                    // QUIC is refused without keys; agents need any keys, gateways their own.
                     keys = stage.keys(&hosts)?;
                     settings.extend(keys.first().cloned());
                     settings.push("security.loopback=true".to_owned());
-                    // As between processes of one host, which are not held back either.
+                    // No rate limit, as between processes of one host.
                     settings.push("security.peer_letters=0".to_owned());
                     settings.push("security.peer_bytes=0".to_owned());
                 }
@@ -162,38 +168,38 @@ impl Way {
                     let (who, _) = stage.start(&Part::Gateway, &domain, &settings).await?;
                     between.push(who);
                 }
-                // Other measurements on this machine can be heard of.
+                // Other measurements on this machine may announce their agents.
                 let (from, to) = agents(["-a", "-b"].map(|end| Stage::domain(&own(end))));
                 let (receiver, name) = stage.start(&to, &own("2"), &settings).await?;
                 let (sender, _) = stage.start(&from, &own("1"), &settings).await?;
                 (sender, receiver, Some(name))
             }
-            Sort::Letters => {
+            Mechanism::Letters => {
                 let settings = settings("shm");
                 let [from, to] = ends.map(|end| Part::Letters { end });
                 let (receiver, address) = stage.start(&to, &own(""), &settings).await?;
                 let (sender, _) = stage.start(&from, &own(""), &settings).await?;
                 (sender, receiver, Some(address))
             }
-            Sort::Iceoryx => {
+            Mechanism::Iceoryx => {
                 let settings = settings("shm");
                 let [from, to] = ends.map(|end| Part::Iceoryx { end, wait });
                 let (receiver, _) = stage.start(&to, &own(""), &settings).await?;
                 let (sender, _) = stage.start(&from, &own(""), &settings).await?;
                 (sender, receiver, None)
             }
-            Sort::Socket(kind) => {
+            Mechanism::Socket(kind) => {
                 let [from, to] = ends.map(|end| Part::Socket { end, kind });
                 let (receiver, address) = stage.start(&to, "raw", &[]).await?;
                 let (sender, _) = stage.start(&from, "raw", &[]).await?;
                 (sender, receiver, Some(address))
             }
-            Sort::Zenoh { shared_memory } => {
+            Mechanism::Zenoh { shared_memory } => {
                 let (receiver, address) = stage.start_zenoh(End::Receiver, shared_memory).await?;
                 let (sender, _) = stage.start_zenoh(End::Sender, shared_memory).await?;
                 (sender, receiver, Some(address))
             }
-            Sort::Relay => {
+            Mechanism::Relay => {
                 let settings = settings("shm");
                 let [from, to] = ends.map(|end| Part::Iceoryx { end, wait });
                 let [near, far] = ends.map(|end| Part::Relay { end });
@@ -210,7 +216,7 @@ impl Way {
             find(stage, sender, address).await?;
         }
         Ok(Self {
-            sort,
+            mechanism,
             wait,
             sender,
             receiver,
@@ -218,12 +224,12 @@ impl Way {
         })
     }
 
-    /// Whether letters of this size go this way; if not, why.
+    /// Sends one letter of this size; an error says why the path does not carry it.
     pub(super) async fn takes(&self, stage: &mut Stage, size: usize) -> Result<(), String> {
-        if !self.sort.is_ours() {
+        if !self.mechanism.is_ours() {
             return Ok(());
         }
-        // An agent's queue takes the letter whether it is being received or not.
+        // The agent's queue takes the letter before the agent receives it.
         let one = Letters {
             count: 1,
             size,
@@ -238,12 +244,12 @@ impl Way {
         Ok(())
     }
 
-    /// Sends letters this way.
+    /// Sends letters along the path.
     pub(super) async fn turn(&self, stage: &mut Stage, letters: Letters) -> Result<Turn, String> {
         let before = self.cpu(stage).await?;
         stage.tell(self.receiver, &Order::Receive(letters)).await?;
         let Event::Receiving = stage.event(self.receiver).await? else {
-            return Err("the receiver does something else".to_owned());
+            return Err("the receiver is not ready".to_owned());
         };
         stage.tell(self.sender, &Order::Send(letters)).await?;
         let sent = stage.event(self.sender).await?;
@@ -261,11 +267,14 @@ impl Way {
             },
         ) = (sent, received)
         else {
-            return Err("the two ends did something else".to_owned());
+            return Err("the ends did not send their times".to_owned());
         };
         let all = [began.len(), ended.len(), arrived.len()];
         if all != [letters.count; 3] {
-            return Err(format!("of {} letters there were {all:?}", letters.count));
+            return Err(format!(
+                "sent, acknowledged and received {all:?} of {} letters",
+                letters.count
+            ));
         }
         Ok(Turn {
             began,
@@ -275,41 +284,41 @@ impl Way {
         })
     }
 
-    /// What the processes in between have used so far.
+    /// Processor time that the processes between the ends have used, in nanoseconds.
     async fn cpu(&self, stage: &mut Stage) -> Result<u64, String> {
         let mut all = 0;
         for who in &self.between {
             stage.tell(*who, &Order::Cpu).await?;
             match stage.event(*who).await? {
                 Event::Cpu { ns } => all += ns,
-                other => return Err(format!("instead of a time there was {other:?}")),
+                other => return Err(format!("expected a time, received {other:?}")),
             }
         }
         Ok(all)
     }
 }
 
-async fn find(stage: &mut Stage, who: Who, to: String) -> Result<(), String> {
+async fn find(stage: &mut Stage, who: ProcessIndex, to: String) -> Result<(), String> {
     stage.tell(who, &Order::Find { to }).await?;
     match stage.event(who).await? {
         Event::Found => Ok(()),
-        other => Err(format!("instead of an end there was {other:?}")),
+        other => Err(format!("expected an end, received {other:?}")),
     }
 }
 
-/// A few letters that tell ways apart, for names of domains.
-fn short(sort: Sort, wait: Wait) -> String {
+/// A short text that distinguishes paths, for names of domains.
+fn short(mechanism: Mechanism, wait: Wait) -> String {
     let wait = match wait {
         Wait::Spin => 's',
         Wait::Block => 'b',
     };
-    match sort {
-        Sort::Agents(kind) => format!("{kind}{wait}"),
-        Sort::Gateways(kind) => format!("g{kind}{wait}"),
-        Sort::Secured(kind) => format!("s{kind}{wait}"),
-        Sort::Letters => format!("let{wait}"),
-        Sort::Iceoryx => format!("ice{wait}"),
-        Sort::Socket(_) | Sort::Zenoh { .. } => "raw".to_owned(),
-        Sort::Relay => format!("rel{wait}"),
+    match mechanism {
+        Mechanism::Agents(kind) => format!("{kind}{wait}"),
+        Mechanism::Gateways(kind) => format!("g{kind}{wait}"),
+        Mechanism::Secured(kind) => format!("s{kind}{wait}"),
+        Mechanism::Letters => format!("let{wait}"),
+        Mechanism::Iceoryx => format!("ice{wait}"),
+        Mechanism::Socket(_) | Mechanism::Zenoh { .. } => "raw".to_owned(),
+        Mechanism::Relay => format!("rel{wait}"),
     }
 }
