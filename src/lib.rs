@@ -44,6 +44,9 @@ mod coalition;
 pub mod config;
 pub mod doctor;
 mod domain;
+#[cfg(feature = "fuzzing")]
+#[doc(hidden)]
+pub mod fuzzing;
 mod gate;
 #[cfg(feature = "net")]
 mod gateway;
