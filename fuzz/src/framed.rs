@@ -20,7 +20,8 @@ pub fn play(bytes: &[u8]) {
     let mut now = Instant::now();
     let mut end = Framed::new(how & 1 == 1, how & 2 == 2, now);
     if how & 4 == 0 {
-        let hello = frame(1, 0, &hello_body(7, 4));
+        let service = if how & 0xf8 == 0 { 1 } else { 7 };
+        let hello = frame(1, 0, &hello_body(service, 4));
         end.arrive(&hello, usize::MAX, now);
     }
     let mut next = 1;

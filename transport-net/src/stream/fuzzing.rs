@@ -191,7 +191,15 @@ impl Framed {
     fn take_events(&mut self) {
         while let Some(event) = self.connection.poll_event() {
             match event {
-                Event::Greeted => self.connection.welcome(),
+                Event::Greeted => {
+                    let peer = self.connection.peer().map(|it| it.identity.incarnation);
+                    assert_ne!(
+                        peer,
+                        Some(Incarnation::from_u64(1)),
+                        "it is this end itself"
+                    );
+                    self.connection.welcome();
+                }
                 Event::Arrived { id, .. } => {
                     assert!(!self.open.contains(&id), "parcel {id} arrives twice");
                     self.open.push(id);

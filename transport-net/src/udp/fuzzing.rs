@@ -232,7 +232,15 @@ impl Datagrams {
                         let twice = self.concluded.insert(attempt, conclusion);
                         assert_eq!(twice, None, "{attempt:?} is concluded twice");
                     }
-                    Told::Introduced(_) | Told::Parted(_) => {}
+                    Told::Introduced(peer) => {
+                        let service = peer.hop.location.incarnation();
+                        assert_ne!(
+                            service,
+                            Incarnation::from_u64(1),
+                            "it is this service itself"
+                        );
+                    }
+                    Told::Parted(_) => {}
                 }
             }
             let Some(transmit) = self.core.poll_transmit(now) else {
