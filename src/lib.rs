@@ -55,6 +55,9 @@ pub mod doctor;
 mod domain;
 mod endpoint;
 mod error;
+#[cfg(feature = "fuzzing")]
+#[doc(hidden)]
+pub mod fuzzing;
 mod gate;
 #[cfg(feature = "net")]
 mod gateway;

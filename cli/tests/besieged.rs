@@ -105,6 +105,8 @@ async fn means(secured: bool, place: &Path, (tcp, datagrams): (SocketAddr, Socke
         random: &mut random,
         name: "rogue",
         receivers: &receivers,
+        known: &[],
+        claimed: &[],
     };
     let mut means = Means {
         tcp: Some(tcp),

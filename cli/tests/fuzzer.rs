@@ -17,6 +17,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use fastrand::Rng;
+use fipa::Incarnation;
 use fipa::keys::Keys;
 use fuzzing::trusted::{client, quic};
 use fuzzing::{Writer, datagram, stream};
@@ -96,6 +97,8 @@ struct Target {
     tls: Option<Arc<rustls::ClientConfig>>,
     quic: Option<quinn::ClientConfig>,
     receivers: Vec<String>,
+    known: Vec<(String, Incarnation)>,
+    claimed: Vec<Incarnation>,
     /// What a peer of ours begins a handshake with, over TCP and in a datagram.
     begun: [Vec<u8>; 2],
 }
@@ -120,7 +123,14 @@ impl Range {
             let packet = runtime.unwrap().block_on(datagram::initial(quic));
             [stream::client_hello(tls), packet]
         };
+        let known = pair.registrations();
+        // Without keys nothing separates strangers: one that claims to be the other host's is believed.
+        let claimed = known
+            .iter()
+            .filter(|(name, _)| secured || name == "arm" || name == "target");
         let target = Target {
+            claimed: claimed.map(|(_, life)| *life).collect(),
+            known,
             ways: if secured { &SECURED } else { &CLEAR },
             tcp: pair.gateway.at("tcp"),
             datagrams: pair.gateway.at(if secured { "quic" } else { "udp" }),
@@ -180,6 +190,8 @@ impl Target {
             random: &mut random,
             name: "rogue",
             receivers: &self.receivers,
+            known: &self.known,
+            claimed: &self.claimed,
         };
         let bytes = match way {
             Frames => {
@@ -262,6 +274,9 @@ fn fuzz(secured: bool) {
         assert!(let_in > 0, "{way:?} was never tried in earnest");
     }
     println!("  at first {at_first:?}\n  warm     {before:?}\n  after    {after:?}");
+    let strange = range.pair.strange();
+    println!("  {strange} letters of the fuzzer came to the honest agent");
+    assert!(strange > 0, "nothing got past admission");
     let letters = took.len();
     assert!(letters > 0, "the honest pair said nothing");
     let (median, last) = percentiles(took);

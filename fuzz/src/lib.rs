@@ -1,5 +1,18 @@
 //! What several fuzz targets check.
 
+pub mod access;
+pub mod config;
+pub mod datagrams;
+pub mod delivery;
+pub mod exchange;
+pub mod framed;
+pub mod host;
+pub mod input;
+pub mod mdns;
+pub mod seeds;
+pub mod shm;
+pub mod texts;
+
 use std::fmt::Debug;
 
 use bytes::Bytes;

@@ -165,6 +165,27 @@ fn a_sender_that_nothing_is_known_of_belongs_to_the_first_link() {
     assert!(is_refused(&second), "{second:?}");
 }
 
+/// A hello that names the registration of an agent takes nothing from that agent.
+#[test]
+fn a_service_cannot_introduce_itself_as_the_agent_of_another_host() {
+    let mut bench = Bench::new();
+    let stranger = Incarnation::from_u64(99);
+    let heard = bench.letter(link(HONEST, HONEST), (stranger, ARM), 1);
+    assert_eq!(heard, Verdict::Later);
+    for agent in [ROVER, stranger] {
+        let introduction = Introduction {
+            name: "rover".into(),
+            hop: link(agent, LIAR),
+            dialled: None,
+        };
+        bench.core.handle_introduced(bench.now, &introduction);
+        let junk = bench.letter(link(agent, LIAR), (agent, ARM), 2);
+        assert!(is_refused(&junk), "{junk:?}");
+        let real = bench.letter(link(HONEST, HONEST), (agent, ARM), 2);
+        assert_eq!(real, Verdict::Later, "of {agent}");
+    }
+}
+
 #[test]
 fn only_the_service_that_has_a_letter_reports_of_it() {
     let mut bench = Bench::new();

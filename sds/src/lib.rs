@@ -27,6 +27,9 @@ mod contacts;
 mod directory;
 mod entry;
 mod exchange;
+#[cfg(feature = "fuzzing")]
+#[doc(hidden)]
+pub mod fuzzing;
 mod host;
 #[cfg(feature = "mdns")]
 mod mdns;

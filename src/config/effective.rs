@@ -9,6 +9,7 @@ use toml_edit::Value as Toml;
 
 use super::keys::{KEYS, MAPS};
 use super::reader::{Reader, bare_or_quoted, dotted};
+use super::sources::Found;
 use super::{Config, ConfigError, Origin, Sources};
 
 /// The configuration that counts, with the origin of every value.
@@ -52,7 +53,11 @@ impl Effective {
     /// # Errors
     /// When a file cannot be read, or with all mistakes that were found.
     pub fn load(sources: &Sources) -> Result<Self, ConfigError> {
-        let found = sources.read()?;
+        Self::of(sources, sources.read()?)
+    }
+
+    /// Reads and checks what was found, and what overrides it.
+    fn of(sources: &Sources, found: Option<Found>) -> Result<Self, ConfigError> {
         let mut reader = Reader::new(&sources.host_name);
         for assignment in sources.set.iter().rev() {
             reader.set(assignment);
@@ -70,6 +75,13 @@ impl Effective {
             return Err(ConfigError::Mistakes(reader.mistakes));
         }
         Ok(Self::new(reader, found.map(|found| found.path)))
+    }
+
+    /// Reads and checks a text as if it stood in `fipa.toml`.
+    #[cfg(feature = "fuzzing")]
+    pub(crate) fn of_text(sources: &Sources, text: String) -> Result<Self, ConfigError> {
+        let path = PathBuf::from("fipa.toml");
+        Self::of(sources, Some(Found { path, text }))
     }
 
     pub(super) fn new(reader: Reader, file: Option<PathBuf>) -> Self {

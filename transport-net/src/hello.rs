@@ -22,6 +22,9 @@ const MAX_DIALLED: usize = Location::MAX_ADDRESS + 32;
 /// At most this many addresses are told; the best stand first.
 const MAX_LISTENING: usize = 16;
 
+/// Why a hello is refused that names the service which it is for.
+pub(crate) const OWN_INCARNATION: &str = "the peer says that it is this service itself";
+
 #[derive(FromBytes, IntoBytes, Immutable, KnownLayout, Unaligned)]
 #[repr(C)]
 struct Fixed {

@@ -20,6 +20,9 @@
 mod address;
 mod answer;
 mod end;
+#[cfg(feature = "fuzzing")]
+#[doc(hidden)]
+pub mod fuzzing;
 mod hello;
 mod identity;
 #[cfg(feature = "ip")]

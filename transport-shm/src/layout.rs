@@ -255,6 +255,102 @@ impl Places {
     }
 }
 
+/// What another process writes into shared memory, for fuzz targets.
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing {
+    use bytes::Bytes;
+
+    use super::*;
+
+    /// Bytes of a request's header before the parcel's.
+    const OWN: usize = 40;
+    /// Bytes of a request's header, as [`header`] takes them.
+    pub const HEADER_LEN: usize = OWN + super::HEADER_LEN;
+    /// The version of the layout that [`header`] reads.
+    pub const VERSION: u32 = super::VERSION;
+
+    /// Reads the header of a request with this payload, whose content lies in `elsewhere` if the header
+    /// says so. Returns whether it is a parcel.
+    ///
+    /// # Panics
+    /// When the places that are announced do not lie in the payload.
+    pub fn header(bytes: &[u8; HEADER_LEN], payload: &[u8], elsewhere: &[u8]) -> bool {
+        let number = |at: usize| {
+            let mut number = [0; 8];
+            number.copy_from_slice(&bytes[at..at + 8]);
+            u64::from_le_bytes(number)
+        };
+        let mut parcel = [0; super::HEADER_LEN];
+        parcel.copy_from_slice(&bytes[OWN..]);
+        let header = Header {
+            version: number(0) as u32,
+            start: (number(0) >> 32) as u32,
+            sender: number(8),
+            token: number(16),
+            segment: number(24),
+            generation: number(32),
+            parcel,
+        };
+        let Some(parcel) = header.parcel() else {
+            return false;
+        };
+        let Some(places) = Places::announced(&header, &parcel, payload.len()) else {
+            return false;
+        };
+        // As the mailbox takes them apart.
+        let around = &payload[places.start..places.end];
+        let read = if header.reference().is_some() {
+            let mut front = Bytes::copy_from_slice(around);
+            let tail = front.split_off(places.content - places.start);
+            let len = usize::try_from(parcel.content_len()).unwrap_or(usize::MAX);
+            let Some(content) = elsewhere.get(..len) else {
+                return false;
+            };
+            parcel.parcel_of_pieces(front, Bytes::copy_from_slice(content), tail)
+        } else {
+            let pieces = [
+                &payload[places.start..places.content],
+                &payload[places.tail..places.end],
+            ];
+            let content = Bytes::copy_from_slice(&payload[places.content..places.tail]);
+            let mut front = Bytes::from(pieces.concat());
+            let tail = front.split_off(places.content - places.start);
+            let apart = parcel.parcel_of_pieces(front, content, tail);
+            let whole = parcel.parcel(Bytes::copy_from_slice(around));
+            assert_eq!(apart.is_ok(), whole.is_ok(), "{apart:?} or {whole:?}");
+            apart
+        };
+        read.is_ok()
+    }
+
+    /// Reads an answer to the request with this token. What is read survives being written.
+    ///
+    /// # Panics
+    /// When it does not.
+    #[must_use]
+    pub fn ack(bytes: &[u8], token: u64) -> Option<Answer> {
+        let at = |index: usize| bytes.get(index).copied().unwrap_or(0);
+        let mut ack = Ack::new(&Answer::Accepted, token);
+        (ack.code, ack.reason, ack.detail_len) = (at(0), at(1), at(2));
+        ack.last = u64::from(at(3)) << 56 | u64::from(at(4));
+        for (place, byte) in ack.detail.iter_mut().zip(bytes.iter().skip(5)) {
+            *place = *byte;
+        }
+        assert_eq!(ack.answer(token.wrapping_add(1)), None);
+        let answer = ack.answer(token)?;
+        let again = Ack::new(&answer, token).answer(token);
+        let again = again.expect("what was read can be written");
+        match (&again, &answer) {
+            // What is no UTF-8 gets longer, and is cut.
+            (Answer::Failed { reason, .. }, Answer::Failed { reason: other, .. }) => {
+                assert_eq!(reason, other);
+            }
+            _ => assert_eq!(again, answer),
+        }
+        Some(answer)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use fipa_transport::FailureReason;

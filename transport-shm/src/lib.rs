@@ -34,6 +34,9 @@ mod domain;
 mod endpoint;
 mod fault;
 mod fork;
+#[cfg(feature = "fuzzing")]
+#[doc(hidden)]
+pub mod fuzzing;
 mod inbox;
 mod inspect;
 mod layout;

@@ -74,6 +74,10 @@ pub(crate) struct Writer<'a> {
     pub(crate) name: &'a str,
     /// To whom letters go.
     pub(crate) receivers: &'a [String],
+    /// Registrations that the other side knows, by name: with a true one a letter gets past admission.
+    pub(crate) known: &'a [(String, Incarnation)],
+    /// Registrations that the speaker claims to be, or to send for, beside made-up ones.
+    pub(crate) claimed: &'a [Incarnation],
 }
 
 impl Writer<'_> {
@@ -135,6 +139,31 @@ impl Writer<'_> {
         Duration::from_millis(self.random.u64(..most))
     }
 
+    /// The true registration of a receiver, most often.
+    fn life_of(&mut self, receiver: &str) -> Incarnation {
+        let known = self.known.iter().find(|(name, _)| name == receiver);
+        match known {
+            Some((_, life)) if self.random.u8(..8) > 0 => *life,
+            _ => Incarnation::from_u64(self.random.u64(..4)),
+        }
+    }
+
+    /// A registration that is not the speaker's.
+    fn claim(&mut self) -> u64 {
+        match self.claimed {
+            [] => self.random.u64(1..),
+            claimed => claimed[self.random.usize(..claimed.len())].as_u64(),
+        }
+    }
+
+    /// A number of a letter.
+    fn counted(&mut self) -> u64 {
+        match self.random.u8(..8) {
+            0 => self.edge(),
+            _ => self.random.u64(..5),
+        }
+    }
+
     fn edge(&mut self) -> u64 {
         EDGES[self.random.usize(..EDGES.len())]
     }
@@ -142,7 +171,11 @@ impl Writer<'_> {
     /// How somebody introduces himself.
     pub(crate) fn hello(&mut self) -> Vec<u8> {
         let mut body = Vec::new();
-        body.extend(self.random.u64(1..).to_le_bytes());
+        let service = match self.random.u8(..8) {
+            0 => self.claim(),
+            _ => self.random.u64(1..),
+        };
+        body.extend(service.to_le_bytes());
         let letter = [1 << 26, 1 << 10, self.edge()][self.random.usize(..3)];
         body.extend(letter.to_le_bytes());
         let in_flight = [100, 1, self.random.u32(..)][self.random.usize(..3)];
@@ -179,11 +212,18 @@ impl Writer<'_> {
         let parcel = Parcel {
             receiver: receiver.as_str().into(),
             stream: Stream {
-                sender: Incarnation::from_u64(self.random.u64(..4)),
-                receiver: Incarnation::from_u64(self.random.u64(..4)),
+                sender: Incarnation::from_u64(match self.random.u8(..4) {
+                    0 => self.claim(),
+                    1 => self.random.u64(..4),
+                    _ => self.random.u64(..),
+                }),
+                receiver: self.life_of(receiver),
             },
-            sequence: self.random.u64(..5),
-            after: self.random.u64(..3),
+            sequence: self.counted(),
+            after: match self.random.u8(..4) {
+                0 => self.counted(),
+                _ => 0,
+            },
             transfer: self.random.u64(..5),
             remaining: Duration::from_millis(self.random.u64(..5000)),
             body,

@@ -19,7 +19,7 @@ use std::time::{Duration, Instant};
 
 use fipa::config::Sources;
 use fipa::keys::{Keys, VALID};
-use fipa::{Agent, AgentId, Config, Domain, Outcome, Performative};
+use fipa::{Agent, AgentId, Config, Domain, Incarnation, Outcome, Performative, ReceiveError};
 use parking_lot::Mutex;
 use serde_json::Value;
 use tokio::runtime::Runtime;
@@ -258,6 +258,32 @@ impl Pair {
         }
     }
 
+    /// The registrations that the first gateway's host knows, by name: its own agent, the gateways and
+    /// the agent of the other host.
+    pub(crate) fn registrations(&self) -> Vec<(String, Incarnation)> {
+        self.arm.knows("rover");
+        let entries = self.arm.agent.domain().directory().entries();
+        let mut known: Vec<_> = entries
+            .iter()
+            .map(|entry| (entry.name.to_string(), entry.incarnation))
+            .collect();
+        let far = self.other_gateway();
+        known.push(("other".to_owned(), far));
+        known
+    }
+
+    fn other_gateway(&self) -> Incarnation {
+        let directory = self.rover.agent.domain().directory();
+        let entries = directory.entries();
+        let gateway = entries.iter().find(|entry| &*entry.name == "other");
+        gateway.unwrap().incarnation
+    }
+
+    /// Letters of others than the pair that the agent of the first host has received.
+    pub(crate) fn strange(&self) -> u64 {
+        self.arm.strange.load(Ordering::Relaxed)
+    }
+
     /// Ends all of it in good order.
     pub(crate) fn end(self) {
         self.rover.end();
@@ -271,6 +297,8 @@ impl Pair {
 pub(crate) struct Party {
     runtime: Runtime,
     agent: Arc<Agent>,
+    /// Letters of others than the pair, while it answers.
+    strange: Arc<AtomicU64>,
 }
 
 impl Party {
@@ -288,16 +316,23 @@ impl Party {
         Self {
             runtime,
             agent: Arc::new(agent),
+            strange: Arc::default(),
         }
     }
 
     /// Answers every honest letter with what it says, and takes none twice.
     pub(crate) fn answer(&self) {
-        let agent = Arc::clone(&self.agent);
+        let (agent, strange) = (Arc::clone(&self.agent), Arc::clone(&self.strange));
         self.runtime.spawn(async move {
             let mut taken = HashSet::new();
-            while let Ok(incoming) = agent.receive().await {
-                let Some(content) = honest(&incoming.message) else {
+            loop {
+                let content = match agent.receive().await {
+                    Ok(incoming) => honest(&incoming.message).map(|it| (it, incoming)),
+                    Err(ReceiveError::Malformed { .. }) => None,
+                    Err(_) => return,
+                };
+                let Some((content, incoming)) = content else {
+                    strange.fetch_add(1, Ordering::Relaxed);
                     continue;
                 };
                 assert!(taken.insert(content.clone()), "twice: {content}");

@@ -14,6 +14,8 @@
 //! learnt elsewhere.
 
 mod file;
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 mod place;
 mod shared;
 mod socket;

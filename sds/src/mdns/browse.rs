@@ -506,6 +506,24 @@ impl Browser {
         due
     }
 
+    /// What is counted is what is kept, within the bounds.
+    #[cfg(feature = "fuzzing")]
+    pub(super) fn check(&self) {
+        let records = || self.records.values();
+        assert_eq!(self.unknown, records().filter(|it| !it.known).count());
+        assert_eq!(self.bytes, records().map(|it| it.len).sum::<usize>());
+        for (from, share) in &self.shares {
+            let of = || records().filter(|it| it.from == *from);
+            assert_eq!(share.records, of().count());
+            assert_eq!(share.unknown, of().filter(|it| !it.known).count());
+            assert_eq!(share.bytes, of().map(|it| it.len).sum::<usize>());
+            assert!(share.records <= MAX_SHARE && share.bytes <= MAX_SHARE_BYTES);
+        }
+        assert!(self.shares.len() <= self.records.len());
+        assert!(self.records.len() <= MdnsDirectory::MAX_RECORDS);
+        assert!(self.bytes <= MdnsDirectory::MAX_BYTES);
+    }
+
     /// When there is something to be done next.
     pub(super) fn poll_timeout(&self) -> Instant {
         let next = self.next.unwrap_or(self.everything.next);

@@ -14,6 +14,8 @@ mod anew;
 mod beacon;
 mod browse;
 mod ear;
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 mod held;
 mod pace;
 mod packet;

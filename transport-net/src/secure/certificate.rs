@@ -238,6 +238,16 @@ impl Certified {
     }
 }
 
+/// What a certificate with these URIs among its alternative names says.
+///
+/// # Errors
+/// When it says nothing that can be used here.
+#[cfg(feature = "fuzzing")]
+pub fn certified(uris: &[&str]) -> Result<Certified, CertificateError> {
+    let names: Vec<GeneralName<'_>> = uris.iter().map(|uri| GeneralName::URI(uri)).collect();
+    Certified::of(&names)
+}
+
 fn decoded(encoded: &str) -> Result<String, CertificateError> {
     let name = percent_decode_str(encoded).decode_utf8();
     match name {

@@ -32,6 +32,10 @@ pub use self::certificate::{
 };
 use self::verify::Known;
 
+#[cfg(feature = "fuzzing")]
+#[doc(hidden)]
+pub use self::certificate::certified;
+
 /// What a host is known by, and whom it knows.
 #[derive(Debug)]
 pub struct Credentials {

@@ -20,7 +20,7 @@ use super::frame::{self, Frame};
 use super::outbox::{About, Outbox, Progress};
 use super::proof::Proof;
 use crate::end::End;
-use crate::hello::Hello;
+use crate::hello::{Hello, OWN_INCARNATION};
 
 /// Numbers of parcels stay below this, so that a ticket has room for the connection's number too.
 pub(crate) const MAX_ID: u64 = 1 << 40;
@@ -582,6 +582,10 @@ impl Connection {
             && expected != found
         {
             return Err(End::WrongIncarnation { expected, found });
+        }
+        if found == self.hello.identity.incarnation {
+            // This side would write to itself, and exchange its directory with itself.
+            return Err(End::Nonsense(OWN_INCARNATION.into()));
         }
         if hello.max_in_flight == 0 {
             return Err(End::Nonsense("the peer takes no parcels at all".into()));

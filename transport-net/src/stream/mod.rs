@@ -15,6 +15,8 @@ mod connection;
 pub(crate) mod counters;
 pub(crate) mod endpoint;
 pub(crate) mod frame;
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 pub(crate) mod link;
 mod outbox;
 pub(crate) mod place;

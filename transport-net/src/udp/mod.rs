@@ -12,6 +12,8 @@ mod core;
 mod counters;
 mod dialling;
 mod endpoint;
+#[cfg(feature = "fuzzing")]
+pub(crate) mod fuzzing;
 mod mtu;
 mod packet;
 mod received;

@@ -10,7 +10,7 @@ use super::super::packet::{self, NO_COOKIE};
 use super::{Core, Inbound, MAX_OUTBOX};
 use crate::address;
 use crate::end::End;
-use crate::hello::Hello;
+use crate::hello::{Hello, OWN_INCARNATION};
 use crate::ration::whose;
 
 impl Core {
@@ -38,7 +38,10 @@ impl Core {
             }
             return;
         }
-        let Some(peer) = Hello::decode(hello).filter(|peer| peer.max_in_flight > 0) else {
+        // One that says that it is this service itself would make it write to itself.
+        let own = self.identity.incarnation;
+        let is_fit = |it: &Hello| it.max_in_flight > 0 && it.identity.incarnation != own;
+        let Some(peer) = Hello::decode(hello).filter(is_fit) else {
             self.counters.ignored += 1;
             return;
         };
@@ -101,8 +104,11 @@ impl Core {
         let hop = self.hop(&peer, path.remote);
         let ration = self.ration(path.remote.ip(), now);
         let meter = self.meter(path.remote.ip());
-        let mut greeted = None;
+        let (own, mut greeted) = (self.identity.incarnation, None);
         self.of_dialling(to, path, |number, connection| {
+            if peer.identity.incarnation == own {
+                return Err(End::Nonsense(OWN_INCARNATION.into()));
+            }
             let name = peer.identity.name.as_str().into();
             connection.welcomed(path, acceptor, peer, now)?;
             connection.ration = ration;

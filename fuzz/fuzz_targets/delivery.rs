@@ -1,0 +1,8 @@
+//! Parcels, reports, answers and hellos of liars do not keep honest agents from being served; see
+//! [`fipa_fuzz::delivery`].
+
+#![no_main]
+
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(init: fipa_fuzz::seeds::write("delivery"), |bytes: &[u8]| fipa_fuzz::delivery::play(bytes));

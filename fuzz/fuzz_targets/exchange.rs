@@ -1,0 +1,8 @@
+//! Letters of the exchange of directories change nothing of other gateways; see
+//! [`fipa_fuzz::exchange`].
+
+#![no_main]
+
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(init: fipa_fuzz::seeds::write("exchange"), |bytes: &[u8]| fipa_fuzz::exchange::play(bytes));

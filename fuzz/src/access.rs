@@ -1,0 +1,73 @@
+//! Rules of access: any rules are understood or refused, and what they say of a letter does not depend
+//! on anything but the rules that name it.
+
+use std::time::{Duration, Instant};
+
+use fipa::fuzzing::Access;
+
+use crate::input::Input;
+
+/// Reads rules and letters from the bytes.
+pub fn play(bytes: &[u8]) {
+    let mut input = Input(bytes);
+    let rate = input.below(4);
+    let deny = lines(&mut input);
+    let allow = lines(&mut input);
+    let Some(mut access) = Access::new(&deny, &allow, rate) else {
+        return;
+    };
+    let denies = Access::new(&deny, &[], 0);
+    let allows = Access::new(&allow, &[], 0);
+    let mut now = Instant::now();
+    let mut sent = 0_u32;
+    let began = now;
+    while !input.is_empty() {
+        let (sender, receiver) = (name(&mut input), name(&mut input));
+        let performative = input.one_of(&["inform", "request", "cfp", ""]);
+        let protocol = input.one_of(&[None, Some("fipa-request"), Some("")]);
+        let between = (sender, receiver);
+        let passes = access.passes(between, performative, protocol);
+        // As a rule that denies, a rule that allows says which letters it names.
+        let named = |rules: &Option<Access>| {
+            let rules = rules.as_ref();
+            rules.is_some_and(|it| !it.passes(between, performative, protocol))
+        };
+        let expected =
+            !named(&denies) && (allow.iter().all(|it| it.1.is_empty()) || named(&allows));
+        assert_eq!(passes, expected, "{sender:?} to {receiver:?}");
+        sent += u32::from(access.may_send("rover", now));
+        if rate > 0 {
+            let seconds = now.duration_since(began).as_secs_f64();
+            let most = rate as f64 * (seconds + 1.0) + 1.0;
+            assert!(f64::from(sent) <= most, "{sent} letters in {seconds} s");
+        }
+        now += Duration::from_millis(u64::from(input.byte()));
+    }
+}
+
+fn name<'a>(input: &mut Input<'a>) -> &'a str {
+    match input.below(4) {
+        0 => std::str::from_utf8(input.bytes(30)).unwrap_or_default(),
+        _ => input.one_of(&["rover", "arm", "rover_1", "rover_.*", "x", "ARM"]),
+    }
+}
+
+fn lines<'a>(input: &mut Input<'a>) -> Vec<(&'a str, Vec<&'a str>)> {
+    let count = input.below(4);
+    (0..count)
+        .map(|_| {
+            let sender = name(input);
+            let receivers = (0..input.below(3)).map(|_| match input.below(3) {
+                0 => std::str::from_utf8(input.bytes(60)).unwrap_or_default(),
+                1 => name(input),
+                _ => input.one_of(&[
+                    "arm performative=inform,cfp",
+                    "arm protocol=fipa-request",
+                    ".* performative=request protocol=x",
+                    "arm performative=",
+                ]),
+            });
+            (sender, receivers.collect())
+        })
+        .collect()
+}

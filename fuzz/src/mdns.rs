@@ -1,0 +1,76 @@
+//! Packets of multicast DNS from several sources, and time.
+//!
+//! What is counted of each source is what is kept, within the bounds; entries that are found keep to
+//! their limits and survive being announced; only records that were found are gone.
+
+use std::net::IpAddr;
+use std::time::{Duration, Instant, SystemTime};
+
+use fipa_sds::fuzzing::{Ear, announced};
+use fipa_sds::{Entry, Members, Mts, Reach, Role, Source};
+use fipa_transport::Incarnation;
+
+use crate::input::Input;
+
+/// Plays a host as the bytes say: packets with their lengths, and what is put over them.
+pub fn play(bytes: &[u8]) {
+    let mut input = Input(bytes);
+    let mut now = Instant::now();
+    let mut ear = Ear::new(now);
+    while !input.is_empty() {
+        let how = input.byte();
+        let from = IpAddr::from([192, 0, 2, how % 3]);
+        match how >> 4 {
+            0..=7 => {
+                let packet = input.long_bytes();
+                ear.arrive(now, from, packet);
+            }
+            8..=12 => {
+                let entry = entry(&mut input);
+                for mut packet in announced(&entry) {
+                    // Some bytes are others on the way.
+                    for _ in 0..input.below(4) {
+                        let at = usize::from(u16::from_le_bytes([input.byte(), input.byte()]));
+                        let at = at % packet.len();
+                        packet[at] = input.byte();
+                    }
+                    ear.arrive(now, from, &packet);
+                }
+            }
+            _ => {
+                let time = input.time().min(Duration::from_secs(7200));
+                ear.pass(&mut now, time);
+            }
+        }
+    }
+    ear.pass(&mut now, Duration::from_secs(600));
+}
+
+fn text(input: &mut Input<'_>) -> String {
+    String::from_utf8_lossy(input.bytes(40)).into_owned()
+}
+
+fn entry(input: &mut Input<'_>) -> Entry {
+    let gateway = Incarnation::from_u64(input.number());
+    let role = match input.below(4) {
+        0 => Role::Gateway,
+        1 => match Members::new([text(input), text(input)], None) {
+            Ok(members) => Role::Coalition(members),
+            Err(_) => Role::Agent,
+        },
+        _ => Role::Agent,
+    };
+    let location = input.one_of(&["tcp://192.0.2.7:7788", "udp://[2001:db8::1]:7788"]);
+    Entry {
+        name: text(input).into(),
+        agent_type: text(input),
+        incarnation: Incarnation::from_u64(input.number()),
+        locations: vec![location.parse().expect("a location")],
+        mts: Mts::new(text(input), gateway),
+        description: text(input),
+        registered: SystemTime::UNIX_EPOCH + input.time().min(Duration::from_secs(10_000)),
+        source: Source::Mdns,
+        reach: Reach::Remote { gateway },
+        role,
+    }
+}

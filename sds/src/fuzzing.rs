@@ -1,0 +1,6 @@
+//! Parts that the fuzz targets reach; `fuzz/` has the targets.
+
+#[cfg(feature = "mdns")]
+pub use crate::mdns::fuzzing::{Ear, announced};
+
+pub use crate::host::fuzzing::{file_name, read_and_written};

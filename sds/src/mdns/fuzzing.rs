@@ -1,0 +1,119 @@
+//! The network's records for fuzz targets: packets of any source in, and what must hold of what is kept.
+
+use std::collections::BTreeSet;
+use std::net::IpAddr;
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use fipa_transport::Incarnation;
+
+use super::beacon::{self, Beacons};
+use super::browse::{Browser, label_of};
+use super::held::Holdings;
+use super::together::Together;
+use super::{packet, record};
+use crate::{Entry, Reach, Source};
+
+/// A host that hears multicast DNS, without its sockets.
+#[derive(Debug)]
+pub struct Ear {
+    browser: Browser,
+    beacons: Beacons,
+    held: Holdings,
+    together: Together,
+    /// Full names that were found and are not gone.
+    found: BTreeSet<String>,
+}
+
+/// The packets that announce this entry: its record and its gateway's beacon.
+#[must_use]
+pub fn announced(entry: &Entry) -> Vec<Vec<u8>> {
+    let label = record::label(&entry.name, 0);
+    let says = record::encode(entry);
+    packet::announcement(&label, "fipa-2.local", &says)
+        .into_iter()
+        .collect()
+}
+
+impl Ear {
+    /// A host whose own gateway has incarnation 1.
+    #[must_use]
+    pub fn new(now: Instant) -> Self {
+        Self {
+            browser: Browser::new(now, Incarnation::from_u64(1), 0.5),
+            beacons: Beacons::default(),
+            held: Holdings::default(),
+            together: Together::default(),
+            found: BTreeSet::new(),
+        }
+    }
+
+    /// A packet arrives from this address.
+    pub fn arrive(&mut self, now: Instant, from: IpAddr, bytes: &[u8]) {
+        if let Some((gateway, said)) = beacon::read(bytes) {
+            let _ = self.together.said(now, gateway, said.coalitions);
+            let held = self.held.of(gateway);
+            let _ = self.beacons.handle(now, gateway, said.all, held);
+            self.browser.confirm(now, gateway);
+        }
+        let heard = self.browser.handle_packet(now, from, bytes, 0.5);
+        self.browser.check();
+        let at = SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000);
+        for (fullname, properties) in heard.found {
+            self.found.insert(fullname.to_string());
+            let entry = match record::decode(label_of(&fullname), &properties, at) {
+                Ok(entry) => entry,
+                Err(error) => {
+                    self.held.put(now, &fullname, None);
+                    let _ = self.together.put(now, &fullname, None);
+                    drop(error.to_string());
+                    continue;
+                }
+            };
+            entry.check().expect("what is read keeps to the limits");
+            assert!(entry.source == Source::Mdns && entry.reach != Reach::Local);
+            if entry.incarnation.is_known() {
+                survives(&entry, at);
+            }
+            self.browser.belongs(&fullname, entry.mts.incarnation);
+            self.held.put(now, &fullname, Some(&entry));
+            let _ = self.together.put(now, &fullname, Some(Arc::new(entry)));
+        }
+    }
+
+    /// Time passes; what is due happens when it is.
+    pub fn pass(&mut self, now: &mut Instant, time: Duration) {
+        let until = *now + time;
+        let mut last = None;
+        while let Some(due) = Some(self.browser.poll_timeout()).filter(|due| *due <= until) {
+            assert_ne!(last.replace(due), Some(due), "time stands still");
+            *now = due.max(*now);
+            let due = self.browser.handle_timeout(*now, 0.5);
+            self.browser.check();
+            for packet in due.packets {
+                assert!(packet.len() <= packet::MAX_PACKET);
+                assert!(packet::parse(&packet).is_some(), "a question that is none");
+            }
+            for fullname in due.gone {
+                let was_found = self.found.remove(&*fullname);
+                assert!(was_found, "{fullname} is gone, and was never found");
+                self.held.put(*now, &fullname, None);
+                let _ = self.together.put(*now, &fullname, None);
+            }
+            let _ = self.together.handle_timeout(*now);
+            let silent = self.beacons.silent(*now);
+            assert!(silent.len() <= 1024);
+        }
+        *now = until;
+    }
+}
+
+/// An entry that was read is the same when it is written and read again.
+fn survives(entry: &Entry, at: SystemTime) {
+    let says = record::encode(entry);
+    let label = record::label(&entry.name, 0);
+    match record::decode(&label, &says, at) {
+        Ok(again) => assert_eq!(&again, entry),
+        Err(error) => panic!("{entry:?} cannot be read again: {error}"),
+    }
+}

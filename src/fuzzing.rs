@@ -1,0 +1,65 @@
+//! Parts that the fuzz targets reach; `fuzz/` has the targets.
+
+use std::time::Instant;
+
+use crate::access::{self, Claim};
+use crate::config::{AccessRule, Config, ConfigError, Effective, Sources};
+
+/// Reads and checks a text as if it stood in `fipa.toml`, with these overrides (`key=value`).
+///
+/// # Errors
+/// With all mistakes.
+pub fn config(text: &str, set: &[&str]) -> Result<Effective, ConfigError> {
+    let sources = Sources {
+        set: set.iter().map(|one| (*one).to_owned()).collect(),
+        host_name: "here".to_owned(),
+        ..Sources::default()
+    };
+    Effective::of_text(&sources, text.to_owned())
+}
+
+/// Rules of access.
+#[derive(Debug)]
+pub struct Access(access::Access);
+
+/// Lines of rules: a sender, and its receivers.
+pub type Lines<'a> = &'a [(&'a str, Vec<&'a str>)];
+
+impl Access {
+    /// Rules with these lines; none when a line cannot be understood, or there is nothing to check.
+    #[must_use]
+    pub fn new(deny: Lines<'_>, allow: Lines<'_>, rate: usize) -> Option<Self> {
+        let lines = |lines: Lines<'_>| -> Vec<AccessRule> {
+            let lines = lines.iter().map(|(sender, receivers)| AccessRule {
+                sender: (*sender).to_owned(),
+                receivers: receivers.iter().map(|it| (*it).to_owned()).collect(),
+            });
+            lines.collect()
+        };
+        let mut config = Config::for_host("here").access;
+        (config.deny, config.allow, config.rate) = (lines(deny), lines(allow), rate);
+        access::Access::new(&config).ok().flatten().map(Self)
+    }
+
+    /// Whether the rules let such a letter pass.
+    #[must_use]
+    pub fn passes(
+        &self,
+        (sender, receiver): (&str, &str),
+        performative: &str,
+        protocol: Option<&str>,
+    ) -> bool {
+        let claim = Claim {
+            sender,
+            receiver,
+            performative,
+            protocol,
+        };
+        self.0.judge(&claim).is_ok()
+    }
+
+    /// Whether the sender may send one more letter.
+    pub fn may_send(&mut self, sender: &str, now: Instant) -> bool {
+        self.0.count(sender, now).is_ok()
+    }
+}

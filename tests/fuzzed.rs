@@ -1,0 +1,115 @@
+//! The bodies of the fuzz targets with drawn inputs: what libFuzzer finds in seconds is found here too,
+//! where it is not at hand.
+//!
+//! `FIPA_FUZZ_SECONDS` is how long each goes on (by default, a number of inputs); `FIPA_FUZZ_SEED` repeats
+//! the inputs of an earlier run.
+
+#![allow(
+    dead_code,
+    missing_docs,
+    unreachable_pub,
+    reason = "modules of the fuzz targets"
+)]
+#![allow(
+    clippy::unwrap_used,
+    clippy::print_stdout,
+    reason = "a test that cannot go on ends"
+)]
+
+#[path = "../fuzz/src/access.rs"]
+mod access;
+#[path = "../fuzz/src/config.rs"]
+mod config;
+#[path = "../fuzz/src/datagrams.rs"]
+mod datagrams;
+#[path = "../fuzz/src/delivery.rs"]
+mod delivery;
+#[path = "../fuzz/src/exchange.rs"]
+mod exchange;
+#[path = "../fuzz/src/framed.rs"]
+mod framed;
+#[path = "../fuzz/src/host.rs"]
+mod host;
+#[path = "../fuzz/src/input.rs"]
+mod input;
+#[path = "../fuzz/src/mdns.rs"]
+mod mdns;
+#[path = "../fuzz/src/seeds.rs"]
+mod seeds;
+#[path = "../fuzz/src/shm.rs"]
+mod shm;
+#[path = "../fuzz/src/texts.rs"]
+mod texts;
+
+use std::time::{Duration, Instant};
+
+use fastrand::Rng;
+
+/// Inputs of each body, unless a time is set.
+const INPUTS: usize = 150;
+
+fn number(variable: &str) -> Option<u64> {
+    std::env::var(variable).ok()?.parse().ok()
+}
+
+/// Runs a body with its seeds, and with what a few changes make of them.
+fn plays(target: &str, play: fn(&[u8])) {
+    let seed = number("FIPA_FUZZ_SEED").unwrap_or_else(|| fastrand::u64(..));
+    println!("{target}: FIPA_FUZZ_SEED={seed}");
+    let seconds = number("FIPA_FUZZ_SECONDS").map(Duration::from_secs);
+    let seeds = seeds::of(target);
+    seeds.iter().for_each(|seed| play(seed));
+    let (mut random, began) = (Rng::with_seed(seed), Instant::now());
+    let mut count = 0;
+    while seconds.map_or(count < INPUTS, |seconds| began.elapsed() < seconds) {
+        let mut input = seeds[random.usize(..seeds.len())].clone();
+        for _ in 0..random.usize(..8) {
+            change(&mut random, &mut input, &seeds);
+        }
+        let before = input.clone();
+        let played = std::panic::catch_unwind(|| play(&input));
+        if let Err(panic) = played {
+            println!("{target}, input {count}: {before:?}");
+            std::panic::resume_unwind(panic);
+        }
+        count += 1;
+    }
+    println!("{target}: {count} inputs");
+}
+
+fn change(random: &mut Rng, input: &mut Vec<u8>, seeds: &[Vec<u8>]) {
+    let at = random.usize(..=input.len());
+    match random.u8(..6) {
+        0 | 1 if at < input.len() => input[at] = random.u8(..),
+        2 => drop(input.drain(at..(at + random.usize(..20)).min(input.len()))),
+        3 => {
+            let new: Vec<u8> = (0..random.usize(..40)).map(|_| random.u8(..)).collect();
+            drop(input.splice(at..at, new));
+        }
+        4 => {
+            let other = &seeds[random.usize(..seeds.len())];
+            input.truncate(at);
+            input.extend_from_slice(&other[random.usize(..=other.len())..]);
+        }
+        _ if at < input.len() => input[at] ^= 1 << random.u8(..8),
+        _ => {}
+    }
+}
+
+macro_rules! bodies {
+    ($($target:ident),*) => {
+        $(#[test]
+        fn $target() {
+            plays(stringify!($target), $target::play);
+        })*
+    };
+}
+
+/// One test for each body.
+mod bodies {
+    use super::*;
+
+    bodies!(
+        access, config, datagrams, delivery, exchange, framed, host, mdns, shm, texts
+    );
+}

@@ -1,0 +1,274 @@
+//! An endpoint of the UDP transport for fuzz targets: datagrams of any peers in, and what must hold of
+//! those that leave.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use fipa_transport::{Answer, AttemptId, Conclusion, Incarnation, Kind, Location, Parcel, Ticket};
+
+use super::config::UdpLimits;
+use super::connection::Path;
+use super::core::{Core, Told};
+use super::packet::{self, Datagram, NO_COOKIE};
+use crate::Identity;
+use crate::hello::Hello;
+
+/// Most datagrams that leave because of one that came.
+const MOST: usize = 4096;
+
+/// An endpoint with peers at a few addresses.
+pub struct Datagrams {
+    core: Core,
+    dispatched: u64,
+    concluded: BTreeMap<AttemptId, Conclusion>,
+    tickets: Vec<Ticket>,
+    /// What each address was told last: a cookie, and the number of the connection with it.
+    cookies: BTreeMap<SocketAddr, packet::Cookie>,
+    numbers: BTreeMap<SocketAddr, u64>,
+    /// Addresses that have brought back a cookie, or that this side has written to first.
+    proved: BTreeSet<SocketAddr>,
+}
+
+/// A datagram as a peer writes it.
+#[derive(Debug, Clone, Copy)]
+pub enum Written<'a> {
+    /// These bytes.
+    Raw(&'a [u8]),
+    /// A hello of this service, with the cookie that its address was given last, or without one.
+    Hello {
+        /// Its number of the connection.
+        initiator: u64,
+        /// Whether it brings back the cookie.
+        cookie: bool,
+        /// Its incarnation and the number of its connection.
+        service: (u64, u64),
+    },
+    /// The answers to a hello of this side: a cookie, a welcome, or a refusal.
+    Cookie,
+    /// See [`Written::Cookie`].
+    Welcome {
+        /// The incarnation of the service that answers.
+        service: u64,
+    },
+    /// See [`Written::Cookie`].
+    Refused,
+    /// The connection is not known.
+    Unknown(u64),
+    /// A packet of the connection with this address, or of any other.
+    Data {
+        /// Whether it is for that connection.
+        known: bool,
+        /// Number of the packet.
+        number: u64,
+        /// Its frames.
+        frames: &'a [u8],
+    },
+}
+
+fn address(peer: u8) -> SocketAddr {
+    SocketAddr::from(([192, 0, 2, 10 + peer % 4], 7788))
+}
+
+fn path(peer: u8) -> Path {
+    Path {
+        socket: 1,
+        remote: address(peer),
+        local: None,
+    }
+}
+
+fn hello(service: u64, serial: u64) -> Hello {
+    Hello {
+        identity: Identity {
+            name: "peer".into(),
+            incarnation: Incarnation::from_u64(service),
+            domain: "default".into(),
+            host: "there".into(),
+        },
+        max_letter: 60_000,
+        max_in_flight: 100,
+        serial,
+        dialled: "0123456789abcdef".into(),
+        listening: vec![address(0).to_string()],
+    }
+}
+
+impl Datagrams {
+    /// An endpoint whose random numbers follow from the seed.
+    #[must_use]
+    pub fn new(seed: u64, now: Instant) -> Self {
+        let mut random = seed;
+        let draw = move || {
+            // SplitMix64.
+            random = random.wrapping_add(0x9e37_79b9_7f4a_7c15);
+            let mixed = (random ^ (random >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+            (mixed ^ (mixed >> 27)).max(1)
+        };
+        let identity = hello(1, 0).identity;
+        let limits = UdpLimits {
+            max_connections: 8,
+            max_in_flight: 8,
+            max_incoming: 200_000,
+            max_incoming_per_source: 100_000,
+            ..UdpLimits::default()
+        };
+        let listening = vec!["192.0.2.1:7788".to_owned()];
+        Self {
+            core: Core::new(identity, limits, listening, Box::new(draw), now),
+            dispatched: 0,
+            concluded: BTreeMap::new(),
+            tickets: Vec::new(),
+            cookies: BTreeMap::new(),
+            numbers: BTreeMap::new(),
+            proved: BTreeSet::new(),
+        }
+    }
+
+    /// A datagram of this peer arrives. An address that has proved nothing is told less than it has
+    /// written.
+    pub fn arrive(&mut self, peer: u8, written: Written<'_>, listening: bool, now: Instant) {
+        let from = address(peer);
+        let cookie = self.cookies.get(&from).copied();
+        let number = self.numbers.get(&from).copied().unwrap_or(1);
+        let bytes = match written {
+            Written::Raw(bytes) => bytes.to_vec(),
+            Written::Hello {
+                initiator,
+                cookie: brings,
+                service: (service, serial),
+            } => {
+                let cookie = cookie.filter(|_| brings).unwrap_or(NO_COOKIE);
+                packet::hello(initiator, &cookie, &hello(service, serial))
+            }
+            Written::Cookie => packet::cookie_for(number, &[7; 16]),
+            Written::Welcome { service } => packet::welcome(number, 5, &hello(service, 0)),
+            Written::Refused => packet::refused(number),
+            Written::Unknown(number) => packet::unknown(number),
+            Written::Data {
+                known,
+                number: packet,
+                frames,
+            } => {
+                let mut bytes = Vec::new();
+                packet::put_data(&mut bytes, if known { number } else { packet }, packet);
+                bytes.extend_from_slice(frames);
+                bytes
+            }
+        };
+        let before = self.flush(now);
+        assert!(before.is_empty() || !before.contains_key(&from) || self.proved.contains(&from));
+        self.core
+            .handle_datagram(now, path(peer), listening, &bytes);
+        for (to, len) in self.flush(now) {
+            assert!(
+                self.proved.contains(&to) || (to == from && len <= bytes.len()),
+                "{len} bytes to {to} for {} of {from}",
+                bytes.len()
+            );
+        }
+    }
+
+    /// This side sends a parcel to this peer.
+    pub fn send(&mut self, peer: u8, service: u64, parcel: &Parcel, now: Instant) {
+        let Ok(to) = Location::new(Kind::Udp, &address(peer).to_string()) else {
+            return;
+        };
+        let to = to.with_incarnation(Incarnation::from_u64(service));
+        let attempt = AttemptId(self.dispatched);
+        let Ok(fresh) = self.core.dispatch(now, attempt, &to, parcel) else {
+            return;
+        };
+        self.dispatched += 1;
+        self.proved.insert(address(peer));
+        if let Some(fresh) = fresh {
+            self.core.begin(now, fresh, vec![path(peer)]);
+        }
+        self.flush(now);
+    }
+
+    /// This side answers one of the parcels that arrived.
+    pub fn answer(&mut self, pick: usize, answer: &Answer, now: Instant) {
+        if !self.tickets.is_empty() {
+            let ticket = self.tickets.swap_remove(pick % self.tickets.len());
+            self.core.answer(now, ticket, answer);
+            self.flush(now);
+        }
+    }
+
+    /// Time passes; what is due happens when it is.
+    pub fn pass(&mut self, now: &mut Instant, time: Duration) {
+        let until = *now + time;
+        let mut steps = 0;
+        while let Some(due) = self.core.poll_timeout().filter(|due| *due <= until) {
+            steps += 1;
+            assert!(steps < 100_000, "time stands still");
+            *now = due.max(*now);
+            self.core.handle_timeout(*now);
+            self.flush(*now);
+        }
+        *now = until;
+    }
+
+    /// The endpoint ends: every attempt has its conclusion then.
+    pub fn close(&mut self, now: Instant) {
+        self.core.close();
+        self.flush(now);
+        for attempt in (0..self.dispatched).map(AttemptId) {
+            assert!(self.concluded.contains_key(&attempt), "{attempt:?}");
+        }
+    }
+
+    /// Takes what leaves, and says how many bytes go to each address.
+    fn flush(&mut self, now: Instant) -> BTreeMap<SocketAddr, usize> {
+        let mut bytes = BTreeMap::new();
+        let mut count = 0;
+        loop {
+            while let Some(told) = self.core.poll_event() {
+                match told {
+                    Told::Arrived { ticket, .. } => self.tickets.push(ticket),
+                    Told::Concluded(attempt, conclusion) => {
+                        assert!(attempt.0 < self.dispatched);
+                        let twice = self.concluded.insert(attempt, conclusion);
+                        assert_eq!(twice, None, "{attempt:?} is concluded twice");
+                    }
+                    Told::Introduced(peer) => {
+                        let service = peer.hop.location.incarnation();
+                        assert_ne!(
+                            service,
+                            Incarnation::from_u64(1),
+                            "it is this service itself"
+                        );
+                    }
+                    Told::Parted(_) => {}
+                }
+            }
+            let Some(transmit) = self.core.poll_transmit(now) else {
+                if self.core.has_events() {
+                    continue;
+                }
+                return bytes;
+            };
+            count += 1;
+            assert!(
+                count < MOST,
+                "one datagram makes this side send without end"
+            );
+            let to = transmit.path.remote;
+            match Datagram::read(&transmit.contents) {
+                Some(Datagram::Cookie { cookie, .. }) => drop(self.cookies.insert(to, cookie)),
+                Some(Datagram::Welcome { acceptor, .. }) => {
+                    self.proved.insert(to);
+                    self.numbers.insert(to, acceptor);
+                    // A welcome is no larger than the hello that it answers.
+                    assert!(transmit.contents.len() <= packet::BASE);
+                    continue;
+                }
+                Some(Datagram::Hello { initiator, .. }) => drop(self.numbers.insert(to, initiator)),
+                Some(_) => {}
+                None => panic!("what leaves is no datagram of this protocol"),
+            }
+            *bytes.entry(to).or_default() += transmit.contents.len();
+        }
+    }
+}
