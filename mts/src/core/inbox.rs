@@ -115,7 +115,7 @@ impl Inbox {
             return Answer::Busy;
         }
         if let Some(gate) = gate
-            && let Err(why) = gate.admits(now, &self.name, &letter, link_of(via, &from))
+            && let Err(why) = gate.admits(now, &self.name, &letter, link_of(via, from))
         {
             return Answer::failed(FailureReason::Refused, why);
         }
