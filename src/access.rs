@@ -5,16 +5,20 @@
 //!
 //! What must not live here: whether a sender is who it says (`fipa_transport_net::secure`).
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap, VecDeque};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use fipa_mts::Source;
 use fipa_sds::Matcher;
 use fipa_transport::Allowance;
 
 use crate::config;
 
-/// Senders whose rate is remembered. When there are more who all send, new ones wait.
-const MAX_SENDERS: usize = 4096;
+/// Senders whose rate is remembered, of all sources. When there are more, the source with the most
+/// senders loses the one that it brought first: a source that invents names makes this process forget
+/// its own senders only.
+const MAX_SENDERS: usize = 8192;
 
 /// What a letter says of itself.
 #[derive(Debug, Clone, Copy)]
@@ -51,7 +55,27 @@ pub(crate) struct Access {
     allow: Vec<Rule>,
     /// Letters a second; none: any number.
     rate: Option<f64>,
-    senders: HashMap<String, Sender>,
+    senders: Senders,
+}
+
+/// The senders of each source, bounded.
+#[derive(Debug, Default)]
+struct Senders {
+    sources: HashMap<Source, OfSource>,
+    /// The number of senders of each source.
+    sizes: BTreeSet<(usize, Source)>,
+    /// All senders.
+    len: usize,
+    /// When silent senders were last looked for.
+    swept: Option<Instant>,
+}
+
+/// The senders of one source.
+#[derive(Debug, Default)]
+struct OfSource {
+    senders: HashMap<Arc<str>, Sender>,
+    /// In the order in which they were first heard.
+    order: VecDeque<Arc<str>>,
 }
 
 /// One receiver of one line.
@@ -90,7 +114,7 @@ impl Access {
             deny,
             allow,
             rate: (config.rate > 0).then_some(config.rate as f64),
-            senders: HashMap::new(),
+            senders: Senders::default(),
         }))
     }
 
@@ -105,28 +129,82 @@ impl Access {
         Ok(())
     }
 
-    /// Counts a letter that may pass by the rules, if its sender may send one more.
-    pub(crate) fn count(&mut self, sender: &str, now: Instant) -> Result<(), Refusal> {
+    /// Counts a letter that may pass by the rules, if its sender may send one more by this source.
+    pub(crate) fn count(
+        &mut self,
+        source: Source,
+        sender: &str,
+        now: Instant,
+    ) -> Result<(), Refusal> {
         let Some(rate) = self.rate else {
             return Ok(());
         };
-        if let Some(sender) = self.senders.get_mut(sender) {
-            return sender.take(rate, now);
-        }
-        if self.senders.len() >= MAX_SENDERS {
-            // Whoever has been silent for a second is as good as new.
-            self.senders
-                .retain(|_, it| !is_over(it.allowance.asked(), now));
-            if self.senders.len() >= MAX_SENDERS {
-                return Err(Refusal::TooMany { told: true });
+        self.senders.of(source, sender, rate, now).take(rate, now)
+    }
+}
+
+impl Senders {
+    /// What this sender may still send by this source.
+    fn of(&mut self, source: Source, sender: &str, rate: f64, now: Instant) -> &mut Sender {
+        let known = self.sources.get(&source);
+        if !known.is_some_and(|known| known.senders.contains_key(sender)) {
+            if self.len >= MAX_SENDERS {
+                self.make_room(now);
             }
+            let known = self.sources.entry(source).or_default();
+            known.order.push_back(sender.into());
+            let before = known.order.len() - 1;
+            self.sizes.remove(&(before, source));
+            self.sizes.insert((before + 1, source));
+            self.len += 1;
         }
-        let sender = self.senders.entry(sender.to_owned());
-        let sender = sender.or_insert_with(|| Sender {
+        let known = self.sources.entry(source).or_default();
+        let fresh = || Sender {
             allowance: Allowance::new(rate, now),
             told: None,
+        };
+        known.senders.entry(sender.into()).or_insert_with(fresh)
+    }
+
+    /// Forgets the senders that were silent for a second, which may send as much as new ones. If there
+    /// are none, the first sender of the source with the most is forgotten.
+    fn make_room(&mut self, now: Instant) {
+        if self.swept.is_none_or(|swept| is_over(swept, now)) {
+            self.swept = Some(now);
+            self.sweep(now);
+        }
+        if self.len < MAX_SENDERS {
+            return;
+        }
+        let Some((size, source)) = self.sizes.pop_last() else {
+            return;
+        };
+        if let Some(known) = self.sources.get_mut(&source)
+            && let Some(first) = known.order.pop_front()
+        {
+            known.senders.remove(&first);
+            self.len -= 1;
+        }
+        if size > 1 {
+            self.sizes.insert((size - 1, source));
+        } else {
+            self.sources.remove(&source);
+        }
+    }
+
+    fn sweep(&mut self, now: Instant) {
+        self.sources.retain(|_, known| {
+            let is_recent = |it: &Sender| !is_over(it.allowance.asked(), now);
+            known.senders.retain(|_, it| is_recent(it));
+            let OfSource { senders, order } = known;
+            order.retain(|sender| senders.contains_key(sender));
+            !order.is_empty()
         });
-        sender.take(rate, now)
+        let sizes = self.sources.iter();
+        self.sizes = sizes
+            .map(|(source, known)| (known.order.len(), *source))
+            .collect();
+        self.len = self.sizes.iter().map(|(size, _)| size).sum();
     }
 }
 
@@ -269,19 +347,45 @@ mod tests {
         }
     }
 
+    const ROVER: Source = Source::Certificate([1; 32]);
+    const CREX: Source = Source::Certificate([2; 32]);
+    const TOLD: Result<(), Refusal> = Err(Refusal::TooMany { told: true });
+
     #[test]
-    fn senders_that_are_remembered_are_bounded_and_forgotten() {
-        let mut access = access(&[], &[], 5);
+    fn invented_senders_displace_those_of_the_same_source_only() {
+        let mut access = access(&[], &[], 2);
         let now = Instant::now();
-        for number in 0..MAX_SENDERS {
-            let name = format!("agent{number}");
-            assert_eq!(access.count(&name, now), Ok(()));
+        for _ in 0..2 {
+            assert_eq!(access.count(ROVER, "rover", now), Ok(()));
         }
-        let too_many = Err(Refusal::TooMany { told: true });
-        assert_eq!(access.count("one more", now), too_many);
+        for number in 0..3 * MAX_SENDERS {
+            let name = format!("agent{number}");
+            assert_eq!(access.count(CREX, &name, now), Ok(()));
+        }
+        assert_eq!(access.senders.len, MAX_SENDERS);
+        // It is still remembered, and others of its host are served.
+        assert_eq!(access.count(ROVER, "rover", now), TOLD);
+        assert_eq!(access.count(ROVER, "arm", now), Ok(()));
+        // Many sources with one name each are one more than the source with two.
+        for number in 0..MAX_SENDERS as u64 {
+            let source = Source::Process(fipa_transport::Incarnation::from_u64(number + 1));
+            assert_eq!(access.count(source, "agent", now), Ok(()));
+        }
+        let of = |source| access.senders.sources.get(&source).map(|it| it.order.len());
+        assert!(of(CREX).is_none_or(|left| left <= 1), "{:?}", of(CREX));
         let later = now + Duration::from_secs(1);
-        assert_eq!(access.count("one more", later), Ok(()));
-        assert_eq!(access.senders.len(), 1);
+        assert_eq!(access.count(ROVER, "one more", later), Ok(()));
+        assert_eq!(access.senders.len, 1, "the silent ones are forgotten");
+        assert_eq!(access.senders.sizes.len(), 1);
+    }
+
+    #[test]
+    fn a_name_that_another_source_uses_up_is_not_used_up() {
+        let mut access = access(&[], &[], 1);
+        let now = Instant::now();
+        assert_eq!(access.count(CREX, "rover", now), Ok(()));
+        assert_eq!(access.count(CREX, "rover", now), TOLD);
+        assert_eq!(access.count(ROVER, "rover", now), Ok(()));
     }
 
     #[test]
@@ -290,13 +394,13 @@ mod tests {
         let begun = Instant::now();
         let at = |ms| begun + Duration::from_millis(ms);
         let said: Vec<_> = [0, 0, 0, 100, 600, 700, 1100, 1100]
-            .map(|ms| access.count("rover", at(ms)))
+            .map(|ms| access.count(ROVER, "rover", at(ms)))
             .into();
         let refused = |told| Err(Refusal::TooMany { told });
         let (first, more) = (refused(true), refused(false));
         let all = [Ok(()), Ok(()), first, more, Ok(()), more, Ok(()), first];
         assert_eq!(said, all);
-        assert_eq!(access.count("crex", at(1100)), Ok(()));
+        assert_eq!(access.count(ROVER, "crex", at(1100)), Ok(()));
     }
 
     #[test]

@@ -75,7 +75,7 @@ impl Door {
                 let mut access = self.access.lock();
                 access
                     .judge(&claim)
-                    .and_then(|()| access.count(sender, now))
+                    .and_then(|()| access.count(link.source, sender, now))
             }
         };
         let gateway = self.gateway_on(link);
@@ -161,6 +161,7 @@ mod tests {
     use fipa_acl::{
         AclRepresentation, AgentId, Envelope, EnvelopeParams, Message, Performative, Received, Time,
     };
+    use fipa_mts::Source;
     use fipa_sds::{HostConfig, Mts, Registration};
     use fipa_transport::{Incarnation, Kind};
 
@@ -218,19 +219,30 @@ mod tests {
 
     const GATEWAY: Incarnation = Incarnation::from_u64(0x6a7e);
 
+    /// The source of the letters of a service on this host.
+    fn source_by(via: Kind, service: Incarnation) -> Source {
+        match via.is_host_local() {
+            true => Source::Process(service),
+            false => Source::at(std::net::Ipv4Addr::LOCALHOST.into()),
+        }
+    }
+
     /// A link with the gateway.
     fn gateway_by(via: Kind) -> Link {
         Link {
             via,
             service: GATEWAY,
+            source: source_by(via, GATEWAY),
         }
     }
 
     /// A link with a process that is not the gateway.
     fn process_by(via: Kind) -> Link {
+        let service = Incarnation::from_u64(0x9);
         Link {
             via,
-            service: Incarnation::from_u64(0x9),
+            service,
+            source: source_by(via, service),
         }
     }
 

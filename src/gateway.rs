@@ -118,6 +118,7 @@ impl Gateway {
             known: Arc::clone(&known),
             contacts: Arc::clone(&contacts.directory),
             service: Arc::clone(&gateway.service),
+            has_keys: !config.security.keys.is_empty(),
             only_loopback: speaks_on_loopback_only(config),
         });
         // From now on, who writes becomes known on this host before its letter arrives there.
@@ -152,6 +153,7 @@ impl Gateway {
             neighbours: Arc::clone(&self.neighbours),
             view: Arc::clone(&self.view),
             exchange: Arc::clone(&self.exchange),
+            notices: Mutex::default(),
         };
         self.tasks.push(tokio::spawn(clerk.run()));
         let exchange = Arc::clone(&self.exchange);
@@ -170,6 +172,7 @@ impl Gateway {
             id,
             neighbours: Arc::clone(&self.neighbours),
             network: self.network.clone(),
+            has_keys: !self.config.security.keys.is_empty(),
         })
     }
 

@@ -1,9 +1,10 @@
 //! Who says which letters are taken.
 
+use std::net::{IpAddr, Ipv4Addr};
 use std::time::Instant;
 
 use fipa_acl::Letter;
-use fipa_transport::{Incarnation, Kind};
+use fipa_transport::{Hop, Incarnation, Kind, Principal};
 
 /// The link on which a letter came.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -13,6 +14,57 @@ pub struct Link {
     /// The service at its other end, as it introduced itself on this link; unknown for a legacy
     /// peer. Only on a [host-local](Kind::is_host_local) link is that a process of this user.
     pub service: Incarnation,
+    /// The party that sent the letter, as far as the link proves it.
+    pub source: Source,
+}
+
+/// The party at the other end of a link, as far as the link proves it. What a party sends is counted for
+/// it, whatever names the letters have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Source {
+    /// The service with this incarnation in a process of this user on this host.
+    Process(Incarnation),
+    /// The services with the key of the certificate with this SHA-256 fingerprint.
+    Certificate([u8; 32]),
+    /// The services at this address, which have proved nothing else: of IPv6 the network of 64 bits, and
+    /// of loopback 127.0.0.1. None if the link has no such address.
+    Address(Option<IpAddr>),
+}
+
+impl Source {
+    /// The source of what this service hands over.
+    #[must_use]
+    pub fn of(hop: &Hop) -> Self {
+        match hop.principal {
+            Principal::Host => Self::Process(hop.location.incarnation()),
+            Principal::Certificate(fingerprint) => Self::Certificate(fingerprint),
+            Principal::Unproved => {
+                let address = hop.location.address();
+                let host = address.rsplit_once(':').map_or(address, |(host, _)| host);
+                let host = host.trim_matches(['[', ']']);
+                let host = host.split_once('%').map_or(host, |(host, _)| host);
+                Self::Address(host.parse().ok().map(network_of))
+            }
+        }
+    }
+
+    /// The source of what comes from this address without proof.
+    #[must_use]
+    pub fn at(address: IpAddr) -> Self {
+        Self::Address(Some(network_of(address)))
+    }
+}
+
+/// The address that stands for all addresses of one host.
+fn network_of(address: IpAddr) -> IpAddr {
+    match address.to_canonical() {
+        ip if ip.is_loopback() => IpAddr::V4(Ipv4Addr::LOCALHOST),
+        IpAddr::V6(v6) if !v6.is_unicast_link_local() => {
+            let network = u128::from(v6) & !u128::from(u64::MAX);
+            IpAddr::V6(network.into())
+        }
+        ip => ip,
+    }
 }
 
 /// Who says which letters are taken: by an agent of this service, or into a gateway's custody.
@@ -30,4 +82,37 @@ pub trait Gate: Send + Sync {
         letter: &Letter,
         link: Link,
     ) -> Result<(), String>;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn source(location: &str, principal: Principal) -> Source {
+        let location: fipa_transport::Location = location.parse().unwrap();
+        let location = location.with_incarnation(Incarnation::from_u64(7));
+        Source::of(&Hop {
+            location,
+            principal,
+        })
+    }
+
+    #[test]
+    fn a_source_is_what_the_link_proves() {
+        let unproved = |location| source(location, Principal::Unproved);
+        let at = |ip: &str| Source::at(ip.parse().unwrap());
+        assert_eq!(unproved("tcp://192.0.2.1:7"), at("192.0.2.1"));
+        assert_eq!(unproved("udp://192.0.2.1:8"), at("192.0.2.1"));
+        // Every host has many addresses of one network.
+        assert_eq!(unproved("tcp://[2001:db8::1]:7"), at("2001:db8::ffff"));
+        assert_ne!(unproved("tcp://[fe80::1]:7"), at("fe80::2"));
+        assert_eq!(unproved("tcp://127.0.0.9:7"), at("::1"));
+        let key = Principal::Certificate([1; 32]);
+        assert_eq!(
+            source("tcp://192.0.2.1:7", key),
+            source("quic://192.0.2.9:7", key)
+        );
+        let process = source("shm://here", Principal::Host);
+        assert_eq!(process, Source::Process(Incarnation::from_u64(7)));
+    }
 }

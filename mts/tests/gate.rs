@@ -7,7 +7,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use fipa_acl::{AgentId, Letter, Message, Performative};
 use fipa_mts::core::{Action, Core, CoreConfig, Now};
-use fipa_mts::{Gate, Link, letter_for};
+use fipa_mts::{Gate, Link, Source, letter_for};
 use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
     Answer, Arrival, Body, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Principal,
@@ -26,6 +26,7 @@ impl Gate for Guarded {
     fn admits(&self, _: Instant, receiver: &str, _: &Letter, link: Link) -> Result<(), String> {
         assert_eq!(link.via, Kind::Shm);
         assert_eq!(link.service, Incarnation::from_u64(1), "the other end");
+        assert_eq!(link.source, Source::Process(Incarnation::from_u64(1)));
         self.0.lock().push(receiver.to_owned());
         match receiver {
             "brake" => Err("hands off".to_owned()),

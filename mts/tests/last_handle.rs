@@ -10,7 +10,7 @@ use fipa_mts::{Contacts, Mts, RuntimeConfig};
 use fipa_sds::MemoryDirectory;
 use fipa_transport::{
     Abandoned, Answer, AttemptId, Hop, Incarnation, Introduction, Kind, ListenError, Location,
-    Parcel, Principal, Sink, Ticket, Transport, WayError, WayFault,
+    Mandate, Parcel, Principal, Sink, Ticket, Transport, WayError, WayFault,
 };
 use parking_lot::Mutex;
 
@@ -125,6 +125,7 @@ fn no_transport_is_closed_from_within_a_call_of_its_own() {
             principal: Principal::Unproved,
         },
         dialled: None,
+        mandate: Mandate::Unproved,
     };
 
     let caller = thread::spawn(move || transport.call(&introduction));

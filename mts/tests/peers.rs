@@ -10,8 +10,8 @@ use fipa_mts::core::{Action, Core, CoreConfig, Now, Peer, Submission};
 use fipa_mts::letter_for;
 use fipa_sds::{Directory as _, MemoryDirectory, Mts, Registration};
 use fipa_transport::{
-    Answer, AttemptId, Body, Conclusion, Hop, Incarnation, Introduction, Kind, Location, Principal,
-    WayError, WayFault,
+    Answer, AttemptId, Body, Conclusion, Hop, Incarnation, Introduction, Kind, Location, Mandate,
+    Principal, WayError, WayFault,
 };
 
 struct Bench {
@@ -122,6 +122,7 @@ fn who_answers_is_asked_seldom_and_at_once_when_the_connection_ends() {
             principal: Principal::Unproved,
         },
         dialled: Some(location),
+        mandate: Mandate::Unproved,
     };
     bench.core.handle_parted(bench.now, &parted);
     assert_eq!(bench.wait(), Duration::ZERO);

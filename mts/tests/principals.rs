@@ -11,7 +11,7 @@ use fipa_mts::letter_for;
 use fipa_sds::{ContactDirectory, Directory, MemoryDirectory, MergedDirectory, Mts, Registration};
 use fipa_transport::{
     Answer, Arrival, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction, Kind,
-    Location, Outcome, Parcel, Principal, Report, Stream, Ticket, Verdict,
+    Location, Mandate, Outcome, Parcel, Principal, Report, Stream, Ticket, Verdict,
 };
 
 const GATEWAY: Incarnation = Incarnation::from_u64(1);
@@ -80,6 +80,7 @@ impl Bench {
                 name: name.into(),
                 hop: link(peer, peer),
                 dialled: None,
+                mandate: Mandate::Unproved,
             };
             core.handle_introduced(now, &introduction);
         }

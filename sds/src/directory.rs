@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use fipa_transport::{Forked, Incarnation};
+use fipa_transport::{Forked, Incarnation, Mandate};
 
 use crate::{Entry, EntryError, Query, Registration, Subscriber, Watch};
 
@@ -100,6 +100,15 @@ pub trait Directory: Send + Sync {
     fn speaks_for(&self, mts: Incarnation) -> bool {
         let _ = mts;
         false
+    }
+
+    /// The agents that the message transport service of this incarnation may speak for, as far as
+    /// this back end knows a link that proves it. What this back end tells of that service is proved.
+    /// A [merged view](crate::MergedDirectory) prefers it to what is not, and leaves out entries of
+    /// other back ends with this service that the mandate does not cover.
+    fn mandate(&self, mts: Incarnation) -> Mandate {
+        let _ = mts;
+        Mandate::Unproved
     }
 }
 

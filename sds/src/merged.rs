@@ -4,10 +4,11 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use arc_swap::ArcSwapOption;
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, Mandate};
 
 use crate::{
-    Change, DeregisterError, Directory, Entry, RegisterError, Registration, Role, Subscriber, Watch,
+    Change, DeregisterError, Directory, Entry, Reach, RegisterError, Registration, Role, Source,
+    Subscriber, Watch,
 };
 
 /// Several directories as one.
@@ -17,6 +18,10 @@ use crate::{
 /// message transport services, because the agent's one was started anew: then it is that of a
 /// directory that [speaks](Directory::speaks_for) for the service. Registrations go to the first
 /// directory that can be written.
+///
+/// Where a link proves a service, its directory has a [mandate](Directory::mandate) of it. A proved entry
+/// precedes all unproved ones of other hosts except those of the configuration. Entries of a service
+/// that its mandate does not cover are not seen, whichever directory has them.
 pub struct MergedDirectory {
     back_ends: BackEnds,
     sorted: ArcSwapOption<Sorted>,
@@ -128,6 +133,10 @@ impl Directory for MergedDirectory {
         self.back_ends.iter().any(|one| one.speaks_for(mts))
     }
 
+    fn mandate(&self, mts: Incarnation) -> Mandate {
+        mandate(&self.back_ends, mts)
+    }
+
     fn register(&self, registration: Registration) -> Result<Arc<Entry>, RegisterError> {
         if let Some(holder) = self.lookup(&registration.name)
             && holder.incarnation != registration.incarnation
@@ -186,14 +195,45 @@ impl Claim {
         };
         match is_moved {
             true => speaks(self) && !speaks(before),
+            false if self.outranks(before, back_ends) => true,
+            false if before.outranks(self, back_ends) => false,
             false => new.precedes(old),
         }
     }
+
+    /// Whether this comes before that whatever times are claimed: it is on another host as that is, and
+    /// proved or of the configuration.
+    fn outranks(&self, other: &Self, back_ends: &[Arc<dyn Directory>]) -> bool {
+        if self.entry.reach == Reach::Local || other.entry.reach == Reach::Local {
+            return false;
+        }
+        let is_static = |claim: &Self| claim.entry.source == Source::Static;
+        let is_proved = |claim: &Self| claim.is_proved(back_ends);
+        match is_proved(self) {
+            true => !is_proved(other) && !is_static(other),
+            false => is_static(self) && is_proved(other),
+        }
+    }
+
+    fn is_proved(&self, back_ends: &[Arc<dyn Directory>]) -> bool {
+        let back_end = back_ends.get(self.at);
+        back_end.is_some_and(|it| it.mandate(self.entry.mts.incarnation).is_proved())
+    }
 }
 
-/// Whether what that back end says counts: of coalitions, what the one that
+/// The mandate of the service, of the first directory that has one.
+fn mandate(back_ends: &[Arc<dyn Directory>], mts: Incarnation) -> Mandate {
+    let mut mandates = back_ends.iter().map(|one| one.mandate(mts));
+    mandates.find(Mandate::is_proved).unwrap_or_default()
+}
+
+/// Whether what that back end says counts: of services with a mandate, what that covers; of coalitions, what the one that
 /// [speaks](Directory::speaks_for) for their message transport service says.
 fn counts(back_ends: &[Arc<dyn Directory>], at: usize, entry: &Entry) -> bool {
+    let is_agent = entry.reach != Reach::Local && entry.role != Role::Gateway;
+    if is_agent && !mandate(back_ends, entry.mts.incarnation).speaks_for(&entry.name) {
+        return false;
+    }
     if !matches!(entry.role, Role::Coalition(_)) {
         return true;
     }

@@ -1,6 +1,6 @@
 //! The index behind the back ends: who claims which name, and who has it.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::hash::Hash;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -40,7 +40,9 @@ macro_rules! reads_its_table {
 }
 
 /// Entries by the origin that claims them (a process, a record). When several claim one name, the
-/// entry that [precedes](Entry::precedes) has it, and the others wait for it to leave.
+/// entry that [precedes](Entry::precedes) has it, and the others wait for it to leave. Origins that are
+/// proved come before all others, in the order in which they claimed the name: the times that they
+/// state do not count.
 #[derive(Debug)]
 pub(crate) struct Table<O> {
     index: RwLock<Index<O>>,
@@ -53,6 +55,9 @@ pub(crate) struct Table<O> {
 struct Index<O> {
     /// Never an empty list; who has the name stands first.
     claims: HashMap<Arc<str>, Vec<(O, Arc<Entry>)>>,
+    /// The names that more than one proved origin claims.
+    contested: BTreeSet<Arc<str>>,
+    is_proved: fn(&O) -> bool,
     incarnations: HashMap<Incarnation, Arc<Entry>>,
     /// What origins of one entry each have said last.
     #[cfg(feature = "mdns")]
@@ -67,9 +72,16 @@ struct Sorted {
 
 impl<O: Clone + Eq + Hash> Table<O> {
     pub(crate) fn new() -> Self {
+        Self::proved_by(|_| false)
+    }
+
+    /// A table in which some origins are proved.
+    pub(crate) fn proved_by(is_proved: fn(&O) -> bool) -> Self {
         Self {
             index: RwLock::new(Index {
                 claims: HashMap::new(),
+                contested: BTreeSet::new(),
+                is_proved,
                 incarnations: HashMap::new(),
                 #[cfg(feature = "mdns")]
                 origins: HashMap::new(),
@@ -112,6 +124,27 @@ impl<O: Clone + Eq + Hash> Table<O> {
             entries: Arc::clone(&entries),
         })));
         entries
+    }
+
+    /// The names that more than one proved origin claims, at most so many: the entry that has the name,
+    /// and each of the others.
+    pub(crate) fn contested(&self, most: usize) -> Vec<(Arc<Entry>, Arc<Entry>)> {
+        let index = self.index.read();
+        let names = index.contested.iter();
+        let claims = names.filter_map(|name| index.claims.get(name)?.split_first());
+        let pairs = claims.flat_map(|((_, holder), others)| {
+            let proved = others
+                .iter()
+                .filter(|(origin, _)| (index.is_proved)(origin));
+            proved.map(|(_, other)| (Arc::clone(holder), Arc::clone(other)))
+        });
+        pairs.take(most).collect()
+    }
+
+    /// What the entries mean to a view of several directories has changed.
+    pub(crate) fn tell_all(&self) {
+        let _index = self.index.write();
+        self.tell(Some(Change::Lagged));
     }
 
     pub(crate) fn generation(&self) -> u64 {
@@ -237,14 +270,34 @@ impl<O: Eq> Index<O> {
     }
 
     fn set(&mut self, origin: O, name: &Arc<str>, entry: Option<Arc<Entry>>) {
+        let is_proved = self.is_proved;
         let mut claims = self.claims.remove(name).unwrap_or_default();
-        claims.retain(|(of, _)| *of != origin);
+        let before = claims.iter().position(|(of, _)| *of == origin);
+        if let Some(before) = before {
+            claims.remove(before);
+        }
+        let proved = |claims: &[(O, Arc<Entry>)]| {
+            let mut origins = claims.iter().map(|(of, _)| of);
+            origins
+                .position(|of| !is_proved(of))
+                .unwrap_or(claims.len())
+        };
+        let first_unproved = proved(&claims);
         if let Some(entry) = entry {
-            let place = claims
-                .iter()
-                .position(|(_, other)| entry.precedes(other))
-                .unwrap_or(claims.len());
+            let place = match is_proved(&origin) {
+                true => before.unwrap_or(first_unproved),
+                false => {
+                    let mut unproved = claims.iter().skip(first_unproved);
+                    let place = unproved.position(|(_, other)| entry.precedes(other));
+                    place.map_or(claims.len(), |place| first_unproved + place)
+                }
+            };
             claims.insert(place, (origin, entry));
+        }
+        if proved(&claims) > 1 {
+            self.contested.insert(name.clone());
+        } else if !self.contested.is_empty() {
+            self.contested.remove(name);
         }
         if !claims.is_empty() {
             self.claims.insert(name.clone(), claims);

@@ -8,7 +8,9 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant, UNIX_EPOCH};
 
-use fipa_sds::{Change, Directory, Entry, Exchange, ExchangeError, Mts, Reach, Role, Source};
+use fipa_sds::{
+    Change, Directory, Entry, Exchange, ExchangeError, Mts, Present, Reach, Role, Source,
+};
 use fipa_transport::{Incarnation, Location};
 
 /// How long the simulated service tries to deliver a letter.
@@ -72,7 +74,9 @@ impl World {
         for index in 0..self.gateways.len() {
             let others = (0..self.gateways.len()).filter(|other| self.connected(index, *other));
             let present: Vec<_> = others
-                .map(|other| (self.gateways[other].mts.clone(), vec![location(other)]))
+                .map(|other| {
+                    Present::unproved(self.gateways[other].mts.clone(), vec![location(other)])
+                })
                 .collect();
             let now = self.now;
             self.gateways[index]
@@ -344,8 +348,8 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
 
     let new = Incarnation::from_u64(77);
     let at = location(0).with_incarnation(new);
-    let known = (world.gateways[0].mts.clone(), vec![location(0)]);
-    let restarted = (Mts::new("same-name-mts", new), vec![at]);
+    let known = Present::unproved(world.gateways[0].mts.clone(), vec![location(0)]);
+    let restarted = Present::unproved(Mts::new("same-name-mts", new), vec![at]);
     let told = br#"{"version":1,"tell":{"full":{"version":1,"first":true,"last":true,"agents":
         [{"name":"arm","type":"arm","id":"00000000000003e9","registered":1001}]}}}"#;
     let now = world.now;
@@ -362,7 +366,7 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     // The connection with the old one ends first: its entries stay until the new one has told its own.
     let newer = Incarnation::from_u64(78);
     let at = location(0).with_incarnation(newer);
-    let started_again = (Mts::new("same-name-mts", newer), vec![at]);
+    let started_again = Present::unproved(Mts::new("same-name-mts", newer), vec![at]);
     exchange.handle_neighbours(now, &[]);
     exchange.handle_neighbours(now, std::slice::from_ref(&started_again));
     assert_eq!(gateway(), Some(new));
@@ -373,7 +377,10 @@ fn another_incarnation_at_a_location_replaces_the_one_that_is_gone() {
     // The connection with the old one seems to be open, but it does not answer.
     let newest = Incarnation::from_u64(79);
     let at = location(0).with_incarnation(newest);
-    let both = [started_again, (Mts::new("same-name-mts", newest), vec![at])];
+    let both = [
+        started_again,
+        Present::unproved(Mts::new("same-name-mts", newest), vec![at]),
+    ];
     exchange.handle_neighbours(now, &both);
     let silent = location(0).with_incarnation(newer);
     assert!(!exchange.handle_silence(now, &silent));
@@ -416,7 +423,10 @@ fn what_was_told_too_early_is_asked_for() {
     let mut world = World::new(2, 6);
     world.join(0, "arm");
     let now = world.now;
-    let present = [(world.gateways[1].mts.clone(), vec![location(1)])];
+    let present = [Present::unproved(
+        world.gateways[1].mts.clone(),
+        vec![location(1)],
+    )];
     world.gateways[0].exchange.handle_neighbours(now, &present);
     world.run(Duration::from_millis(200));
     assert!(!world.agrees());
@@ -433,7 +443,7 @@ fn a_gateway_that_is_elsewhere_takes_its_agents_along() {
     world.run(Duration::from_millis(300));
     let elsewhere: Location = "tcp://10.0.0.99:1#0000000000000001".parse().unwrap();
     let (mts, now) = (world.gateways[0].mts.clone(), world.now);
-    let present = [(mts, vec![elsewhere.clone()])];
+    let present = [Present::unproved(mts, vec![elsewhere.clone()])];
     world.gateways[1].exchange.handle_neighbours(now, &present);
     let entry = world.gateways[1]
         .exchange
@@ -491,7 +501,7 @@ fn told(exchange: &mut Exchange, content: &str) -> Result<(), ExchangeError> {
 fn with_neighbour() -> Exchange {
     let mut exchange = Exchange::new(0);
     let mts = Mts::new("hostile", Incarnation::from_u64(7));
-    exchange.handle_neighbours(Instant::now(), &[(mts, vec![location(6)])]);
+    exchange.handle_neighbours(Instant::now(), &[Present::unproved(mts, vec![location(6)])]);
     exchange
 }
 
@@ -589,7 +599,7 @@ fn what_a_neighbour_can_tell_is_bounded() {
     // So many neighbours and no more.
     let crowd: Vec<_> = (0..2000)
         .map(|number| {
-            (
+            Present::unproved(
                 Mts::new("x", Incarnation::from_u64(number + 1)),
                 vec![location(0)],
             )

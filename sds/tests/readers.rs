@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 
 use fipa_sds::{
     Change, ContactDirectory, DeregisterError, Directory, Exchange, ExchangeDirectory, Matcher,
-    MemoryDirectory, MergedDirectory, Mts, Query, Reach, RegisterError, Registration, Resolution,
-    Source, StaticDirectory, resolve,
+    MemoryDirectory, MergedDirectory, Mts, Present, Query, Reach, RegisterError, Registration,
+    Resolution, Source, StaticDirectory, resolve,
 };
 use fipa_transport::{Incarnation, Location};
 
@@ -144,7 +144,7 @@ fn exchange() -> (Instant, Exchange, Arc<ExchangeDirectory>) {
     let (now, mut exchange) = (Instant::now(), Exchange::new(0));
     let gateways: Vec<_> = (1..=3)
         .map(|number| {
-            (
+            Present::unproved(
                 Mts::new("mts", Incarnation::from_u64(number)),
                 vec![location(number)],
             )

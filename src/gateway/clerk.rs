@@ -4,23 +4,29 @@
 //! Letters are told apart by their ontology. What nobody here understands is answered so, when an
 //! answer was asked for.
 
+use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 use std::error::Error;
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, Message, Performative};
+use fipa_acl::{AgentId, Message, Performative, escape};
 use fipa_mts::core::{Received, Submission};
 use fipa_mts::letter_for;
-use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Entry, Matcher, Query};
+use fipa_sds::{Directory, EXCHANGE_ONTOLOGY, Matcher, Query};
 use fipa_transport::Incarnation;
+use parking_lot::Mutex;
 
-use super::exchange::Exchanging;
+use super::exchange::{Exchanging, MANAGEMENT_ONTOLOGY};
 use super::neighbours::Neighbours;
 use crate::routes;
 use crate::service::Service;
 
 /// How long an answer may be under way.
 const ANSWER_DEADLINE: Duration = Duration::from_secs(5);
+
+/// Longest text of a notice that is logged, in characters.
+const MAX_NOTICE: usize = 1024;
 
 /// The agent that the gateway itself is.
 pub(crate) struct Clerk {
@@ -29,6 +35,8 @@ pub(crate) struct Clerk {
     pub(crate) neighbours: Arc<Neighbours>,
     pub(crate) view: Arc<dyn Directory>,
     pub(super) exchange: Arc<Exchanging>,
+    /// When a notice of each gateway was last logged.
+    pub(super) notices: Mutex<HashMap<Incarnation, Instant>>,
 }
 
 impl Clerk {
@@ -58,6 +66,12 @@ impl Clerk {
             let content = message.content().map(|content| &content[..]);
             return self.exchange.received(sender, content.unwrap_or_default());
         }
+        if message.ontology() == Some(MANAGEMENT_ONTOLOGY)
+            && *message.performative() == Performative::Failure
+            && received.service == sender
+        {
+            return self.log_notice(sender, message);
+        }
         let asked = matches!(
             message.performative(),
             Performative::Request
@@ -80,6 +94,26 @@ impl Clerk {
             _ => self.answer(message, sender, Performative::NotUnderstood, |answer| {
                 answer.content("the gateway does not know this ontology")
             }),
+        }
+    }
+
+    /// Another gateway tells the operator of this one about a name. One notice a second of each gateway
+    /// is logged.
+    fn log_notice(&self, gateway: Incarnation, message: &Message) {
+        let now = Instant::now();
+        let mut notices = self.notices.lock();
+        notices.retain(|_, told| now.saturating_duration_since(*told) < Duration::from_secs(1));
+        let all = self.neighbours.all();
+        let neighbour = all.iter().find(|it| it.entry.incarnation == gateway);
+        if let Some(neighbour) = neighbour
+            && let Entry::Vacant(place) = notices.entry(gateway)
+        {
+            place.insert(now);
+            let content = message.content().map(|content| &content[..]);
+            let text = String::from_utf8_lossy(content.unwrap_or_default());
+            let text: String = text.chars().take(MAX_NOTICE).collect();
+            let (gateway, notice) = (escape(&neighbour.entry.name), escape(&text));
+            tracing::warn!(%gateway, %notice, "another gateway tells of a name");
         }
     }
 
@@ -130,7 +164,7 @@ impl Clerk {
     }
 
     /// Sends a message in the gateway's name.
-    pub(crate) fn send(&self, message: &Message, to: &Entry) {
+    pub(crate) fn send(&self, message: &Message, to: &fipa_sds::Entry) {
         match letter_for(message, SystemTime::now()) {
             Ok(letter) => {
                 let submission = Submission {

@@ -7,11 +7,11 @@ use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_acl::{AgentId, Message, Performative};
+use fipa_acl::{AgentId, Message, Performative, escape};
 use fipa_mts::core::Submission;
 use fipa_mts::{Sending, letter_for};
 use fipa_sds::{
-    Directory, EXCHANGE_ONTOLOGY, Entry, Exchange, ExchangeDirectory, MergedDirectory, Mts,
+    Directory, EXCHANGE_ONTOLOGY, Entry, Exchange, ExchangeDirectory, MergedDirectory, Present,
 };
 use fipa_transport::{Incarnation, Location, WayFault};
 use parking_lot::Mutex;
@@ -30,7 +30,7 @@ const DEADLINE: Duration = Duration::from_secs(5);
 const GOODBYE_DEADLINE: Duration = Duration::from_millis(500);
 
 /// The ontology of messages about registrations (FIPA00023).
-const MANAGEMENT_ONTOLOGY: &str = "fipa-agent-management";
+pub(super) const MANAGEMENT_ONTOLOGY: &str = "fipa-agent-management";
 
 /// What neighbours have told, and what they are told.
 pub(super) struct Exchanging {
@@ -46,6 +46,8 @@ pub(super) struct Means {
     pub(super) id: AgentId,
     pub(super) neighbours: Arc<Neighbours>,
     pub(super) network: Option<Arc<dyn Network>>,
+    /// Whether `security.keys` is set.
+    pub(super) has_keys: bool,
 }
 
 impl Exchanging {
@@ -79,17 +81,18 @@ impl Exchanging {
     /// Tells and is told, until the service ends.
     pub(super) async fn run(self: Arc<Self>, means: Means, known: Arc<MergedDirectory>) {
         let (mut host, mut there) = (means.service.host.watch(), known.watch());
-        let mut contests = Contests::default();
+        let (mut contests, mut disputes) = (Contests::default(), Disputes::default());
         let mut sent: JoinSet<(Incarnation, bool)> = JoinSet::new();
         let mut own_changed = true;
         loop {
             let told_now = contests.due().is_some_and(|due| due <= Instant::now());
             if std::mem::take(&mut own_changed) || told_now {
-                let (own, contested) = own_agents(&means.service.host, &*known);
+                let (own, contested) = own_agents(&means.service.host, &*known, means.has_keys);
                 self.core.lock().handle_own(Instant::now(), &own);
                 contests.tell(&means, &contested);
             }
-            let due = [self.work(&means, &mut sent), contests.due()];
+            disputes.tell(&means, Instant::now(), &self.directory.contested());
+            let due = [self.work(&means, &mut sent), contests.due(), disputes.due()];
             let until = due
                 .into_iter()
                 .flatten()
@@ -135,9 +138,13 @@ impl Exchanging {
             let entry = &neighbour.entry;
             let others = announced_at.get(&entry.incarnation);
             let others = others.into_iter().flat_map(|other| &other.locations);
-            (entry.mts.clone(), with_others(&entry.locations, others))
+            Present {
+                mts: entry.mts.clone(),
+                locations: with_others(&entry.locations, others),
+                mandate: neighbour.mandate.clone(),
+            }
         };
-        let present: Vec<(Mts, Vec<Location>)> = neighbours.iter().map(located).collect();
+        let present: Vec<Present> = neighbours.iter().map(located).collect();
         let mut core = self.core.lock();
         core.handle_neighbours(now, &present);
         for (location, fault) in means.neighbours.take_doubted() {
@@ -246,15 +253,100 @@ impl Contests {
     }
 }
 
+/// The names that agents of two other hosts claim, both proved: since when, and whether the gateways
+/// there were told.
+#[derive(Default)]
+struct Disputes {
+    all: HashMap<(Arc<str>, Incarnation), (Instant, bool)>,
+    /// The gateways of the agents that do not have the names.
+    by: HashMap<(Arc<str>, Incarnation), Incarnation>,
+    /// When a gateway was last told.
+    told: HashMap<Incarnation, Instant>,
+}
+
+impl Disputes {
+    /// How often the claims of one gateway are told.
+    const PAUSE: Duration = Duration::from_secs(1);
+
+    /// When a gateway is to be told next.
+    fn due(&self) -> Option<Instant> {
+        let untold = self.all.iter().filter(|(_, (_, told))| !told);
+        untold
+            .map(|(key, (since, _))| {
+                let told = self.by.get(key).and_then(|gateway| self.told.get(gateway));
+                let free = told.map_or(*since, |told| *told + Self::PAUSE);
+                free.max(*since + CONTESTED)
+            })
+            .min()
+    }
+
+    /// Tells the gateways of both agents, once, that both claim one name. Of the claims that one gateway
+    /// makes to names of others, one a second is told.
+    fn tell(&mut self, means: &Means, now: Instant, contested: &[(Arc<Entry>, Arc<Entry>)]) {
+        for (holder, other) in self.next(now, contested) {
+            let (name, at, by) = (&other.name, &holder.mts.name, &other.mts.name);
+            let (shown, by_shown) = (escape(at), escape(by));
+            tracing::warn!(%name, holder = %shown, other = %by_shown, "agents of two hosts have one name");
+            let content = format!(
+                "the name {name:?} is registered at {at:?} and at {by:?}: this host reaches the agent \
+                 at {at:?}; deregister one of them"
+            );
+            for gateway in means.neighbours.all() {
+                let known = gateway.entry.incarnation;
+                if known == holder.mts.incarnation || known == other.mts.incarnation {
+                    drop(means.notify(&gateway.entry, &content));
+                }
+            }
+        }
+    }
+
+    /// The disputes that are to be told now.
+    fn next(
+        &mut self,
+        now: Instant,
+        contested: &[(Arc<Entry>, Arc<Entry>)],
+    ) -> Vec<(Arc<Entry>, Arc<Entry>)> {
+        if contested.is_empty() && self.all.is_empty() {
+            return Vec::new();
+        }
+        let key = |other: &Entry| (Arc::clone(&other.name), other.incarnation);
+        let present = contested
+            .iter()
+            .map(|(_, other)| (key(other), other.mts.incarnation));
+        self.by = present.collect();
+        self.all.retain(|key, _| self.by.contains_key(key));
+        self.told.retain(|_, told| now < *told + Self::PAUSE);
+        let mut due = Vec::new();
+        for (holder, other) in contested {
+            let (since, told) = self.all.entry(key(other)).or_insert((now, false));
+            let is_free = !self.told.contains_key(&other.mts.incarnation);
+            if !*told && is_free && now >= *since + CONTESTED {
+                *told = true;
+                self.told.insert(other.mts.incarnation, now);
+                due.push((Arc::clone(holder), Arc::clone(other)));
+            }
+        }
+        due
+    }
+}
+
 impl Contested {
     fn tell(&self, means: &Means) {
-        let Self { entry, holder } = self;
-        let (name, mts) = (&entry.name, &holder.mts.name);
-        tracing::warn!(%name, holder = %mts, "an earlier registration on another host has the name");
-        let content = format!(
-            "the name {name:?} was registered earlier at {mts:?}: other hosts reach that agent, \
-             and this one on its own host only; deregister one of them"
-        );
+        let Self { entry, holder, .. } = self;
+        let (name, mts) = (&entry.name, escape(&holder.mts.name));
+        let content = if self.is_announced {
+            tracing::warn!(%name, holder = %mts, "an agent of another host has the same name");
+            format!(
+                "the name {name:?} is registered at {mts:?} as well: each other host reaches the agent \
+                 that it was told of first; deregister one of them"
+            )
+        } else {
+            tracing::warn!(%name, holder = %mts, "an earlier registration on another host has the name");
+            format!(
+                "the name {name:?} was registered earlier at {mts:?}: other hosts reach that agent, \
+                 and this one on its own host only; deregister one of them"
+            )
+        };
         if let Ok(receiver) = AgentId::new(&**name) {
             let message = Message::builder(Performative::Failure)
                 .sender(means.id.clone())
@@ -285,6 +377,17 @@ impl Means {
         self.post(&message.ok()?, to, deadline)
     }
 
+    /// Tells the operator of another gateway something about a name.
+    fn notify(&self, to: &Entry, content: &str) -> Option<Sending> {
+        let message = Message::builder(Performative::Failure)
+            .sender(self.id.clone())
+            .receiver(AgentId::new(&*to.name).ok()?)
+            .ontology(MANAGEMENT_ONTOLOGY)
+            .content(content.to_owned())
+            .build();
+        self.post(&message.ok()?, to, DEADLINE)
+    }
+
     fn post(&self, message: &Message, to: &Entry, deadline: Duration) -> Option<Sending> {
         let letter = Some(message).and_then(|message| {
             let letter = letter_for(message, SystemTime::now());
@@ -305,6 +408,51 @@ impl Means {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// An agent with this name and number, at the gateway with that number.
+    fn agent(name: &str, number: u64, gateway: u64) -> Arc<Entry> {
+        let gateway = Incarnation::from_u64(gateway);
+        Arc::new(Entry {
+            name: name.into(),
+            agent_type: String::new(),
+            incarnation: Incarnation::from_u64(number),
+            locations: Vec::new(),
+            mts: fipa_sds::Mts::new("mts", gateway),
+            description: String::new(),
+            registered: SystemTime::UNIX_EPOCH,
+            source: fipa_sds::Source::Exchange,
+            reach: fipa_sds::Reach::Remote { gateway },
+            role: fipa_sds::Role::Agent,
+        })
+    }
+
+    #[test]
+    fn disputes_are_told_once_and_one_a_second_for_each_gateway_that_claims_names_of_others() {
+        let (mut disputes, begun) = (Disputes::default(), Instant::now());
+        let at = |ms| begun + Duration::from_millis(ms);
+        let of = |name: &str, gateway| (agent(name, 1, 7), agent(name, 10 + gateway, gateway));
+        // Gateway 8 claims three names, and gateway 9 one.
+        let all = [of("a", 8), of("b", 8), of("c", 8), of("a", 9)];
+        let mut told = |ms, all: &[_]| {
+            let next = disputes.next(at(ms), all).into_iter();
+            let names = next.map(|(_, other)| (other.name.to_string(), other.mts.incarnation));
+            (names.collect::<Vec<_>>(), disputes.due())
+        };
+        let one = |name: &str, gateway| (name.to_owned(), Incarnation::from_u64(gateway));
+        // An agent that moves has two gateways for a moment.
+        assert_eq!(told(0, &all), (vec![], Some(at(1000))));
+        assert_eq!(told(999, &all), (vec![], Some(at(1000))));
+        let first = vec![one("a", 8), one("a", 9)];
+        assert_eq!(told(1000, &all), (first, Some(at(2000))));
+        assert_eq!(told(1500, &all), (vec![], Some(at(2000))));
+        assert_eq!(told(2000, &all), (vec![one("b", 8)], Some(at(3000))));
+        assert_eq!(told(3000, &all), (vec![one("c", 8)], None));
+        assert_eq!(told(9000, &all), (vec![], None));
+        // It is told again when it ended meanwhile.
+        assert_eq!(told(9000, &[]), (vec![], None));
+        assert_eq!(told(9000, &all[3..]), (vec![], Some(at(10_000))));
+        assert_eq!(told(10_000, &all[3..]), (vec![one("a", 9)], None));
+    }
 
     #[test]
     fn a_kind_without_a_connection_is_reached_where_it_is_announced() {

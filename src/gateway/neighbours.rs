@@ -9,12 +9,13 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
+use fipa_acl::escape;
 use fipa_mts::core::Peer;
 use fipa_sds::{
     DeregisterError, Directory, Entry, MergedDirectory, Mts, Reach, RegisterError, Registration,
     Role, Source, Subscriber, Watch,
 };
-use fipa_transport::{Incarnation, Introduction, Location, WayFault};
+use fipa_transport::{Incarnation, Introduction, Location, Mandate, Principal, WayFault};
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 
@@ -61,6 +62,10 @@ pub struct Neighbour {
     hops: Vec<Location>,
     /// How many connections are open with it.
     pub connections: usize,
+    /// What its links prove. Connections that prove something else are not its own.
+    principal: Principal,
+    /// The agents that its links prove it to speak for.
+    pub(super) mandate: Mandate,
     /// What `discovery.static` calls it, if it stands there.
     pub peer: Option<Arc<str>>,
 }
@@ -117,6 +122,11 @@ impl Neighbours {
         }
         let mut state = self.state.lock();
         let before = state.present.get(&incarnation);
+        if before.is_some_and(|before| before.principal != peer.hop.principal) {
+            let (name, at) = (escape(&peer.name), &peer.hop.location);
+            tracing::info!(%name, %at, "a connected gateway has another certificate");
+            return;
+        }
         let neighbour = state.neighbour(peer, before);
         if let Err(error) = neighbour.entry.check() {
             tracing::info!(%error, at = %peer.hop.location, "a gateway that cannot be written to");
@@ -138,7 +148,8 @@ impl Neighbours {
     pub(super) fn parted(&self, now: Instant, peer: &Introduction) {
         let incarnation = peer.hop.location.incarnation();
         let mut state = self.state.lock();
-        let Some(known) = state.present.get_mut(&incarnation) else {
+        let known = state.present.get_mut(&incarnation);
+        let Some(known) = known.filter(|known| known.principal == peer.hop.principal) else {
             return;
         };
         if let Some(place) = known.hops.iter().position(|hop| *hop == peer.hop.location) {
@@ -226,6 +237,8 @@ impl State {
             configured: Vec::new(),
             hops: Vec::new(),
             connections: 0,
+            principal: peer.hop.principal,
+            mandate: peer.mandate.clone(),
             peer: None,
         });
         if let Some(listed) = listed
@@ -325,7 +338,7 @@ impl Directory for View {
 
 #[cfg(test)]
 mod tests {
-    use fipa_transport::{Hop, Principal};
+    use fipa_transport::Hop;
 
     use super::*;
 
@@ -345,6 +358,7 @@ mod tests {
                 principal: Principal::Unproved,
             },
             dialled: dialled.map(|text| text.parse().unwrap()),
+            mandate: Mandate::Unproved,
         }
     }
 

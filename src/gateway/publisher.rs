@@ -24,6 +24,8 @@ pub(super) struct Publisher {
     pub(super) contacts: Arc<ContactDirectory>,
     /// Takes letters for all that this gateway stands for.
     pub(super) service: Arc<Service>,
+    /// Whether `security.keys` is set.
+    pub(super) has_keys: bool,
     /// Whether what is announced stays on this host.
     pub(super) only_loopback: bool,
 }
@@ -62,10 +64,15 @@ impl Publisher {
 }
 
 /// The agents and coalitions of this host, as far as others are to know of them: first those that are, then those
-/// whose name somebody on another host has had for longer, each with that holder.
+/// whose name belongs to an agent of another host, too, each with that holder.
+///
+/// Without keys the earlier registration has the name on all hosts. With keys the times that other
+/// hosts state do not count: the agents of this host are announced, and claims that no link proves
+/// change nothing.
 pub(super) fn own_agents(
     host: &HostDirectory,
     known: &dyn Directory,
+    has_keys: bool,
 ) -> (Vec<Arc<Entry>>, Vec<Contested>) {
     let (mut own, mut contested) = (Vec::new(), Vec::new());
     let entries = host.entries();
@@ -74,25 +81,32 @@ pub(super) fn own_agents(
         .filter(|entry| entry.reach == Reach::Local && entry.role != Role::Gateway);
     let age = |entry: &Entry| (entry.registered, entry.incarnation);
     for entry in agents {
-        match known.known(&entry.name) {
-            Some(holder)
-                if holder.incarnation != entry.incarnation && age(&holder) < age(entry) =>
-            {
-                contested.push(Contested {
-                    entry: Arc::clone(entry),
-                    holder,
-                });
-            }
-            _ => own.push(Arc::clone(entry)),
+        let holder = known.known(&entry.name);
+        let holder = holder.filter(|holder| holder.incarnation != entry.incarnation);
+        let holder = holder.filter(|holder| match has_keys {
+            true => known.mandate(holder.mts.incarnation).is_proved(),
+            false => age(holder) < age(entry),
+        });
+        if holder.is_none() || has_keys {
+            own.push(Arc::clone(entry));
+        }
+        if let Some(holder) = holder {
+            contested.push(Contested {
+                entry: Arc::clone(entry),
+                holder,
+                is_announced: has_keys,
+            });
         }
     }
     (own, contested)
 }
 
-/// An agent of this host whose name belongs to somebody on another host.
+/// An agent of this host whose name an agent of another host has as well.
 pub(super) struct Contested {
     pub(super) entry: Arc<Entry>,
     pub(super) holder: Arc<Entry>,
+    /// Whether other hosts are told of the agent nevertheless.
+    pub(super) is_announced: bool,
 }
 
 /// The task that does it.
@@ -158,7 +172,11 @@ impl Keeper {
 
     /// Announces what has joined on this host, and takes back what has left.
     fn announce(&mut self, network: &dyn Directory) {
-        let (agents, _) = own_agents(&self.publisher.host, &*self.publisher.known);
+        let (agents, _) = own_agents(
+            &self.publisher.host,
+            &*self.publisher.known,
+            self.publisher.has_keys,
+        );
         let mine: HashMap<&Arc<str>, &Arc<Entry>> =
             agents.iter().map(|entry| (&entry.name, entry)).collect();
         // Who is the same agent changes in place, without having been away.
@@ -222,5 +240,55 @@ impl Keeper {
                 }
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use fipa_sds::{Exchange, HostConfig, Mts, Present};
+    use fipa_transport::Mandate;
+
+    use super::*;
+
+    /// The agents that are announced, and those that are contested, of a host with a rover while a
+    /// neighbour with this mandate tells of a rover that was registered long before.
+    fn announced(mandate: Mandate, has_keys: bool) -> (usize, usize) {
+        let place = tempfile::tempdir().unwrap();
+        let host = HostDirectory::open(HostConfig {
+            dir: place.path().join("domain"),
+            mts: Mts::new("mts", Incarnation::from_u64(1)),
+            gateway: true,
+        });
+        let host = host.unwrap();
+        let at = "shm://0000000000000001#0000000000000001".parse().unwrap();
+        let rover = Registration::new("rover", Incarnation::from_u64(2), vec![at]);
+        host.register(rover).unwrap();
+        let gateway = Incarnation::from_u64(7);
+        let mut exchange = Exchange::new(0);
+        let present = Present {
+            mts: Mts::new("crex-mts", gateway),
+            locations: vec!["tcp://192.0.2.1:7788#0000000000000007".parse().unwrap()],
+            mandate,
+        };
+        exchange.handle_neighbours(Instant::now(), &[present]);
+        let told = br#"{"version":1,"tell":{"full":{"version":1,"first":true,"last":true,
+            "agents":[{"name":"rover","id":"0000000000000008","registered":1}]}}}"#;
+        let taken = exchange.handle_letter(Instant::now(), gateway, told);
+        taken.unwrap();
+        let known = MergedDirectory::new(vec![exchange.directory()]);
+        let (own, contested) = own_agents(&host, &known, has_keys);
+        assert!(contested.iter().all(|it| it.is_announced == has_keys));
+        (own.len(), contested.len())
+    }
+
+    #[tokio::test]
+    async fn with_keys_no_claimed_time_keeps_agents_of_this_host_from_others() {
+        let certified = |agents: &[&str]| {
+            Mandate::Certified(agents.iter().map(|agent| (*agent).to_owned()).collect())
+        };
+        assert_eq!(announced(Mandate::Unproved, false), (0, 1));
+        assert_eq!(announced(Mandate::Unproved, true), (1, 0));
+        assert_eq!(announced(certified(&[]), true), (1, 1), "told");
+        assert_eq!(announced(certified(&["crex"]), true), (1, 0));
     }
 }

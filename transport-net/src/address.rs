@@ -284,6 +284,17 @@ pub(crate) fn way_back(listening: &[String], from: SocketAddr) -> SocketAddr {
     back
 }
 
+/// Whether a peer that listens there lists this address as one of its own. Addresses that mean another
+/// host on every host, or on every link, do not count.
+pub(crate) fn lists(listening: &[String], ip: IpAddr) -> bool {
+    let ip = ip.to_canonical();
+    let own = listening
+        .iter()
+        .filter_map(|text| numeric_ignoring_scope(text));
+    let mut own = own.map(|address| address.ip().to_canonical());
+    !ip.is_loopback() && !ip.is_unspecified() && !is_link_local(ip) && own.any(|own| own == ip)
+}
+
 /// The scope names an interface of another host: it must not be looked up here.
 fn numeric_ignoring_scope(text: &str) -> Option<SocketAddr> {
     match text.split_once('%') {

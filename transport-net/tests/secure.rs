@@ -16,7 +16,7 @@ use common::{NAME, Party, accepted, config, letter_parcel, parcel, until};
 use fipa_acl::{
     AclRepresentation, AgentId, Envelope, EnvelopeParams, Letter, Message, Performative,
 };
-use fipa_transport::{Answer, Conclusion, FailureReason, Transport, WayFault};
+use fipa_transport::{Answer, Conclusion, FailureReason, Mandate, Transport, WayFault};
 use fipa_transport_net::secure::{Rules, Security};
 use fipa_transport_net::{Counters, Limits, TcpTransport};
 
@@ -225,6 +225,13 @@ fn a_peer_speaks_for_its_own_agents_only<T: Proving>() {
         let letter = letter_parcel(attempt, letter_from(sender));
         from.send(attempt, to.location(), letter).unwrap();
         assert_eq!(from.conclusion(attempt), accepted(), "{sender}");
+    }
+    // Each side tells its directory what the other may speak for.
+    for (party, agents) in [(&to, ["rover", "rover_*"]), (&from, ["crex", "arm_1"])] {
+        let record = party.sink.record.lock();
+        let mandates: Vec<_> = record.introduced.iter().map(|it| &it.mandate).collect();
+        let agents = Mandate::Certified(agents.map(str::to_owned).into());
+        assert_eq!(mandates, [&agents]);
     }
     let claimed = letter_parcel(3, letter_from("crex"));
     from.send(3, to.location(), claimed).unwrap();

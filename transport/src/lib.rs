@@ -33,5 +33,6 @@ pub use owner::{Forked, OwnerProcess};
 pub use parcel::{Body, Parcel, Report, Stream};
 pub use transport::{
     Abandoned, Answer, Arrival, Arriving, AttemptId, Conclusion, Hop, Introduction, LegacySource,
-    ListenError, LoanedContent, Principal, Sink, Ticket, Transport, Verdict, WayError, WayFault,
+    ListenError, LoanedContent, Mandate, Principal, Sink, Ticket, Transport, Verdict, WayError,
+    WayFault,
 };

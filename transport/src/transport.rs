@@ -191,6 +191,47 @@ pub struct Introduction {
     pub hop: Hop,
     /// The location for which this side opened the connection, if this side did.
     pub dialled: Option<Location>,
+    /// The agents that the service may speak for on this connection.
+    pub mandate: Mandate,
+}
+
+/// The agents that a service may speak for, as far as its link proves it.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub enum Mandate {
+    /// The link proves nothing, and restricts nothing.
+    #[default]
+    Unproved,
+    /// The service has the key of a certificate that names these agents. A name that ends with `*`
+    /// stands for all names that begin so. An empty list stands for every agent.
+    Certified(Arc<[String]>),
+}
+
+impl Mandate {
+    /// Whether the link proves the agents of the service.
+    #[must_use]
+    pub fn is_proved(&self) -> bool {
+        *self != Self::Unproved
+    }
+
+    /// Whether the service may speak for the agent with this name.
+    #[must_use]
+    pub fn speaks_for(&self, name: &str) -> bool {
+        match self {
+            Self::Unproved => true,
+            Self::Certified(agents) => {
+                let mut agents = agents.iter();
+                agents.len() == 0 || agents.any(|agent| is_meant(agent, name))
+            }
+        }
+    }
+}
+
+/// Whether an agent of a certificate is the one with this name, or the beginning of its name.
+fn is_meant(agent: &str, name: &str) -> bool {
+    match agent.strip_suffix('*') {
+        Some(beginning) => name.starts_with(beginning),
+        None => agent == name,
+    }
 }
 
 /// A parcel that arrived.

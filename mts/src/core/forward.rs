@@ -17,7 +17,7 @@ use super::inbox::link_of;
 use super::lane::{Delivery, Lane, LaneId, LaneKey};
 use super::limits::SenderLimit;
 use super::{Core, MAX_DEADLINE, News, Now, own_lane};
-use crate::gate::Link;
+use crate::gate::{self, Link};
 use smallvec::smallvec;
 
 use crate::failure::sender_of;
@@ -180,7 +180,7 @@ impl Core {
             lane.wait_for_credit(from.location);
             return Verdict::Now(Answer::Busy);
         }
-        if let Err(why) = self.admits(now, &entry.name, &stamped, link_of(via, &from.location)) {
+        if let Err(why) = self.admits(now, &entry.name, &stamped, link_of(via, &from)) {
             return Verdict::Now(Answer::failed(FailureReason::Refused, why));
         }
         if from.is_remote() {
@@ -376,6 +376,7 @@ impl Core {
         let unproved = Link {
             via,
             service: Incarnation::UNKNOWN,
+            source: gate::Source::at(from.address),
         };
         for (receiver, resolution) in receivers {
             let (entries, missing) = match resolution {

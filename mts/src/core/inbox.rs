@@ -11,7 +11,7 @@ use fipa_transport::{Answer, FailureReason, Hop, Incarnation, Kind, Location, Pa
 use super::rules::{self, Offer};
 use super::{CoreConfig, MAX_DEADLINE};
 use crate::Gate;
-use crate::gate::Link;
+use crate::gate::{Link, Source};
 
 /// A letter taken from an agent's queue.
 #[derive(Debug, Clone)]
@@ -115,7 +115,7 @@ impl Inbox {
             return Answer::Busy;
         }
         if let Some(gate) = gate
-            && let Err(why) = gate.admits(now, &self.name, &letter, link_of(via, &from.location))
+            && let Err(why) = gate.admits(now, &self.name, &letter, link_of(via, from))
         {
             return Answer::failed(FailureReason::Refused, why);
         }
@@ -248,11 +248,12 @@ impl Inbox {
     }
 }
 
-/// The link of a letter that came by this kind from the service at this location.
-pub(super) fn link_of(via: Kind, back: &Location) -> Link {
+/// The link of a letter that this service handed over by this kind of transport.
+pub(super) fn link_of(via: Kind, from: &Hop) -> Link {
     Link {
         via,
-        service: back.incarnation(),
+        service: from.location.incarnation(),
+        source: Source::of(from),
     }
 }
 

@@ -167,6 +167,7 @@ impl Principals {
 #[cfg(test)]
 mod tests {
     use fipa_sds::{MemoryDirectory, Mts};
+    use fipa_transport::Mandate;
 
     use super::*;
 
@@ -187,6 +188,7 @@ mod tests {
             name: name.into(),
             hop: hop(SERVICE, principal),
             dialled: None,
+            mandate: Mandate::Unproved,
         }
     }
 

@@ -3,7 +3,8 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use fipa_transport::{Incarnation, Location};
+use arc_swap::ArcSwap;
+use fipa_transport::{Incarnation, Location, Mandate};
 use parking_lot::Mutex;
 
 use super::{Agents, Exchange, ExchangeError};
@@ -11,9 +12,14 @@ use crate::table::Table;
 use crate::{Directory, Entry, Role, Subscriber};
 
 /// The agents that neighbours have told of.
+///
+/// Of two neighbours with a [certified](Mandate::Certified) link that claim one name, the one that
+/// claimed it first here has it until its entry leaves: neither can claim an earlier registration.
 #[derive(Debug)]
 pub struct ExchangeDirectory {
-    table: Table<Incarnation>,
+    table: Table<Teller>,
+    /// The certified links with neighbours.
+    mandates: ArcSwap<HashMap<Incarnation, Mandate>>,
     /// What each gateway has told. The lock is held while the table is changed, too.
     told: Mutex<HashMap<Incarnation, Agents>>,
 }
@@ -21,21 +27,73 @@ pub struct ExchangeDirectory {
 impl Default for ExchangeDirectory {
     fn default() -> Self {
         Self {
-            table: Table::new(),
+            table: Table::proved_by(|teller| teller.is_proved),
+            mandates: ArcSwap::default(),
             told: Mutex::default(),
         }
     }
 }
 
-type Update = (Incarnation, Arc<str>, Option<Arc<Entry>>);
+/// The gateway that has told of an agent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+struct Teller {
+    gateway: Incarnation,
+    /// Whether its link is certified.
+    is_proved: bool,
+}
+
+type Update = (Teller, Arc<str>, Option<Arc<Entry>>);
 
 impl ExchangeDirectory {
+    /// Most contested names that [`contested`](Self::contested) returns.
+    pub const MAX_CONTESTED: usize = 1024;
+
+    /// Names that more than one neighbour with a certified link claims: the entry that has the name,
+    /// and each other one. At most [`MAX_CONTESTED`](Self::MAX_CONTESTED).
+    #[must_use]
+    pub fn contested(&self) -> Vec<(Arc<Entry>, Arc<Entry>)> {
+        self.table.contested(Self::MAX_CONTESTED)
+    }
+
+    /// Whether any link with a neighbour is certified.
+    #[must_use]
+    pub fn is_proved(&self) -> bool {
+        !self.mandates.load().is_empty()
+    }
+
+    /// The link with the gateway proves this. What the gateway has told before is forgotten when that is
+    /// something else.
+    pub(super) fn prove(&self, gateway: Incarnation, mandate: &Mandate) {
+        if self.mandate(gateway) == *mandate {
+            return;
+        }
+        self.forget(gateway);
+        self.mandates.rcu(|mandates| {
+            let mut mandates = HashMap::clone(mandates);
+            match mandate.is_proved() {
+                true => mandates.insert(gateway, mandate.clone()),
+                false => mandates.remove(&gateway),
+            };
+            mandates
+        });
+        // What other directories say of this gateway counts, or no longer does.
+        self.table.tell_all();
+    }
+
+    fn teller(&self, gateway: Incarnation) -> Teller {
+        Teller {
+            gateway,
+            is_proved: self.mandates.load().contains_key(&gateway),
+        }
+    }
+
     /// These are all agents of the gateway now.
     pub(super) fn replace(
         &self,
         gateway: Incarnation,
         entries: Agents,
     ) -> Result<(), ExchangeError> {
+        let teller = self.teller(gateway);
         let mut told = self.told.lock();
         let others = told.iter().filter(|(other, _)| **other != gateway);
         let total: usize = others.map(|(_, entries)| entries.len()).sum();
@@ -47,9 +105,9 @@ impl ExchangeDirectory {
         let left = before
             .into_keys()
             .filter(|name| now.is_none_or(|now| !now.contains_key(name)))
-            .map(|name| (gateway, name, None));
+            .map(|name| (teller, name, None));
         let here = now.into_iter().flatten();
-        let here = here.map(|(name, entry)| (gateway, Arc::clone(name), Some(Arc::clone(entry))));
+        let here = here.map(|(name, entry)| (teller, Arc::clone(name), Some(Arc::clone(entry))));
         let updates: Vec<Update> = left.chain(here).collect();
         self.table.update(updates);
         Ok(())
@@ -62,6 +120,7 @@ impl ExchangeDirectory {
         joined: Vec<Arc<Entry>>,
         left: Vec<String>,
     ) -> Result<(), ExchangeError> {
+        let teller = self.teller(gateway);
         let mut told = self.told.lock();
         let total: usize = told.values().map(Agents::len).sum();
         let of_gateway = told.entry(gateway).or_default();
@@ -69,12 +128,12 @@ impl ExchangeDirectory {
         let mut updates: Vec<Update> = Vec::new();
         for name in left {
             if let Some((name, _)) = after.remove_entry(name.as_str()) {
-                updates.push((gateway, name, None));
+                updates.push((teller, name, None));
             }
         }
         for entry in joined {
             after.insert(Arc::clone(&entry.name), Arc::clone(&entry));
-            updates.push((gateway, Arc::clone(&entry.name), Some(entry)));
+            updates.push((teller, Arc::clone(&entry.name), Some(entry)));
         }
         let total = total - of_gateway.len() + after.len();
         if after.len() > Exchange::MAX_AGENTS || total > Exchange::MAX_TOTAL {
@@ -87,6 +146,7 @@ impl ExchangeDirectory {
 
     /// The gateway is elsewhere now, and all its agents with it.
     pub(super) fn relocate(&self, gateway: Incarnation, locations: &[Location]) {
+        let teller = self.teller(gateway);
         let mut told = self.told.lock();
         let mut updates: Vec<Update> = Vec::new();
         for (name, entry) in told.get_mut(&gateway).into_iter().flatten() {
@@ -94,20 +154,22 @@ impl ExchangeDirectory {
                 locations: locations.to_vec(),
                 ..Entry::clone(entry)
             });
-            updates.push((gateway, Arc::clone(name), Some(Arc::clone(entry))));
+            updates.push((teller, Arc::clone(name), Some(Arc::clone(entry))));
         }
         self.table.update(updates);
     }
 
-    /// Lets go of agents of the gateway that another directory knows. Says whether there were any.
+    /// Lets go of agents of the gateway that another directory knows, unless they are proved. Says
+    /// whether there were any.
     /// Coalitions stay: this directory [speaks for](Directory::speaks_for) them.
     pub(super) fn leave_to_others(
         &self,
         gateway: Incarnation,
         knows: impl Fn(&Entry) -> bool,
     ) -> bool {
+        let teller = self.teller(gateway);
         let mut told = self.told.lock();
-        let Some(agents) = told.get_mut(&gateway) else {
+        let Some(agents) = told.get_mut(&gateway).filter(|_| !teller.is_proved) else {
             return false;
         };
         let agent = |entry: &&Arc<Entry>| entry.role == Role::Agent && knows(entry);
@@ -117,19 +179,17 @@ impl ExchangeDirectory {
             agents.remove(name);
         }
         let any = !known.is_empty();
-        let updates: Vec<Update> = known
-            .into_iter()
-            .map(|name| (gateway, name, None))
-            .collect();
+        let updates: Vec<Update> = known.into_iter().map(|name| (teller, name, None)).collect();
         self.table.update(updates);
         any
     }
 
     /// The gateway is gone, and all its agents with it.
     pub(super) fn forget(&self, gateway: Incarnation) {
+        let teller = self.teller(gateway);
         let mut told = self.told.lock();
         let names = told.remove(&gateway).unwrap_or_default().into_keys();
-        self.table.update(names.map(|name| (gateway, name, None)));
+        self.table.update(names.map(|name| (teller, name, None)));
     }
 }
 
@@ -139,5 +199,10 @@ impl Directory for ExchangeDirectory {
     /// What a gateway tells in letters comes at once and is all there is.
     fn speaks_for(&self, mts: Incarnation) -> bool {
         self.told.lock().contains_key(&mts)
+    }
+
+    fn mandate(&self, mts: Incarnation) -> Mandate {
+        let mandates = self.mandates.load();
+        mandates.get(&mts).cloned().unwrap_or_default()
     }
 }

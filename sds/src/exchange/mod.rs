@@ -13,7 +13,7 @@
 //! start at once make a few letters.
 //!
 //! A neighbour may be hostile: it can tell of agents of its own only, that are reached through
-//! itself; how many it may tell of is bounded; and what makes no sense is not used.
+//! itself, and that the certificate of its link names, if it has one; how many it may tell of is bounded; and what makes no sense is not used.
 
 mod directory;
 mod wire;
@@ -24,7 +24,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_acl::escape;
-use fipa_transport::{Incarnation, Location};
+use fipa_transport::{Incarnation, Location, Mandate};
 
 pub use directory::ExchangeDirectory;
 use wire::{Changes, Full, Told};
@@ -47,6 +47,29 @@ pub struct Exchange {
     early: HashSet<Incarnation>,
     directory: Arc<ExchangeDirectory>,
     random: u64,
+}
+
+/// A gateway that can be written to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Present {
+    /// The gateway.
+    pub mts: Mts,
+    /// Where it takes letters.
+    pub locations: Vec<Location>,
+    /// The agents that its links prove it to speak for. It can tell of no others.
+    pub mandate: Mandate,
+}
+
+impl Present {
+    /// A gateway on whose links nothing is proved.
+    #[must_use]
+    pub const fn unproved(mts: Mts, locations: Vec<Location>) -> Self {
+        Self {
+            mts,
+            locations,
+            mandate: Mandate::Unproved,
+        }
+    }
 }
 
 /// What this gateway tells.
@@ -72,6 +95,7 @@ struct Logged {
 struct Neighbour {
     mts: Mts,
     locations: Vec<Location>,
+    mandate: Mandate,
     /// Since when it cannot be written to.
     gone: Option<Instant>,
     telling: Telling,
@@ -181,11 +205,11 @@ impl Exchange {
         }
     }
 
-    /// These gateways can be written to now, each with where it takes letters.
-    pub fn handle_neighbours(&mut self, now: Instant, present: &[(Mts, Vec<Location>)]) {
+    /// These gateways can be written to now.
+    pub fn handle_neighbours(&mut self, now: Instant, present: &[Present]) {
         for neighbour in self.neighbours.values_mut() {
             let mts = neighbour.mts.incarnation;
-            let here = present.iter().any(|(other, _)| other.incarnation == mts);
+            let here = present.iter().any(|it| it.mts.incarnation == mts);
             if here {
                 if neighbour.gone.take().is_some() {
                     // It may have forgotten meanwhile what it was told, and then says so.
@@ -199,8 +223,19 @@ impl Exchange {
                 neighbour.gone = Some(now);
             }
         }
-        for (mts, locations) in present {
+        for Present {
+            mts,
+            locations,
+            mandate,
+        } in present
+        {
             if let Some(known) = self.neighbours.get_mut(&mts.incarnation) {
+                if known.mandate != *mandate {
+                    known.mandate = mandate.clone();
+                    self.directory.prove(mts.incarnation, mandate);
+                    (known.held, known.staged) = (None, None);
+                    known.ask_again(now);
+                }
                 if known.locations != *locations {
                     known.locations.clone_from(locations);
                     self.directory.relocate(mts.incarnation, locations);
@@ -212,6 +247,8 @@ impl Exchange {
             }
             let due = now + self.jitter();
             let mut neighbour = Neighbour::new(mts.clone(), locations.clone(), due);
+            neighbour.mandate = mandate.clone();
+            self.directory.prove(mts.incarnation, mandate);
             if self.early.remove(&mts.incarnation) {
                 neighbour.ask_again(now);
             }
@@ -277,6 +314,7 @@ impl Exchange {
     fn end(&mut self, gateway: Incarnation) {
         self.neighbours.remove(&gateway);
         self.directory.forget(gateway);
+        self.directory.prove(gateway, &Mandate::Unproved);
     }
 
     /// What a letter of this gateway, with [`EXCHANGE_ONTOLOGY`], has as its content.
@@ -359,6 +397,7 @@ impl Exchange {
                 .is_some_and(|since| now >= since + Self::MEMORY);
             if gone {
                 directory.forget(*incarnation);
+                directory.prove(*incarnation, &Mandate::Unproved);
             }
             !gone
         });
@@ -571,6 +610,7 @@ impl Neighbour {
         Self {
             mts,
             locations,
+            mandate: Mandate::Unproved,
             gone: None,
             telling: Telling::nothing(),
             under_way: None,
@@ -661,8 +701,14 @@ impl Neighbour {
     }
 
     /// The entry of an agent of this neighbour. It is where the neighbour is, whatever it says.
-    /// None if there cannot be such an agent, which is no reason not to use the others.
+    /// None if there cannot be such an agent, or its link does not speak for it. The others are used
+    /// nevertheless.
     fn entry(&self, agent: wire::Agent) -> Option<Arc<Entry>> {
+        if !self.mandate.speaks_for(&agent.name) {
+            let (gateway, agent) = (escape(&self.mts.name), escape(&agent.name));
+            tracing::debug!(%gateway, %agent, "the certificate of the gateway does not name this agent");
+            return None;
+        }
         let entry = Entry {
             name: agent.name.into(),
             agent_type: agent.agent_type,

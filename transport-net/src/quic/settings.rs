@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use quinn::crypto::rustls::{QuicClientConfig, QuicServerConfig};
-use quinn::{ClientConfig, IdleTimeout, ServerConfig, TransportConfig, VarInt};
+use quinn::{ClientConfig, Connection, IdleTimeout, ServerConfig, TransportConfig, VarInt};
 
 use crate::Limits;
 use crate::secure::Security;
@@ -11,7 +11,7 @@ use crate::secure::Security;
 /// What both sides have to speak (RFC 7301).
 const PROTOCOL: &[u8] = b"fipa/1";
 
-/// Letters that may arrive at the same time. They are read one after the other, so more would only
+/// Letters that may arrive at the same time on a connection with a whole window. They are read one after the other, so more would only
 /// wait.
 const STREAMS: u32 = 64;
 
@@ -22,6 +22,19 @@ const STREAM_WINDOW: u32 = 512 << 10;
 /// room for another: otherwise letters that wait for their turn could keep the one whose turn it is
 /// from arriving.
 const WINDOW: u32 = (STREAMS + 1) * STREAM_WINDOW;
+
+/// Letters and bytes of a connection that has no share of the budget for whole windows.
+const FIRST_STREAMS: u32 = 2;
+const FIRST_WINDOW: u32 = (FIRST_STREAMS + 1) * STREAM_WINDOW;
+
+/// What a connection with a whole window takes of the budget.
+pub(super) const WIDENING: usize = (WINDOW - FIRST_WINDOW) as usize;
+
+/// Gives a connection its whole window.
+pub(super) fn widen(connection: &Connection) {
+    connection.set_receive_window(VarInt::from_u32(WINDOW));
+    connection.set_max_concurrent_uni_streams(VarInt::from_u32(STREAMS));
+}
 
 /// Bytes that were sent and are not acknowledged.
 const SEND_WINDOW: u64 = 8 << 20;
@@ -40,9 +53,9 @@ pub(super) fn transport(limits: &Limits) -> Arc<TransportConfig> {
     let silence = IdleTimeout::try_from(silence).unwrap_or_else(|_| VarInt::MAX.into());
     transport
         .max_concurrent_bidi_streams(VarInt::from_u32(1))
-        .max_concurrent_uni_streams(VarInt::from_u32(STREAMS))
+        .max_concurrent_uni_streams(VarInt::from_u32(FIRST_STREAMS))
         .stream_receive_window(VarInt::from_u32(STREAM_WINDOW))
-        .receive_window(VarInt::from_u32(WINDOW))
+        .receive_window(VarInt::from_u32(FIRST_WINDOW))
         .send_window(SEND_WINDOW)
         // The letter that is read first is sent first.
         .send_fairness(false)

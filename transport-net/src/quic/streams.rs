@@ -16,8 +16,10 @@ use bytes::BytesMut;
 use parking_lot::Mutex;
 use quinn::{Connection, ConnectionError, ReadError, RecvStream, SendStream, VarInt, WriteError};
 
+use super::settings;
 use super::sockets::why_lost;
 use crate::stream::frame::{self, FrameReader, Space};
+use crate::stream::place::Room;
 
 /// Answers go before letters.
 const URGENT: i32 = 1;
@@ -43,6 +45,13 @@ impl Control {
             Err(ReadError::ConnectionLost(error)) => Err(lost(&error)),
             Err(error) => Err(error.into()),
         }
+    }
+
+    /// Gives the connection its whole window, if there is room for that many bytes.
+    pub(crate) fn widen(&self, take: impl FnOnce(usize) -> Option<Room>) -> Option<Room> {
+        let room = take(settings::WIDENING)?;
+        settings::widen(&self.connection);
+        Some(room)
     }
 
     /// Waits until the peer has closed the connection.

@@ -13,6 +13,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use fipa_acl::{escape, is_unprintable};
+use fipa_transport::Mandate;
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, percent_decode_str, utf8_percent_encode};
 use ring::digest::{SHA256, SHA256_OUTPUT_LEN, digest};
 use rustls::pki_types::{CertificateDer, UnixTime};
@@ -80,7 +81,8 @@ pub struct Certificate {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Certified {
     mts: String,
-    agents: Vec<String>,
+    /// Certified, always.
+    mandate: Mandate,
 }
 
 /// A certificate that says nothing, or nothing that can be used here.
@@ -205,7 +207,10 @@ impl Certified {
             return Err(CertificateError::Agents);
         }
         match <[String; 1]>::try_from(services) {
-            Ok([mts]) => Ok(Self { mts, agents }),
+            Ok([mts]) => Ok(Self {
+                mts,
+                mandate: Mandate::Certified(agents.into()),
+            }),
             Err(services) => Err(CertificateError::Services(services.len())),
         }
     }
@@ -220,21 +225,21 @@ impl Certified {
     /// when it may speak for every agent.
     #[must_use]
     pub fn agents(&self) -> &[String] {
-        &self.agents
+        match &self.mandate {
+            Mandate::Certified(agents) => agents,
+            Mandate::Unproved => &[],
+        }
     }
 
     /// Whether the service may speak for the agent with this name, or for itself.
     #[must_use]
     pub fn speaks_for(&self, name: &str) -> bool {
-        self.agents.is_empty()
-            || self.mts == name
-            || self
-                .agents
-                .iter()
-                .any(|agent| match agent.strip_suffix('*') {
-                    Some(beginning) => name.starts_with(beginning),
-                    None => agent == name,
-                })
+        self.mts == name || self.mandate.speaks_for(name)
+    }
+
+    /// The agents that the service may speak for beside itself.
+    pub(crate) fn mandate(&self) -> &Mandate {
+        &self.mandate
     }
 }
 

@@ -11,8 +11,8 @@ use std::time::{Duration, Instant};
 
 use fipa_acl::{EnvelopeView, Letter, MessageView};
 use fipa_transport::{
-    Abandoned, Answer, AttemptId, Body, Conclusion, Incarnation, Parcel, Principal, WayError,
-    WayFault,
+    Abandoned, Answer, AttemptId, Body, Conclusion, Incarnation, Mandate, Parcel, Principal,
+    WayError, WayFault,
 };
 
 use super::config::Limits;
@@ -209,6 +209,11 @@ impl Connection {
     /// The certificate that the peer has proved to have the key of, if any.
     pub(crate) fn proved_principal(&self) -> Option<Principal> {
         self.proof.principal()
+    }
+
+    /// The agents that the peer may speak for.
+    pub(crate) fn mandate(&self) -> Mandate {
+        self.proof.mandate()
     }
 
     /// Takes a parcel for sending.

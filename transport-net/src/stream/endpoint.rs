@@ -31,7 +31,7 @@ use super::config::{Limits, StreamConfig};
 use super::connection::{Connection, Role, SendError, letter_len};
 use super::counters::{Tally, count};
 use super::link::{Link, MAX_LINKS, of_ticket};
-use super::place::{Meter, Rooms};
+use super::place::{Meter, Room, Rooms};
 use super::source::{Account, Home, Source};
 use crate::Identity;
 #[cfg(feature = "ip")]
@@ -67,6 +67,8 @@ pub(crate) struct Endpoint {
     pub(crate) legacy: Legacy,
     /// What is taken for letters that are arriving.
     pub(crate) rooms: Rooms,
+    /// What is taken for bytes that peers may send ahead; see [`Self::window`].
+    windows: Rooms,
     /// What peers may still send.
     #[cfg(feature = "ip")]
     rations: Rations,
@@ -141,6 +143,8 @@ struct Peer {
     home: Home,
     /// What it dialled, if it opened the connection, and the number that it gave to that.
     dialled: Option<(String, u64)>,
+    /// Where it listens, as it says.
+    listening: Vec<String>,
 }
 
 /// What follows for other connections from a peer's introduction.
@@ -164,6 +168,15 @@ struct Inbound {
 }
 
 impl Peer {
+    /// Whether a peer at this home may be this one at another of its addresses: it has listed that.
+    fn is_also_at(&self, home: Home) -> bool {
+        match home {
+            Home::Process(_) => false,
+            #[cfg(feature = "ip")]
+            Home::Address(ip) => self.home != home && address::lists(&self.listening, ip),
+        }
+    }
+
     /// Whether this connection takes the place of that one, if both are of the same service: that
     /// service was restarted, or it opened this one after that one, from another address or for the
     /// same location. Connections that cross each other stay, and so do those for several locations.
@@ -213,6 +226,7 @@ impl Endpoint {
             #[cfg(feature = "ip")]
             legacy: Legacy::default(),
             rooms: Rooms::default(),
+            windows: Rooms::default(),
             #[cfg(feature = "ip")]
             rations: Rations::default(),
             tally: Tally::default(),
@@ -240,6 +254,13 @@ impl Endpoint {
     pub(crate) fn meter(&self, account: &Account) -> Meter {
         let budget = self.config.budget_of(account);
         self.rooms.meter(account.clone(), budget)
+    }
+
+    /// Takes room for bytes that a peer of this account may send ahead. The budget is as large as that of
+    /// arriving letters.
+    pub(crate) fn window(&self, account: &Account, len: usize) -> Option<Room> {
+        let budget = self.config.budget_of(account);
+        self.windows.meter(account.clone(), budget).take_now(len)
     }
 
     pub(crate) fn tally(&self) -> &Tally {
@@ -597,6 +618,7 @@ impl Endpoint {
             proved,
             home: from.home(),
             dialled: (!peer.dialled.is_empty()).then(|| (peer.dialled.clone(), peer.serial)),
+            listening: peer.listening.clone(),
         };
         let mut silent: Vec<u32> = Vec::new();
         let rivals = loop {
@@ -822,6 +844,9 @@ impl Registry {
                 (Some(proved), Some(before)) if proved == before && this.replaces(peer) => {
                     &mut rivals.superseded
                 }
+                // The connected peer itself has said that it has this address. Both connections stay,
+                // unless it has moved there.
+                (None, None) if is_same && peer.is_also_at(this.home) => &mut rivals.doubted,
                 (None, None) if is_same && this.replaces(peer) => match this.home {
                     // The kernel proves the process.
                     Home::Process(_) => &mut rivals.superseded,

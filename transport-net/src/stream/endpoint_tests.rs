@@ -62,6 +62,7 @@ struct Greeting {
     dialled: &'static str,
     proved: Option<Principal>,
     from: Source,
+    listening: &'static [&'static str],
 }
 
 fn greeting(incarnation: u64, proved: Option<Principal>, from: &str) -> Greeting {
@@ -71,6 +72,7 @@ fn greeting(incarnation: u64, proved: Option<Principal>, from: &str) -> Greeting
         dialled: "tcp://10.0.0.1:7788",
         proved,
         from: at(from),
+        listening: &[],
     }
 }
 
@@ -82,7 +84,7 @@ async fn enters(endpoint: &Endpoint, greeting: Greeting) -> Result<(Arc<Link>, H
         max_in_flight: 8,
         serial: greeting.serial,
         dialled: greeting.dialled.into(),
-        listening: Vec::new(),
+        listening: greeting.listening.iter().map(|it| (*it).into()).collect(),
     };
     let entered = endpoint.enter(&link, &peer, greeting.proved, greeting.from);
     Ok((link.clone(), entered.await?))
@@ -218,4 +220,56 @@ async fn a_moved_peer_with_keys_takes_the_place_of_its_older_connections_and_its
         .await
         .unwrap();
     assert_eq!(crossing.ending(), None);
+}
+
+#[tokio::test]
+async fn without_keys_a_peer_is_served_at_each_address_that_its_first_connection_lists() {
+    let endpoint = endpoint(Limits::default());
+    let first = Greeting {
+        listening: &["0.0.0.0:7788", "10.0.0.7:7788", "10.0.1.7:7788"],
+        ..comes(None, 7, "10.0.0.7:1", 1, X)
+    };
+    let (first, _) = enters(&endpoint, first).await.unwrap();
+    tokio::spawn(ends_when_asked_to(first.clone()));
+    for dialled in [X, Y] {
+        let second = comes(None, 7, "10.0.1.7:1", 2, dialled);
+        enters(&endpoint, second).await.unwrap();
+        assert_eq!(first.ending(), None, "both stay: {dialled}");
+    }
+    // A stranger cannot list its own address: the connected peer has to. The peer of the first
+    // connection has no socket here and gives no sign of life.
+    let stranger = Greeting {
+        listening: &["10.0.0.8:7788", "10.0.0.7:7788"],
+        ..comes(None, 8, "10.0.0.8:1", 3, X)
+    };
+    let (claimed, _) = enters(&endpoint, comes(None, 8, "10.0.0.9:1", 1, X))
+        .await
+        .unwrap();
+    tokio::spawn(ends_when_asked_to(claimed.clone()));
+    enters(&endpoint, stranger).await.unwrap();
+    assert_eq!(claimed.ending(), Some(End::Superseded), "it was asked");
+    assert_eq!(first.ending(), None);
+}
+
+#[tokio::test]
+async fn what_peers_may_send_ahead_has_one_budget_with_a_share_for_each_certificate() {
+    let endpoint = endpoint(Limits::default());
+    let limits = endpoint.limits().clone();
+    let len = limits.max_incoming_per_source / 2 - 1;
+    let account = |number| Account::Certificate([number; 32]);
+    let of_one: Vec<_> = (0..64)
+        .filter_map(|_| endpoint.window(&account(0), len))
+        .collect();
+    assert_eq!(of_one.len(), 2);
+    let of_all: Vec<_> = (0..64)
+        .filter_map(|number| endpoint.window(&account(number), len))
+        .collect();
+    let taken = (of_one.len() + of_all.len()) * len;
+    assert!(
+        taken <= limits.max_incoming && taken + len > limits.max_incoming,
+        "{taken}"
+    );
+    // A connection that ends gives its share back.
+    drop(of_all);
+    assert!(endpoint.window(&account(9), len).is_some());
 }

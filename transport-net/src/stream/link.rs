@@ -349,6 +349,7 @@ impl Running {
         self.link.proved(&proof);
         self.ration = self.endpoint.ration(from.home());
         let account = Account::of(from, proof.principal().as_ref());
+        let _window = read.widen(|len| self.endpoint.window(&account, len));
         reader.count_with(self.endpoint.meter(&account));
         if let Some(letters) = beside.reader() {
             letters.count_with(self.endpoint.meter(&account));
@@ -575,9 +576,10 @@ impl Running {
     ) -> Result<(), End> {
         match event {
             Event::Greeted => {
-                let (peer, proved) = {
+                let (peer, proved, mandate) = {
                     let connection = &self.link.state.lock().connection;
-                    (connection.peer().cloned(), connection.proved_principal())
+                    let proved = connection.proved_principal();
+                    (connection.peer().cloned(), proved, connection.mandate())
                 };
                 if let Some(peer) = peer {
                     let hop = self.endpoint.enter(&self.link, &peer, proved, from).await?;
@@ -585,6 +587,7 @@ impl Running {
                         name: peer.identity.name.into(),
                         hop,
                         dialled: self.dialled.clone(),
+                        mandate,
                     });
                 }
                 self.link.state.lock().connection.welcome();

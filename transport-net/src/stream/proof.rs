@@ -2,7 +2,7 @@
 //!
 //! Without TLS nothing is proved, and nothing follows.
 
-use fipa_transport::Principal;
+use fipa_transport::{Mandate, Principal};
 
 #[cfg(feature = "secure")]
 use std::time::{Duration, SystemTime};
@@ -51,6 +51,15 @@ impl Proof {
         }
         let _unproved = agent;
         true
+    }
+
+    /// The agents that the peer may speak for beside itself.
+    pub(crate) fn mandate(&self) -> Mandate {
+        #[cfg(feature = "secure")]
+        if let Some((_, certificate)) = &self.certificate {
+            return certificate.certified().mandate().clone();
+        }
+        Mandate::Unproved
     }
 
     /// Whether there are agents that the peer may not speak for.

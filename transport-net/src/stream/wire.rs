@@ -17,6 +17,7 @@ use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::net::{UnixStream, unix};
 
 use super::frame::{FrameReader, Space};
+use super::place::Room;
 #[cfg(feature = "quic")]
 use crate::quic::streams as quic;
 #[cfg(feature = "secure")]
@@ -106,6 +107,19 @@ impl Reading {
                 letters: letters.take(),
             },
             _ => Beside::default(),
+        }
+    }
+
+    /// Lets the peer send ahead as much as is usual, if there is room for what it may send beyond the
+    /// minimum. The room is to be kept as long as the connection. Only QUIC buffers that much.
+    pub(crate) fn widen(&self, take: impl FnOnce(usize) -> Option<Room>) -> Option<Room> {
+        match self {
+            #[cfg(feature = "quic")]
+            Self::Quic(control, _) => control.widen(take),
+            _ => {
+                let _unbuffered = take;
+                None
+            }
         }
     }
 

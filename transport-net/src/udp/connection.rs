@@ -368,6 +368,18 @@ impl Connection {
         true
     }
 
+    /// Asks the peer for a sign of life.
+    pub(crate) fn ask(&mut self) {
+        if !self.urgent.iter().any(|kept| matches!(kept, Kept::Ping)) {
+            self.urgent.push_back(Kept::Ping);
+        }
+    }
+
+    /// Whether the peer was heard after this time.
+    pub(crate) fn is_heard_since(&self, since: Instant) -> bool {
+        self.heard.is_some_and(|heard| heard > since)
+    }
+
     /// The peer is looked for at a location that this connection was not opened for. When the peer
     /// did not list that address it may have moved there, so the connection is in doubt.
     pub(crate) fn is_used_for(&mut self, now: Instant, to: &Location) {

@@ -18,8 +18,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fipa_transport::{
-    Abandoned, Answer, AttemptId, Conclusion, Hop, Incarnation, Introduction, Location, Parcel,
-    Ticket, WayError, WayFault,
+    Abandoned, Answer, AttemptId, Conclusion, Hop, Incarnation, Introduction, Location, Mandate,
+    Parcel, Ticket, WayError, WayFault,
 };
 
 use super::config::UdpLimits;
@@ -109,6 +109,8 @@ struct Entry {
     peer: Option<Introduction>,
     /// Where the hello came from, and its number, if the peer opened it.
     greeted: Option<(SocketAddr, u64)>,
+    /// When it was asked for a sign of life because another peer says to be the same service.
+    asked: Option<Instant>,
     timer: Option<Instant>,
     is_ready: bool,
     is_eventful: bool,
@@ -303,7 +305,8 @@ impl Core {
             } => self.welcome(now, path, to, acceptor, hello),
             Datagram::Refused { to } => {
                 self.of_dialling(to, path, |_, _| {
-                    let detail = "the peer takes no more connections (its max_connections)";
+                    let detail = "the peer takes no more connections (its max_connections), or is connected \
+                                  with this service already";
                     Err(End::NotOpened(WayError::new(WayFault::Refused, detail)))
                 });
             }
@@ -540,6 +543,7 @@ impl Core {
             dialled,
             peer: None,
             greeted,
+            asked: None,
             timer: None,
             is_ready: false,
             is_eventful: false,
@@ -557,6 +561,7 @@ impl Core {
                 name,
                 hop,
                 dialled: entry.dialled.clone(),
+                mandate: Mandate::Unproved,
             };
             self.notes.push_back(Told::Introduced(peer.clone()));
             entry.peer = Some(peer);

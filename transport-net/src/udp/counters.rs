@@ -30,4 +30,6 @@ pub struct UdpCounters {
     pub refused_nonsense: u64,
     /// Connections refused because there were too many.
     pub refused_crowd: u64,
+    /// Connections refused because the service that their peers say to be is connected.
+    pub refused_unproved: u64,
 }

@@ -151,6 +151,9 @@ impl World {
     }
 
     fn transmit(&mut self, who: usize, transmit: Transmit) {
+        if transmit.path.remote != address(1 - who) {
+            return;
+        }
         let len = transmit.contents.len();
         if len > self.weather.interface {
             if let Some(number) = transmit.connection {
@@ -173,15 +176,20 @@ impl World {
         }
     }
 
-    /// Goes on to what happens next. Nothing happens any more when it says no.
-    fn step(&mut self) -> bool {
+    /// When something happens next.
+    fn next(&self) -> Option<Instant> {
         let next = [
             self.wire.keys().next().map(|(at, _)| *at),
             self.owed.keys().next().map(|(at, _)| *at),
             self.cores[A].poll_timeout(),
             self.cores[B].poll_timeout(),
         ];
-        let Some(next) = next.into_iter().flatten().min() else {
+        next.into_iter().flatten().min()
+    }
+
+    /// Goes on to what happens next. Nothing happens any more when it says no.
+    fn step(&mut self) -> bool {
+        let Some(next) = self.next() else {
             return false;
         };
         self.now = self.now.max(next);
@@ -607,49 +615,136 @@ fn an_interface_that_takes_less_than_every_path_carries_ends_the_connection() {
     assert!(error.detail.contains("1200"), "{error}");
 }
 
-/// A peer at another address sends A a hello with the identity of B.
-fn says_to_be_b(world: &mut World) {
-    let hello = crate::hello::Hello {
-        serial: 1,
-        dialled: "x".into(),
-        ..world.cores[B].own_hello(0, String::new())
-    };
-    let from: SocketAddr = "192.0.2.99:7788".parse().unwrap();
-    world.receive(A, from, &packet::hello(99, &NO_COOKIE, &hello));
-    let reply = world.cores[A].poll_transmit(world.now).unwrap();
-    let Some(Datagram::Cookie { cookie, .. }) = Datagram::read(&reply.contents) else {
-        panic!("no cookie");
-    };
-    world.receive(A, from, &packet::hello(99, &cookie, &hello));
-    // What A sends there goes nowhere.
-    while let Some(transmit) = world.cores[A].poll_transmit(world.now) {
-        if transmit.path.remote != from {
-            world.transmit(A, transmit);
+/// A peer that says to be another one.
+struct Stranger {
+    from: SocketAddr,
+    hello: crate::hello::Hello,
+    cookie: packet::Cookie,
+}
+
+impl Stranger {
+    /// A peer with the identity of B gets a cookie from A.
+    fn as_b(world: &mut World, from: &str, dialled: &str) -> Self {
+        let hello = crate::hello::Hello {
+            serial: 1 << 60,
+            dialled: dialled.into(),
+            ..world.cores[B].own_hello(0, String::new())
+        };
+        let from: SocketAddr = from.parse().unwrap();
+        world.receive(A, from, &packet::hello(99, &NO_COOKIE, &hello));
+        let reply = world.cores[A].poll_transmit(world.now).unwrap();
+        let Some(Datagram::Cookie { cookie, .. }) = Datagram::read(&reply.contents) else {
+            panic!("no cookie");
+        };
+        Self {
+            from,
+            hello,
+            cookie,
+        }
+    }
+
+    /// Says hello every 100 ms for this time. What A sends it goes nowhere.
+    fn greets(&self, world: &mut World, time: Duration) {
+        let end = world.now + time;
+        while world.now < end {
+            let hello = packet::hello(99, &self.cookie, &self.hello);
+            world.receive(A, self.from, &hello);
+            world.flush();
+            let next = world.now + Duration::from_millis(100);
+            while world.next().is_some_and(|due| due <= next) {
+                world.step();
+            }
+            world.now = next;
+        }
+    }
+}
+
+/// Nothing but what the tests are about ends a connection.
+fn patient() -> UdpLimits {
+    UdpLimits {
+        connect_timeout: Duration::from_secs(1000),
+        idle_close: Duration::from_secs(1000),
+        ..UdpLimits::default()
+    }
+}
+
+#[test]
+fn a_stranger_elsewhere_is_served_when_the_service_gives_no_sign_of_life() {
+    for gone in [false, true] {
+        let mut world = World::new(1, FAIR, &patient());
+        world.send(A, 1, 10).unwrap();
+        world.until_concluded(A, &BTreeSet::from([1]));
+        let before = world.cores[A].counters();
+        assert_eq!(before.connections, 1);
+        world.cut = gone;
+        let stranger = Stranger::as_b(&mut world, "192.0.2.99:7788", "x");
+        stranger.greets(&mut world, Duration::from_millis(900));
+        assert_eq!(
+            world.cores[A].counters().accepted,
+            before.accepted,
+            "{gone}"
+        );
+        stranger.greets(&mut world, Duration::from_millis(900));
+        let after = world.cores[A].counters();
+        assert_eq!(after.connections, 1);
+        assert_eq!(after.accepted - before.accepted, u64::from(gone));
+        assert_eq!(after.refused_unproved > 0, !gone);
+    }
+}
+
+#[test]
+fn a_stranger_at_the_address_of_the_service_is_served_when_that_gives_no_sign_of_life() {
+    for gone in [false, true] {
+        let mut world = World::new(1, FAIR, &patient());
+        world.send(B, 1, 10).unwrap();
+        let hello = world
+            .wire
+            .values()
+            .find_map(|(_, _, bytes)| match Datagram::read(bytes) {
+                Some(Datagram::Hello { hello, .. }) => crate::hello::Hello::decode(hello),
+                _ => None,
+            });
+        let dialled = hello.unwrap().dialled;
+        world.until_concluded(B, &BTreeSet::from([1]));
+        assert_eq!(world.cores[A].counters().accepted, 1);
+        world.cut = gone;
+        let stranger = Stranger::as_b(&mut world, "192.0.2.2:99", &dialled);
+        stranger.greets(&mut world, Duration::from_secs(2));
+        let after = world.cores[A].counters();
+        assert_eq!(
+            (after.connections, after.accepted),
+            (1, 1 + u64::from(gone))
+        );
+        // The letters of the service still arrive.
+        if !gone {
+            world.send(B, 2, 10).unwrap();
+            world.until_concluded(B, &BTreeSet::from([1, 2]));
+            assert_eq!(world.check(B, &BTreeSet::from([1, 2])), 2);
         }
     }
 }
 
 #[test]
-fn a_service_that_comes_from_elsewhere_is_asked_where_it_was() {
-    let limits = UdpLimits {
-        // Nothing else ends a connection here.
-        connect_timeout: Duration::from_secs(1000),
-        idle_close: Duration::from_secs(1000),
-        ..UdpLimits::default()
-    };
-    for moved in [false, true] {
-        let mut world = World::new(1, FAIR, &limits);
-        world.send(A, 1, 10).unwrap();
-        world.until_concluded(A, &BTreeSet::from([1]));
-        assert_eq!(world.cores[A].counters().connections, 1);
-        world.cut = moved;
-        let begun = world.now;
-        says_to_be_b(&mut world);
-        assert_eq!(world.cores[A].counters().connections, 2);
-        while world.now < begun + limits.silence / 4 && world.step() {}
-        let left = if moved { 1 } else { 2 };
-        assert_eq!(world.cores[A].counters().connections, left, "{moved}");
-    }
+fn a_service_is_served_at_once_at_each_address_that_its_first_connection_lists() {
+    let mut world = World::new(1, FAIR, &patient());
+    let other = "192.0.2.99:7788";
+    world.cores[B].listens_on(vec![address(B).to_string(), other.to_owned()]);
+    world.send(A, 1, 10).unwrap();
+    world.until_concluded(A, &BTreeSet::from([1]));
+    let begun = world.now;
+    let second = Stranger::as_b(&mut world, other, "x");
+    second.greets(&mut world, Duration::from_millis(100));
+    assert_eq!(world.cores[A].counters().connections, 2);
+    // When it has moved there, the first connection ends.
+    world.cut = true;
+    let third = Stranger::as_b(&mut world, other, "y");
+    third.greets(&mut world, UdpLimits::default().silence);
+    assert_eq!(
+        world.cores[A].counters().connections,
+        2,
+        "{:?}",
+        world.now - begun
+    );
 }
 
 #[test]

@@ -17,8 +17,9 @@ use bytes::Bytes;
 use fipa_acl::{Letter, Payload};
 use fipa_transport::wire::ParcelHeader;
 use fipa_transport::{
-    Answer, Arrival, Arriving, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, LegacySource,
-    LoanedContent, Location, Parcel, Sink, Stream, Ticket, Transport, Verdict, WayError,
+    Answer, Arrival, Arriving, AttemptId, Body, Conclusion, Hop, Incarnation, Introduction, Kind,
+    LegacySource, LoanedContent, Location, Parcel, Sink, Stream, Ticket, Transport, Verdict,
+    WayError,
 };
 use fipa_transport_net::{
     Identity, Limits, TcpConfig, TcpTransport, UdpConfig, UdpLimits, UnixConfig,
@@ -135,6 +136,7 @@ pub(crate) struct Record {
     pub(crate) arrivals: Vec<(Parcel, Hop, Ticket)>,
     pub(crate) unframed: Vec<(Letter, Kind)>,
     pub(crate) concluded: HashMap<AttemptId, Vec<Conclusion>>,
+    pub(crate) introduced: Vec<Introduction>,
 }
 
 pub(crate) struct Recorder {
@@ -212,6 +214,10 @@ impl Sink for Recorder {
             "the tests' peers are here, not at {from:?}"
         );
         self.record.lock().unframed.push((letter, via));
+    }
+
+    fn introduced(&self, peer: &Introduction) {
+        self.record.lock().introduced.push(peer.clone());
     }
 
     fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {

@@ -1,7 +1,7 @@
 //! How connections begin: strangers are given cookies, and those who bring one back a connection.
 
 use std::net::SocketAddr;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use fipa_transport::{Hop, Kind, Location, Principal};
 
@@ -12,6 +12,24 @@ use crate::address;
 use crate::end::End;
 use crate::hello::{Hello, OWN_INCARNATION};
 use crate::ration::whose;
+use crate::seldom::warn_seldom;
+
+/// How long a connected service has to give a sign of life when a stranger says that it is the service.
+const SIGN_OF_LIFE: Duration = Duration::from_secs(1);
+
+/// For how long such a question and its answer count. Longer than [`SIGN_OF_LIFE`] and the longest pause
+/// between two hellos.
+const ASKED_FOR: Duration = Duration::from_secs(3);
+
+/// Whether a new connection of a service that may be connected begins.
+enum Standing {
+    /// It begins.
+    Free,
+    /// The connected service has been asked for a sign of life.
+    Asked,
+    /// The connected service has given one.
+    Taken,
+}
 
 impl Core {
     /// A stranger says hello.
@@ -50,15 +68,27 @@ impl Core {
             ip: from.ip(),
             dialled: peer.dialled.clone(),
         };
-        match self.inbound.get(&inbound).copied() {
-            Some((serial, _)) if serial > peer.serial => {
-                self.counters.ignored += 1;
+        let before = self.inbound.get(&inbound);
+        if before.is_some_and(|(serial, _)| *serial > peer.serial) {
+            self.counters.ignored += 1;
+            return;
+        }
+        match self.standing(now, &inbound) {
+            Standing::Free => {}
+            // The peer sends its hello again, because it gets no answer.
+            Standing::Asked => return,
+            Standing::Taken => {
+                let before = self.counters.refused_unproved;
+                warn_seldom(
+                    before,
+                    format_args!(
+                        "{from}: connection refused: its incarnation has a connection that is alive"
+                    ),
+                );
+                self.counters.refused_unproved += 1;
+                self.reply(path, packet::refused(initiator));
                 return;
             }
-            // What the peer sent on its connection before this one must not arrive after what it
-            // sends now.
-            Some((_, before)) => self.end(before, &End::Superseded),
-            None => {}
         }
         let home = whose(from.ip());
         let same_address = self.greeted.keys().filter(|(a, _)| whose(a.ip()) == home);
@@ -86,6 +116,56 @@ impl Core {
         let own = self.own_hello(0, String::new());
         self.reply(path, packet::welcome(initiator, id, &own));
         self.touch(number);
+    }
+
+    /// Whether the service with this incarnation may be the peer of a new connection. A stranger must
+    /// not end the connections of the service that it claims to be: these are asked for a sign of life,
+    /// and end if there is none within [`SIGN_OF_LIFE`]. Nothing is remembered of the stranger.
+    fn standing(&mut self, now: Instant, inbound: &Inbound) -> Standing {
+        let mut standing = Standing::Free;
+        for number in self.rivals(inbound) {
+            let Some(rival) = self.connections.get_mut(&number) else {
+                continue;
+            };
+            let asked = rival.asked.filter(|asked| now < *asked + ASKED_FOR);
+            match asked {
+                None => {
+                    rival.asked = Some(now);
+                    rival.connection.ask();
+                    self.touch(number);
+                }
+                Some(asked) if rival.connection.is_heard_since(asked) => return Standing::Taken,
+                Some(asked) if now >= asked + SIGN_OF_LIFE => {
+                    // What the peer sent on its connection before this one must not arrive after what
+                    // it sends now.
+                    self.end(number, &End::Superseded);
+                    continue;
+                }
+                Some(_) => {}
+            }
+            standing = Standing::Asked;
+        }
+        standing
+    }
+
+    /// The connections that end if this one begins: the earlier one for the same location, and those at
+    /// other addresses than this, unless their peers list this one as their own.
+    fn rivals(&self, inbound: &Inbound) -> Vec<u32> {
+        let same = self.inbound.get(inbound).map(|(_, number)| *number);
+        let known = self.known.get(&inbound.incarnation);
+        let is_rival = |number: &u32| {
+            let Some(entry) = self.connections.get(number) else {
+                return false;
+            };
+            let there = entry.connection.path().map(|path| path.remote.ip());
+            if there == Some(inbound.ip) {
+                return same == Some(*number);
+            }
+            let peer = entry.connection.peer();
+            !peer.is_some_and(|peer| address::lists(&peer.listening, inbound.ip))
+        };
+        let known = known.into_iter().flatten().copied();
+        known.filter(is_rival).collect()
     }
 
     /// A peer has answered the hello of a connection.

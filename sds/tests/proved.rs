@@ -1,0 +1,240 @@
+//! Names that several gateways claim, some of them over links that prove what they may speak for.
+
+// The exception that clippy.toml makes for tests does not reach what they call.
+#![allow(clippy::unwrap_used)]
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use fipa_sds::{
+    Change, ContactDirectory, Directory, Exchange, MergedDirectory, Mts, Present, StaticDirectory,
+};
+use fipa_transport::{Incarnation, Location, Mandate};
+
+/// A gateway and its agent have numbers that belong together.
+const fn agent_of(gateway: u64) -> Incarnation {
+    Incarnation::from_u64(gateway + 1000)
+}
+
+fn location(gateway: u64) -> Location {
+    let text = format!("tcp://10.0.0.{gateway}:7788#{gateway:016x}");
+    text.parse().unwrap()
+}
+
+fn certified(agents: &[&str]) -> Mandate {
+    Mandate::Certified(agents.iter().map(|agent| (*agent).to_owned()).collect())
+}
+
+fn present(gateway: u64, mandate: Mandate) -> Present {
+    Present {
+        mts: Mts::new(format!("mts-{gateway}"), Incarnation::from_u64(gateway)),
+        locations: vec![location(gateway)],
+        mandate,
+    }
+}
+
+struct Bench {
+    now: Instant,
+    exchange: Exchange,
+    neighbours: Vec<Present>,
+    versions: u64,
+}
+
+impl Bench {
+    fn new(neighbours: Vec<Present>) -> Self {
+        let mut bench = Self {
+            now: Instant::now(),
+            exchange: Exchange::new(0),
+            neighbours,
+            versions: 0,
+        };
+        bench.connect();
+        bench
+    }
+
+    fn connect(&mut self) {
+        self.exchange.handle_neighbours(self.now, &self.neighbours);
+    }
+
+    /// The gateway tells that these are its agents, each registered at this time.
+    fn tell(&mut self, gateway: u64, agents: &[&str], registered: u64) {
+        self.versions += 1;
+        let (version, id) = (self.versions, agent_of(gateway));
+        let agents: Vec<String> = agents
+            .iter()
+            .map(|name| format!(r#"{{"name":"{name}","id":"{id}","registered":{registered}}}"#))
+            .collect();
+        let content = format!(
+            r#"{{"version":1,"tell":{{"full":{{"version":{version},"first":true,"last":true,
+            "agents":[{}]}}}}}}"#,
+            agents.join(",")
+        );
+        let from = Incarnation::from_u64(gateway);
+        let taken = self
+            .exchange
+            .handle_letter(self.now, from, content.as_bytes());
+        taken.unwrap();
+    }
+
+    fn holder(&self, name: &str) -> Option<u64> {
+        let entry = self.exchange.directory().known(name)?;
+        Some(entry.mts.incarnation.as_u64())
+    }
+}
+
+#[test]
+fn agents_that_the_certificate_does_not_name_are_left_out() {
+    let mut bench = Bench::new(vec![present(1, certified(&["rover", "arm_*"]))]);
+    bench.tell(1, &["rover", "arm_1", "crex", "arm"], 5);
+    let directory = bench.exchange.directory();
+    let names: Vec<String> = directory
+        .entries()
+        .iter()
+        .map(|it| it.name.to_string())
+        .collect();
+    assert_eq!(names, ["arm_1", "rover"]);
+    // The owner trusts another certificate of that gateway: it tells everything again.
+    bench.neighbours = vec![present(1, certified(&["crex"]))];
+    bench.connect();
+    assert_eq!(directory.entries().len(), 0);
+    bench.tell(1, &["rover", "crex"], 5);
+    assert_eq!(
+        (bench.holder("rover"), bench.holder("crex")),
+        (None, Some(1))
+    );
+}
+
+#[test]
+fn a_proved_claim_precedes_an_earlier_one_without_proof() {
+    let mut bench = Bench::new(vec![
+        present(1, Mandate::Unproved),
+        present(2, certified(&[])),
+    ]);
+    bench.tell(1, &["rover"], 1);
+    assert_eq!(bench.holder("rover"), Some(1));
+    bench.tell(2, &["rover"], 9);
+    assert_eq!(bench.holder("rover"), Some(2));
+    bench.tell(1, &["rover"], 0);
+    assert_eq!(bench.holder("rover"), Some(2));
+    bench.tell(2, &[], 0);
+    assert_eq!(bench.holder("rover"), Some(1));
+}
+
+#[test]
+fn the_first_of_two_proved_claims_keeps_the_name_until_it_leaves() {
+    let mut bench = Bench::new(vec![present(1, certified(&[])), present(2, certified(&[]))]);
+    bench.tell(1, &["rover"], 50);
+    // An earlier registration is only claimed.
+    bench.tell(2, &["rover"], 1);
+    assert_eq!(bench.holder("rover"), Some(1));
+    let contested = bench.exchange.directory().contested();
+    let claims = contested.iter().map(|(holder, other)| {
+        (
+            holder.mts.incarnation.as_u64(),
+            other.mts.incarnation.as_u64(),
+        )
+    });
+    assert_eq!(claims.collect::<Vec<_>>(), [(1, 2)]);
+    // The holder tells the same again, or something new of itself, and keeps its place.
+    bench.tell(1, &["rover"], 99);
+    assert_eq!(bench.holder("rover"), Some(1));
+    // An agent that moves is not locked out: it leaves one gateway.
+    bench.tell(1, &[], 0);
+    assert_eq!(bench.holder("rover"), Some(2));
+    assert!(bench.exchange.directory().contested().is_empty());
+    // Nor is one whose host is lost.
+    bench.tell(1, &["rover"], 0);
+    assert_eq!(bench.holder("rover"), Some(2));
+    bench.neighbours.remove(1);
+    bench.connect();
+    bench.exchange.handle_timeout(bench.now + Exchange::MEMORY);
+    assert_eq!(bench.holder("rover"), Some(1));
+}
+
+#[test]
+fn proved_agents_of_a_gateway_that_is_away_are_not_left_to_other_directories() {
+    for (mandate, stays) in [(Mandate::Unproved, false), (certified(&[]), true)] {
+        let mut bench = Bench::new(vec![present(1, mandate)]);
+        bench.tell(1, &["rover"], 5);
+        bench.neighbours.clear();
+        bench.connect();
+        bench.exchange.leave_to_others(|_| true);
+        assert_eq!(bench.holder("rover").is_some(), stays);
+    }
+}
+
+#[test]
+fn without_proof_the_earlier_registration_has_the_name() {
+    let unproved = [1, 2].map(|gateway| present(gateway, Mandate::Unproved));
+    let mut bench = Bench::new(unproved.to_vec());
+    bench.tell(1, &["rover"], 50);
+    bench.tell(2, &["rover"], 1);
+    assert_eq!(bench.holder("rover"), Some(2));
+    assert!(bench.exchange.directory().contested().is_empty());
+}
+
+/// What is announced or heard without proof, before what neighbours tell.
+fn merged(bench: &Bench, unproved: Arc<dyn Directory>) -> MergedDirectory {
+    MergedDirectory::new(vec![unproved, bench.exchange.directory()])
+}
+
+fn heard(name: &str, gateway: u64, agent: u64) -> Arc<ContactDirectory> {
+    let contacts = ContactDirectory::new();
+    let agent = Incarnation::from_u64(agent);
+    contacts
+        .heard(Instant::now(), name, agent, location(gateway))
+        .unwrap();
+    Arc::new(contacts)
+}
+
+#[test]
+fn in_a_merged_view_proved_entries_come_first() {
+    let mut bench = Bench::new(vec![present(1, certified(&[]))]);
+    let view = merged(&bench, heard("rover", 66, 6));
+    let mut watch = view.watch();
+    assert_eq!(view.known("rover").unwrap().mts.incarnation.as_u64(), 66);
+    // Registered long after the other was heard of, as it says.
+    bench.tell(1, &["rover"], 200_000_000_000_000);
+    let is_proved = |view: &MergedDirectory| {
+        let all = [view.known("rover"), view.entries().first().cloned()];
+        all.map(|entry| entry.unwrap().mts.incarnation.as_u64()) == [1, 1]
+    };
+    assert!(is_proved(&view));
+    assert!(matches!(
+        watch.try_next(),
+        Some(Change::Changed { .. } | Change::Left(_))
+    ));
+    assert!(view.mandate(Incarnation::from_u64(1)).is_proved());
+    // A view of views keeps to it.
+    let outer = MergedDirectory::new(vec![heard("rover", 67, 7), Arc::new(view)]);
+    assert!(is_proved(&outer));
+}
+
+#[test]
+fn what_the_configuration_says_comes_before_what_is_proved() {
+    let mut bench = Bench::new(vec![present(1, certified(&[]))]);
+    let old = StaticDirectory::new([("rover", vec![location(9)])]).unwrap();
+    let view = merged(&bench, Arc::new(old));
+    bench.tell(1, &["rover"], 1);
+    assert_ne!(view.known("rover").unwrap().mts.incarnation.as_u64(), 1);
+}
+
+#[test]
+fn other_directories_cannot_say_more_of_a_gateway_than_its_certificate() {
+    let mut bench = Bench::new(Vec::new());
+    let view = merged(&bench, heard("crex", 1, 6));
+    let mut watch = view.watch();
+    assert!(view.known("crex").is_some());
+    bench.neighbours = vec![present(1, certified(&["rover"]))];
+    bench.connect();
+    // A connection with the gateway proves that it does not speak for that name.
+    assert!(view.known("crex").is_none());
+    assert!(view.entries().is_empty());
+    assert_eq!(watch.try_next(), Some(Change::Lagged));
+    bench.neighbours.clear();
+    bench.connect();
+    bench
+        .exchange
+        .handle_timeout(bench.now + Exchange::MEMORY + Duration::from_millis(1));
+    assert!(view.known("crex").is_some(), "nothing is proved any more");
+}
