@@ -362,3 +362,10 @@ fn everything_at_once_holds_up_no_stream() {
         ..Weather::busy()
     });
 }
+
+// A gateway of another host and a process of this one lie, at any time and in every field.
+
+#[test]
+fn liars_break_no_promise() {
+    run(Weather::calm().with_liars());
+}

@@ -8,7 +8,7 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use fipa_sds::{Directory, Reach};
+use fipa_sds::{Directory, Reach, Role};
 use fipa_transport::{Hop, Incarnation, Introduction, Principal};
 
 use crate::Map;
@@ -123,11 +123,17 @@ impl Principals {
         if !from.is_remote() || !sender.is_known() {
             return Ok(());
         }
-        // The letters of a service itself come on links of its own only.
-        if self.services.contains_key(&sender) && sender != from.location.incarnation() {
+        let known = directory.known_incarnation(sender);
+        // The letters of a service itself come on links of its own only. A hello may name an agent's
+        // incarnation, which makes no service of the agent.
+        let is_agent = known.as_ref().is_some_and(|it| it.role == Role::Agent);
+        if !is_agent
+            && self.services.contains_key(&sender)
+            && sender != from.location.incarnation()
+        {
             return Err(Impostor::Sender);
         }
-        let owner = match directory.known_incarnation(sender).map(|it| it.reach) {
+        let owner = match known.map(|it| it.reach) {
             Some(Reach::Local) => Some(Principal::Host),
             Some(Reach::Remote { gateway }) => self.services.get(&gateway).map(|it| it.principal),
             None => None,

@@ -5,7 +5,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
-use fipa_transport::{FailureReason, Incarnation, Outcome};
+use fipa_transport::{FailureReason, Incarnation, Outcome, Parcel};
 
 use super::links::transfer_time;
 use super::{ATTEMPT_TIMEOUT, World};
@@ -35,6 +35,10 @@ pub(crate) enum Invariant {
     NotPassedOver,
     /// A letter sent after all faults is delivered within a bound.
     Liveness,
+    /// A letter in the name of an honest agent was sent by it.
+    NoForgery,
+    /// No gateway passes letters of one host on to another.
+    NoRelay,
     /// Without any fault no letter fails, and each failure is told.
     Calm,
 }
@@ -162,11 +166,29 @@ impl World {
         }
     }
 
+    /// A letter of a hostile member comes from one honest host to another.
+    pub(super) fn check_no_relay(&mut self, from: usize, to: usize, parcel: &Parcel) {
+        let [one, other] = [from, to].map(|at| &self.processes[at]);
+        let honest = !one.hostile && !other.hostile;
+        let Some(liars) = self.liars.as_ref().filter(|_| honest && one.host != other.host) else {
+            return;
+        };
+        let sender = parcel.stream.sender;
+        if liars.is_of_gateway(sender) {
+            let text = format!("a letter of {sender} is passed on from {from} to {to}");
+            self.breach(Invariant::NoRelay, || text);
+        }
+    }
+
     pub(super) fn check_end(&mut self) {
         let mut failed = 0;
         let mut breaches = Vec::new();
         for (number, sent) in &self.sent {
             for (receiver, outcome) in &sent.outcomes {
+                if self.is_liars_name(receiver) {
+                    // What becomes of these is for the liars to say.
+                    continue;
+                }
                 let key = (Arc::clone(receiver), *number);
                 let was_taken = self.taken.contains_key(&key);
                 let was_refused = || {
@@ -208,13 +230,13 @@ impl World {
             self.breach(invariant, || text);
         }
         let told = self.failures_told;
-        if self.forecast.is_calm() && failed != told {
+        if self.forecast.is_calm() && !self.forecast.liars && failed != told {
             self.breach(Invariant::Calm, || {
                 format!("{failed} failures, {told} told")
             });
         }
         let mut living = self.processes.iter().filter(|process| process.alive);
-        if living.any(|process| process.core.has_open_letters()) {
+        if living.any(|process| !process.hostile && process.core.has_open_letters()) {
             self.breach(Invariant::OneOutcome, || {
                 "letters are still open at the end".into()
             });

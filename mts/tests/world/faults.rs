@@ -55,7 +55,7 @@ impl World {
     /// A process dies.
     pub(super) fn die(&mut self) -> Result<(), Breach> {
         let living: Vec<usize> = (0..self.processes.len())
-            .filter(|&at| self.processes[at].alive)
+            .filter(|&at| self.processes[at].alive && !self.processes[at].hostile)
             .collect();
         let Some(&dead) = self.random.choice(&living) else {
             return Ok(());
@@ -81,6 +81,7 @@ impl World {
             while self.take(dead, agent) {}
         }
         self.processes[dead].alive = false;
+        self.part(dead);
         self.break_off(dead);
         let forgotten = Event::Forgotten {
             process: dead,

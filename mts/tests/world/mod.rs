@@ -3,6 +3,7 @@
 mod checks;
 mod faults;
 mod gates;
+mod liar;
 mod links;
 mod moves;
 mod traffic;
@@ -22,6 +23,7 @@ use parking_lot::Mutex;
 
 use self::checks::{Breaches, Invariant};
 use self::gates::{Denied, Refused, Rules};
+use self::liar::Liars;
 use self::links::{Flight, Flown, Link};
 use self::traffic::Sent;
 use self::view::{Registered, Registry, View};
@@ -46,6 +48,8 @@ type Breach = String;
 struct Process {
     host: usize,
     gateway: bool,
+    /// It lies; its core is not used.
+    hostile: bool,
     incarnation: Incarnation,
     core: Core,
     agents: Vec<(Arc<str>, Incarnation)>,
@@ -60,6 +64,8 @@ struct Process {
 
 enum Event {
     Send,
+    /// A hostile member sends something.
+    Lie,
     /// The next letter of a pair that sends without a pause.
     Stream {
         pair: usize,
@@ -161,6 +167,9 @@ pub(crate) struct World {
     /// The last letter of each sender that a registration has taken.
     last_taken: Map<(Incarnation, Incarnation), u64>,
     names: Map<Incarnation, Arc<str>>,
+    /// All registrations of honest agents.
+    honest: Set<Incarnation>,
+    liars: Option<Liars>,
     /// Agents that are about to read.
     reading: Set<Incarnation>,
     failures_told: u64,
@@ -217,6 +226,8 @@ impl World {
             taken: Map::default(),
             last_taken: Map::default(),
             names: Map::default(),
+            honest: Set::default(),
+            liars: None,
             reading: Set::default(),
             failures_told: 0,
             followed: 0,
@@ -238,6 +249,9 @@ impl World {
                     .collect();
                 world.birth(host, false, &names, &known);
             }
+        }
+        if weather.liars {
+            world.admit_liars();
         }
         world.plan_traffic();
         world.plan_faults();
@@ -317,6 +331,7 @@ impl World {
         let mut process = Process {
             host,
             gateway,
+            hostile: false,
             incarnation,
             core: Core::new(config, Arc::new(view)).gated(Arc::new(self.rules(host, gateway))),
             agents: Vec::new(),
@@ -335,6 +350,7 @@ impl World {
                 self.incarnation()
             };
             if !gateway {
+                self.honest.insert(agent);
                 process.core.register(Arc::clone(&name), agent);
                 process.agents.push((Arc::clone(&name), agent));
             }
@@ -350,9 +366,12 @@ impl World {
                 left: Vec::new(),
             });
         }
-        self.by_incarnation
-            .insert(incarnation, self.processes.len());
+        let at = self.processes.len();
+        self.by_incarnation.insert(incarnation, at);
         self.processes.push(process);
+        for other in 0..at {
+            self.meet(at, other);
+        }
     }
 
     /// The rules of access of a process on this host.
@@ -368,6 +387,7 @@ impl World {
             share,
             denied: here.map(|(_, denied)| denied.clone()).collect(),
             rate: (gateway && w.rate > 0.0).then_some((w.rate, self.heals)),
+            strangers: w.reading_pause_ms == 1,
             taken: Mutex::default(),
             refused: Arc::clone(&self.refused),
         }
@@ -410,6 +430,7 @@ impl World {
     fn happen(&mut self, event: Event) -> Result<(), Breach> {
         match event {
             Event::Send => self.send_burst(),
+            Event::Lie => self.lie(),
             Event::Stream { pair } => self.send_on(pair),
             Event::Arrive(flown) => self.arrive(*flown),
             Event::Conclude {
@@ -419,7 +440,7 @@ impl World {
             } => {
                 let now = self.clocks();
                 let process = &mut self.processes[at];
-                if process.alive && process.open.remove(&attempt).is_some() {
+                if process.alive && !process.hostile && process.open.remove(&attempt).is_some() {
                     self.trace(|| format!("{at} has {conclusion:?} of {attempt:?}"));
                     self.note_end(at, attempt, &conclusion);
                     let process = &mut self.processes[at];
@@ -519,7 +540,10 @@ impl World {
     }
 
     fn robots(&self) -> impl Iterator<Item = usize> {
-        let robot = |at: &usize| self.processes[*at].alive && !self.processes[*at].gateway;
+        let robot = |at: &usize| {
+            let process = &self.processes[*at];
+            process.alive && !process.gateway && !process.hostile
+        };
         (0..self.processes.len()).filter(robot)
     }
 

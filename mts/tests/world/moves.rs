@@ -34,7 +34,7 @@ impl World {
     pub(super) fn end_registrations(&mut self, host: usize, lives: &[Incarnation]) {
         let mut seen: Vec<Vec<(usize, Arc<Entry>)>> = vec![Vec::new(); self.weather.hosts];
         for process in 0..self.processes.len() {
-            if !self.processes[process].alive {
+            if !self.processes[process].alive || self.processes[process].hostile {
                 continue;
             }
             let host = self.processes[process].host;
@@ -66,6 +66,7 @@ impl World {
         process.core.register(Arc::clone(&name), life);
         process.agents.push((Arc::clone(&name), life));
         self.names.insert(life, Arc::clone(&name));
+        self.honest.insert(life);
         self.registry.lock().register(Registered {
             name,
             incarnation: life,
@@ -89,7 +90,8 @@ impl World {
             self.processes[*at].core.handle_departure(now, entry);
         }
         for at in 0..self.processes.len() {
-            if self.processes[at].alive && self.processes[at].host == host {
+            let process = &self.processes[at];
+            if process.alive && !process.hostile && process.host == host {
                 self.processes[at].core.handle_directory_change(now);
                 self.carry_out(at)?;
             }

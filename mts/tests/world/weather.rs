@@ -103,6 +103,8 @@ pub(crate) struct Weather {
     /// Pairs of agents that send without a pause from the beginning to the end, also after the
     /// world has healed.
     pub streams: usize,
+    /// Whether a gateway and a process lie, also after the world has healed. Gateways have keys then.
+    pub liars: bool,
 }
 
 impl Weather {
@@ -139,6 +141,7 @@ impl Weather {
             rate: 0.0,
             bursts: 100,
             streams: 1,
+            liars: false,
         }
     }
 
@@ -151,6 +154,14 @@ impl Weather {
             queue: 256,
             lane: 1024,
             ..Self::calm()
+        }
+    }
+
+    /// The same, with a gateway and a process that lie.
+    pub(crate) fn with_liars(self) -> Self {
+        Self {
+            liars: true,
+            ..self
         }
     }
 
