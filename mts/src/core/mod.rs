@@ -61,7 +61,7 @@ pub use notice::{News, Notice};
 use crate::{Gate, Map};
 use peers::Peers;
 pub use peers::{Peer, PeerState};
-use principals::Principals;
+use principals::{Impostor, Principals};
 pub use routes::{Route, Standing, Way, WayState};
 
 /// What time it is, by both clocks.
@@ -507,6 +507,9 @@ impl Core {
                 let sender = parcel.stream.sender;
                 let directory = &*self.desk.directory;
                 if let Err(impostor) = self.principals.check_sender(sender, &from, directory) {
+                    if impostor == Impostor::Stranger {
+                        return Verdict::Now(Answer::Busy);
+                    }
                     let detail = impostor.to_string();
                     return Verdict::Now(Answer::failed(FailureReason::Refused, detail));
                 }
@@ -658,6 +661,7 @@ impl Core {
     pub fn handle_departure(&mut self, now: Now, entry: &Entry) {
         if self.desk.config.forwards {
             self.desk.departed.left(now.instant, entry);
+            self.principals.left(entry);
         }
     }
 

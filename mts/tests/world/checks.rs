@@ -5,7 +5,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
-use fipa_transport::{FailureReason, Incarnation, Outcome, Parcel};
+use fipa_transport::{Attempt, FailureReason, Incarnation, Outcome, Parcel};
 
 use super::links::transfer_time;
 use super::{ATTEMPT_TIMEOUT, World};
@@ -35,6 +35,10 @@ pub(crate) enum Invariant {
     NotPassedOver,
     /// A letter sent after all faults is delivered within a bound.
     Liveness,
+    /// A receiver remembers every letter that can be open.
+    Remembered,
+    /// The reason of a failure is the true one.
+    Reason,
     /// A letter in the name of an honest agent was sent by it.
     NoForgery,
     /// No gateway passes letters of one host on to another.
@@ -84,12 +88,52 @@ impl World {
         }
     }
 
+    /// A letter has this outcome now.
+    pub(super) fn check_outcome(&mut self, number: u64, receiver: &str, outcome: &Outcome) {
+        let Outcome::Failed { reason, attempts } = outcome else {
+            return;
+        };
+        let forgotten = |attempt: &Attempt| attempt.error.detail == "too long ago to tell";
+        if attempts.iter().any(forgotten) && !self.is_liars_name(receiver) {
+            self.breach(Invariant::Remembered, || {
+                format!("letter {number}: {outcome}")
+            });
+        }
+        let by_full_queue = [
+            FailureReason::QueueFull,
+            FailureReason::NoSuchAgent,
+            FailureReason::Unconfirmed,
+        ];
+        // With less time than a letter may take, the clock is the reason.
+        let sent = self.sent.get(&number);
+        let is_patient = sent.is_some_and(|sent| sent.deadline >= Duration::from_secs(2));
+        let slow = self.forecast.is_slow_only() && !self.forecast.liars;
+        if slow && is_patient && !by_full_queue.contains(reason) {
+            self.breach(Invariant::Reason, || {
+                format!("letter {number} to {receiver} met a full queue at most: {outcome}")
+            });
+        }
+    }
+
+    /// A letter was sent by a service that has closed: it has failed as such already.
+    pub(super) fn check_closed(&mut self, number: u64) {
+        let sent = &self.sent[&number];
+        let closed = |outcome: &Outcome| {
+            matches!(outcome, Outcome::Failed { reason, attempts }
+                if *reason == FailureReason::Closed && attempts.is_empty())
+        };
+        if sent.outcomes.len() != sent.expected || !sent.outcomes.values().all(closed) {
+            let text = format!("letter {number} of a closed service: {:?}", sent.outcomes);
+            self.breach(Invariant::Reason, || text);
+        }
+    }
+
     pub(super) fn check_liveness(&mut self, number: u64) {
         let sent = &self.sent[&number];
         let (Some(bound), [receiver]) = (sent.bound, &*sent.receivers) else {
             return;
         };
-        let outcome = sent.outcomes.get(receiver);
+        let (w, outcome) = (self.weather, sent.outcomes.get(receiver));
         let was_refused = || {
             let key = (number, Arc::clone(receiver));
             self.refused.lock().contains(&key)
@@ -105,7 +149,7 @@ impl World {
             Some(Outcome::Failed {
                 reason: FailureReason::QueueFull,
                 attempts,
-            }) if attempts.is_empty() && self.weather.lane < 1024 => return,
+            }) if attempts.is_empty() && (w.lane < 1024 || w.lane_bytes < 64 << 20) => return,
             Some(outcome) => outcome.to_string(),
             None => "no outcome".to_owned(),
         };
@@ -170,7 +214,11 @@ impl World {
     pub(super) fn check_no_relay(&mut self, from: usize, to: usize, parcel: &Parcel) {
         let [one, other] = [from, to].map(|at| &self.processes[at]);
         let honest = !one.hostile && !other.hostile;
-        let Some(liars) = self.liars.as_ref().filter(|_| honest && one.host != other.host) else {
+        let Some(liars) = self
+            .liars
+            .as_ref()
+            .filter(|_| honest && one.host != other.host)
+        else {
             return;
         };
         let sender = parcel.stream.sender;

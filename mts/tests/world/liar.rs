@@ -10,12 +10,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use fipa_acl::{
-    AgentId, Envelope, EnvelopeParams, Letter, Message, Performative, Received, Time,
-};
+use fipa_acl::{AgentId, Envelope, EnvelopeParams, Letter, Message, Performative, Received, Time};
 use fipa_mts::core::{Core, CoreConfig, MAX_DEADLINE};
 use fipa_mts::letter_for;
-use fipa_sds::Role;
+use fipa_sds::{Directory, Role};
 use fipa_transport::{
     Answer, Attempt, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction,
     Kind, Outcome, Parcel, Principal, Report, Stream, WayError, WayFault,
@@ -23,7 +21,7 @@ use fipa_transport::{
 
 use super::links::Flown;
 use super::view::{Registered, View, way};
-use super::{AGENTS, Breach, Event, PROCESSES, Process, World};
+use super::{AGENTS, Breach, Event, PROCESSES, Process, Set, World};
 
 /// Parcels of others whose headers the liars know.
 const OVERHEARD: usize = 64;
@@ -46,6 +44,8 @@ pub(super) struct Liars {
     /// Introductions whose connections are open, and where.
     introduced: Vec<(usize, Introduction)>,
     attempts: u64,
+    /// Agents that a process has, or had, in its directory.
+    learnt: Set<(usize, Incarnation)>,
 }
 
 impl Liars {
@@ -87,6 +87,7 @@ impl World {
                 tickets: super::Map::default(),
                 next_ticket: 0,
                 alive: true,
+                closed: None,
                 wake: None,
             });
         }
@@ -123,10 +124,8 @@ impl World {
             owed: Vec::new(),
             introduced: Vec::new(),
             attempts: 0,
+            learnt: Set::default(),
         });
-        for other in 0..self.processes.len() {
-            self.meet(at[0], other);
-        }
         self.at(self.start, Event::Lie);
     }
 
@@ -135,13 +134,17 @@ impl World {
         let are_gateways = [one, other]
             .iter()
             .all(|at| self.processes[*at].gateway && self.processes[*at].alive);
-        if !self.weather.liars || !are_gateways || one == other {
+        if !self.weather.liars || !are_gateways || !self.met.insert((one, other)) {
             return;
         }
+        self.met.insert((other, one));
         let now = self.clocks();
+        self.trace(|| format!("{one} and {other} meet"));
         for (at, peer) in [(one, other), (other, one)] {
             let introduction = self.introduction_of(peer);
-            self.processes[at].core.handle_introduced(now, &introduction);
+            self.processes[at]
+                .core
+                .handle_introduced(now, &introduction);
         }
     }
 
@@ -152,8 +155,8 @@ impl World {
         }
         let now = self.clocks();
         let introduction = self.introduction_of(gone);
-        for process in &mut self.processes {
-            if process.gateway && process.alive && !process.hostile {
+        for (at, process) in self.processes.iter_mut().enumerate() {
+            if process.alive && self.met.contains(&(at, gone)) {
                 process.core.handle_parted(now, &introduction);
             }
         }
@@ -177,6 +180,12 @@ impl World {
     /// Whether this registration is of an agent of a hostile member, or of none.
     pub(super) fn is_hostile(&self, sender: Incarnation) -> bool {
         self.liars.is_some() && !self.honest.contains(&sender)
+    }
+
+    /// Whether an agent of a living process has this registration.
+    pub(super) fn is_registered(&self, agent: Incarnation) -> bool {
+        let mut living = self.processes.iter().filter(|process| process.alive);
+        living.any(|process| process.agents.iter().any(|(_, it)| *it == agent))
     }
 
     pub(super) fn is_liars_name(&self, name: &str) -> bool {
@@ -366,12 +375,29 @@ impl World {
             _ => {
                 let at = self.random.usize(..self.processes.len());
                 let agents = &self.processes[at].agents;
-                match agents.len() {
-                    0 => self.processes[at].incarnation,
+                let agent = match agents.len() {
+                    0 => return self.own_incarnation(true),
                     some => agents[self.random.usize(..some)].1,
+                };
+                match self.is_known(agent, target) {
+                    true => agent,
+                    false => self.own_incarnation(true),
                 }
             }
         }
+    }
+
+    /// Whether this registration is, or was, in the directory of the target. Before that it belongs to
+    /// the first link on which it is heard, whose ever that is.
+    fn is_known(&mut self, agent: Incarnation, target: usize) -> bool {
+        let known = self.view(target).known_incarnation(agent).is_some();
+        self.liars.as_mut().is_some_and(|liars| match known {
+            true => {
+                liars.learnt.insert((target, agent));
+                true
+            }
+            false => liars.learnt.contains(&(target, agent)),
+        })
     }
 
     /// An agent of this hostile member.
@@ -430,17 +456,26 @@ impl World {
         let ended = self.random.u32(..3) == 0;
         let known = self.liars.as_mut().and_then(|liars| {
             let here = liars.introduced.iter().position(|(at, _)| *at == target);
-            here.filter(|_| ended).map(|it| liars.introduced.swap_remove(it).1)
+            here.filter(|_| ended)
+                .map(|it| liars.introduced.swap_remove(it).1)
         });
         if let Some(introduction) = known {
-            self.processes[target].core.handle_parted(now, &introduction);
+            self.processes[target]
+                .core
+                .handle_parted(now, &introduction);
             return self.carry_out(target);
         }
-        let service = match self.random.bool() {
+        let mut service = match self.random.bool() {
             true => self.processes[liar].incarnation,
             false => self.any_incarnation(target),
         };
-        let host = self.random.usize(..=self.weather.hosts);
+        let gateway = self.by_incarnation.get(&service).copied();
+        if gateway.is_some_and(|gateway| !self.met.contains(&(target, gateway))) {
+            // A service belongs to the first certificate that it is introduced with.
+            service = self.processes[liar].incarnation;
+        }
+        // Its certificate proves its name.
+        let host = self.processes[liar].host;
         let introduction = Introduction {
             name: format!("gateway{host}").into(),
             hop: Hop {
@@ -464,7 +499,9 @@ impl World {
         let known = match overheard > 0 && self.random.u32(..8) > 0 {
             true => {
                 let place = self.random.usize(..overheard);
-                self.liars.as_ref().map(|liars| liars.overheard[place].clone())
+                self.liars
+                    .as_ref()
+                    .map(|liars| liars.overheard[place].clone())
             }
             false => None,
         };
@@ -522,7 +559,10 @@ impl World {
             8 => Body::Credit,
             _ => Body::Predecessor,
         };
-        if matches!(parcel.body, Body::Letter(_)) && !remote {
+        let is_letter = matches!(parcel.body, Body::Letter(_));
+        let sender = parcel.stream.sender;
+        let is_unheard = !self.is_hostile(sender) && !self.is_known(sender, target);
+        if is_letter && (!remote || is_unheard) {
             parcel.stream.sender = self.own_incarnation(remote);
         }
         let kind = match (self.random.bool(), remote) {

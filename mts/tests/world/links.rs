@@ -7,8 +7,8 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel, Principal, Ticket,
-    Verdict, WayError, WayFault,
+    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel,
+    Principal, Ticket, Verdict, WayError, WayFault,
 };
 
 use super::gates::number_of;
@@ -236,7 +236,13 @@ impl World {
         }
     }
 
-    pub(super) fn conclude_within(&mut self, ms: u64, at: usize, attempt: AttemptId, conclusion: Conclusion) {
+    pub(super) fn conclude_within(
+        &mut self,
+        ms: u64,
+        at: usize,
+        attempt: AttemptId,
+        conclusion: Conclusion,
+    ) {
         let conclude = Event::Conclude {
             at,
             attempt,
@@ -374,6 +380,9 @@ impl World {
         let stream = parcel.stream;
         let text = self.traced.then(|| text_of(attempt, &parcel));
         let cut = self.is_cut(to, from);
+        if remote && named.is_none() {
+            self.meet(to, from);
+        }
         let process = &mut self.processes[to];
         process.next_ticket += 1;
         let ticket = Ticket(process.next_ticket);

@@ -28,7 +28,7 @@ use self::links::{Flight, Flown, Link};
 use self::traffic::Sent;
 use self::view::{Registered, Registry, View};
 use self::watching::Watching;
-pub(crate) use self::weather::Weather;
+pub(crate) use self::weather::{Deadlines, Weather};
 
 const PROCESSES: usize = 3;
 const AGENTS: usize = 2;
@@ -59,6 +59,8 @@ struct Process {
     tickets: Map<Ticket, (usize, AttemptId)>,
     next_ticket: u64,
     alive: bool,
+    /// Since when it refuses to send: the service has ended.
+    closed: Option<Instant>,
     wake: Option<Instant>,
 }
 
@@ -92,6 +94,13 @@ enum Event {
     },
     Die,
     Restart,
+    GatewayDies,
+    /// A process closes.
+    Close,
+    /// It has closed, and ends.
+    Closed {
+        process: usize,
+    },
     Forgotten {
         process: usize,
         returns: bool,
@@ -170,6 +179,8 @@ pub(crate) struct World {
     /// All registrations of honest agents.
     honest: Set<Incarnation>,
     liars: Option<Liars>,
+    /// Gateways that have a connection with each other, or had.
+    met: Set<(usize, usize)>,
     /// Agents that are about to read.
     reading: Set<Incarnation>,
     failures_told: u64,
@@ -228,6 +239,7 @@ impl World {
             names: Map::default(),
             honest: Set::default(),
             liars: None,
+            met: Set::default(),
             reading: Set::default(),
             failures_told: 0,
             followed: 0,
@@ -320,6 +332,9 @@ impl World {
             queue: self.weather.queue,
             window: 8,
             lane: self.weather.lane,
+            queue_bytes: self.weather.queue_bytes,
+            lane_bytes: self.weather.lane_bytes,
+            custody_bytes: self.weather.custody_bytes,
             attempt_timeout: ATTEMPT_TIMEOUT,
             ..CoreConfig::new(name, incarnation, self.weather.order.to_vec())
         };
@@ -339,6 +354,7 @@ impl World {
             tickets: Map::default(),
             next_ticket: 0,
             alive: true,
+            closed: None,
             wake: None,
         };
         process.core.watch(self.watched);
@@ -369,9 +385,6 @@ impl World {
         let at = self.processes.len();
         self.by_incarnation.insert(incarnation, at);
         self.processes.push(process);
-        for other in 0..at {
-            self.meet(at, other);
-        }
     }
 
     /// The rules of access of a process on this host.
@@ -470,6 +483,9 @@ impl World {
             }
             Event::Die => self.die(),
             Event::Restart => self.restart(),
+            Event::GatewayDies => self.gateway_dies(),
+            Event::Close => self.close(),
+            Event::Closed { process } => self.closed(process),
             Event::Forgotten { process, returns } => self.forgotten(process, returns),
             Event::Reborn { process } => self.reborn(process),
             Event::Move => self.leave(),

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use fipa_sds::{Directory, Entry, Role};
+use fipa_sds::{Directory, Entry, Reach, Role};
 use fipa_transport::Incarnation;
 
 use super::view::Registered;
@@ -43,6 +43,15 @@ impl World {
                 .iter()
                 .filter_map(|life| view.known_incarnation(*life));
             seen[host].extend(entries.map(|entry| (process, entry)));
+            // The agents of a gateway leave with it.
+            let all = view.entries();
+            let behind = all.iter().filter(|entry| match entry.reach {
+                Reach::Remote { gateway } => {
+                    lives.contains(&gateway) && entry.incarnation != gateway
+                }
+                Reach::Local => false,
+            });
+            seen[host].extend(behind.map(|entry| (process, Arc::clone(entry))));
         }
         let times = self.news_times(host);
         for life in lives {

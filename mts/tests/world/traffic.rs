@@ -83,7 +83,7 @@ impl World {
         {
             receiver = liar;
         }
-        for _ in 0..self.random.u32(1..6) {
+        for _ in 0..self.random.u32(1..self.weather.burst) {
             self.send(at, (&name, sender), &receiver)?;
         }
         Ok(())
@@ -173,7 +173,11 @@ impl World {
             },
         );
         self.at(self.now + deadline + SLACK, Event::Deadline { number });
-        self.carry_out(at)
+        self.carry_out(at)?;
+        if self.processes[at].closed.is_some() {
+            self.check_closed(number);
+        }
+        Ok(())
     }
 
     /// The names of those that get a letter for a pattern.
@@ -199,6 +203,7 @@ impl World {
             return Err(format!("an outcome of a letter nobody sent: {outcome}"));
         };
         self.trace(|| format!("letter {number} to {receiver}: {outcome}"));
+        self.check_outcome(number, &receiver, &outcome);
         let sent = self.sent.get_mut(&number).expect("it was sent");
         let stream = (sent.sender, Arc::clone(&receiver));
         if let Some(open) = self.open.get_mut(&stream)
@@ -263,6 +268,8 @@ impl World {
         let own = sent.filter(|(_, sent)| sent.sender == received.sender);
         match own.map(|(number, _)| number) {
             Some(number) => self.check_take(agent, number),
+            // What is sent in the name of a registration that has ended harms no agent.
+            None if !self.is_registered(received.sender) => {}
             None => self.breach(Invariant::NoForgery, || {
                 let sender = received.sender;
                 format!("{agent} took a letter in the name of {sender}, which has not sent it")

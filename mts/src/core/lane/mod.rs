@@ -100,6 +100,8 @@ pub(crate) struct Lane {
     pauses: u32,
     /// The receiver's queue was full when it was last heard of.
     busy: bool,
+    /// When it was last full.
+    was_busy: Option<Instant>,
     /// A registration that has moved, and until when its successor is waited for.
     moving: Option<(Incarnation, Instant)>,
     /// A registration that has left the directory, and when something was last heard about
@@ -144,6 +146,7 @@ impl Lane {
             paused_for_lower: false,
             pauses: 0,
             busy: false,
+            was_busy: None,
             moving: None,
             ended: None,
             holds: false,
