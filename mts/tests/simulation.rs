@@ -65,6 +65,7 @@ const FEW_SEEDS: u64 = 5;
 fn run(weather: Weather, usually: u64) -> u64 {
     let (mut letters, mut followed, mut bounded) = (0, 0, 0);
     let mut slowest = Duration::ZERO;
+    let mut most = (0.0, 0);
     let mut breaches = BTreeMap::new();
     let seeds = seeds(usually);
     for &seed in &seeds {
@@ -77,6 +78,8 @@ fn run(weather: Weather, usually: u64) -> u64 {
         }
         letters += world.letters();
         followed += world.followed();
+        let (per_byte, steps) = world.work();
+        most = (f64::max(most.0, per_byte), most.1.max(steps));
         bounded += world.liveness().0;
         slowest = slowest.max(world.liveness().1);
     }
@@ -93,7 +96,8 @@ fn run(weather: Weather, usually: u64) -> u64 {
     assert!(letters > 0, "nothing was sent");
     println!(
         "{letters} letters over {seeds} seeds, {bounded} of them after the last fault, delivered \
-         within {slowest:?}: {weather:?}"
+         within {slowest:?}, {:.3} steps for each byte and {} for one arrival at most: {weather:?}",
+        most.0, most.1,
     );
     followed
 }

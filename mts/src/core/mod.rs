@@ -35,6 +35,8 @@ mod principals;
 mod routes;
 #[doc(hidden)]
 pub mod rules;
+#[doc(hidden)]
+pub mod work;
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -421,6 +423,7 @@ impl Core {
 
     /// All lanes, in the order in which they were made: runs with one seed are the same.
     fn lanes_in_order(&self) -> Vec<LaneId> {
+        work::steps(self.lanes.len());
         let mut lanes: Vec<LaneId> = self.lanes.keys().copied().collect();
         lanes.sort_unstable();
         lanes
@@ -499,6 +502,7 @@ impl Core {
             from,
             ticket,
         } = arrival;
+        work::steps(1);
         if let Err(impostor) = self.principals.check_service(&from) {
             return Verdict::Now(Answer::failed(FailureReason::Refused, impostor.to_string()));
         }
@@ -793,6 +797,7 @@ impl Core {
     }
 
     fn forget_lanes(&mut self, forget: impl Fn(&Lane) -> bool) {
+        work::steps(self.lanes.len());
         let ids = &mut self.lane_ids;
         self.lanes.retain(|_, lane| {
             let goes = forget(lane);

@@ -15,6 +15,11 @@ const LONGEST_PENALTY: Duration = Duration::from_secs(5);
 /// How long a busy receiver is left alone when no credit comes.
 const BUSY_PAUSE: Duration = Duration::from_millis(100);
 
+/// Steps of a core for each byte that arrives, at most.
+const STEPS_PER_BYTE: f64 = 1.0;
+/// Steps of a core for one arrival, at most, for each letter that a lane may hold.
+const MOST_STEPS: u64 = 8;
+
 /// What must hold in every run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Invariant {
@@ -43,6 +48,8 @@ pub(crate) enum Invariant {
     NoForgery,
     /// No gateway passes letters of one host on to another.
     NoRelay,
+    /// The steps of cores are bounded by the bytes that arrive.
+    Work,
     /// Without any fault no letter fails, and each failure is told.
     Calm,
 }
@@ -276,6 +283,13 @@ impl World {
         }
         for (invariant, text) in breaches {
             self.breach(invariant, || text);
+        }
+        let (per_byte, most) = self.work();
+        let one = MOST_STEPS * self.forecast.lane as u64;
+        if per_byte > STEPS_PER_BYTE || most > one {
+            self.breach(Invariant::Work, || {
+                format!("{per_byte} steps for each byte, {most} for one arrival")
+            });
         }
         let told = self.failures_told;
         if self.forecast.is_calm() && !self.forecast.liars && failed != told {

@@ -315,7 +315,8 @@ impl World {
     fn false_letter(&mut self, target: usize) -> Option<Letter> {
         let handed = self.liars.as_ref().map_or(0, |liars| liars.handed.len());
         let mut letter = match self.random.u32(..4) {
-            0 if handed > 0 => {
+            // Large ones would fill the queues of slow readers.
+            0 if handed > 0 && self.weather.reading_pause_ms == 1 => {
                 let place = self.random.usize(..handed);
                 self.liars.as_ref()?.handed[place].clone()
             }

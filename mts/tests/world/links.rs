@@ -11,6 +11,9 @@ use fipa_transport::{
     Principal, Ticket, Verdict, WayError, WayFault,
 };
 
+#[cfg(debug_assertions)]
+use fipa_mts::core::work;
+
 use super::gates::number_of;
 use super::liar::certificate;
 use super::view::{address_of, way};
@@ -23,6 +26,9 @@ pub(super) const BYTES_PER_SECOND: u64 = 4_000_000;
 const SOCKET: usize = 16 << 10;
 /// Largest letter in a datagram.
 pub(super) const MAX_DATAGRAM: usize = 8 << 10;
+
+/// Bytes of a parcel's header that count, at least.
+const HEADER: usize = 64;
 
 /// One direction between two processes.
 pub(super) struct Link {
@@ -400,7 +406,14 @@ impl World {
         };
         let at_once = kind == Kind::Shm;
         let waiting = process.core.waiting(stream.receiver);
+        let bytes = HEADER + size_of(&arrival.parcel);
+        #[cfg(debug_assertions)]
+        let _before = work::taken();
         let verdict = process.core.handle_arrival(now, kind, at_once, arrival);
+        #[cfg(debug_assertions)]
+        self.work.count(bytes, work::taken());
+        #[cfg(not(debug_assertions))]
+        let _ = bytes;
         let is_taken = process.core.waiting(stream.receiver) > waiting;
         if let Some(text) = text {
             let copy = if copy { " (a copy)" } else { "" };

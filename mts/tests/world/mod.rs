@@ -132,6 +132,24 @@ enum Event {
     },
 }
 
+/// Bytes that arrived, and the steps of cores because of them.
+#[derive(Debug, Default)]
+struct Work {
+    bytes: u64,
+    steps: u64,
+    /// Most steps for one arrival.
+    most: u64,
+}
+
+impl Work {
+    #[cfg(debug_assertions)]
+    fn count(&mut self, bytes: usize, steps: u64) {
+        self.bytes += bytes as u64;
+        self.steps += steps;
+        self.most = self.most.max(steps);
+    }
+}
+
 pub(crate) struct World {
     seed: u64,
     /// What goes wrong until the world heals.
@@ -179,6 +197,8 @@ pub(crate) struct World {
     /// All registrations of honest agents.
     honest: Set<Incarnation>,
     liars: Option<Liars>,
+    /// What arrived, and the steps of cores for it.
+    work: Work,
     /// Gateways that have a connection with each other, or had.
     met: Set<(usize, usize)>,
     /// Agents that are about to read.
@@ -240,6 +260,7 @@ impl World {
             honest: Set::default(),
             liars: None,
             met: Set::default(),
+            work: Work::default(),
             reading: Set::default(),
             failures_told: 0,
             followed: 0,
@@ -276,6 +297,12 @@ impl World {
 
     pub(crate) fn followed(&self) -> u64 {
         self.followed
+    }
+
+    /// Steps of cores for each byte that arrived, and most steps for one arrival.
+    pub(crate) fn work(&self) -> (f64, u64) {
+        let Work { bytes, steps, most } = self.work;
+        (steps as f64 / bytes.max(1) as f64, most)
     }
 
     /// How many letters the bound of liveness was checked for, and the longest time one of them

@@ -35,6 +35,7 @@ use self::delivery::State;
 use super::desk::{Author, Desk, Origin, Purpose, Settlement, Undelivered, life_of};
 use super::routes::Tally;
 use super::rules;
+use super::work;
 
 /// Pauses between rounds over all ways, and before a letter that was handed back goes out again.
 const FIRST_PAUSE: Duration = Duration::from_millis(10);
@@ -300,6 +301,7 @@ impl Lane {
     fn dispatch_waiting(&mut self, now: Instant, desk: &mut Desk) {
         let mut index = 0;
         while index < self.letters.len() && self.under_way < desk.config.window {
+            work::steps(1);
             let registration = self.letters[index].registration;
             // All between have the same, or the loop would not have come here.
             if !rules::may_dispatch(self.first_registration(), registration) {
@@ -531,6 +533,7 @@ impl Lane {
     /// way has its outcome when its transport has concluded it, which is at once.
     pub(crate) fn give_up(&mut self, now: Instant, desk: &mut Desk) {
         self.recovering = true;
+        work::steps(self.letters.len());
         let mut index = 0;
         while let Some(delivery) = self.letters.get_mut(index) {
             delivery.deadline = now;
