@@ -13,11 +13,11 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use fipa_transport::Kind;
-use world::{Weather, World};
+use world::{Deadlines, Weather, World};
 
 /// `FIPA_SIM_SEEDS=100000 cargo test -p fipa-mts --test simulation` runs more of them, and
 /// `FIPA_SIM_SEED=17` one. With `FIPA_SIM_TRACE=1` it prints what happens.
-fn seeds() -> Vec<u64> {
+fn seeds(usually: u64) -> Vec<u64> {
     let number = |name: &str| {
         std::env::var(name)
             .ok()
@@ -26,16 +26,48 @@ fn seeds() -> Vec<u64> {
     if let Some(seed) = number("FIPA_SIM_SEED") {
         return vec![seed];
     }
-    (0..number("FIPA_SIM_SEEDS").unwrap_or(50)).collect()
+    (0..number("FIPA_SIM_SEEDS").unwrap_or(usually)).collect()
 }
+
+/// Each profile of faults is a test, and so is the same with hostile members.
+macro_rules! profiles {
+    ($($(#[$doc:meta])* $name:ident = $weather:expr;)*) => {
+        $(
+            $(#[$doc])*
+            #[test]
+            fn $name() {
+                run($weather, SEEDS);
+            }
+        )*
+
+        /// A gateway of another host and a process of this one lie, at any time and in every field.
+        mod among_liars {
+            use super::*;
+
+            $(
+                $(#[$doc])*
+                #[test]
+                fn $name() {
+                    run($weather.with_liars(), FEW_SEEDS);
+                }
+            )*
+        }
+    };
+}
+
+/// Seeds of each profile, unless the environment says otherwise.
+const SEEDS: u64 = 50;
+/// Seeds of each profile with hostile members.
+const FEW_SEEDS: u64 = 5;
 
 /// Runs every seed, and fails with the first breach of each invariant and the number of seeds in
 /// which it was broken. Returns how many letters a later registration of their receiver took.
-fn run(weather: Weather) -> u64 {
+fn run(weather: Weather, usually: u64) -> u64 {
     let (mut letters, mut followed, mut bounded) = (0, 0, 0);
     let mut slowest = Duration::ZERO;
+    let mut most = (0.0, 0);
     let mut breaches = BTreeMap::new();
-    let seeds = seeds();
+    let seeds = seeds(usually);
     for &seed in &seeds {
         let mut world = World::new(seed, weather);
         for (invariant, breach) in world.run().err().unwrap_or_default() {
@@ -46,6 +78,8 @@ fn run(weather: Weather) -> u64 {
         }
         letters += world.letters();
         followed += world.followed();
+        let (per_byte, steps) = world.work();
+        most = (f64::max(most.0, per_byte), most.1.max(steps));
         bounded += world.liveness().0;
         slowest = slowest.max(world.liveness().1);
     }
@@ -62,303 +96,278 @@ fn run(weather: Weather) -> u64 {
     assert!(letters > 0, "nothing was sent");
     println!(
         "{letters} letters over {seeds} seeds, {bounded} of them after the last fault, delivered \
-         within {slowest:?}: {weather:?}"
+         within {slowest:?}, {:.3} steps for each byte and {} for one arrival at most: {weather:?}",
+        most.0, most.1,
     );
     followed
 }
 
 #[test]
-fn in_calm_weather_everything_is_delivered() {
-    run(Weather::calm());
-}
-
-#[test]
-fn losses_and_delays_break_no_promise() {
-    run(Weather {
-        loss: 0.05,
-        answer_loss: 0.05,
-        refusal: 0.05,
-        silence: 0.02,
-        ..Weather::calm()
-    });
-}
-
-#[test]
-fn heavy_losses_break_no_promise() {
-    run(Weather {
-        loss: 0.3,
-        answer_loss: 0.2,
-        refusal: 0.1,
-        silence: 0.1,
-        ..Weather::calm()
-    });
-}
-
-#[test]
-fn slow_receivers_hold_senders_back() {
-    run(Weather {
-        reading_pause_ms: 300,
-        queue: 4,
-        ..Weather::calm()
-    });
-}
-
-#[test]
-fn deaths_and_rebirths_break_no_promise() {
-    run(Weather {
-        deaths: 12,
-        answering_ms: 80,
-        loss: 0.02,
-        answer_loss: 0.02,
-        ..Weather::calm()
-    });
-}
-
-#[test]
 fn letters_to_agents_that_move_follow_or_fail() {
-    let followed = run(Weather {
+    let weather = Weather {
         moves: 60,
         news_ms: 60,
         hosts: 3,
         ..Weather::calm()
-    });
+    };
+    let followed = run(weather, SEEDS);
+    run(weather.with_liars(), FEW_SEEDS);
     assert!(
         followed > 0,
         "no letter came to a host that its receiver had left"
     );
 }
 
-#[test]
-fn moves_in_foul_weather_break_no_promise() {
-    run(Weather {
-        moves: 60,
-        news_ms: 60,
-        hosts: 3,
-        loss: 0.1,
-        answer_loss: 0.1,
-        refusal: 0.1,
-        silence: 0.05,
-        deaths: 4,
-        ..Weather::calm()
-    });
-}
+profiles! {
+    in_calm_weather_everything_is_delivered = Weather::calm();
 
-#[test]
-fn copies_and_overtaking_break_no_promise() {
-    run(Weather {
-        overtaken: 0.2,
-        copies: 0.2,
-        loss: 0.05,
-        silence: 0.05,
-        ..Weather::calm()
-    });
-}
+    losses_and_delays_break_no_promise = Weather {
+            loss: 0.05,
+            answer_loss: 0.05,
+            refusal: 0.05,
+            silence: 0.02,
+            ..Weather::calm()
+        };
 
-#[test]
-fn hosts_that_are_cut_off_break_no_promise() {
-    run(Weather {
-        partitions: 4,
-        overtaken: 0.05,
-        copies: 0.05,
-        answer_loss: 0.05,
-        hosts: 3,
-        ..Weather::calm()
-    });
-}
+    heavy_losses_break_no_promise = Weather {
+            loss: 0.3,
+            answer_loss: 0.2,
+            refusal: 0.1,
+            silence: 0.1,
+            ..Weather::calm()
+        };
 
-#[test]
-fn everything_at_once_breaks_no_promise() {
-    run(Weather {
-        loss: 0.1,
-        answer_loss: 0.1,
-        refusal: 0.1,
-        silence: 0.05,
-        deaths: 10,
-        reading_pause_ms: 50,
-        answering_ms: 30,
-        queue: 8,
-        outages: 6,
-        partitions: 2,
-        overtaken: 0.1,
-        copies: 0.1,
-        ..Weather::calm()
-    });
-}
+    slow_receivers_hold_senders_back = Weather {
+            reading_pause_ms: 300,
+            queue: 4,
+            ..Weather::calm()
+        };
 
-// Letters that fail, and streams that go on: after each of these letters the ones behind it are
-// delivered as if it had never been sent.
+    deaths_and_rebirths_break_no_promise = Weather {
+            deaths: 12,
+            answering_ms: 80,
+            loss: 0.02,
+            answer_loss: 0.02,
+            ..Weather::calm()
+        };
 
-#[test]
-fn letters_that_gateways_refuse_hold_up_no_stream() {
-    run(Weather {
-        refused_by_gateways: 0.02,
-        ..Weather::busy()
-    });
-}
 
-#[test]
-fn letters_that_receivers_refuse_hold_up_no_stream() {
-    run(Weather {
-        refused_by_receivers: 0.02,
-        ..Weather::busy()
-    });
-}
+    moves_in_foul_weather_break_no_promise = Weather {
+            moves: 60,
+            news_ms: 60,
+            hosts: 3,
+            loss: 0.1,
+            answer_loss: 0.1,
+            refusal: 0.1,
+            silence: 0.05,
+            deaths: 4,
+            ..Weather::calm()
+        };
 
-#[test]
-fn receivers_that_are_denied_for_a_while_get_later_letters() {
-    run(Weather {
-        denials: 10,
-        refusal: 0.05,
-        answer_loss: 0.05,
-        ..Weather::busy()
-    });
-}
+    copies_and_overtaking_break_no_promise = Weather {
+            overtaken: 0.2,
+            copies: 0.2,
+            loss: 0.05,
+            silence: 0.05,
+            ..Weather::calm()
+        };
 
-#[test]
-fn a_rate_limit_holds_up_no_stream() {
-    run(Weather {
-        rate: 40.0,
-        ..Weather::busy()
-    });
-}
+    hosts_that_are_cut_off_break_no_promise = Weather {
+            partitions: 4,
+            overtaken: 0.05,
+            copies: 0.05,
+            answer_loss: 0.05,
+            hosts: 3,
+            ..Weather::calm()
+        };
 
-#[test]
-fn deadlines_that_pass_behind_large_letters_hold_up_no_stream() {
-    run(Weather {
+    everything_at_once_breaks_no_promise = Weather {
+            loss: 0.1,
+            answer_loss: 0.1,
+            refusal: 0.1,
+            silence: 0.05,
+            deaths: 10,
+            reading_pause_ms: 50,
+            answering_ms: 30,
+            queue: 8,
+            outages: 6,
+            partitions: 2,
+            overtaken: 0.1,
+            copies: 0.1,
+            ..Weather::calm()
+        };
+
+    // Letters that fail, and streams that go on: after each of these letters the ones behind it are
+    // delivered as if it had never been sent.
+
+    letters_that_gateways_refuse_hold_up_no_stream = Weather {
+            refused_by_gateways: 0.02,
+            ..Weather::busy()
+        };
+
+    letters_that_receivers_refuse_hold_up_no_stream = Weather {
+            refused_by_receivers: 0.02,
+            ..Weather::busy()
+        };
+
+    receivers_that_are_denied_for_a_while_get_later_letters = Weather {
+            denials: 10,
+            refusal: 0.05,
+            answer_loss: 0.05,
+            ..Weather::busy()
+        };
+
+    a_rate_limit_holds_up_no_stream = Weather {
+            rate: 40.0,
+            ..Weather::busy()
+        };
+
+    deadlines_that_pass_behind_large_letters_hold_up_no_stream = Weather {
+            order: &[Kind::Shm, Kind::Tcp],
+            large: 0.1,
+            stalls: 6,
+            ..Weather::busy()
+        };
+
+    letters_too_large_for_a_datagram_hold_up_no_stream = Weather {
+            large: 0.1,
+            ..Weather::busy()
+        };
+
+    streams_go_on_when_links_heal = Weather {
+            loss: 0.05,
+            silence: 0.05,
+            answer_loss: 0.05,
+            refusal: 0.05,
+            outages: 4,
+            partitions: 2,
+            ..Weather::busy()
+        };
+
+    /// Two gateways hold letters of a stream at once, because the last stretch is slow.
+    two_slow_gateways_hold_up_no_stream = Weather {
+            local_ms: 80,
+            answering_ms: 50,
+            partitions: 2,
+            silence: 0.05,
+            refused_by_gateways: 0.01,
+            ..Weather::busy()
+        };
+
+    slow_receivers_and_small_lanes_hold_up_no_stream = Weather {
+            reading_pause_ms: 20,
+            queue: 8,
+            lane: 16,
+            refused_by_gateways: 0.01,
+            silence: 0.02,
+            ..Weather::busy()
+        };
+
+    letters_reach_hosts_whose_address_changes = Weather {
+            addresses: 8,
+            news_ms: 200,
+            loss: 0.02,
+            answer_loss: 0.02,
+            ..Weather::busy()
+        };
+
+    // Receivers that are registered again while copies of their letters are still on the way.
+
+    late_copies_reach_no_agent_that_has_moved = Weather {
+            overtaken: 0.2,
+            late_ms: 3000,
+            moves: 30,
+            news_ms: 60,
+            hosts: 3,
+            ..Weather::busy()
+        };
+
+    late_copies_reach_no_agent_that_was_started_again = Weather {
+            overtaken: 0.2,
+            late_ms: 3000,
+            restarts: 12,
+            news_ms: 60,
+            ..Weather::busy()
+        };
+
+    parcels_that_wait_in_a_socket_reach_no_agent_that_has_moved = Weather {
+            order: &[Kind::Shm, Kind::Tcp, Kind::Udp],
+            stalls: 6,
+            moves: 30,
+            news_ms: 60,
+            hosts: 3,
+            ..Weather::busy()
+        };
+
+    parcels_that_wait_in_a_socket_reach_no_agent_that_was_started_again = Weather {
+            order: &[Kind::Shm, Kind::Tcp, Kind::Udp],
+            stalls: 6,
+            restarts: 12,
+            ..Weather::busy()
+        };
+
+    everything_at_once_holds_up_no_stream = Weather {
+            loss: 0.05,
+            silence: 0.05,
+            answer_loss: 0.05,
+            refusal: 0.05,
+            overtaken: 0.05,
+            late_ms: 2000,
+            large: 0.05,
+            deaths: 6,
+            restarts: 4,
+            moves: 10,
+            news_ms: 60,
+            addresses: 2,
+            stalls: 3,
+            outages: 3,
+            partitions: 1,
+            refused_by_gateways: 0.01,
+            refused_by_receivers: 0.01,
+            denials: 3,
+            rate: 60.0,
+            hosts: 3,
+            ..Weather::busy()
+        };
+
+    // Bounds.
+
+    bytes_of_queues_and_lanes_are_bounded = Weather {
         order: &[Kind::Shm, Kind::Tcp],
-        large: 0.1,
-        stalls: 6,
-        ..Weather::busy()
-    });
-}
-
-#[test]
-fn letters_too_large_for_a_datagram_hold_up_no_stream() {
-    run(Weather {
-        large: 0.1,
-        ..Weather::busy()
-    });
-}
-
-#[test]
-fn streams_go_on_when_links_heal() {
-    run(Weather {
-        loss: 0.05,
-        silence: 0.05,
-        answer_loss: 0.05,
-        refusal: 0.05,
-        outages: 4,
-        partitions: 2,
-        ..Weather::busy()
-    });
-}
-
-/// Two gateways hold letters of a stream at once, because the last stretch is slow.
-#[test]
-fn two_slow_gateways_hold_up_no_stream() {
-    run(Weather {
-        local_ms: 80,
-        answering_ms: 50,
-        partitions: 2,
-        silence: 0.05,
-        refused_by_gateways: 0.01,
-        ..Weather::busy()
-    });
-}
-
-#[test]
-fn slow_receivers_and_small_lanes_hold_up_no_stream() {
-    run(Weather {
+        large: 0.3,
+        queue_bytes: 60_000,
+        lane_bytes: 120_000,
+        custody_bytes: 200_000,
         reading_pause_ms: 20,
-        queue: 8,
-        lane: 16,
-        refused_by_gateways: 0.01,
         silence: 0.02,
+        refused_by_gateways: 0.01,
         ..Weather::busy()
-    });
-}
+    };
 
-#[test]
-fn letters_reach_hosts_whose_address_changes() {
-    run(Weather {
-        addresses: 8,
-        news_ms: 200,
-        loss: 0.02,
-        answer_loss: 0.02,
+    full_queues_are_told_as_such = Weather {
+        reading_pause_ms: 400,
+        queue: 2,
         ..Weather::busy()
-    });
-}
+    };
 
-// Receivers that are registered again while copies of their letters are still on the way.
-
-#[test]
-fn late_copies_reach_no_agent_that_has_moved() {
-    run(Weather {
-        overtaken: 0.2,
-        late_ms: 3000,
-        moves: 30,
-        news_ms: 60,
-        hosts: 3,
-        ..Weather::busy()
-    });
-}
-
-#[test]
-fn late_copies_reach_no_agent_that_was_started_again() {
-    run(Weather {
-        overtaken: 0.2,
-        late_ms: 3000,
-        restarts: 12,
-        news_ms: 60,
-        ..Weather::busy()
-    });
-}
-
-#[test]
-fn parcels_that_wait_in_a_socket_reach_no_agent_that_has_moved() {
-    run(Weather {
-        order: &[Kind::Shm, Kind::Tcp, Kind::Udp],
-        stalls: 6,
-        moves: 30,
-        news_ms: 60,
-        hosts: 3,
-        ..Weather::busy()
-    });
-}
-
-#[test]
-fn parcels_that_wait_in_a_socket_reach_no_agent_that_was_started_again() {
-    run(Weather {
-        order: &[Kind::Shm, Kind::Tcp, Kind::Udp],
-        stalls: 6,
-        restarts: 12,
-        ..Weather::busy()
-    });
-}
-
-#[test]
-fn everything_at_once_holds_up_no_stream() {
-    run(Weather {
+    services_that_close_say_so = Weather {
+        closings: 8,
         loss: 0.05,
         silence: 0.05,
-        answer_loss: 0.05,
-        refusal: 0.05,
-        overtaken: 0.05,
-        late_ms: 2000,
-        large: 0.05,
-        deaths: 6,
-        restarts: 4,
-        moves: 10,
-        news_ms: 60,
-        addresses: 2,
-        stalls: 3,
-        outages: 3,
-        partitions: 1,
-        refused_by_gateways: 0.01,
-        refused_by_receivers: 0.01,
-        denials: 3,
-        rate: 60.0,
-        hosts: 3,
+        answering_ms: 40,
         ..Weather::busy()
-    });
+    };
+
+    /// Many letters are open when a gateway dies, and their receivers remember all of them.
+    letters_of_a_lost_custodian_are_remembered = Weather {
+        gateway_deaths: 8,
+        burst: 400,
+        bursts: 6,
+        local_ms: 30,
+        answering_ms: 60,
+        answer_loss: 0.02,
+        queue: 1024,
+        deadlines: Deadlines::Same,
+        ..Weather::busy()
+    };
 }

@@ -11,7 +11,7 @@ use fipa_transport::{FailureReason, Incarnation, LegacySource, Location, Signatu
 use super::desk::{Action, Author, Origin, Undelivered, life_of};
 use super::inbox::Received;
 use super::lane::Delivery;
-use super::{Core, News, Now, own_lane};
+use super::{Core, News, Now, own_lane, work};
 use crate::failure::Failure;
 use crate::stamp;
 
@@ -76,9 +76,18 @@ impl Core {
                     if !self.failure_limit.allows(now.instant, address, &named) {
                         continue;
                     }
+                    // The message is decoded as often only as its bytes came.
+                    if !self
+                        .failure_limit
+                        .may_pay(now.instant, address, letter.len())
+                    {
+                        continue;
+                    }
                     from
                 }
             };
+            // The message is decoded, and written anew.
+            work::steps(letter.len() / 512);
             let Some(report) = Failure::of(&letter, &receiver, reason, &detail) else {
                 continue;
             };

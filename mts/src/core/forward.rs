@@ -16,7 +16,7 @@ use super::failures::{cannot_be_decoded, locations_given};
 use super::inbox::link_of;
 use super::lane::{Delivery, Lane, LaneId, LaneKey};
 use super::limits::SenderLimit;
-use super::{Core, MAX_DEADLINE, News, Now, own_lane};
+use super::{Core, MAX_DEADLINE, News, Now, own_lane, work};
 use crate::gate::{self, Link};
 use smallvec::smallvec;
 
@@ -277,6 +277,8 @@ impl Core {
         if from.is_remote() && entry.reach != Reach::Local {
             return Err(unknown("the agent is not on the gateway's host"));
         }
+        // The envelope is read for stamps, and again for its sender.
+        work::steps(letter.envelope().len() / 512);
         match stamp::carries(&letter, &config.name, config.incarnation) {
             Ok(true) => return Err(Answer::failed(FailureReason::Loop, &*config.name)),
             Ok(false) => {}
@@ -401,6 +403,7 @@ impl Core {
                 self.unframed_failed(&name, &letter, (via, from), why);
             }
             for entry in here {
+                work::steps(1);
                 if let Err(why) = self.admits(now, &entry.name, &letter, unproved) {
                     let why = (FailureReason::Refused, why);
                     self.unframed_failed(&entry.name, &letter, (via, from), why);

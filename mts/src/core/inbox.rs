@@ -9,7 +9,7 @@ use fipa_acl::Letter;
 use fipa_transport::{Answer, FailureReason, Hop, Incarnation, Kind, Location, Parcel, Stream};
 
 use super::rules::{self, Offer};
-use super::{CoreConfig, MAX_DEADLINE};
+use super::{CoreConfig, MAX_DEADLINE, work};
 use crate::Gate;
 use crate::gate::{Link, Source};
 
@@ -206,6 +206,7 @@ impl Inbox {
     }
 
     fn wait(&mut self, stream: Stream, back: &Location) {
+        work::steps(self.waiting.len());
         let waits_already = self.waiting.iter().any(|(other, _)| *other == stream);
         if !waits_already && self.waiting.len() < MAX_WAITING {
             self.waiting.push_back((stream, back.clone()));
@@ -241,6 +242,7 @@ impl Inbox {
     /// Forgets senders of which nothing can still be under way.
     fn forget_old(&mut self, now: Instant) {
         // Twice, because a letter's remaining time does not count the time on the way.
+        work::steps(self.senders.len());
         let memory = MAX_DEADLINE * 2;
         self.senders
             .retain(|_, taken| now.saturating_duration_since(taken.seen) < memory);

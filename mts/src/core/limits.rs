@@ -164,6 +164,19 @@ impl FailureLimit {
         paid.last = now;
     }
 
+    /// Whether letters from this address had as many bytes as the letter that failed, less those of
+    /// failure messages. If not, the message is counted.
+    pub(super) fn may_pay(&mut self, now: Instant, from: Option<IpAddr>, bytes: usize) -> bool {
+        let Some(from) = from else { return true };
+        let paid = self.paid.get(&host(from)).map_or(0, |paid| paid.bytes);
+        // No more is ever in store.
+        let may = paid >= (bytes as u64).min(MAX_CREDIT);
+        if !may {
+            self.leave_out(now);
+        }
+        may
+    }
+
     /// Whether letters from this address had as many bytes as a failure message about one of them, and
     /// takes these bytes away. If not, the message is counted. Without an address nothing is limited:
     /// the sender is an agent of another gateway.

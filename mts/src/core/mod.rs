@@ -35,6 +35,8 @@ mod principals;
 mod routes;
 #[doc(hidden)]
 pub mod rules;
+#[doc(hidden)]
+pub mod work;
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -61,7 +63,7 @@ pub use notice::{News, Notice};
 use crate::{Gate, Map};
 use peers::Peers;
 pub use peers::{Peer, PeerState};
-use principals::Principals;
+use principals::{Impostor, Principals};
 pub use routes::{Route, Standing, Way, WayState};
 
 /// What time it is, by both clocks.
@@ -421,6 +423,7 @@ impl Core {
 
     /// All lanes, in the order in which they were made: runs with one seed are the same.
     fn lanes_in_order(&self) -> Vec<LaneId> {
+        work::steps(self.lanes.len());
         let mut lanes: Vec<LaneId> = self.lanes.keys().copied().collect();
         lanes.sort_unstable();
         lanes
@@ -499,6 +502,7 @@ impl Core {
             from,
             ticket,
         } = arrival;
+        work::steps(1);
         if let Err(impostor) = self.principals.check_service(&from) {
             return Verdict::Now(Answer::failed(FailureReason::Refused, impostor.to_string()));
         }
@@ -507,6 +511,9 @@ impl Core {
                 let sender = parcel.stream.sender;
                 let directory = &*self.desk.directory;
                 if let Err(impostor) = self.principals.check_sender(sender, &from, directory) {
+                    if impostor == Impostor::Stranger {
+                        return Verdict::Now(Answer::Busy);
+                    }
                     let detail = impostor.to_string();
                     return Verdict::Now(Answer::failed(FailureReason::Refused, detail));
                 }
@@ -658,6 +665,7 @@ impl Core {
     pub fn handle_departure(&mut self, now: Now, entry: &Entry) {
         if self.desk.config.forwards {
             self.desk.departed.left(now.instant, entry);
+            self.principals.left(entry);
         }
     }
 
@@ -789,6 +797,7 @@ impl Core {
     }
 
     fn forget_lanes(&mut self, forget: impl Fn(&Lane) -> bool) {
+        work::steps(self.lanes.len());
         let ids = &mut self.lane_ids;
         self.lanes.retain(|_, lane| {
             let goes = forget(lane);

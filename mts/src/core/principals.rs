@@ -8,7 +8,7 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use fipa_sds::{Directory, Reach, Role};
+use fipa_sds::{Directory, Entry, Reach, Role};
 use fipa_transport::{Hop, Incarnation, Introduction, Principal};
 
 use crate::Map;
@@ -26,9 +26,10 @@ pub(super) struct Principals {
     services: Map<Incarnation, Service>,
     /// The services in the order in which they were first connected.
     order: VecDeque<Incarnation>,
-    /// Senders that the directory did not know when they first wrote.
-    senders: Map<Incarnation, Principal>,
-    heard: Map<Principal, VecDeque<Incarnation>>,
+    /// Senders that the directory did not know when they first wrote,
+    /// and those that have left it; none for one whose gateway was never connected.
+    senders: Map<Incarnation, Option<Principal>>,
+    heard: Map<Option<Principal>, VecDeque<Incarnation>>,
 }
 
 #[derive(Debug)]
@@ -45,6 +46,10 @@ pub(super) enum Impostor {
     /// The service of the link belongs to another principal.
     #[error("another service has proved to be the one that this link names")]
     Service,
+    /// The gateway of the sender has not introduced itself yet, so it is not this one as far as is
+    /// known. No final answer.
+    #[error("the gateway of the sender has not introduced itself yet")]
+    Stranger,
     /// The sender belongs to another principal.
     #[error("the link does not prove to speak for the sender of this letter")]
     Sender,
@@ -138,29 +143,65 @@ impl Principals {
         }
         let owner = match known.map(|it| it.reach) {
             Some(Reach::Local) => Some(Principal::Host),
-            Some(Reach::Remote { gateway }) => self.services.get(&gateway).map(|it| it.principal),
+            Some(Reach::Remote { gateway }) => match self.services.get(&gateway) {
+                Some(gateway) => Some(gateway.principal),
+                // The gateway introduces itself before it hands letters over. It may also have a new
+                // incarnation that the directory will show.
+                None if from.principal != Principal::Unproved => return Err(Impostor::Stranger),
+                None => None,
+            },
             None => None,
         };
-        let owner = owner.unwrap_or_else(|| self.first_heard(sender, from.principal));
+        let owner = match owner {
+            Some(owner) => owner,
+            None => self.first_heard(sender, from.principal)?,
+        };
         match owner == from.principal {
             true => Ok(()),
             false => Err(Impostor::Sender),
         }
     }
 
-    fn first_heard(&mut self, sender: Incarnation, principal: Principal) -> Principal {
-        if let Some(owner) = self.senders.get(&sender) {
-            return *owner;
+    /// This entry has left the directory. Its registration keeps its principal: the gateway may have
+    /// lost the connection only, and letters in the agent's name are not for others to send meanwhile.
+    pub(super) fn left(&mut self, entry: &Entry) {
+        let owner = match entry.reach {
+            Reach::Local => Some(Principal::Host),
+            Reach::Remote { gateway } => self.services.get(&gateway).map(|it| it.principal),
+        };
+        if entry.incarnation.is_known() {
+            self.remember(entry.incarnation, owner);
         }
-        let heard = self.heard.entry(principal).or_default();
+    }
+
+    fn first_heard(
+        &mut self,
+        sender: Incarnation,
+        principal: Principal,
+    ) -> Result<Principal, Impostor> {
+        match self.senders.get(&sender) {
+            Some(Some(owner)) => Ok(*owner),
+            // Its gateway left before it introduced itself.
+            Some(None) if principal != Principal::Unproved => Err(Impostor::Stranger),
+            _ => {
+                self.remember(sender, Some(principal));
+                Ok(principal)
+            }
+        }
+    }
+
+    fn remember(&mut self, sender: Incarnation, owner: Option<Principal>) {
+        if self.senders.insert(sender, owner) == Some(owner) {
+            return;
+        }
+        let heard = self.heard.entry(owner).or_default();
         if heard.len() >= MAX_SENDERS
             && let Some(oldest) = heard.pop_front()
+            && self.senders.get(&oldest) == Some(&owner)
         {
             self.senders.remove(&oldest);
         }
         heard.push_back(sender);
-        self.senders.insert(sender, principal);
-        principal
     }
 }
 

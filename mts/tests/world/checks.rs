@@ -5,7 +5,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
-use fipa_transport::{FailureReason, Incarnation, Outcome};
+use fipa_transport::{Attempt, FailureReason, Incarnation, Outcome, Parcel};
 
 use super::links::transfer_time;
 use super::{ATTEMPT_TIMEOUT, World};
@@ -14,6 +14,11 @@ use super::{ATTEMPT_TIMEOUT, World};
 const LONGEST_PENALTY: Duration = Duration::from_secs(5);
 /// How long a busy receiver is left alone when no credit comes.
 const BUSY_PAUSE: Duration = Duration::from_millis(100);
+
+/// Steps of a core for each byte that arrives, at most.
+const STEPS_PER_BYTE: f64 = 1.0;
+/// Steps of a core for one arrival, at most, for each letter that a lane may hold.
+const MOST_STEPS: u64 = 8;
 
 /// What must hold in every run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -35,6 +40,16 @@ pub(crate) enum Invariant {
     NotPassedOver,
     /// A letter sent after all faults is delivered within a bound.
     Liveness,
+    /// A receiver remembers every letter that can be open.
+    Remembered,
+    /// The reason of a failure is the true one.
+    Reason,
+    /// A letter in the name of an honest agent was sent by it.
+    NoForgery,
+    /// No gateway passes letters of one host on to another.
+    NoRelay,
+    /// The steps of cores are bounded by the bytes that arrive.
+    Work,
     /// Without any fault no letter fails, and each failure is told.
     Calm,
 }
@@ -80,12 +95,52 @@ impl World {
         }
     }
 
+    /// A letter has this outcome now.
+    pub(super) fn check_outcome(&mut self, number: u64, receiver: &str, outcome: &Outcome) {
+        let Outcome::Failed { reason, attempts } = outcome else {
+            return;
+        };
+        let forgotten = |attempt: &Attempt| attempt.error.detail == "too long ago to tell";
+        if attempts.iter().any(forgotten) && !self.is_liars_name(receiver) {
+            self.breach(Invariant::Remembered, || {
+                format!("letter {number}: {outcome}")
+            });
+        }
+        let by_full_queue = [
+            FailureReason::QueueFull,
+            FailureReason::NoSuchAgent,
+            FailureReason::Unconfirmed,
+        ];
+        // With less time than a letter may take, the clock is the reason.
+        let sent = self.sent.get(&number);
+        let is_patient = sent.is_some_and(|sent| sent.deadline >= Duration::from_secs(2));
+        let slow = self.forecast.is_slow_only() && !self.forecast.liars;
+        if slow && is_patient && !by_full_queue.contains(reason) {
+            self.breach(Invariant::Reason, || {
+                format!("letter {number} to {receiver} met a full queue at most: {outcome}")
+            });
+        }
+    }
+
+    /// A letter was sent by a service that has closed: it has failed as such already.
+    pub(super) fn check_closed(&mut self, number: u64) {
+        let sent = &self.sent[&number];
+        let closed = |outcome: &Outcome| {
+            matches!(outcome, Outcome::Failed { reason, attempts }
+                if *reason == FailureReason::Closed && attempts.is_empty())
+        };
+        if sent.outcomes.len() != sent.expected || !sent.outcomes.values().all(closed) {
+            let text = format!("letter {number} of a closed service: {:?}", sent.outcomes);
+            self.breach(Invariant::Reason, || text);
+        }
+    }
+
     pub(super) fn check_liveness(&mut self, number: u64) {
         let sent = &self.sent[&number];
         let (Some(bound), [receiver]) = (sent.bound, &*sent.receivers) else {
             return;
         };
-        let outcome = sent.outcomes.get(receiver);
+        let (w, outcome) = (self.weather, sent.outcomes.get(receiver));
         let was_refused = || {
             let key = (number, Arc::clone(receiver));
             self.refused.lock().contains(&key)
@@ -101,7 +156,7 @@ impl World {
             Some(Outcome::Failed {
                 reason: FailureReason::QueueFull,
                 attempts,
-            }) if attempts.is_empty() && self.weather.lane < 1024 => return,
+            }) if attempts.is_empty() && (w.lane < 1024 || w.lane_bytes < 64 << 20) => return,
             Some(outcome) => outcome.to_string(),
             None => "no outcome".to_owned(),
         };
@@ -162,11 +217,33 @@ impl World {
         }
     }
 
+    /// A letter of a hostile member comes from one honest host to another.
+    pub(super) fn check_no_relay(&mut self, from: usize, to: usize, parcel: &Parcel) {
+        let [one, other] = [from, to].map(|at| &self.processes[at]);
+        let honest = !one.hostile && !other.hostile;
+        let Some(liars) = self
+            .liars
+            .as_ref()
+            .filter(|_| honest && one.host != other.host)
+        else {
+            return;
+        };
+        let sender = parcel.stream.sender;
+        if liars.is_of_gateway(sender) {
+            let text = format!("a letter of {sender} is passed on from {from} to {to}");
+            self.breach(Invariant::NoRelay, || text);
+        }
+    }
+
     pub(super) fn check_end(&mut self) {
         let mut failed = 0;
         let mut breaches = Vec::new();
         for (number, sent) in &self.sent {
             for (receiver, outcome) in &sent.outcomes {
+                if self.is_liars_name(receiver) {
+                    // What becomes of these is for the liars to say.
+                    continue;
+                }
                 let key = (Arc::clone(receiver), *number);
                 let was_taken = self.taken.contains_key(&key);
                 let was_refused = || {
@@ -207,14 +284,21 @@ impl World {
         for (invariant, text) in breaches {
             self.breach(invariant, || text);
         }
+        let (per_byte, most) = self.work();
+        let one = MOST_STEPS * self.forecast.lane as u64;
+        if per_byte > STEPS_PER_BYTE || most > one {
+            self.breach(Invariant::Work, || {
+                format!("{per_byte} steps for each byte, {most} for one arrival")
+            });
+        }
         let told = self.failures_told;
-        if self.forecast.is_calm() && failed != told {
+        if self.forecast.is_calm() && !self.forecast.liars && failed != told {
             self.breach(Invariant::Calm, || {
                 format!("{failed} failures, {told} told")
             });
         }
         let mut living = self.processes.iter().filter(|process| process.alive);
-        if living.any(|process| process.core.has_open_letters()) {
+        if living.any(|process| !process.hostile && process.core.has_open_letters()) {
             self.breach(Invariant::OneOutcome, || {
                 "letters are still open at the end".into()
             });

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::{Incarnation, Kind};
 
+use super::checks::Invariant;
 use super::gates::Denied;
 use super::{Breach, Event, PROCESSES, World};
 
@@ -17,8 +18,10 @@ impl World {
     pub(super) fn plan_faults(&mut self) {
         let w = self.weather;
         type Fault = (u32, fn() -> Event);
-        let faults: [Fault; 7] = [
+        let faults: [Fault; 9] = [
             (w.deaths, || Event::Die),
+            (w.gateway_deaths, || Event::GatewayDies),
+            (w.closings, || Event::Close),
             (w.restarts, || Event::Restart),
             (w.moves, || Event::Move),
             (w.partitions, || Event::CutOff),
@@ -55,13 +58,56 @@ impl World {
     /// A process dies.
     pub(super) fn die(&mut self) -> Result<(), Breach> {
         let living: Vec<usize> = (0..self.processes.len())
-            .filter(|&at| self.processes[at].alive)
+            .filter(|&at| self.processes[at].alive && !self.processes[at].hostile)
             .collect();
         let Some(&dead) = self.random.choice(&living) else {
             return Ok(());
         };
         let returns = self.random.f64() < 0.8;
         self.kill(dead, returns)
+    }
+
+    /// A gateway is killed and started again.
+    pub(super) fn gateway_dies(&mut self) -> Result<(), Breach> {
+        let gateways = (0..self.processes.len()).filter(|at| {
+            let process = &self.processes[*at];
+            process.alive && process.gateway && !process.hostile
+        });
+        let gateways: Vec<usize> = gateways.collect();
+        match self.random.choice(&gateways) {
+            Some(&dead) => self.kill(dead, true),
+            None => Ok(()),
+        }
+    }
+
+    /// A robot process gives up what is under way, refuses to send for a moment, and ends.
+    pub(super) fn close(&mut self) -> Result<(), Breach> {
+        let open = self
+            .robots()
+            .filter(|at| self.processes[*at].closed.is_none());
+        let open: Vec<usize> = open.collect();
+        let Some(&at) = self.random.choice(&open) else {
+            return Ok(());
+        };
+        let now = self.clocks();
+        self.processes[at].closed = Some(self.now);
+        self.processes[at].core.give_up(now);
+        self.carry_out(at)?;
+        if self.processes[at].core.has_open_letters() {
+            self.breach(Invariant::OneOutcome, || {
+                "a closed service has open letters".into()
+            });
+        }
+        let end = self.after_ms(100, Event::Closed { process: at });
+        self.fault_until(end);
+        Ok(())
+    }
+
+    pub(super) fn closed(&mut self, at: usize) -> Result<(), Breach> {
+        match self.processes[at].alive {
+            true => self.kill(at, true),
+            false => Ok(()),
+        }
     }
 
     /// A robot process is killed and started again.
@@ -81,6 +127,7 @@ impl World {
             while self.take(dead, agent) {}
         }
         self.processes[dead].alive = false;
+        self.part(dead);
         self.break_off(dead);
         let forgotten = Event::Forgotten {
             process: dead,

@@ -22,6 +22,9 @@ pub(super) struct Rules {
     pub(super) denied: Vec<Denied>,
     /// Letters a second, and until when that is a limit.
     pub(super) rate: Option<(f64, Instant)>,
+    /// Whether letters without a number are taken, which are of hostile members. They are not where
+    /// agents read slowly: queues full of them are no lie.
+    pub(super) strangers: bool,
     pub(super) taken: Mutex<Option<Allowance>>,
     pub(super) refused: Refused,
 }
@@ -55,7 +58,10 @@ impl Rules {
 impl Gate for Rules {
     fn admits(&self, now: Instant, receiver: &str, letter: &Letter, _: Link) -> Result<(), String> {
         let Some(number) = number_of(letter) else {
-            return Ok(());
+            return match self.strangers {
+                true => Ok(()),
+                false => Err("strangers are refused".to_owned()),
+            };
         };
         match self.refuses(now, receiver, number) {
             None => Ok(()),

@@ -7,11 +7,15 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use fipa_transport::{
-    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Kind, Location, Parcel, Principal, Ticket,
-    Verdict, WayError, WayFault,
+    Answer, Arrival, AttemptId, Body, Conclusion, Hop, Incarnation, Kind, Location, Parcel,
+    Principal, Ticket, Verdict, WayError, WayFault,
 };
 
+#[cfg(debug_assertions)]
+use fipa_mts::core::work;
+
 use super::gates::number_of;
+use super::liar::certificate;
 use super::view::{address_of, way};
 use super::{Breach, Event, World};
 
@@ -22,6 +26,9 @@ pub(super) const BYTES_PER_SECOND: u64 = 4_000_000;
 const SOCKET: usize = 16 << 10;
 /// Largest letter in a datagram.
 pub(super) const MAX_DATAGRAM: usize = 8 << 10;
+
+/// Bytes of a parcel's header that count, at least.
+const HEADER: usize = 64;
 
 /// One direction between two processes.
 pub(super) struct Link {
@@ -54,6 +61,29 @@ pub(super) struct Flown {
     mute: bool,
     /// Not the parcel itself, but a second one.
     copy: bool,
+    /// The service that its link names, if it is not the one that sent it.
+    named: Option<Incarnation>,
+}
+
+impl Flown {
+    /// A parcel of a hostile member, on a link that names this service.
+    pub(super) fn lie(
+        (from, to): (usize, usize),
+        kind: Kind,
+        (attempt, parcel): (AttemptId, Parcel),
+        named: Incarnation,
+    ) -> Self {
+        Self {
+            from,
+            to,
+            kind,
+            attempt,
+            parcel,
+            mute: false,
+            copy: false,
+            named: Some(named),
+        }
+    }
 }
 
 fn error(fault: WayFault) -> WayError {
@@ -76,6 +106,7 @@ impl World {
                 text_of(attempt, &parcel)
             )
         });
+        self.overhear(&parcel);
         let target = self.by_incarnation.get(&location.incarnation()).copied();
         let target = target.filter(|target| self.processes[*target].alive);
         let flight = Flight {
@@ -135,6 +166,7 @@ impl World {
                 parcel,
                 mute,
                 copy,
+                named: None,
             }))
         };
         if copied {
@@ -210,7 +242,13 @@ impl World {
         }
     }
 
-    fn conclude_within(&mut self, ms: u64, at: usize, attempt: AttemptId, conclusion: Conclusion) {
+    pub(super) fn conclude_within(
+        &mut self,
+        ms: u64,
+        at: usize,
+        attempt: AttemptId,
+        conclusion: Conclusion,
+    ) {
         let conclude = Event::Conclude {
             at,
             attempt,
@@ -307,9 +345,13 @@ impl World {
             parcel,
             mute,
             copy,
+            named,
         } = flown;
         let broken = || Conclusion::Unconfirmed(error(WayFault::Broken));
         let is_letter = matches!(parcel.body, Body::Letter(_));
+        if is_letter {
+            self.check_no_relay(from, to, &parcel);
+        }
         // An attempt that ended with a certain *not taken* must not deliver its letter later.
         if copy && is_letter && !self.may_repeat.contains(&(from, attempt)) {
             return Ok(());
@@ -317,6 +359,12 @@ impl World {
         if !self.processes[to].alive {
             if !copy {
                 self.conclude_within(5, from, attempt, broken());
+            }
+            return Ok(());
+        }
+        if self.processes[to].hostile {
+            if !copy {
+                self.answer_falsely(from, attempt, parcel);
             }
             return Ok(());
         }
@@ -329,7 +377,8 @@ impl World {
             true => self.registry.lock().present_address(host, kind),
             false => 0,
         };
-        let location = way(kind, self.processes[from].incarnation, address);
+        let service = named.unwrap_or(self.processes[from].incarnation);
+        let location = way(kind, service, address);
         let letter = match &parcel.body {
             Body::Letter(letter) => number_of(letter),
             _ => None,
@@ -337,6 +386,9 @@ impl World {
         let stream = parcel.stream;
         let text = self.traced.then(|| text_of(attempt, &parcel));
         let cut = self.is_cut(to, from);
+        if remote && named.is_none() {
+            self.meet(to, from);
+        }
         let process = &mut self.processes[to];
         process.next_ticket += 1;
         let ticket = Ticket(process.next_ticket);
@@ -345,6 +397,7 @@ impl World {
             from: Hop {
                 location,
                 principal: match remote {
+                    true if self.weather.liars => certificate(host),
                     true => Principal::Unproved,
                     false => Principal::Host,
                 },
@@ -353,7 +406,14 @@ impl World {
         };
         let at_once = kind == Kind::Shm;
         let waiting = process.core.waiting(stream.receiver);
+        let bytes = HEADER + size_of(&arrival.parcel);
+        #[cfg(debug_assertions)]
+        let _before = work::taken();
         let verdict = process.core.handle_arrival(now, kind, at_once, arrival);
+        #[cfg(debug_assertions)]
+        self.work.count(bytes, work::taken());
+        #[cfg(not(debug_assertions))]
+        let _ = bytes;
         let is_taken = process.core.waiting(stream.receiver) > waiting;
         if let Some(text) = text {
             let copy = if copy { " (a copy)" } else { "" };
@@ -380,6 +440,7 @@ impl World {
         }
         if let Some(number) = letter
             && is_taken
+            && !self.is_hostile(stream.sender)
         {
             self.accepted(stream.receiver, number);
         }

@@ -3,6 +3,7 @@
 mod checks;
 mod faults;
 mod gates;
+mod liar;
 mod links;
 mod moves;
 mod traffic;
@@ -22,11 +23,12 @@ use parking_lot::Mutex;
 
 use self::checks::{Breaches, Invariant};
 use self::gates::{Denied, Refused, Rules};
+use self::liar::Liars;
 use self::links::{Flight, Flown, Link};
 use self::traffic::Sent;
 use self::view::{Registered, Registry, View};
 use self::watching::Watching;
-pub(crate) use self::weather::Weather;
+pub(crate) use self::weather::{Deadlines, Weather};
 
 const PROCESSES: usize = 3;
 const AGENTS: usize = 2;
@@ -46,6 +48,8 @@ type Breach = String;
 struct Process {
     host: usize,
     gateway: bool,
+    /// It lies; its core is not used.
+    hostile: bool,
     incarnation: Incarnation,
     core: Core,
     agents: Vec<(Arc<str>, Incarnation)>,
@@ -55,11 +59,15 @@ struct Process {
     tickets: Map<Ticket, (usize, AttemptId)>,
     next_ticket: u64,
     alive: bool,
+    /// Since when it refuses to send: the service has ended.
+    closed: Option<Instant>,
     wake: Option<Instant>,
 }
 
 enum Event {
     Send,
+    /// A hostile member sends something.
+    Lie,
     /// The next letter of a pair that sends without a pause.
     Stream {
         pair: usize,
@@ -86,6 +94,13 @@ enum Event {
     },
     Die,
     Restart,
+    GatewayDies,
+    /// A process closes.
+    Close,
+    /// It has closed, and ends.
+    Closed {
+        process: usize,
+    },
     Forgotten {
         process: usize,
         returns: bool,
@@ -115,6 +130,24 @@ enum Event {
         host: usize,
         kind: Kind,
     },
+}
+
+/// Bytes that arrived, and the steps of cores because of them.
+#[derive(Debug, Default)]
+struct Work {
+    bytes: u64,
+    steps: u64,
+    /// Most steps for one arrival.
+    most: u64,
+}
+
+impl Work {
+    #[cfg(debug_assertions)]
+    fn count(&mut self, bytes: usize, steps: u64) {
+        self.bytes += bytes as u64;
+        self.steps += steps;
+        self.most = self.most.max(steps);
+    }
 }
 
 pub(crate) struct World {
@@ -161,6 +194,13 @@ pub(crate) struct World {
     /// The last letter of each sender that a registration has taken.
     last_taken: Map<(Incarnation, Incarnation), u64>,
     names: Map<Incarnation, Arc<str>>,
+    /// All registrations of honest agents.
+    honest: Set<Incarnation>,
+    liars: Option<Liars>,
+    /// What arrived, and the steps of cores for it.
+    work: Work,
+    /// Gateways that have a connection with each other, or had.
+    met: Set<(usize, usize)>,
     /// Agents that are about to read.
     reading: Set<Incarnation>,
     failures_told: u64,
@@ -217,6 +257,10 @@ impl World {
             taken: Map::default(),
             last_taken: Map::default(),
             names: Map::default(),
+            honest: Set::default(),
+            liars: None,
+            met: Set::default(),
+            work: Work::default(),
             reading: Set::default(),
             failures_told: 0,
             followed: 0,
@@ -239,6 +283,9 @@ impl World {
                 world.birth(host, false, &names, &known);
             }
         }
+        if weather.liars {
+            world.admit_liars();
+        }
         world.plan_traffic();
         world.plan_faults();
         world
@@ -250,6 +297,12 @@ impl World {
 
     pub(crate) fn followed(&self) -> u64 {
         self.followed
+    }
+
+    /// Steps of cores for each byte that arrived, and most steps for one arrival.
+    pub(crate) fn work(&self) -> (f64, u64) {
+        let Work { bytes, steps, most } = self.work;
+        (steps as f64 / bytes.max(1) as f64, most)
     }
 
     /// How many letters the bound of liveness was checked for, and the longest time one of them
@@ -306,6 +359,9 @@ impl World {
             queue: self.weather.queue,
             window: 8,
             lane: self.weather.lane,
+            queue_bytes: self.weather.queue_bytes,
+            lane_bytes: self.weather.lane_bytes,
+            custody_bytes: self.weather.custody_bytes,
             attempt_timeout: ATTEMPT_TIMEOUT,
             ..CoreConfig::new(name, incarnation, self.weather.order.to_vec())
         };
@@ -317,6 +373,7 @@ impl World {
         let mut process = Process {
             host,
             gateway,
+            hostile: false,
             incarnation,
             core: Core::new(config, Arc::new(view)).gated(Arc::new(self.rules(host, gateway))),
             agents: Vec::new(),
@@ -324,6 +381,7 @@ impl World {
             tickets: Map::default(),
             next_ticket: 0,
             alive: true,
+            closed: None,
             wake: None,
         };
         process.core.watch(self.watched);
@@ -335,6 +393,7 @@ impl World {
                 self.incarnation()
             };
             if !gateway {
+                self.honest.insert(agent);
                 process.core.register(Arc::clone(&name), agent);
                 process.agents.push((Arc::clone(&name), agent));
             }
@@ -350,8 +409,8 @@ impl World {
                 left: Vec::new(),
             });
         }
-        self.by_incarnation
-            .insert(incarnation, self.processes.len());
+        let at = self.processes.len();
+        self.by_incarnation.insert(incarnation, at);
         self.processes.push(process);
     }
 
@@ -368,6 +427,7 @@ impl World {
             share,
             denied: here.map(|(_, denied)| denied.clone()).collect(),
             rate: (gateway && w.rate > 0.0).then_some((w.rate, self.heals)),
+            strangers: w.reading_pause_ms == 1,
             taken: Mutex::default(),
             refused: Arc::clone(&self.refused),
         }
@@ -410,6 +470,7 @@ impl World {
     fn happen(&mut self, event: Event) -> Result<(), Breach> {
         match event {
             Event::Send => self.send_burst(),
+            Event::Lie => self.lie(),
             Event::Stream { pair } => self.send_on(pair),
             Event::Arrive(flown) => self.arrive(*flown),
             Event::Conclude {
@@ -419,7 +480,7 @@ impl World {
             } => {
                 let now = self.clocks();
                 let process = &mut self.processes[at];
-                if process.alive && process.open.remove(&attempt).is_some() {
+                if process.alive && !process.hostile && process.open.remove(&attempt).is_some() {
                     self.trace(|| format!("{at} has {conclusion:?} of {attempt:?}"));
                     self.note_end(at, attempt, &conclusion);
                     let process = &mut self.processes[at];
@@ -449,6 +510,9 @@ impl World {
             }
             Event::Die => self.die(),
             Event::Restart => self.restart(),
+            Event::GatewayDies => self.gateway_dies(),
+            Event::Close => self.close(),
+            Event::Closed { process } => self.closed(process),
             Event::Forgotten { process, returns } => self.forgotten(process, returns),
             Event::Reborn { process } => self.reborn(process),
             Event::Move => self.leave(),
@@ -519,7 +583,10 @@ impl World {
     }
 
     fn robots(&self) -> impl Iterator<Item = usize> {
-        let robot = |at: &usize| self.processes[*at].alive && !self.processes[*at].gateway;
+        let robot = |at: &usize| {
+            let process = &self.processes[*at];
+            process.alive && !process.gateway && !process.hostile
+        };
         (0..self.processes.len()).filter(robot)
     }
 

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use fipa_sds::{Directory, Entry, Role};
+use fipa_sds::{Directory, Entry, Reach, Role};
 use fipa_transport::Incarnation;
 
 use super::view::Registered;
@@ -34,7 +34,7 @@ impl World {
     pub(super) fn end_registrations(&mut self, host: usize, lives: &[Incarnation]) {
         let mut seen: Vec<Vec<(usize, Arc<Entry>)>> = vec![Vec::new(); self.weather.hosts];
         for process in 0..self.processes.len() {
-            if !self.processes[process].alive {
+            if !self.processes[process].alive || self.processes[process].hostile {
                 continue;
             }
             let host = self.processes[process].host;
@@ -43,6 +43,15 @@ impl World {
                 .iter()
                 .filter_map(|life| view.known_incarnation(*life));
             seen[host].extend(entries.map(|entry| (process, entry)));
+            // The agents of a gateway leave with it.
+            let all = view.entries();
+            let behind = all.iter().filter(|entry| match entry.reach {
+                Reach::Remote { gateway } => {
+                    lives.contains(&gateway) && entry.incarnation != gateway
+                }
+                Reach::Local => false,
+            });
+            seen[host].extend(behind.map(|entry| (process, Arc::clone(entry))));
         }
         let times = self.news_times(host);
         for life in lives {
@@ -66,6 +75,7 @@ impl World {
         process.core.register(Arc::clone(&name), life);
         process.agents.push((Arc::clone(&name), life));
         self.names.insert(life, Arc::clone(&name));
+        self.honest.insert(life);
         self.registry.lock().register(Registered {
             name,
             incarnation: life,
@@ -89,7 +99,8 @@ impl World {
             self.processes[*at].core.handle_departure(now, entry);
         }
         for at in 0..self.processes.len() {
-            if self.processes[at].alive && self.processes[at].host == host {
+            let process = &self.processes[at];
+            if process.alive && !process.hostile && process.host == host {
                 self.processes[at].core.handle_directory_change(now);
                 self.carry_out(at)?;
             }

@@ -12,13 +12,14 @@ use fipa_transport::{Incarnation, Outcome};
 
 use super::checks::Invariant;
 use super::gates::{content_of, number_in};
+use super::liar::TO_LIARS;
 use super::links::MAX_DATAGRAM;
 use super::{AGENTS, Breach, Event, PROCESSES, World};
 
 /// Outcomes may come this much after the deadline: one turn of the core's timer.
 const SLACK: Duration = Duration::from_millis(5);
 /// How long letters are still sent when all faults are over.
-const AFTER: Duration = Duration::from_millis(1500);
+pub(super) const AFTER: Duration = Duration::from_millis(1500);
 
 /// What is remembered of a sent letter, by its number.
 pub(super) struct Sent {
@@ -75,8 +76,14 @@ impl World {
             1..=10 => "nobody".to_owned(),
             _ => format!("h{host}_p{}_{}", self.random.usize(..PROCESSES), 0),
         };
-        let receiver = receiver.as_str().into();
-        for _ in 0..self.random.u32(1..6) {
+        let mut receiver: Arc<str> = receiver.as_str().into();
+        if self.liars.is_some()
+            && self.random.f64() < TO_LIARS
+            && let Some(liar) = self.name_of_liar()
+        {
+            receiver = liar;
+        }
+        for _ in 0..self.random.u32(1..self.weather.burst) {
             self.send(at, (&name, sender), &receiver)?;
         }
         Ok(())
@@ -139,7 +146,8 @@ impl World {
         let (send, expected) = self.processes[at].core.send(now, submission);
         self.sends.insert((at, send), number);
         let bound = Some(self.bound(size))
-            .filter(|bound| self.now >= self.quiet && known.is_some() && deadline > *bound);
+            .filter(|bound| self.now >= self.quiet && known.is_some() && deadline > *bound)
+            .filter(|_| !self.is_liars_name(receiver));
         if let Some(bound) = bound {
             self.bounded += 1;
             self.at(self.now + bound, Event::Liveness { number });
@@ -165,7 +173,11 @@ impl World {
             },
         );
         self.at(self.now + deadline + SLACK, Event::Deadline { number });
-        self.carry_out(at)
+        self.carry_out(at)?;
+        if self.processes[at].closed.is_some() {
+            self.check_closed(number);
+        }
+        Ok(())
     }
 
     /// The names of those that get a letter for a pattern.
@@ -191,6 +203,7 @@ impl World {
             return Err(format!("an outcome of a letter nobody sent: {outcome}"));
         };
         self.trace(|| format!("letter {number} to {receiver}: {outcome}"));
+        self.check_outcome(number, &receiver, &outcome);
         let sent = self.sent.get_mut(&number).expect("it was sent");
         let stream = (sent.sender, Arc::clone(&receiver));
         if let Some(open) = self.open.get_mut(&stream)
@@ -239,10 +252,29 @@ impl World {
             self.failures_told += 1;
             return true;
         }
-        let message = Message::decode(received.letter.payload()).expect("a message");
-        let content = message.content().expect("content");
-        let number = number_in(content).expect("a number");
-        self.check_take(agent, number);
+        let number = match Message::decode(received.letter.payload()) {
+            Ok(message) => message.content().and_then(|content| number_in(content)),
+            Err(error) => {
+                let (now, receiver) = (self.clocks(), Arc::clone(&self.names[&agent]));
+                let core = &mut self.processes[at].core;
+                core.handle_undecodable(now, &receiver, &received, error.to_string());
+                None
+            }
+        };
+        if self.is_hostile(received.sender) {
+            return true;
+        }
+        let sent = number.and_then(|number| Some((number, self.sent.get(&number)?)));
+        let own = sent.filter(|(_, sent)| sent.sender == received.sender);
+        match own.map(|(number, _)| number) {
+            Some(number) => self.check_take(agent, number),
+            // What is sent in the name of a registration that has ended harms no agent.
+            None if !self.is_registered(received.sender) => {}
+            None => self.breach(Invariant::NoForgery, || {
+                let sender = received.sender;
+                format!("{agent} took a letter in the name of {sender}, which has not sent it")
+            }),
+        }
         true
     }
 }

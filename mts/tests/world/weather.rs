@@ -62,6 +62,10 @@ pub(crate) struct Weather {
     pub stalls: u32,
     /// How many processes die in the course of the run. Most come back as a new life.
     pub deaths: u32,
+    /// How many gateways die, and come back.
+    pub gateway_deaths: u32,
+    /// How many robot processes close in order: they give up what is under way, refuse more, and end.
+    pub closings: u32,
     /// How many robot processes are killed and started again, with agents of the same names.
     pub restarts: u32,
     /// How often an agent leaves its process and is registered in another one, mostly elsewhere.
@@ -84,6 +88,12 @@ pub(crate) struct Weather {
     pub queue: usize,
     /// Bound of each lane.
     pub lane: usize,
+    /// Bytes in each agent's queue.
+    pub queue_bytes: usize,
+    /// Bytes in each lane.
+    pub lane_bytes: usize,
+    /// Bytes that a gateway has in custody.
+    pub custody_bytes: usize,
     /// The transports in order of preference.
     pub order: &'static [Kind],
     /// Which deadlines letters have.
@@ -98,11 +108,15 @@ pub(crate) struct Weather {
     pub denials: u32,
     /// Letters a second that a gateway takes from one host; 0 for any number.
     pub rate: f64,
+    /// Letters that it sends then, less than this.
+    pub burst: u32,
     /// How often an agent sends a few letters.
     pub bursts: u32,
     /// Pairs of agents that send without a pause from the beginning to the end, also after the
     /// world has healed.
     pub streams: usize,
+    /// Whether a gateway and a process lie, also after the world has healed. Gateways have keys then.
+    pub liars: bool,
 }
 
 impl Weather {
@@ -130,6 +144,12 @@ impl Weather {
             local_ms: 0,
             queue: 64,
             lane: 32,
+            queue_bytes: 64 << 20,
+            lane_bytes: 64 << 20,
+            custody_bytes: 256 << 20,
+            gateway_deaths: 0,
+            closings: 0,
+            burst: 6,
             order: &[Kind::Shm, Kind::Udp, Kind::Tcp],
             deadlines: Deadlines::Same,
             large: 0.0,
@@ -139,6 +159,7 @@ impl Weather {
             rate: 0.0,
             bursts: 100,
             streams: 1,
+            liars: false,
         }
     }
 
@@ -151,6 +172,14 @@ impl Weather {
             queue: 256,
             lane: 1024,
             ..Self::calm()
+        }
+    }
+
+    /// The same, with a gateway and a process that lie.
+    pub(crate) fn with_liars(self) -> Self {
+        Self {
+            liars: true,
+            ..self
         }
     }
 
@@ -168,11 +197,22 @@ impl Weather {
         }
     }
 
+    /// Whether nothing but slow reading goes wrong: then letters fail because queues are full.
+    pub(super) fn is_slow_only(&self) -> bool {
+        let read_at_once = Self {
+            queue: 64,
+            deadlines: Deadlines::Same,
+            reading_pause_ms: 1,
+            ..*self
+        };
+        self.reading_pause_ms > 1 && self.lane >= 1024 && read_at_once.is_calm()
+    }
+
     pub(super) fn is_calm(&self) -> bool {
         self.loss + self.answer_loss + self.refusal + self.silence == 0.0
             && self.overtaken + self.copies == 0.0
             && self.partitions + self.stalls + self.outages + self.addresses == 0
-            && self.deaths + self.restarts + self.moves == 0
+            && self.deaths + self.restarts + self.moves + self.gateway_deaths + self.closings == 0
             && self.refused_by_gateways + self.refused_by_receivers + self.rate == 0.0
             && self.denials == 0
             && self.deadlines == Deadlines::Same

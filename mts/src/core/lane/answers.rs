@@ -113,6 +113,7 @@ impl Lane {
             }
             Answer::Busy => {
                 self.busy = true;
+                self.was_busy = Some(now);
                 let delivery = &mut self.letters[index];
                 delivery.progress.busy = true;
                 delivery.progress.tried.clear();

@@ -5,6 +5,7 @@ use std::time::Instant;
 use fipa_transport::{FailureReason, WayError, WayFault};
 
 use super::super::desk::Desk;
+use super::super::work;
 use super::delivery::{Holding, State};
 use super::{ENDED_PATIENCE, Lane};
 
@@ -18,6 +19,8 @@ impl Lane {
         let ended = self
             .ended
             .filter(|(_, heard)| now >= *heard + ENDED_PATIENCE);
+        // For what is due, and for what will be.
+        work::steps(2 * self.letters.len());
         let mut index = 0;
         while let Some(delivery) = self.letters.get_mut(index) {
             let expired = delivery.deadline <= now;

@@ -7,6 +7,7 @@ use fipa_transport::Incarnation;
 
 use super::super::desk::{Desk, Settlement, Upstream};
 use super::super::rules::{self, Hold};
+use super::super::work;
 use super::Lane;
 use super::delivery::{Holding, State};
 
@@ -98,6 +99,7 @@ impl Lane {
     pub(super) fn hold(&mut self, now: Instant, index: usize, patience: Duration, desk: &mut Desk) {
         let delivery = &self.letters[index];
         let after = delivery.after;
+        work::steps(self.left.len());
         let left = self.left.iter().rev().find(|(other, _)| *other == after);
         let since = left.map_or(delivery.since, |(_, at)| *at);
         let missing_for = now.saturating_duration_since(since);
@@ -131,6 +133,7 @@ impl Lane {
             return;
         }
         self.holds = false;
+        work::steps(self.letters.len());
         for delivery in &mut self.letters {
             if delivery.after == sequence {
                 delivery.progress.hold = None;

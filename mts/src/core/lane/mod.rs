@@ -35,6 +35,7 @@ use self::delivery::State;
 use super::desk::{Author, Desk, Origin, Purpose, Settlement, Undelivered, life_of};
 use super::routes::Tally;
 use super::rules;
+use super::work;
 
 /// Pauses between rounds over all ways, and before a letter that was handed back goes out again.
 const FIRST_PAUSE: Duration = Duration::from_millis(10);
@@ -100,6 +101,8 @@ pub(crate) struct Lane {
     pauses: u32,
     /// The receiver's queue was full when it was last heard of.
     busy: bool,
+    /// When it was last full.
+    was_busy: Option<Instant>,
     /// A registration that has moved, and until when its successor is waited for.
     moving: Option<(Incarnation, Instant)>,
     /// A registration that has left the directory, and when something was last heard about
@@ -144,6 +147,7 @@ impl Lane {
             paused_for_lower: false,
             pauses: 0,
             busy: false,
+            was_busy: None,
             moving: None,
             ended: None,
             holds: false,
@@ -297,6 +301,7 @@ impl Lane {
     fn dispatch_waiting(&mut self, now: Instant, desk: &mut Desk) {
         let mut index = 0;
         while index < self.letters.len() && self.under_way < desk.config.window {
+            work::steps(1);
             let registration = self.letters[index].registration;
             // All between have the same, or the loop would not have come here.
             if !rules::may_dispatch(self.first_registration(), registration) {
@@ -528,6 +533,7 @@ impl Lane {
     /// way has its outcome when its transport has concluded it, which is at once.
     pub(crate) fn give_up(&mut self, now: Instant, desk: &mut Desk) {
         self.recovering = true;
+        work::steps(self.letters.len());
         let mut index = 0;
         while let Some(delivery) = self.letters.get_mut(index) {
             delivery.deadline = now;

@@ -33,7 +33,9 @@ impl Lane {
     /// The reason for the letter at `index`, which waits and whose deadline has passed. A letter
     /// without attempts of its own gets those of the letters before it.
     pub(super) fn reason_while_waiting(&mut self, index: usize) -> FailureReason {
-        let busy = self.busy;
+        // Full since the letter came: what waits behind others has met no full queue itself.
+        let since = self.letters[index].since;
+        let busy = self.busy || self.was_busy.is_some_and(|at| at >= since);
         let waits_behind = self.waits_behind();
         let delivery = &mut self.letters[index];
         if delivery.progress.attempts.is_empty() && !delivery.progress.busy && !busy {

@@ -1,0 +1,205 @@
+//! The worst letters that the limits allow: the steps of the core for each are bounded by its bytes.
+//! In a release, `--nocapture` shows the time that the core takes for it, which is the time under the
+//! runtime's lock.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+#![expect(clippy::print_stdout, reason = "it tells the time")]
+
+use std::net::{IpAddr, Ipv4Addr};
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use bytes::Bytes;
+use fipa_acl::{AgentId, Envelope, EnvelopeParams, Letter, Message, Performative, Received, Time};
+#[cfg(debug_assertions)]
+use fipa_mts::core::work;
+use fipa_mts::core::{Core, CoreConfig, Now, Unframed};
+use fipa_mts::letter_for;
+use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+use fipa_transport::{
+    Arrival, Body, Hop, Incarnation, Kind, LegacySource, Location, Outcome, Parcel, Principal,
+    Report, Signature, Stream, Ticket, Verdict,
+};
+
+const AGENTS: u64 = 1000;
+const PEER: Incarnation = Incarnation::from_u64(2);
+const PROCESS: Incarnation = Incarnation::from_u64(3);
+
+fn core() -> (Core, Arc<dyn Directory>) {
+    let directory = MemoryDirectory::new(Mts::new("mts", PROCESS));
+    for number in 0..AGENTS {
+        let at = Location::new(Kind::Shm, "process").unwrap();
+        let at = vec![at.with_incarnation(PROCESS)];
+        let agent = Incarnation::from_u64(100 + number);
+        directory
+            .register(Registration::new(format!("arm_{number}"), agent, at))
+            .unwrap();
+    }
+    let directory: Arc<dyn Directory> = Arc::new(directory);
+    let kinds = vec![Kind::Shm, Kind::Tcp];
+    let config = CoreConfig {
+        forwards: true,
+        ..CoreConfig::new("gateway", Incarnation::from_u64(1), kinds)
+    };
+    (Core::new(config, Arc::clone(&directory)), directory)
+}
+
+fn now() -> Now {
+    Now {
+        instant: Instant::now(),
+        utc: SystemTime::UNIX_EPOCH + Duration::from_secs(1 << 30),
+    }
+}
+
+/// A letter to these receivers with this many user-defined parameters.
+fn letter(receivers: &[String], parameters: usize) -> Letter {
+    let mut message = Message::builder(Performative::Inform).sender(AgentId::new("liar").unwrap());
+    for receiver in receivers {
+        message = message.receiver(AgentId::new(receiver).unwrap());
+    }
+    for number in 0..parameters {
+        message = message.user_defined(format!("x-{number}"), "value");
+    }
+    letter_for(&message.build().unwrap(), SystemTime::UNIX_EPOCH).unwrap()
+}
+
+/// Does the work of one arrival. Its steps are bounded by its bytes and by its receivers, of which there
+/// are as many as agents of this host for a pattern.
+fn bounded<R>(what: &str, bytes: usize, receivers: u64, work: impl FnOnce() -> R) -> R {
+    #[cfg(debug_assertions)]
+    let _before = work::taken();
+    let begins = Instant::now();
+    let result = work();
+    let took = begins.elapsed();
+    #[cfg(debug_assertions)]
+    {
+        let steps = work::taken();
+        println!("{what}: {bytes} bytes, {steps} steps");
+        let most = 64 + bytes as u64 + 4 * receivers;
+        assert!(steps <= most, "{what}: {steps} steps for {bytes} bytes");
+    }
+    println!("{what}: {bytes} bytes, {took:?}");
+    result
+}
+
+fn arrives(core: &mut Core, stream: (u64, u64), sequence: u64, body: Body) -> Verdict {
+    let (sender, receiver) = stream;
+    let location = Location::new(Kind::Tcp, "192.0.2.1:1").unwrap();
+    let arrival = Arrival {
+        parcel: Parcel {
+            receiver: format!("arm_{}", receiver - 100).into(),
+            stream: Stream {
+                sender: Incarnation::from_u64(sender),
+                receiver: Incarnation::from_u64(receiver),
+            },
+            sequence,
+            after: sequence - 1,
+            transfer: sequence,
+            remaining: Duration::from_secs(5),
+            body,
+        },
+        from: Hop {
+            location: location.with_incarnation(PEER),
+            principal: Principal::Unproved,
+        },
+        ticket: Ticket(sequence),
+    };
+    core.handle_arrival(now(), Kind::Tcp, false, arrival)
+}
+
+fn unframed(core: &mut Core, directory: &dyn Directory, what: &str, letter: Letter) {
+    let from = LegacySource {
+        address: IpAddr::V4(Ipv4Addr::LOCALHOST),
+        signature: Signature::FipaServices,
+    };
+    let bytes = letter.len();
+    let read = Unframed::read(letter, Kind::Tcp, from, directory).unwrap();
+    bounded(what, bytes, AGENTS, || {
+        core.handle_unframed(now(), Duration::from_secs(5), read);
+    });
+    while core.poll_action().is_some() {}
+}
+
+#[test]
+fn a_letter_of_a_legacy_peer_to_the_most_receivers() {
+    let names: Vec<String> = (0..64).map(|number| format!("arm_{number}")).collect();
+    let unknown: Vec<String> = (0..64).map(|number| format!("nobody_{number}")).collect();
+    let pattern = vec!["arm_.*".to_owned()];
+    for (what, receivers) in [
+        ("64 agents", &names),
+        ("64 unknown names", &unknown),
+        ("a pattern for 1,000 agents", &pattern),
+    ] {
+        for parameters in [0, 1000, 20_000] {
+            let (mut core, directory) = core();
+            let what = format!("{what}, {parameters} parameters");
+            unframed(&mut core, &*directory, &what, letter(receivers, parameters));
+        }
+    }
+}
+
+#[test]
+fn a_letter_with_the_most_parameters() {
+    for parameters in [0, 1000, 50_000] {
+        let (mut core, _) = core();
+        let letter = letter(&["arm_0".to_owned()], parameters);
+        let what = format!("{parameters} parameters");
+        let verdict = bounded(&what, letter.len(), 1, || {
+            arrives(&mut core, (9, 100), 1, Body::Letter(letter))
+        });
+        assert_eq!(verdict, Verdict::Later);
+    }
+}
+
+#[test]
+fn a_letter_with_the_most_stamps() {
+    for stamps in [1, 100, 5000] {
+        let (mut core, _) = core();
+        let mut letter = letter(&["arm_0".to_owned()], 0);
+        let received = Received {
+            by: "another".into(),
+            date: Time::from_system_time(SystemTime::UNIX_EPOCH).unwrap(),
+            from: None,
+            id: Some(PEER.to_string()),
+            via: None,
+            user_defined: Vec::new(),
+        };
+        let stamp = Envelope::encode_extension(&EnvelopeParams {
+            received: Some(received),
+            ..EnvelopeParams::default()
+        });
+        let stamp = Bytes::from(stamp.unwrap().repeat(stamps));
+        letter = letter.stamped(stamp);
+        let what = format!("{stamps} stamps");
+        bounded(&what, letter.len(), 1, || {
+            arrives(&mut core, (9, 100), 1, Body::Letter(letter))
+        });
+    }
+}
+
+/// A full lane whose letters all wait for the one before them.
+#[test]
+fn a_letter_for_a_full_lane() {
+    let (mut core, _) = core();
+    let letter = letter(&["arm_0".to_owned()], 0);
+    for sequence in (2..1024).rev() {
+        arrives(&mut core, (9, 100), sequence, Body::Letter(letter.clone()));
+    }
+    bounded("the letter that 1,022 wait behind", letter.len(), 1, || {
+        arrives(&mut core, (9, 100), 1, Body::Letter(letter.clone()))
+    });
+    bounded("a letter too many", letter.len(), 1, || {
+        arrives(&mut core, (9, 100), 5000, Body::Letter(letter.clone()))
+    });
+    let report = Report::Settled(Outcome::Delivered {
+        via: Kind::Tcp,
+        attempts: Vec::new(),
+    });
+    for (what, body) in [
+        ("a predecessor", Body::Predecessor),
+        ("a credit", Body::Credit),
+        ("a report", Body::Report(report)),
+    ] {
+        bounded(what, 64, 1, || arrives(&mut core, (9, 100), 1023, body));
+    }
+}
