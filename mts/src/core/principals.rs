@@ -73,7 +73,7 @@ impl Principals {
             return;
         }
         // The registration of an agent of another principal, which has written before.
-        let of_others = |owner: &Principal| *owner != principal;
+        let of_others = |owner: &Option<Principal>| *owner != Some(principal);
         if self.senders.get(&incarnation).is_some_and(of_others) {
             return;
         }
