@@ -6,6 +6,11 @@
 //! whichever side opened it; so reports find their way back to peers that cannot be dialled. When
 //! two endpoints connect to each other at the same time both connections are kept: the one that is
 //! not used closes when it has been idle.
+//!
+//! A connection on which an attempt had no answer, and nothing else has come either, is *suspect*: the
+//! system repeats lost packets more and more rarely, and a peer that has moved never answers. What is
+//! dispatched from then on takes another connection with the same peer, which is opened if there is
+//! none. When that is open and the suspect one is still silent, the suspect one ends.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap};
@@ -497,24 +502,35 @@ impl Endpoint {
             }
             _ => return Err(End::Closed.after()),
         };
+        let dialled = registry.dialled.get(to);
         let known = registry.known.get(&to.incarnation());
-        if let Some(link) = registry.dialled.get(to) {
-            return Ok(Way::There(link.clone()));
-        }
-        if let Some(link) = known.and_then(|links| links.first()).cloned() {
-            drop(registry);
-            link.is_used_for(to);
+        let open = || dialled.into_iter().chain(known.into_iter().flatten());
+        let is_full = registry.links.len() >= self.limits().max_connections;
+        let healthy = open().find(|link| !link.is_suspect());
+        // Another connection is opened beside suspect ones, if it gets a place, and none was a moment
+        // ago: a peer that is busy is not to be given more work.
+        let age = self.limits().connect_timeout;
+        let young = || open().find(|link| !link.is_older_than(age));
+        let link = healthy.or_else(young);
+        let link = link.or_else(|| open().next().filter(|_| is_full));
+        if let Some(link) = link.cloned() {
+            if dialled.is_none_or(|dialled| !Arc::ptr_eq(dialled, &link)) {
+                drop(registry);
+                link.is_used_for(to);
+            }
             return Ok(Way::There(link));
         }
-        if registry.links.len() >= self.limits().max_connections {
+        if is_full {
             return Err(End::Crowd.after());
         }
+        let suspect = open().cloned().collect();
         let serial = registry.last_serial + 1;
         registry.last_serial = serial;
         let role = Role::Dialler {
             expected: to.incarnation(),
         };
         let link = self.make_link(&mut registry, role, serial, to.to_string());
+        link.opened_beside(suspect);
         registry.links.insert(link.number, link.clone());
         registry.dialled.insert(to.clone(), link.clone());
         Ok(Way::ToDial(link, sink))
@@ -586,6 +602,10 @@ impl Endpoint {
         proved: Option<Principal>,
         from: Source,
     ) -> Result<Hop, End> {
+        if !self.is_sought_by(peer) {
+            // It takes the place of none of the peer's connections with this service.
+            return Err(End::NotSought);
+        }
         let incarnation = peer.identity.incarnation;
         let inbound = Inbound {
             incarnation,
@@ -662,6 +682,14 @@ impl Endpoint {
             location,
             principal: proved.unwrap_or(principal),
         })
+    }
+
+    /// Whether the peer opened the connection for this service, as far as it says. If not, it dialled
+    /// an address that another incarnation had before.
+    fn is_sought_by(&self, peer: &Hello) -> bool {
+        let sought = peer.dialled.parse::<Location>().ok();
+        let sought = sought.map_or(Incarnation::UNKNOWN, |location| location.incarnation());
+        !sought.is_known() || sought == self.config.identity.incarnation
     }
 
     /// Gives a place to a connection whose peer has introduced itself, in place of others.

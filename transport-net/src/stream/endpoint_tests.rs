@@ -219,3 +219,59 @@ async fn a_moved_peer_with_keys_takes_the_place_of_its_older_connections_and_its
         .unwrap();
     assert_eq!(crossing.ending(), None);
 }
+
+#[tokio::test]
+async fn a_peer_that_looked_for_an_earlier_service_keeps_its_connection_with_this_one() {
+    let endpoint = endpoint(Limits::default());
+    let proved = certificate(1);
+    let (good, _) = enters(&endpoint, comes(proved, 7, "10.0.0.7:1", 1, X))
+        .await
+        .unwrap();
+    // From a new address, as after a move, the peer dials what a directory still says.
+    let earlier = comes(proved, 7, "10.0.0.8:1", 2, "tcp://10.0.0.1:7788#0000000000000009");
+    let entered = enters(&endpoint, earlier).await;
+    assert_eq!(entered.map(|_| ()), Err(End::NotSought));
+    assert_eq!(good.ending(), None);
+}
+
+/// A link that was dialled for this location, and whose peer has introduced itself.
+async fn dials(endpoint: &Endpoint, to: &Location) -> Arc<Link> {
+    let Way::ToDial(link, _) = endpoint.way_to(to).unwrap() else {
+        panic!("there is a connection already");
+    };
+    link.connected(Instant::now());
+    link.greeted_by(Hello {
+        identity: identity(to.incarnation().as_u64()),
+        max_letter: 1 << 20,
+        max_in_flight: 8,
+        serial: 0,
+        dialled: String::new(),
+        listening: Vec::new(),
+    });
+    link
+}
+
+#[tokio::test]
+async fn letters_take_another_connection_when_one_is_suspect() {
+    let endpoint = endpoint(Limits {
+        keep_alive: Duration::ZERO,
+        connect_timeout: Duration::ZERO,
+        ..Limits::default()
+    });
+    let to: Location = "tcp://10.0.0.7:7788#0000000000000007".parse().unwrap();
+    let first = dials(&endpoint, &to).await;
+    let Way::There(same) = endpoint.way_to(&to).unwrap() else {
+        panic!("a connection that works is kept");
+    };
+    assert!(Arc::ptr_eq(&first, &same));
+    first.doubt();
+    assert!(first.is_suspect());
+    let second = dials(&endpoint, &to).await;
+    assert_eq!(first.ending(), Some(End::Silent), "the other one is open");
+    let Way::There(used) = endpoint.way_to(&to).unwrap() else {
+        panic!("it is used");
+    };
+    assert!(Arc::ptr_eq(&second, &used));
+    second.doubt();
+    assert!(matches!(endpoint.way_to(&to).unwrap(), Way::ToDial(..)));
+}
