@@ -383,7 +383,10 @@ impl Robot {
         let announced = usable.elapsed();
         self.waits_for(&other.name);
         let found = usable.elapsed();
-        eprintln!("{}: announced after {announced:.1?}, found after {found:.1?}", other.name);
+        eprintln!(
+            "{}: announced after {announced:.1?}, found after {found:.1?}",
+            other.name
+        );
     }
 
     /// Waits until this host's directory no longer has the agent.

@@ -59,7 +59,8 @@ impl Holdings {
                 // are not verified already.
                 let waiting: HashSet<&Arc<str>> = self.queue.iter().collect();
                 let rest = known.records.difference(&known.verified);
-                let rest: Vec<Arc<str>> = rest.filter(|it| !waiting.contains(it)).cloned().collect();
+                let rest: Vec<Arc<str>> =
+                    rest.filter(|it| !waiting.contains(it)).cloned().collect();
                 self.queue.extend(rest);
             }
             if known.records.is_empty() {

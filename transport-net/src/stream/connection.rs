@@ -381,7 +381,9 @@ impl Connection {
 
     /// The time that the bytes may take to arrive that were written since the peer was last heard.
     fn transfer_time(&self) -> Duration {
-        Duration::from_millis(self.clock.written_since.saturating_mul(1000) / SLOWEST_BYTES_PER_SECOND)
+        Duration::from_millis(
+            self.clock.written_since.saturating_mul(1000) / SLOWEST_BYTES_PER_SECOND,
+        )
     }
 
     /// Asks the peer for a sign of life, of which nothing follows here.

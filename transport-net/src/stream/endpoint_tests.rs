@@ -228,7 +228,13 @@ async fn a_peer_that_looked_for_an_earlier_service_keeps_its_connection_with_thi
         .await
         .unwrap();
     // From a new address, as after a move, the peer dials what a directory still says.
-    let earlier = comes(proved, 7, "10.0.0.8:1", 2, "tcp://10.0.0.1:7788#0000000000000009");
+    let earlier = comes(
+        proved,
+        7,
+        "10.0.0.8:1",
+        2,
+        "tcp://10.0.0.1:7788#0000000000000009",
+    );
     let entered = enters(&endpoint, earlier).await;
     assert_eq!(entered.map(|_| ()), Err(End::NotSought));
     assert_eq!(good.ending(), None);

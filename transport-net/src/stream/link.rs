@@ -55,7 +55,6 @@ pub(crate) struct Link {
     suspect: AtomicBool,
     /// Suspect connections with the same peer, which this one was opened beside.
     beside: Mutex<Vec<Arc<Link>>>,
-    made: Instant,
 }
 
 #[derive(Debug)]
@@ -93,7 +92,6 @@ impl Link {
             begun: AtomicBool::new(false),
             suspect: AtomicBool::new(false),
             beside: Mutex::default(),
-            made: Instant::now(),
         })
     }
 
@@ -102,25 +100,24 @@ impl Link {
         self.begun.load(Ordering::Acquire)
     }
 
-    /// The socket is connected. The suspect connections that this one was opened beside, and on which
-    /// still nothing has come, end: what waits in their sockets would arrive late or not at all.
+    /// The socket is connected.
     pub(crate) fn connected(&self, now: Instant) {
+        self.state.lock().connection.connected(now);
+    }
+
+    /// The peer has introduced itself. The suspect connections that this one was opened beside, and on
+    /// which still nothing has come, end: what waits in their sockets would arrive late or not at all.
+    pub(crate) fn replace_suspects(&self) {
         for other in std::mem::take(&mut *self.beside.lock()) {
             if other.is_suspect() {
                 other.leave(End::Silent);
             }
         }
-        self.state.lock().connection.connected(now);
     }
 
     /// This connection is to be opened beside suspect ones with the same peer.
     pub(crate) fn opened_beside(&self, others: Vec<Arc<Self>>) {
         *self.beside.lock() = others;
-    }
-
-    /// Whether the link was made up so long ago.
-    pub(crate) fn is_older_than(&self, age: Duration) -> bool {
-        self.made.elapsed() >= age
     }
 
     /// Whether letters are to take another connection, if they can.
@@ -256,6 +253,8 @@ impl Link {
             .handle_frame(Frame::Hello(hello), Instant::now());
         assert_eq!(greeted, Ok(()));
         state.connection.welcome();
+        drop(state);
+        self.replace_suspects();
     }
 
     /// The task has ended.
@@ -653,6 +652,7 @@ impl Running {
                     });
                 }
                 self.link.state.lock().connection.welcome();
+                self.link.replace_suspects();
                 if let Some(peer) = &self.peer {
                     self.sink.introduced(peer);
                 }

@@ -12,8 +12,8 @@ use fipa_transport::{
 use super::super::desk::{Desk, Settlement};
 use super::super::routes::Tally;
 use super::super::rules::{self, Belief, End, Told};
-use super::delivery::State;
 use super::custody::ASK_CUSTODIAN_AFTER;
+use super::delivery::State;
 use super::{BUSY_PAUSE, CONGESTED_PAUSE, CONGESTED_TRIES, ENDED_PATIENCE, Lane, MOVING_PATIENCE};
 
 impl Lane {
