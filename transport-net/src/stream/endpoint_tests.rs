@@ -227,6 +227,7 @@ async fn a_peer_that_looked_for_an_earlier_service_keeps_its_connection_with_thi
     let (good, _) = enters(&endpoint, comes(proved, 7, "10.0.0.7:1", 1, X))
         .await
         .unwrap();
+    tokio::spawn(ends_when_asked_to(good.clone()));
     // From a new address, as after a move, the peer dials what a directory still says.
     let earlier = comes(
         proved,
