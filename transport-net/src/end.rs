@@ -12,6 +12,8 @@ pub(crate) enum End {
         expected: Incarnation,
         found: Incarnation,
     },
+    /// The peer looked for a service of another incarnation than this one.
+    NotSought,
     /// The peer sent what it must not send.
     Nonsense(String),
     /// The peer was too slow to say hello, or in the middle of a frame.
@@ -54,6 +56,7 @@ impl End {
         matches!(
             self,
             Self::WrongIncarnation { .. }
+                | Self::NotSought
                 | Self::Idle
                 | Self::Crowd
                 | Self::Impostor(_)
@@ -95,6 +98,7 @@ impl End {
         let (fault, detail) = match self {
             Self::NotOpened(error) => return error.clone(),
             Self::WrongIncarnation { .. } => (WayFault::Broken, "the peer is another one"),
+            Self::NotSought => (WayFault::Broken, "the peer looked for another service"),
             Self::Nonsense(what) => (WayFault::Broken, what.as_str()),
             Self::TooSlow(what) => (WayFault::TimedOut, *what),
             Self::Silent => (WayFault::TimedOut, "the peer gave no sign of life"),

@@ -158,6 +158,8 @@ pub(crate) struct Note {
     pub(crate) location: Location,
     pub(crate) parcel: Parcel,
     pub(crate) tries: u32,
+    /// When it was sent last, if it is to be acknowledged.
+    pub(crate) sent: Option<Instant>,
     /// Until when it is repeated without an acknowledgment.
     pub(crate) until: Option<Instant>,
 }
@@ -178,6 +180,8 @@ pub(crate) struct Desk {
     /// Whether anybody is told of what happens to letters.
     pub(crate) watched: bool,
     health: Map<Location, Health>,
+    /// The time in which services acknowledge reports.
+    round_trips: Map<Incarnation, Duration>,
     /// Lanes that found no room on the way to a location, in order.
     waiting_for_room: Map<Location, VecDeque<LaneId>>,
     next_attempt: u64,
@@ -209,6 +213,7 @@ impl Desk {
             tallies: Tallies::default(),
             watched: false,
             health: Map::default(),
+            round_trips: Map::default(),
             waiting_for_room: Map::default(),
             next_attempt: 1,
         }
@@ -291,27 +296,31 @@ impl Desk {
             location: back,
             parcel,
             tries: 0,
+            sent: None,
             until: None,
         });
     }
 
-    /// Tells a service that a letter handed to it has a lower predecessor now. A lost note costs
-    /// time only, because the service hands the letter back when it waits too long.
+    /// Tells a service the present predecessor of a letter that was handed to it in this transfer, and
+    /// asks whether it has the letter. A lost note costs time only: the service hands the letter back
+    /// when it waits too long, and is asked again.
     pub(crate) fn predecessor(
         &mut self,
         stream: Stream,
         receiver: Arc<str>,
-        (sequence, after): (u64, u64),
+        (sequence, after, transfer): (u64, u64, u64),
         location: Location,
     ) {
         let parcel = Parcel {
             after,
+            transfer,
             ..note_parcel(stream, receiver, sequence, Body::Predecessor)
         };
         self.note(Note {
             location,
             parcel,
             tries: 0,
+            sent: None,
             until: None,
         });
     }
@@ -407,6 +416,7 @@ impl Desk {
             location: back,
             parcel,
             tries: 0,
+            sent: None,
             until: Some(deadline),
         });
     }
@@ -475,6 +485,24 @@ impl Desk {
     pub(super) fn failing(&self, now: Instant, location: &Location) -> Option<(u32, Instant)> {
         let health = self.health.get(location)?;
         (health.retry_at > now).then_some((health.failures, health.retry_at))
+    }
+
+    /// A service has acknowledged a report within this time.
+    pub(crate) fn acknowledged(&mut self, service: Incarnation, took: Duration) {
+        if let Some(known) = self.round_trips.get_mut(&service) {
+            // Smoothed, as TCP does (RFC 6298 section 2).
+            *known = (*known * 7 + took) / 8;
+            return;
+        }
+        if self.round_trips.len() >= MAX_HEALTH {
+            self.round_trips.clear();
+        }
+        self.round_trips.insert(service, took);
+    }
+
+    /// The time in which this service acknowledges reports, if it has.
+    pub(crate) fn round_trip(&self, service: Incarnation) -> Option<Duration> {
+        self.round_trips.get(&service).copied()
     }
 
     pub(crate) fn way_worked(&mut self, location: &Location) {

@@ -452,6 +452,9 @@ impl Core {
             self.timers.push(Reverse((due, id)));
         }
         while let Some(attempt) = self.desk.repeated.pop_front() {
+            if let Some(Purpose::Note(note)) = self.desk.attempts.get_mut(&attempt) {
+                note.sent = Some(now.instant);
+            }
             if self.notes.len() < MAX_LATE_NOTES {
                 let due = now.instant + self.desk.config.attempt_timeout;
                 self.notes
@@ -561,15 +564,19 @@ impl Core {
                 Verdict::Now(Answer::Accepted)
             }
             Body::Predecessor => {
+                let mut is_here = false;
                 if let Some(lane) = self.lane_ids.get(&LaneKey::Custody(parcel.stream)) {
-                    let letter = (parcel.sequence, parcel.after);
+                    let letter = (parcel.sequence, parcel.after, parcel.transfer);
                     let from = from.location.incarnation();
                     self.with_lane(now, *lane, |lane, desk| {
-                        lane.predecessor_told(now.instant, from, letter, desk);
+                        is_here = lane.predecessor_told(now.instant, from, letter, desk);
                     });
                 }
                 self.tell_failures(now);
-                Verdict::Now(Answer::Accepted)
+                Verdict::Now(match is_here {
+                    true => Answer::Accepted,
+                    false => Answer::Returned { uncertain: true },
+                })
             }
         }
     }
@@ -622,7 +629,30 @@ impl Core {
     }
 
     fn note_concluded(&mut self, now: Now, note: Note, conclusion: Conclusion) {
-        let arrived = matches!(conclusion, Conclusion::Answered(_) | Conclusion::Handed);
+        // A note that is refused has changed nothing.
+        let arrived = matches!(
+            conclusion,
+            Conclusion::Answered(Answer::Accepted | Answer::Returned { .. }) | Conclusion::Handed
+        );
+        if arrived && let Some(sent) = note.sent {
+            let took = now.instant.saturating_duration_since(sent);
+            self.desk.acknowledged(note.location.incarnation(), took);
+        }
+        if note.parcel.body == Body::Predecessor && is_denied(&conclusion) {
+            let Parcel {
+                stream,
+                sequence,
+                transfer,
+                ..
+            } = note.parcel;
+            if let Some(lane) = self.lane_of(stream, &note.parcel.receiver) {
+                let letter = (stream.receiver, sequence, transfer);
+                self.with_lane(now, lane, |lane, desk| {
+                    lane.custodian_denied(now.instant, letter, desk);
+                });
+            }
+            return;
+        }
         // Other notes that are lost are made up for by the pauses of those they are for.
         let again = note.until.is_some_and(|until| now.instant < until);
         if !arrived && again && self.notes.len() < MAX_LATE_NOTES {
@@ -780,6 +810,7 @@ impl Core {
                 location,
                 parcel: desk::note_parcel(nobodys, name, 0, Body::Credit),
                 tries: 0,
+                sent: None,
                 until: None,
             });
         }
@@ -839,6 +870,15 @@ impl Core {
             }
         }
         self.desk.undelivered.clear();
+    }
+}
+
+/// Whether a custodian that was asked does not have the letter, or is not there.
+fn is_denied(conclusion: &Conclusion) -> bool {
+    match conclusion {
+        Conclusion::Answered(Answer::Returned { .. }) => true,
+        Conclusion::NotSent(error) => error.fault == WayFault::WrongIncarnation,
+        _ => false,
     }
 }
 

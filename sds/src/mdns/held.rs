@@ -36,6 +36,8 @@ struct Gateway {
     records: HashSet<Arc<str>>,
     /// Since when it is doubted, by this record of it.
     doubted: Option<(Instant, Arc<str>)>,
+    /// The records that are verified with it.
+    verified: HashSet<Arc<str>>,
 }
 
 impl Holdings {
@@ -53,8 +55,13 @@ impl Holdings {
             if let Some((since, _)) = end
                 && now < since + DOUBT
             {
-                // It did not answer for this one, so probably not for the others either.
-                self.queue.extend(known.records.iter().cloned());
+                // It did not answer for this one, so probably not for the others either: those that
+                // are not verified already.
+                let waiting: HashSet<&Arc<str>> = self.queue.iter().collect();
+                let rest = known.records.difference(&known.verified);
+                let rest: Vec<Arc<str>> =
+                    rest.filter(|it| !waiting.contains(it)).cloned().collect();
+                self.queue.extend(rest);
             }
             if known.records.is_empty() {
                 self.gateways.remove(&gateway);
@@ -72,6 +79,7 @@ impl Holdings {
             },
             records: HashSet::new(),
             doubted: None,
+            verified: HashSet::new(),
         });
         known.held.digest.add(digest);
         known.held.changed = now;
@@ -84,8 +92,9 @@ impl Holdings {
         self.gateways.get(&gateway).map(|known| known.held)
     }
 
-    /// Whether this gateway is there is doubted: one of its records is verified, and if that is
-    /// gone, so are all. Says whether anything is held of it that was not in doubt already.
+    /// Whether this gateway is there is doubted: its records are verified at once, as many as are at one
+    /// time. Where it has more, one of those stands for the rest. Says whether anything is held of it
+    /// that was not in doubt already.
     pub(super) fn doubt(&mut self, now: Instant, gateway: Incarnation) -> bool {
         let Some(known) = self.gateways.get_mut(&gateway) else {
             return false;
@@ -94,11 +103,16 @@ impl Holdings {
         if already.is_some_and(|(since, _)| now < *since + DOUBT) {
             return false;
         }
-        let Some(fullname) = known.records.iter().next() else {
+        let asked: Vec<Arc<str>> = known.records.iter().take(BATCH).cloned().collect();
+        let Some(first) = asked.first() else {
             return false;
         };
-        known.doubted = Some((now, Arc::clone(fullname)));
-        self.queue.push_front(Arc::clone(fullname));
+        // Without more records, each of them is verified and ends by itself.
+        known.doubted = Some((now, Arc::clone(first)));
+        known.verified = asked.iter().cloned().collect();
+        for fullname in asked.into_iter().rev() {
+            self.queue.push_front(fullname);
+        }
         true
     }
 
@@ -215,11 +229,13 @@ mod tests {
         }
         assert!(holdings.doubt(now, gateway));
         assert!(!holdings.doubt(now, gateway));
-        let [doubted] = &holdings.due(now)[..] else {
-            panic!("one is asked for");
+        // As many as possible are asked for at once.
+        let verified = holdings.due(now);
+        assert_eq!(verified.len(), BATCH);
+        let [doubted, others @ ..] = &verified[..] else {
+            panic!("some are asked for");
         };
-        let other = if &**doubted == "0" { 1 } else { 0 };
-        put(&mut holdings, now, other, 7, false);
+        put(&mut holdings, now, others[0].parse().unwrap(), 7, false);
         assert_eq!(holdings.poll_timeout(now), None, "that one left by itself");
         put(&mut holdings, now, doubted.parse().unwrap(), 7, false);
         let mut asked = Vec::new();
@@ -230,7 +246,7 @@ mod tests {
             assert!(batch.len() <= BATCH);
             asked.extend(batch);
         }
-        assert_eq!(asked.len(), 58);
+        assert_eq!(asked.len(), 60 - BATCH, "those that were not asked for");
         // Later, an end is an end and nothing more.
         assert!(holdings.doubt(now, gateway));
         let doubted = holdings.due(now + PAUSE);

@@ -1,6 +1,7 @@
 //! What is agreed upon with peers: windows, streams, and how long silence lasts.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use quinn::crypto::rustls::{QuicClientConfig, QuicServerConfig};
 use quinn::{ClientConfig, Connection, IdleTimeout, ServerConfig, TransportConfig, VarInt};
@@ -39,6 +40,10 @@ pub(super) fn widen(connection: &Connection) {
 /// Bytes that were sent and are not acknowledged.
 const SEND_WINDOW: u64 = 8 << 20;
 
+/// Round trip that is assumed before one was measured: a lost first packet is repeated after three times
+/// as long. The default of 333 ms is that of the Internet; here are networks of robots.
+const INITIAL_RTT: Duration = Duration::from_millis(100);
+
 /// Handshakes of which the first packet has come and nothing been done yet; more are refused.
 const MAX_INCOMING: usize = 256;
 
@@ -60,6 +65,7 @@ pub(super) fn transport(limits: &Limits) -> Arc<TransportConfig> {
         // The letter that is read first is sent first.
         .send_fairness(false)
         .datagram_receive_buffer_size(None)
+        .initial_rtt(INITIAL_RTT)
         .max_idle_timeout(Some(silence));
     Arc::new(transport)
 }

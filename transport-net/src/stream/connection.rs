@@ -29,6 +29,9 @@ pub(crate) const MAX_ID: u64 = 1 << 40;
 /// does not read needs no more signs of life.
 const MAX_CONTROL: usize = 4;
 
+/// A peer that has to read more before it can answer gets more time: it reads this fast at least.
+const SLOWEST_BYTES_PER_SECOND: u64 = 128 << 10;
+
 /// Which side opened the connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Role {
@@ -70,6 +73,8 @@ pub(crate) struct Connection {
     open: bool,
     /// Whether nothing is read, because there is no memory for the next letter.
     paused: bool,
+    /// See [`Connection::is_suspect`].
+    suspect: bool,
     /// Whether it is about to end for idleness: what comes now needs another connection.
     retiring: bool,
     ended: bool,
@@ -96,7 +101,8 @@ struct Sent {
     attempt: Option<AttemptId>,
     receiver: Arc<str>,
     letter_len: u64,
-    begun: bool,
+    /// When the kernel began to take it, if it has.
+    begun: Option<Instant>,
 }
 
 /// What the timers go by.
@@ -106,6 +112,8 @@ struct Clock {
     connected: Option<Instant>,
     received: Instant,
     written: Instant,
+    /// Bytes written since something last arrived.
+    written_since: u64,
     /// When something last went on that makes the connection useful.
     busy: Instant,
     pinged: bool,
@@ -127,6 +135,7 @@ impl Connection {
             proof: Proof::default(),
             open: false,
             paused: false,
+            suspect: false,
             retiring: false,
             ended: false,
             outbox: Outbox::default(),
@@ -144,6 +153,7 @@ impl Connection {
                 connected,
                 received: now,
                 written: now,
+                written_since: 0,
                 busy: now,
                 pinged: false,
                 doubted: None,
@@ -265,20 +275,32 @@ impl Connection {
                 attempt: Some(attempt),
                 receiver: Arc::clone(&parcel.receiver),
                 letter_len,
-                begun: false,
+                begun: None,
             },
         );
         Ok(())
     }
 
-    /// Ends an attempt: it is not sent if the kernel has taken nothing of it.
-    pub(crate) fn abandon(&mut self, attempt: AttemptId) -> Abandoned {
+    /// Ends an attempt: it is not sent if the kernel has taken nothing of it. An attempt that had time
+    /// enough, and in which nothing came from the peer, puts the connection in doubt.
+    pub(crate) fn abandon(&mut self, attempt: AttemptId, now: Instant) -> Abandoned {
         let Some(id) = self.attempts.remove(&attempt) else {
             return Abandoned::Unconfirmed;
         };
         if self.outbox.remove_parcel(id) {
             self.sent.remove(&id);
+            if !self.open {
+                self.suspect_slow_start(now);
+            }
             return Abandoned::NotSent;
+        }
+        let begun = self.sent.get(&id).and_then(|sent| sent.begun);
+        if let Some(begun) = begun
+            && begun > self.clock.received
+            && now >= begun + self.answer_patience()
+            && self.doubt(now, Duration::ZERO)
+        {
+            self.suspect = true;
         }
         if let Some(sent) = self.sent.get_mut(&id) {
             // The peer counts it until it has answered, so it goes on filling the window.
@@ -302,6 +324,8 @@ impl Connection {
         self.clock.received = now;
         self.clock.pinged = false;
         self.clock.doubted = None;
+        self.clock.written_since = 0;
+        self.suspect = false;
         self.clock.partial = match (self.clock.partial, partial) {
             (_, false) => None,
             (None, true) => Some((now, 0)),
@@ -316,6 +340,7 @@ impl Connection {
             self.clock.received = now;
             self.clock.pinged = false;
             self.clock.doubted = None;
+            self.suspect = false;
         }
     }
 
@@ -333,6 +358,37 @@ impl Connection {
             }
         }
         true
+    }
+
+    /// The peer has not introduced itself yet. If that takes long, what is dispatched from now on
+    /// needs another connection: the system repeats lost packets more and more rarely.
+    fn suspect_slow_start(&mut self, now: Instant) {
+        let since = self.clock.connected.unwrap_or(self.clock.received);
+        self.suspect |= now >= since + self.answer_patience();
+    }
+
+    /// Whether letters are to take another connection with the same peer, if there is one or one can
+    /// be opened: an attempt got no answer, and nothing has come since.
+    pub(crate) fn is_suspect(&self) -> bool {
+        self.suspect
+    }
+
+    /// Another connection with the peer came from elsewhere; see [`is_suspect`](Self::is_suspect).
+    pub(crate) fn suspect(&mut self, now: Instant) {
+        self.suspect |= self.doubt(now, Duration::ZERO);
+    }
+
+    /// The time without an answer, and without any byte from the peer, after which an attempt that is
+    /// abandoned speaks against the connection.
+    fn answer_patience(&self) -> Duration {
+        self.limits.keep_alive / 20 + self.transfer_time()
+    }
+
+    /// The time that the bytes may take to arrive that were written since the peer was last heard.
+    fn transfer_time(&self) -> Duration {
+        Duration::from_millis(
+            self.clock.written_since.saturating_mul(1000) / SLOWEST_BYTES_PER_SECOND,
+        )
     }
 
     /// Asks the peer for a sign of life, of which nothing follows here.
@@ -360,7 +416,7 @@ impl Connection {
             true => doubted,
             false => doubted.max(self.clock.written),
         };
-        Some(since + self.doubt_patience())
+        Some(since + self.doubt_patience() + self.transfer_time())
     }
 
     /// Takes a frame from the peer.
@@ -407,6 +463,7 @@ impl Connection {
     /// The kernel took so many bytes of what [`gather`](Self::gather) had shown.
     pub(crate) fn written(&mut self, taken: usize, now: Instant) {
         self.clock.written = now;
+        self.clock.written_since += taken as u64;
         let Self {
             outbox,
             sent,
@@ -420,7 +477,7 @@ impl Connection {
         outbox.written(taken, |progress| match progress {
             Progress::Begun(About::Parcel(id)) => {
                 if let Some(sent) = sent.get_mut(&id) {
-                    sent.begun = true;
+                    sent.begun = Some(now);
                     *begun += 1;
                     clock.busy = now;
                 }
@@ -525,7 +582,7 @@ impl Connection {
         std::mem::take(&mut self.sent)
             .into_iter()
             .filter_map(|(id, sent)| {
-                let conclusion = if sent.begun && id <= taken {
+                let conclusion = if sent.begun.is_some() && id <= taken {
                     Conclusion::Unconfirmed(end.after())
                 } else {
                     Conclusion::NotSent(end.before(greeted))
@@ -638,7 +695,7 @@ impl Connection {
 
     fn conclude(&mut self, id: u64, answer: Answer, now: Instant) -> Result<(), End> {
         match self.sent.remove(&id) {
-            Some(sent) if sent.begun => {
+            Some(sent) if sent.begun.is_some() => {
                 self.begun -= 1;
                 self.clock.busy = now;
                 if let Some(attempt) = sent.attempt {

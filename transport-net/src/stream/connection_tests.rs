@@ -193,7 +193,7 @@ fn perform(step: &Step, this: &mut Side, other: &mut Side, now: Instant) {
         Step::Abandon(pick) if !this.dispatched.is_empty() => {
             let sequence = this.dispatched[pick % this.dispatched.len()];
             if !this.concluded.contains_key(&AttemptId(sequence)) {
-                this.connection.abandon(AttemptId(sequence));
+                this.connection.abandon(AttemptId(sequence), now);
                 this.abandoned.push(sequence);
             }
         }
@@ -374,7 +374,7 @@ fn bytes_that_wait_are_bounded_and_one_letter_always_fits() {
     a.dispatch(4000).unwrap();
     assert!(matches!(a.dispatch(1), Err(SendError::Way(error))
         if error.fault == WayFault::Congested));
-    a.connection.abandon(AttemptId(0));
+    a.connection.abandon(AttemptId(0), now);
     a.dispatch(1).unwrap();
 }
 
@@ -476,8 +476,41 @@ fn a_peer_in_doubt_that_still_reads_is_not_given_up() {
         a.transmit(100, &mut BytesMut::new(), now);
         a.connection.handle_timeout(now, 0).unwrap();
     }
-    now += patience;
+    // What was written has time to arrive.
+    now += patience + Duration::from_millis(10);
     assert_eq!(a.connection.handle_timeout(now, 0), Err(End::Silent));
+}
+
+#[test]
+fn an_attempt_without_an_answer_makes_a_silent_connection_suspect() {
+    let start = Instant::now();
+    let (mut a, mut b) = greeted(start);
+    let patience = limits().keep_alive / 20 + Duration::from_millis(50);
+    let dispatch = |a: &mut Side, now| {
+        a.dispatch(10).unwrap();
+        a.transmit(usize::MAX, &mut BytesMut::new(), now);
+        AttemptId(a.connection.last_sent - 1)
+    };
+    let now = start + Duration::from_millis(1);
+    let first = dispatch(&mut a, now);
+    // Its letter had a short deadline, which says nothing about the connection.
+    a.connection.abandon(first, now + patience / 2);
+    assert!(!a.connection.is_suspect());
+    let second = dispatch(&mut a, now);
+    a.connection.received(1, false, now + patience / 2);
+    a.connection.abandon(second, now + patience * 2);
+    assert!(!a.connection.is_suspect(), "something came meanwhile");
+    let now = now + patience * 3;
+    let third = dispatch(&mut a, now);
+    a.connection.abandon(third, now + patience);
+    assert!(a.connection.is_suspect());
+    // The peer is asked, and what it says counts.
+    let mut asked = BytesMut::new();
+    a.transmit(usize::MAX, &mut asked, now + patience);
+    assert!(!asked.is_empty());
+    a.connection.received(1, false, now + patience);
+    assert!(!a.connection.is_suspect());
+    settle(&mut a, &mut b, now + patience);
 }
 
 #[test]

@@ -6,6 +6,11 @@
 //! whichever side opened it; so reports find their way back to peers that cannot be dialled. When
 //! two endpoints connect to each other at the same time both connections are kept: the one that is
 //! not used closes when it has been idle.
+//!
+//! A connection on which an attempt had no answer, and nothing else has come either, is *suspect*: the
+//! system repeats lost packets more and more rarely, and a peer that has moved never answers. What is
+//! dispatched from then on takes another connection with the same peer, which is opened if there is
+//! none. When that is open and the suspect one is still silent, the suspect one ends.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap};
@@ -54,6 +59,9 @@ const SIGN_OF_LIFE: Duration = Duration::from_secs(1);
 /// After so many silent connections, a stranger is refused when there are others to ask.
 const MAX_ASKED: usize = 4;
 
+/// The pause between connections that are opened beside suspect ones doubles this often.
+const LONGEST_BESIDE: u32 = 4;
+
 /// How long accepting rests when the system has no descriptors left.
 const REST: Duration = Duration::from_millis(100);
 
@@ -87,6 +95,8 @@ struct Registry {
     links: HashMap<u32, Arc<Link>>,
     /// The connection that was opened for a location.
     dialled: HashMap<Location, Arc<Link>>,
+    /// Locations for which connections were opened beside suspect ones.
+    beside: HashMap<Location, Beside>,
     /// A connection with the service of this incarnation, and all others in the order they came.
     known: HashMap<Incarnation, Vec<Arc<Link>>>,
     /// The peers' last connections for each of the locations they dialled.
@@ -100,6 +110,25 @@ struct Registry {
     last_stranger: u64,
     last_number: u32,
     last_serial: u64,
+}
+
+/// How often a connection was opened beside suspect ones, and when last.
+#[derive(Debug, Clone, Copy)]
+struct Beside {
+    last: Instant,
+    times: u32,
+}
+
+impl Beside {
+    /// Whether it is too soon for another one. The pause doubles each time.
+    fn is_soon(self, now: Instant, pause: Duration) -> bool {
+        now < self.last + pause.saturating_mul(1 << self.times.min(LONGEST_BESIDE))
+    }
+
+    /// Whether it is so long ago that it does not matter any more.
+    fn is_over(self, now: Instant, pause: Duration) -> bool {
+        now >= self.last + pause.saturating_mul(4 << LONGEST_BESIDE)
+    }
 }
 
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -518,24 +547,43 @@ impl Endpoint {
             }
             _ => return Err(End::Closed.after()),
         };
+        let dialled = registry.dialled.get(to);
         let known = registry.known.get(&to.incarnation());
-        if let Some(link) = registry.dialled.get(to) {
-            return Ok(Way::There(link.clone()));
-        }
-        if let Some(link) = known.and_then(|links| links.first()).cloned() {
-            drop(registry);
-            link.is_used_for(to);
+        let open = || dialled.into_iter().chain(known.into_iter().flatten());
+        let is_full = registry.links.len() >= self.limits().max_connections;
+        let healthy = open().find(|link| !link.is_suspect());
+        // Another connection is opened beside suspect ones, if it gets a place, and ever more rarely:
+        // a peer that is busy is not to be given more work.
+        let now = Instant::now();
+        let spare = self.limits().connect_timeout;
+        let is_soon = || {
+            registry
+                .beside
+                .get(to)
+                .is_some_and(|it| it.is_soon(now, spare))
+        };
+        let link = healthy.or_else(|| open().next().filter(|_| is_full || is_soon()));
+        if let Some(link) = link.cloned() {
+            if dialled.is_none_or(|dialled| !Arc::ptr_eq(dialled, &link)) {
+                drop(registry);
+                link.is_used_for(to);
+            }
             return Ok(Way::There(link));
         }
-        if registry.links.len() >= self.limits().max_connections {
+        if is_full {
             return Err(End::Crowd.after());
         }
+        let suspect: Vec<_> = open().cloned().collect();
         let serial = registry.last_serial + 1;
         registry.last_serial = serial;
         let role = Role::Dialler {
             expected: to.incarnation(),
         };
         let link = self.make_link(&mut registry, role, serial, to.to_string());
+        if !suspect.is_empty() {
+            registry.note_beside(to, now, spare);
+        }
+        link.opened_beside(suspect);
         registry.links.insert(link.number, link.clone());
         registry.dialled.insert(to.clone(), link.clone());
         Ok(Way::ToDial(link, sink))
@@ -607,6 +655,10 @@ impl Endpoint {
         proved: Option<Principal>,
         from: Source,
     ) -> Result<Hop, End> {
+        if !self.is_sought_by(peer) {
+            // It takes the place of none of the peer's connections with this service.
+            return Err(End::NotSought);
+        }
         let incarnation = peer.identity.incarnation;
         let inbound = Inbound {
             incarnation,
@@ -684,6 +736,14 @@ impl Endpoint {
             location,
             principal: proved.unwrap_or(principal),
         })
+    }
+
+    /// Whether the peer opened the connection for this service, as far as it says. If not, it dialled
+    /// an address that another incarnation had before.
+    fn is_sought_by(&self, peer: &Hello) -> bool {
+        let sought = peer.dialled.parse::<Location>().ok();
+        let sought = sought.map_or(Incarnation::UNKNOWN, |location| location.incarnation());
+        !sought.is_known() || sought == self.config.identity.incarnation
     }
 
     /// Gives a place to a connection whose peer has introduced itself, in place of others.
@@ -877,6 +937,19 @@ impl Registry {
         known.push(link.clone());
         self.peers.insert(link.number, peer);
         Ok(())
+    }
+
+    /// A connection is opened beside suspect ones now. What is remembered is bounded by the connections
+    /// that an endpoint may have within the longest pause.
+    fn note_beside(&mut self, to: &Location, now: Instant, pause: Duration) {
+        self.beside.retain(|_, it| !it.is_over(now, pause));
+        let known = self.beside.entry(to.clone());
+        let beside = known.or_insert(Beside {
+            last: now,
+            times: 0,
+        });
+        beside.times += 1;
+        beside.last = now;
     }
 
     /// Which stranger goes when another one comes from this home: the oldest of those from the home

@@ -273,3 +273,66 @@ async fn what_peers_may_send_ahead_has_one_budget_with_a_share_for_each_certific
     drop(of_all);
     assert!(endpoint.window(&account(9), len).is_some());
 }
+
+#[tokio::test]
+async fn a_peer_that_looked_for_an_earlier_service_keeps_its_connection_with_this_one() {
+    let endpoint = endpoint(Limits::default());
+    let proved = certificate(1);
+    let (good, _) = enters(&endpoint, comes(proved, 7, "10.0.0.7:1", 1, X))
+        .await
+        .unwrap();
+    tokio::spawn(ends_when_asked_to(good.clone()));
+    // From a new address, as after a move, the peer dials what a directory still says.
+    let earlier = comes(
+        proved,
+        7,
+        "10.0.0.8:1",
+        2,
+        "tcp://10.0.0.1:7788#0000000000000009",
+    );
+    let entered = enters(&endpoint, earlier).await;
+    assert_eq!(entered.map(|_| ()), Err(End::NotSought));
+    assert_eq!(good.ending(), None);
+}
+
+/// A link that was dialled for this location, and whose peer has introduced itself.
+async fn dials(endpoint: &Endpoint, to: &Location) -> Arc<Link> {
+    let Way::ToDial(link, _) = endpoint.way_to(to).unwrap() else {
+        panic!("there is a connection already");
+    };
+    link.connected(Instant::now());
+    link.greeted_by(Hello {
+        identity: identity(to.incarnation().as_u64()),
+        max_letter: 1 << 20,
+        max_in_flight: 8,
+        serial: 0,
+        dialled: String::new(),
+        listening: Vec::new(),
+    });
+    link
+}
+
+#[tokio::test]
+async fn letters_take_another_connection_when_one_is_suspect() {
+    let endpoint = endpoint(Limits {
+        keep_alive: Duration::ZERO,
+        connect_timeout: Duration::ZERO,
+        ..Limits::default()
+    });
+    let to: Location = "tcp://10.0.0.7:7788#0000000000000007".parse().unwrap();
+    let first = dials(&endpoint, &to).await;
+    let Way::There(same) = endpoint.way_to(&to).unwrap() else {
+        panic!("a connection that works is kept");
+    };
+    assert!(Arc::ptr_eq(&first, &same));
+    first.doubt();
+    assert!(first.is_suspect());
+    let second = dials(&endpoint, &to).await;
+    assert_eq!(first.ending(), Some(End::Silent), "the other one is open");
+    let Way::There(used) = endpoint.way_to(&to).unwrap() else {
+        panic!("it is used");
+    };
+    assert!(Arc::ptr_eq(&second, &used));
+    second.doubt();
+    assert!(matches!(endpoint.way_to(&to).unwrap(), Way::ToDial(..)));
+}

@@ -51,6 +51,10 @@ pub(crate) struct Link {
     heard: Notify,
     over: watch::Sender<bool>,
     begun: AtomicBool,
+    /// Whether the connection is [suspect](Connection::is_suspect); to be read without its lock.
+    suspect: AtomicBool,
+    /// Suspect connections with the same peer, which this one was opened beside.
+    beside: Mutex<Vec<Arc<Link>>>,
 }
 
 #[derive(Debug)]
@@ -86,6 +90,8 @@ impl Link {
             heard: Notify::new(),
             over: watch::Sender::new(false),
             begun: AtomicBool::new(false),
+            suspect: AtomicBool::new(false),
+            beside: Mutex::default(),
         })
     }
 
@@ -97,6 +103,31 @@ impl Link {
     /// The socket is connected.
     pub(crate) fn connected(&self, now: Instant) {
         self.state.lock().connection.connected(now);
+    }
+
+    /// The peer has introduced itself. The suspect connections that this one was opened beside, and on
+    /// which still nothing has come, end: what waits in their sockets would arrive late or not at all.
+    pub(crate) fn replace_suspects(&self) {
+        for other in std::mem::take(&mut *self.beside.lock()) {
+            if other.is_suspect() {
+                other.leave(End::Silent);
+            }
+        }
+    }
+
+    /// This connection is to be opened beside suspect ones with the same peer.
+    pub(crate) fn opened_beside(&self, others: Vec<Arc<Self>>) {
+        *self.beside.lock() = others;
+    }
+
+    /// Whether letters are to take another connection, if they can.
+    pub(crate) fn is_suspect(&self) -> bool {
+        self.suspect.load(Ordering::Acquire)
+    }
+
+    fn note_suspicion(&self, state: &State) {
+        self.suspect
+            .store(state.connection.is_suspect(), Ordering::Release);
     }
 
     /// The peer has proved this, before its hello.
@@ -112,8 +143,16 @@ impl Link {
         Ok(())
     }
 
+    /// Ends an attempt. A peer that has not answered in time is asked for a sign of life.
     pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
-        self.state.lock().connection.abandon(attempt)
+        let mut state = self.state.lock();
+        let end = state.connection.abandon(attempt, Instant::now());
+        self.note_suspicion(&state);
+        if state.connection.is_suspect() && self.has_begun() {
+            self.flush(&mut state);
+            self.wake.notify_one();
+        }
+        end
     }
 
     /// Answers a parcel that arrived on this link, by its number.
@@ -145,7 +184,8 @@ impl Link {
     /// Another connection with the same service comes from another address.
     pub(crate) fn doubt(&self) {
         let mut state = self.state.lock();
-        state.connection.doubt(Instant::now(), Duration::ZERO);
+        state.connection.suspect(Instant::now());
+        self.note_suspicion(&state);
         self.flush(&mut state);
         self.wake.notify_one();
     }
@@ -201,6 +241,20 @@ impl Link {
     #[cfg(all(test, feature = "ip"))]
     pub(crate) fn ending(&self) -> Option<End> {
         self.state.lock().ending.clone()
+    }
+
+    /// The peer says hello.
+    #[cfg(all(test, feature = "ip"))]
+    pub(crate) fn greeted_by(&self, hello: crate::hello::Hello) {
+        use super::frame::Frame;
+        let mut state = self.state.lock();
+        let greeted = state
+            .connection
+            .handle_frame(Frame::Hello(hello), Instant::now());
+        assert_eq!(greeted, Ok(()));
+        state.connection.welcome();
+        drop(state);
+        self.replace_suspects();
     }
 
     /// The task has ended.
@@ -368,6 +422,9 @@ impl Running {
             end = proof.withdrawn() => end,
         };
         self.end = end;
+        if self.end == End::Silent {
+            writer.discard();
+        }
         drop((writer, beside, reader));
         let (link, patience) = (self.link.clone(), self.endpoint.limits().handshake_timeout);
         let orderly = self.end.is_orderly();
@@ -409,6 +466,7 @@ impl Running {
             let (flushed, due) = {
                 let mut state = link.state.lock();
                 state.connection.pause(blocked.0, Instant::now());
+                link.note_suspicion(&state);
                 let flushed = state.flush();
                 self.endpoint
                     .tally()
@@ -551,6 +609,7 @@ impl Running {
         // A letter that waits for memory is no sign of life.
         if arrived > 0 || !reader.is_blocked() {
             state.connection.received(arrived, partial, now);
+            link.note_suspicion(&state);
         }
         drop(state);
         if arrived > 0 {
@@ -582,7 +641,12 @@ impl Running {
                     (connection.peer().cloned(), proved, connection.mandate())
                 };
                 if let Some(peer) = peer {
-                    let hop = self.endpoint.enter(&self.link, &peer, proved, from).await?;
+                    let entered = self.endpoint.enter(&self.link, &peer, proved, from).await;
+                    if let Err(End::NotSought) = entered {
+                        // The hello tells the peer which service is here.
+                        self.link.state.lock().connection.welcome();
+                    }
+                    let hop = entered?;
                     self.peer = Some(Introduction {
                         name: peer.identity.name.into(),
                         hop,
@@ -591,6 +655,7 @@ impl Running {
                     });
                 }
                 self.link.state.lock().connection.welcome();
+                self.link.replace_suspects();
                 if let Some(peer) = &self.peer {
                     self.sink.introduced(peer);
                 }

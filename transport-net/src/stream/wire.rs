@@ -177,6 +177,21 @@ impl Writing {
         }
     }
 
+    /// Has the kernel forget, when the socket is closed, what the peer has not acknowledged, and tell
+    /// the peer that the connection is over.
+    pub(crate) fn discard(&self) {
+        #[cfg(feature = "ip")]
+        let socket = match self {
+            Self::Plain(socket) => socket,
+            #[cfg(feature = "secure")]
+            Self::Tls(socket, _) => socket,
+            _ => return,
+        };
+        // Without it, the peer notices later.
+        #[cfg(feature = "ip")]
+        let _ = socket2::SockRef::from(socket.as_ref()).set_linger(Some(std::time::Duration::ZERO));
+    }
+
     /// Hands over what is taken at once.
     pub(crate) fn try_write(&self, slices: &[IoSlice<'_>]) -> io::Result<usize> {
         match self {

@@ -27,6 +27,10 @@ use crate::stream::wire::{self, Reading, Writing};
 /// How long one address is waited for before the next is tried as well.
 const STAGGER: Duration = Duration::from_millis(250);
 
+/// How long an address is waited for before it is asked again, and how often it is asked.
+const ASKED_AGAIN: Duration = Duration::from_millis(400);
+const MAX_ASKED: usize = 4;
+
 /// Most addresses of one name, or of one service, that are tried.
 const MAX_ADDRESSES: usize = 8;
 
@@ -40,7 +44,7 @@ pub(crate) async fn dial(
     let limits = endpoint.limits().clone();
     let addresses = addresses(&*sink, &to);
     let running = Running::new(endpoint, link.clone(), sink, Some(to.clone()));
-    let (stream, peer) = match reach(&limits, &link, &to, addresses, connect).await {
+    let (stream, peer) = match reach(&limits, &link, &to, addresses, insist).await {
         Ok(connected) => connected,
         Err(end) => return running.fail(end),
     };
@@ -208,6 +212,19 @@ where
                 Err(error) => last = io::Error::other(error),
             },
             () = sleep(STAGGER), if !is_last => {}
+        }
+    }
+}
+
+/// Opens a connection, and another one after a while when there is no answer: the system repeats a lost
+/// SYN after one second, and then after two. The first one to be open is used.
+async fn insist(address: SocketAddr) -> io::Result<(TcpStream, SocketAddr)> {
+    let mut asked = JoinSet::new();
+    loop {
+        asked.spawn(connect(address));
+        tokio::select! {
+            Some(ended) = asked.join_next() => return ended.unwrap_or_else(|e| Err(io::Error::other(e))),
+            () = sleep(ASKED_AGAIN), if asked.len() < MAX_ASKED => {}
         }
     }
 }

@@ -12,7 +12,7 @@ use fipa_transport::{
 use super::super::desk::{Desk, Settlement};
 use super::super::routes::Tally;
 use super::super::rules::{self, Belief, End, Told};
-use super::custody::PREDECESSOR_PATIENCE;
+use super::custody::ASK_CUSTODIAN_AFTER;
 use super::delivery::State;
 use super::{BUSY_PAUSE, CONGESTED_PAUSE, CONGESTED_TRIES, ENDED_PATIENCE, Lane, MOVING_PATIENCE};
 
@@ -105,7 +105,12 @@ impl Lane {
             }
             Answer::Custody => {
                 let delivery = &mut self.letters[index];
-                delivery.progress.state = State::Custody { attempt, location };
+                delivery.progress.state = State::Custody {
+                    attempt,
+                    location,
+                    since: now,
+                };
+                self.ask_custodian_at(now + ASK_CUSTODIAN_AFTER);
                 // A letter before it may have failed since this copy left.
                 if !self.is_custody() {
                     self.tell_predecessor(index, desk);
@@ -122,7 +127,8 @@ impl Lane {
                 self.pause_until(now + BUSY_PAUSE);
             }
             Answer::OutOfOrder { last } => {
-                self.came_early(now, index, (last, PREDECESSOR_PATIENCE), desk);
+                let patience = self.predecessor_patience(index, desk);
+                self.came_early(now, index, (last, patience), desk);
             }
             Answer::Returned { uncertain } => {
                 self.letters[index].ended(end_of(uncertain));
@@ -378,6 +384,13 @@ impl Lane {
 
     /// The directory has changed: services that have letters in custody may be gone.
     pub(crate) fn directory_changed(&mut self, now: Instant, desk: &mut Desk) {
+        self.check_next_hops(now, desk);
+        self.notice_end(now, desk);
+        self.pump(now, desk);
+    }
+
+    /// Looks for letters that services have which lead to their receiver no more.
+    pub(super) fn check_next_hops(&mut self, now: Instant, desk: &mut Desk) {
         let mut entry: Option<(Incarnation, Option<std::sync::Arc<Entry>>)> = None;
         for index in 0..self.letters.len() {
             let registration = self.letters[index].registration;
@@ -395,8 +408,6 @@ impl Lane {
                 self.check_next_hop(now, index, &entry, desk);
             }
         }
-        self.notice_end(now, desk);
-        self.pump(now, desk);
     }
 
     /// Notices that the registration which the first letters are for has left the directory:
@@ -452,13 +463,9 @@ impl Lane {
                     desk.abandon(location.kind(), *attempt, error);
                 }
             }
-            State::Custody { location, .. } => {
-                let location = location.clone();
-                delivery.progress.state = State::Waiting;
-                delivery.ended(End::CustodianLost);
+            State::Custody { .. } => {
                 let text = "the gateway that had the letter in custody is gone";
-                let error = WayError::new(WayFault::Broken, text);
-                self.came_back(now, index, &location, error, desk);
+                self.custodian_lost(now, index, text, desk);
             }
             State::Waiting => {}
         }

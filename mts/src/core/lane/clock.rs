@@ -16,6 +16,7 @@ impl Lane {
         if self.due.is_none_or(|due| due > now) {
             return;
         }
+        self.ask_custodians(now, desk);
         let ended = self
             .ended
             .filter(|(_, heard)| now >= *heard + ENDED_PATIENCE);
@@ -98,6 +99,8 @@ impl Lane {
             .filter(|until| *until > now);
         let ended = self.ended.map(|(_, heard)| heard + ENDED_PATIENCE);
         let ended = ended.filter(|due| *due > now);
-        letters.chain([paused, moving, ended]).flatten().min()
+        let ask = self.ask_custodian.filter(|due| *due > now);
+        let others = [paused, moving, ended, ask];
+        letters.chain(others).flatten().min()
     }
 }

@@ -1,19 +1,32 @@
 //! What custodians do about predecessors: a letter waits for one that is in the lane, and is handed
 //! back when one does not arrive. Copies of held letters, and notes about predecessors, come here.
+//!
+//! And what the service before a custodian does: it asks now and then whether the custodian has the
+//! letter. Whatever became of its report, a custodian without the letter has lost it.
 
 use std::time::{Duration, Instant};
 
-use fipa_transport::Incarnation;
+use fipa_transport::{Incarnation, WayError, WayFault};
 
 use super::super::desk::{Desk, Settlement, Upstream};
-use super::super::rules::{self, Hold};
+use super::super::rules::{self, End, Hold};
 use super::super::work;
 use super::Lane;
 use super::delivery::{Holding, State};
 
-/// How long a predecessor that is not here may take to arrive. Longer than two round trips of
-/// most networks; where it is not, a letter travels twice, and nothing is lost.
-pub(super) const PREDECESSOR_PATIENCE: Duration = Duration::from_millis(50);
+/// How long a predecessor that is not here may take to arrive, at least and at most: two round trips to
+/// the service that handed the letter over. Where they take longer than this service has seen, a letter
+/// travels twice, and nothing is lost.
+const LEAST_PATIENCE: Duration = Duration::from_millis(50);
+const MOST_PATIENCE: Duration = Duration::from_secs(1);
+/// Time in custody after which the custodian is asked whether it has the letter, and the pause until it is
+/// asked again.
+pub(super) const ASK_CUSTODIAN_AFTER: Duration = Duration::from_secs(1);
+const ASK_CUSTODIAN_AGAIN: Duration = Duration::from_secs(2);
+/// The same when the custodian did not have another letter of this lane.
+const ASK_CUSTODIAN_ON: Duration = Duration::from_millis(10);
+/// Letters of one lane that are asked about at once.
+const ASKED_AT_ONCE: usize = 16;
 /// Letters that left a lane are remembered, at most this many.
 const MAX_LEFT: usize = 64;
 
@@ -37,20 +50,121 @@ impl Lane {
         Ok(())
     }
 
-    /// A note says that this letter has a lower predecessor. Believed from a service that handed
-    /// the letter over.
+    /// A note says which predecessor this letter has now, and asks whether the letter of this hand-over
+    /// is here. Believed from the service that handed it over. Returns whether it is here.
     pub(crate) fn predecessor_told(
         &mut self,
         now: Instant,
         from: Incarnation,
-        (sequence, after): (u64, u64),
+        (sequence, after, transfer): (u64, u64, u64),
         desk: &mut Desk,
-    ) {
-        if let Some(index) = self.index(sequence)
-            && self.letters[index].came_from(from)
-        {
+    ) -> bool {
+        let index = self.index(sequence);
+        let index = index.filter(|index| self.letters[*index].came_from(from, transfer));
+        if let Some(index) = index {
             self.lower_predecessor(index, after, desk);
             self.pump(now, desk);
+        }
+        index.is_some()
+    }
+
+    /// How long the predecessor of the letter at `index` may take to arrive.
+    pub(super) fn predecessor_patience(&self, index: usize, desk: &Desk) -> Duration {
+        let upstreams = self.letters[index].upstreams();
+        let slowest = upstreams.filter_map(|it| desk.round_trip(it)).max();
+        (slowest.unwrap_or_default() * 2).clamp(LEAST_PATIENCE, MOST_PATIENCE)
+    }
+
+    /// Custodians are asked at this time at the latest.
+    pub(super) fn ask_custodian_at(&mut self, at: Instant) {
+        if self.ask_custodian.is_none_or(|due| at < due) {
+            self.ask_custodian = Some(at);
+            self.due_at(at);
+        }
+    }
+
+    /// Asks the custodians of the letters that have been longest in custody whether they have them, and
+    /// tells them the present predecessors by the way. What the directory says of them is looked at
+    /// again, too.
+    pub(super) fn ask_custodians(&mut self, now: Instant, desk: &mut Desk) {
+        if self.ask_custodian.is_none_or(|due| due > now) {
+            return;
+        }
+        self.ask_custodian = None;
+        let mut asked = 0;
+        let mut next: Option<Instant> = None;
+        for index in 0..self.letters.len() {
+            let delivery = &self.letters[index];
+            let State::Custody {
+                attempt,
+                location,
+                since,
+            } = &delivery.progress.state
+            else {
+                continue;
+            };
+            let due = *since + ASK_CUSTODIAN_AFTER;
+            if due > now {
+                next = Some(next.map_or(due, |next| next.min(due)));
+                continue;
+            }
+            if asked >= ASKED_AT_ONCE {
+                break;
+            }
+            asked += 1;
+            let (attempt, location) = (*attempt, location.clone());
+            let stream = self.stream_of(delivery);
+            let after = self.after(index);
+            let letter = (delivery.sequence, after, attempt.0);
+            desk.predecessor(stream, self.receiver.clone(), letter, location);
+            let delivery = &mut self.letters[index];
+            delivery.after = delivery.after.min(after);
+        }
+        if asked > 0 {
+            next = Some(now + ASK_CUSTODIAN_AGAIN);
+            self.check_next_hops(now, desk);
+        }
+        if let Some(next) = next {
+            self.ask_custodian_at(next);
+        }
+    }
+
+    /// The custodian that was asked about this hand-over of a letter does not have it.
+    pub(crate) fn custodian_denied(
+        &mut self,
+        now: Instant,
+        (registration, sequence, transfer): (Incarnation, u64, u64),
+        desk: &mut Desk,
+    ) {
+        let Some(index) = self.index(sequence) else {
+            return;
+        };
+        let delivery = &self.letters[index];
+        let is_meant = delivery.registration == registration
+            && matches!(delivery.progress.state, State::Custody { attempt, .. } if attempt.0 == transfer);
+        if is_meant {
+            let text = "the gateway that had the letter in custody does not have it";
+            self.custodian_lost(now, index, text, desk);
+            // It may have lost others, too.
+            self.ask_custodian_at(now + ASK_CUSTODIAN_ON);
+            self.pump(now, desk);
+        }
+    }
+
+    /// The service that has the letter in custody is lost, or has lost it.
+    pub(super) fn custodian_lost(
+        &mut self,
+        now: Instant,
+        index: usize,
+        text: &'static str,
+        desk: &mut Desk,
+    ) {
+        let delivery = &mut self.letters[index];
+        let before = std::mem::replace(&mut delivery.progress.state, State::Waiting);
+        if let State::Custody { location, .. } = before {
+            delivery.ended(End::CustodianLost);
+            let error = WayError::new(WayFault::Broken, text);
+            self.came_back(now, index, &location, error, desk);
         }
     }
 
@@ -69,8 +183,10 @@ impl Lane {
             }
             State::UnderWay { location, .. } | State::Custody { location, .. } => {
                 let (sequence, location) = (delivery.sequence, location.clone());
+                let transfer = delivery.progress.state.handed_over();
+                let transfer = transfer.map_or(0, |(attempt, _)| attempt.0);
                 let receiver = self.receiver.clone();
-                desk.predecessor(stream, receiver, (sequence, lower), location);
+                desk.predecessor(stream, receiver, (sequence, lower, transfer), location);
             }
         }
     }

@@ -84,6 +84,8 @@ pub(super) enum State {
         /// The attempt that handed it over.
         attempt: AttemptId,
         location: Location,
+        /// When the custodian said so.
+        since: Instant,
     },
 }
 
@@ -95,7 +97,9 @@ impl State {
             Self::UnderWay {
                 attempt, location, ..
             }
-            | Self::Custody { attempt, location } => Some((*attempt, location)),
+            | Self::Custody {
+                attempt, location, ..
+            } => Some((*attempt, location)),
         }
     }
 }
@@ -241,13 +245,22 @@ impl Delivery {
         }
     }
 
-    /// Whether this service has handed the letter over.
-    pub(super) fn came_from(&self, service: Incarnation) -> bool {
+    /// Whether this service has handed the letter over, this time at the latest.
+    pub(super) fn came_from(&self, service: Incarnation, transfer: u64) -> bool {
         match &self.origin {
-            Origin::Forwarded { upstreams } => upstreams
-                .iter()
-                .any(|upstream| upstream.back.incarnation() == service),
+            Origin::Forwarded { upstreams } => upstreams.iter().any(|upstream| {
+                upstream.back.incarnation() == service && upstream.transfer >= transfer
+            }),
             _ => false,
         }
+    }
+
+    /// The services that have handed the letter over.
+    pub(super) fn upstreams(&self) -> impl Iterator<Item = Incarnation> {
+        let upstreams = match &self.origin {
+            Origin::Forwarded { upstreams } => upstreams.as_slice(),
+            _ => &[],
+        };
+        upstreams.iter().map(|upstream| upstream.back.incarnation())
     }
 }

@@ -108,6 +108,8 @@ pub(crate) struct Lane {
     /// A registration that has left the directory, and when something was last heard about
     /// letters for it.
     ended: Option<(Incarnation, Instant)>,
+    /// When custodians are asked whether they have letters of this lane.
+    ask_custodian: Option<Instant>,
     /// Whether a letter may wait for its predecessor to arrive.
     holds: bool,
     /// Letters that left this lane without being delivered, and when.
@@ -150,6 +152,7 @@ impl Lane {
             was_busy: None,
             moving: None,
             ended: None,
+            ask_custodian: None,
             holds: false,
             left: VecDeque::new(),
             due: None,
@@ -630,13 +633,16 @@ impl Lane {
         let Some(delivery) = self.letters.get(index) else {
             return;
         };
-        let State::Custody { location, .. } = &delivery.progress.state else {
+        let State::Custody {
+            attempt, location, ..
+        } = &delivery.progress.state
+        else {
             return;
         };
         let after = self.after(index);
         if after < delivery.after {
             let stream = self.stream_of(delivery);
-            let letter = (delivery.sequence, after);
+            let letter = (delivery.sequence, after, attempt.0);
             desk.predecessor(stream, Arc::clone(&self.receiver), letter, location.clone());
             self.letters[index].after = after;
         }

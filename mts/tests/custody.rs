@@ -1,0 +1,290 @@
+//! A letter in custody whose report never arrives, or is not believed: the service before the custodian
+//! asks now and then, and a custodian that does not have the letter has lost it.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use fipa_acl::{AgentId, Letter, Message, Performative};
+use fipa_mts::core::{Action, Core, CoreConfig, Now, Submission};
+use fipa_mts::letter_for;
+use fipa_sds::{Directory, MemoryDirectory, Mts, Registration};
+use fipa_transport::{
+    Answer, Arrival, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Kind, Location,
+    Outcome, Parcel, Principal, Report, Stream, Ticket, Verdict, WayError, WayFault,
+};
+
+const OWN: Incarnation = Incarnation::from_u64(1);
+const ROVER: Incarnation = Incarnation::from_u64(2);
+const ARM: Incarnation = Incarnation::from_u64(3);
+const NEXT: Incarnation = Incarnation::from_u64(9);
+/// Deadline of every letter. No test takes as long.
+const DEADLINE: Duration = Duration::from_secs(60);
+
+/// The core of one service, whose directory has one agent `arm`, behind another service.
+struct Service {
+    core: Core,
+    start: Instant,
+}
+
+impl Service {
+    fn new(forwards: bool) -> Self {
+        let directory = MemoryDirectory::new(Mts::new("mts", NEXT));
+        let at = shm(NEXT);
+        directory
+            .register(Registration::new("arm", ARM, vec![at]))
+            .unwrap();
+        let config = CoreConfig {
+            forwards,
+            ..CoreConfig::new("mts", OWN, vec![Kind::Shm])
+        };
+        let mut core = Core::new(config, Arc::new(directory));
+        core.register("rover".into(), ROVER);
+        Self {
+            core,
+            start: Instant::now(),
+        }
+    }
+
+    fn at(&self, ms: u64) -> Now {
+        let since = Duration::from_millis(ms);
+        Now {
+            instant: self.start + since,
+            utc: SystemTime::UNIX_EPOCH + since,
+        }
+    }
+
+    fn send(&mut self) {
+        let submission = Submission {
+            sender: ROVER,
+            letter: letter(),
+            receivers: vec!["arm".into()],
+            deadline: DEADLINE,
+        };
+        self.core.send(self.at(0), submission);
+    }
+
+    /// A letter arrives for `arm`, in this transfer of the service before.
+    fn arrive(&mut self, ms: u64, sequence: u64, transfer: u64) -> Verdict {
+        self.receive(ms, Kind::Shm, {
+            let body = Body::Letter(letter());
+            parcel(sequence, transfer, body)
+        })
+    }
+
+    fn receive(&mut self, ms: u64, via: Kind, parcel: Parcel) -> Verdict {
+        let from = Hop {
+            location: shm(OWN),
+            principal: Principal::Host,
+        };
+        let arrival = Arrival {
+            parcel,
+            from,
+            ticket: Ticket(1),
+        };
+        let now = self.at(ms);
+        self.core.handle_arrival(now, via, true, arrival)
+    }
+
+    fn conclude(&mut self, ms: u64, attempt: AttemptId, conclusion: Conclusion) {
+        let now = self.at(ms);
+        self.core.handle_conclusion(now, attempt, conclusion);
+    }
+
+    fn answer(&mut self, ms: u64, attempt: AttemptId, answer: Answer) {
+        self.conclude(ms, attempt, Conclusion::Answered(answer));
+    }
+
+    /// Time passes in steps until something is to be dispatched, at most for this long.
+    fn wait_for_dispatch(&mut self, mut ms: u64, until: u64) -> Option<(u64, AttemptId, Parcel)> {
+        loop {
+            if let Some((attempt, parcel)) = self.dispatched() {
+                return Some((ms, attempt, parcel));
+            }
+            if ms >= until {
+                return None;
+            }
+            ms += 10;
+            let now = self.at(ms);
+            self.core.handle_timeout(now);
+        }
+    }
+
+    fn dispatched(&mut self) -> Option<(AttemptId, Parcel)> {
+        std::iter::from_fn(|| self.core.poll_action()).find_map(|action| match action {
+            Action::Dispatch {
+                attempt, parcel, ..
+            } => Some((attempt, parcel)),
+            _ => None,
+        })
+    }
+
+    fn outcome(&mut self) -> Option<Outcome> {
+        std::iter::from_fn(|| self.core.poll_action()).find_map(|action| match action {
+            Action::Outcome { outcome, .. } => Some(outcome),
+            _ => None,
+        })
+    }
+}
+
+fn shm(service: Incarnation) -> Location {
+    let text = format!("shm://{service}#{service}");
+    text.parse().unwrap()
+}
+
+fn letter() -> Letter {
+    let message = Message::builder(Performative::Inform)
+        .sender(AgentId::new("rover").unwrap())
+        .receiver(AgentId::new("arm").unwrap())
+        .build()
+        .unwrap();
+    letter_for(&message, SystemTime::UNIX_EPOCH).unwrap()
+}
+
+fn parcel(sequence: u64, transfer: u64, body: Body) -> Parcel {
+    Parcel {
+        receiver: "arm".into(),
+        stream: Stream {
+            sender: ROVER,
+            receiver: ARM,
+        },
+        sequence,
+        after: 0,
+        transfer,
+        remaining: DEADLINE,
+        body,
+    }
+}
+
+/// Sends a letter that goes into custody. Returns its hand-over.
+fn in_custody(sender: &mut Service) -> Parcel {
+    sender.send();
+    let (attempt, handed) = sender.dispatched().unwrap();
+    sender.answer(1, attempt, Answer::Custody);
+    handed
+}
+
+#[test]
+fn a_letter_that_its_custodian_does_not_have_is_sent_again() {
+    let mut sender = Service::new(false);
+    let handed = in_custody(&mut sender);
+    let (ms, ask, question) = sender.wait_for_dispatch(1, 10_000).unwrap();
+    assert_eq!(question.body, Body::Predecessor);
+    assert_eq!(
+        (question.sequence, question.transfer),
+        (handed.sequence, handed.transfer)
+    );
+    sender.answer(ms, ask, Answer::Returned { uncertain: true });
+    let (ms, attempt, again) = sender.wait_for_dispatch(ms, 10_000).unwrap();
+    assert!(matches!(again.body, Body::Letter(_)));
+    assert_eq!(again.sequence, handed.sequence);
+    assert!(again.transfer > handed.transfer);
+    sender.answer(ms, attempt, Answer::Accepted);
+    let outcome = sender.outcome();
+    assert!(
+        matches!(outcome, Some(Outcome::Delivered { .. })),
+        "{outcome:?}"
+    );
+}
+
+#[test]
+fn a_letter_may_have_been_taken_that_its_custodian_does_not_have() {
+    let mut sender = Service::new(false);
+    in_custody(&mut sender);
+    let (ms, ask, _) = sender.wait_for_dispatch(1, 10_000).unwrap();
+    sender.answer(ms, ask, Answer::Returned { uncertain: true });
+    let (ms, attempt, _) = sender.wait_for_dispatch(ms, 10_000).unwrap();
+    sender.answer(ms, attempt, Answer::failed(FailureReason::Refused, ""));
+    let outcome = sender.outcome();
+    let Some(Outcome::Failed { reason, .. }) = outcome else {
+        panic!("{outcome:?}");
+    };
+    assert_eq!(reason, FailureReason::Unconfirmed);
+}
+
+#[test]
+fn a_custodian_that_has_the_letter_keeps_it_and_is_asked_again() {
+    let mut sender = Service::new(false);
+    in_custody(&mut sender);
+    let mut ms = 1;
+    for _ in 0..5 {
+        let (later, ask, question) = sender.wait_for_dispatch(ms, ms + 10_000).unwrap();
+        assert_eq!(question.body, Body::Predecessor);
+        let conclusion = match ms {
+            1 => Conclusion::Unconfirmed(WayError::new(WayFault::TimedOut, "")),
+            _ => Conclusion::Answered(Answer::Accepted),
+        };
+        sender.conclude(later, ask, conclusion);
+        ms = later;
+    }
+    assert_eq!(sender.outcome(), None);
+}
+
+#[test]
+fn a_gateway_says_which_letters_it_has() {
+    let mut gateway = Service::new(true);
+    let asked =
+        |gateway: &mut Service, ms, sequence, transfer| match gateway.receive(ms, Kind::Shm, {
+            parcel(sequence, transfer, Body::Predecessor)
+        }) {
+            Verdict::Now(answer) => answer,
+            Verdict::Later => panic!("notes are answered at once"),
+        };
+    let without = Answer::Returned { uncertain: true };
+    assert_eq!(asked(&mut gateway, 0, 5, 70), without);
+    assert_eq!(gateway.arrive(0, 5, 70), Verdict::Now(Answer::Custody));
+    let (attempt, _) = gateway.dispatched().unwrap();
+    assert_eq!(asked(&mut gateway, 1, 5, 70), Answer::Accepted);
+    assert_eq!(asked(&mut gateway, 1, 6, 71), without);
+    // A report that names another transfer would not be believed.
+    assert_eq!(asked(&mut gateway, 1, 5, 72), without);
+    gateway.answer(2, attempt, Answer::Accepted);
+    assert_eq!(asked(&mut gateway, 3, 5, 70), without);
+}
+
+#[test]
+fn a_report_that_is_refused_is_repeated() {
+    let mut gateway = Service::new(true);
+    gateway.arrive(0, 5, 70);
+    let (attempt, _) = gateway.dispatched().unwrap();
+    gateway.answer(1, attempt, Answer::Accepted);
+    let (first, report) = gateway.dispatched().unwrap();
+    let is_report = |parcel: &Parcel| matches!(parcel.body, Body::Report(Report::Settled(_)));
+    assert!(is_report(&report));
+    gateway.answer(2, first, Answer::failed(FailureReason::Refused, "impostor"));
+    let (ms, second, report) = gateway.wait_for_dispatch(2, 10_000).unwrap();
+    assert!(is_report(&report));
+    gateway.answer(ms, second, Answer::Accepted);
+    assert_eq!(gateway.wait_for_dispatch(ms, ms + 10_000), None);
+}
+
+/// Letter 2 came back to the gateway because letter 1 is not there. Returns the time for which the
+/// gateway waits for letter 1 until it hands letter 2 back.
+fn patience(gateway: &mut Service, began: u64) -> u64 {
+    let letter = Parcel {
+        after: 100,
+        ..parcel(101, 900, Body::Letter(letter()))
+    };
+    gateway.receive(began, Kind::Shm, letter);
+    let (attempt, _) = gateway.dispatched().unwrap();
+    gateway.answer(began, attempt, Answer::OutOfOrder { last: 0 });
+    let (ms, _, returned) = gateway.wait_for_dispatch(began, began + 10_000).unwrap();
+    let is_return = matches!(returned.body, Body::Report(Report::Returned { .. }));
+    assert!(is_return, "{returned:?}");
+    ms - began
+}
+
+#[test]
+fn predecessors_have_two_round_trips_to_arrive() {
+    let mut gateway = Service::new(true);
+    assert_eq!(patience(&mut gateway, 0), 50);
+    // A service that takes 200 ms to acknowledge a report.
+    let mut gateway = Service::new(true);
+    gateway.arrive(0, 5, 70);
+    let (attempt, _) = gateway.dispatched().unwrap();
+    gateway.answer(0, attempt, Answer::Accepted);
+    let (report, _) = gateway.dispatched().unwrap();
+    gateway.answer(200, report, Answer::Accepted);
+    assert_eq!(patience(&mut gateway, 1000), 400);
+}
