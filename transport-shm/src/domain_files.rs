@@ -88,7 +88,7 @@ impl DomainFiles {
     }
 
     /// Marks this as belonging to an endpoint.
-    pub(crate) fn as_member(mut self) -> Self {
+    pub(crate) fn for_endpoint(mut self) -> Self {
         self.member = true;
         self
     }

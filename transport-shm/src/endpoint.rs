@@ -73,7 +73,7 @@ impl Endpoint {
         let budget = Arc::new(Budget::new(&config));
         // Under the lock, so that no other process takes unfinished files for those of a dead one.
         let lock = domain.enter()?;
-        let domain = Arc::new(domain.as_member());
+        let domain = Arc::new(domain.for_endpoint());
         let opened = Self::open_locked(config, runtime, budget, Arc::clone(&domain));
         // Before `domain` is dropped: after a failure, its last owner takes the lock to clean up.
         drop(lock);

@@ -374,7 +374,7 @@ impl PeerProcess {
         })
     }
 
-    /// How often the process has polled its mailbox until it was empty; 0 if it does not listen yet.
+    /// Number of times the process has polled its mailbox until it was empty; 0 if it does not listen yet.
     pub(crate) fn polls(&self) -> u64 {
         load(&self.page.words().polls)
     }
@@ -503,11 +503,11 @@ fn ring(mut doorbell: &File) {
 struct StatusWords {
     /// Number of threads of the process that poll.
     pollers: AtomicU32,
-    /// How often the process has cleared its doorbell before it polled.
+    /// Number of times the process has cleared its doorbell before it polled.
     wakeups: AtomicU64,
     /// Keeps `polls`, which changes often, in a cache line of its own.
     _apart: [u64; 6],
-    /// How often the process has found its mailbox empty, or emptied it.
+    /// Number of times the process has found its mailbox empty, or emptied it.
     polls: AtomicU64,
 }
 
@@ -542,7 +542,7 @@ impl StatusPage {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used, reason = "a test that cannot go on says so")]
+    #![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
 
     use std::os::unix::fs::symlink;
 
