@@ -379,7 +379,7 @@ fn close_waits_until_the_last_letters_are_taken() {
     });
     assert_eq!(sent.conclusions(), 3);
     wait_for("end of the connection", || {
-        !place
+        !domain
             .files()
             .iter()
             .any(|file| file.ends_with(".connection"))
