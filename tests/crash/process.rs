@@ -30,7 +30,7 @@ const WINDOW: usize = 6;
 /// Number of letters that a holding process keeps.
 const HELD: usize = 40;
 
-/// Lengths of contents: copied, in index, of several pages, and in a segment.
+/// Lengths of contents: copied, in place, of several pages, and in a segment.
 pub(crate) const SIZES: [usize; 4] = [40, 1500, 5000, LARGE];
 
 /// Length of content that is stored once for several receivers.

@@ -178,7 +178,7 @@ impl Endpoint {
         &self.tally
     }
 
-    /// Whether no file is missing by which other processes find this one.
+    /// Whether all files exist by which other processes find this one.
     pub(crate) fn is_there(&self) -> bool {
         let missing = |file: &PathBuf| {
             let found = std::fs::symlink_metadata(file);
@@ -221,7 +221,8 @@ impl Endpoint {
             found |= (0..POLLS_PER_ROUND).any(|_| self.work());
             self.wait_for_answered();
             drop(polling);
-            // Work that arrived meanwhile is done in the next round, in which the page states "polling" again.
+            // Work that arrived meanwhile is done in the next round, in which the page states
+            // "polling" again.
             if !self.has_work() {
                 self.wake_answered();
                 return found;

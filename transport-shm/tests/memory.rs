@@ -4,43 +4,9 @@
 
 mod common;
 
-use std::fs;
-
 use bytes::Bytes;
-use common::{FRONT, TestDomain, attempt, parcel, wait_for};
+use common::{FRONT, TestDomain, attempt, mapping_of, parcel, wait_for};
 use fipa_transport::{Answer, Conclusion, Transport, WayFault};
-
-/// The file that a piece of this process's memory is mapped from, if any.
-fn mapped_from(bytes: &[u8]) -> Option<String> {
-    let address = bytes.as_ptr() as usize;
-    let maps = fs::read_to_string("/proc/self/maps").unwrap();
-    let line = maps.lines().find(|line| {
-        let range = line.split(' ').next().unwrap();
-        let (start, end) = range.split_once('-').unwrap();
-        let start = usize::from_str_radix(start, 16).unwrap();
-        let end = usize::from_str_radix(end, 16).unwrap();
-        (start..end).contains(&address) && address + bytes.len() <= end
-    });
-    let file = line.unwrap().split_whitespace().nth(5);
-    file.filter(|file| file.starts_with('/')).map(str::to_owned)
-}
-
-/// Position of a piece of memory in the file it is mapped from.
-fn position(bytes: &[u8]) -> usize {
-    let address = bytes.as_ptr() as usize;
-    let maps = fs::read_to_string("/proc/self/maps").unwrap();
-    let mut positions = maps.lines().filter_map(|line| {
-        let mut fields = line.split_whitespace();
-        let (start, end) = fields.next()?.split_once('-')?;
-        let start = usize::from_str_radix(start, 16).ok()?;
-        let end = usize::from_str_radix(end, 16).ok()?;
-        let offset = usize::from_str_radix(fields.nth(1)?, 16).ok()?;
-        (start..end)
-            .contains(&address)
-            .then(|| address - start + offset)
-    });
-    positions.next().unwrap()
-}
 
 fn pattern(len: usize) -> Bytes {
     (0..len)
@@ -60,10 +26,14 @@ fn loaned_content_is_never_copied() {
         assert_eq!(loan.content_mut().len(), len);
         loan.content_mut().copy_from_slice(&pattern(len));
         let content = loan.freeze();
-        let from = mapped_from(&content).expect("loaned memory is mapped from a file");
+        let from = mapping_of(&content);
+        let path = from
+            .path
+            .as_deref()
+            .expect("loaned memory is mapped from a file");
         assert!(
-            from.starts_with(&format!("/dev/shm/{}", domain.prefix)),
-            "{from}"
+            path.starts_with(&format!("/dev/shm/{}", domain.prefix)),
+            "{path}"
         );
 
         sender
@@ -74,8 +44,7 @@ fn loaned_content_is_never_copied() {
         assert_eq!(received, pattern(len));
         // The same bytes of the same file, mapped a second time, and not a copy.
         assert_ne!(received.as_ptr(), content.as_ptr());
-        assert_eq!(mapped_from(&received), Some(from));
-        assert_eq!(position(&received), position(&content));
+        assert_eq!(mapping_of(&received), from);
         assert_eq!(received.as_ptr() as usize % 8, 0);
     }
     wait_for("answers", || sent.conclusions() == 3);
@@ -298,7 +267,7 @@ fn content_outlives_both_transports() {
     wait_for("letter", || got.arrivals() == 1);
     let content = got.content(0);
     got.arrived.lock().unwrap().clear();
-    assert!(mapped_from(&content).is_some());
+    assert!(mapping_of(&content).path.is_some());
     sender.close();
     receiver.close();
     assert_eq!(content, pattern(100_000));

@@ -11,7 +11,7 @@ use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 
 use bytes::Bytes;
-use common::{TestDomain, attempt, location_of, parcel, wait_for};
+use common::{TestDomain, attempt, location_of, mapping_of, parcel, wait_for};
 use fipa_transport::{Answer, Conclusion, Incarnation, Transport, WayFault};
 use fipa_transport_shm::{ShmConfig, ShmTransport, cleanup_dead};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
@@ -149,21 +149,10 @@ fn wait_without_limit(condition: impl Fn() -> bool) {
     }
 }
 
-/// Position of content in memory: device and inode of the file, and the offset in it.
+/// Device, inode and offset of content in memory, as one line of text.
 fn position(content: &[u8]) -> String {
-    let address = content.as_ptr() as usize;
-    let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
-    let found = maps.lines().find_map(|line| {
-        let mut fields = line.split_whitespace();
-        let (start, end) = fields.next()?.split_once('-')?;
-        let start = usize::from_str_radix(start, 16).ok()?;
-        let end = usize::from_str_radix(end, 16).ok()?;
-        let offset = usize::from_str_radix(fields.nth(1)?, 16).ok()?;
-        let (device, inode) = (fields.next()?, fields.next()?);
-        let here = (start..end).contains(&address) && address + content.len() <= end;
-        here.then(|| format!("{device} {inode} {}", address - start + offset))
-    });
-    found.unwrap()
+    let at = mapping_of(content);
+    format!("{} {} {}", at.device, at.inode, at.offset)
 }
 
 #[test]

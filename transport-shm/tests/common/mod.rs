@@ -195,3 +195,36 @@ pub(crate) fn parcel(content: Bytes) -> Parcel {
 /// Length of the pieces in front of the content of [`parcel`].
 pub(crate) const FRONT: usize =
     "arm_left".len() + "envelope".len() + "message up to its content".len();
+
+/// The part of a file that memory of this process is mapped from.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct MappedRange {
+    pub(crate) device: String,
+    pub(crate) inode: String,
+    /// Offset in the file, in bytes.
+    pub(crate) offset: usize,
+    pub(crate) path: Option<String>,
+}
+
+/// The mapping that contains these bytes, from `/proc/self/maps`.
+pub(crate) fn mapping_of(bytes: &[u8]) -> MappedRange {
+    let address = bytes.as_ptr() as usize;
+    let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
+    let found = maps.lines().find_map(|line| {
+        let mut fields = line.split_whitespace();
+        let (start, end) = fields.next()?.split_once('-')?;
+        let start = usize::from_str_radix(start, 16).ok()?;
+        let end = usize::from_str_radix(end, 16).ok()?;
+        let offset = usize::from_str_radix(fields.nth(1)?, 16).ok()?;
+        let (device, inode) = (fields.next()?, fields.next()?);
+        let path = fields.next().filter(|path| path.starts_with('/'));
+        let contains = (start..end).contains(&address) && address + bytes.len() <= end;
+        contains.then(|| MappedRange {
+            device: device.to_owned(),
+            inode: inode.to_owned(),
+            offset: address - start + offset,
+            path: path.map(str::to_owned),
+        })
+    });
+    found.unwrap()
+}
