@@ -1,4 +1,5 @@
-//! A domain of its own with child processes, a log of their output, and the checks after each round.
+//! A domain of its own with child processes, a log of their output, and the checks after each
+//! round.
 
 use std::collections::{BTreeSet, HashMap};
 use std::io::{BufRead, BufReader, Write};
@@ -403,7 +404,8 @@ impl Cluster {
         assert_eq!(seen, count);
     }
 
-    /// Checks the letters and resources after a round, in which all processes but the survivors ended.
+    /// Checks the letters and resources after a round, in which all processes but the survivors
+    /// ended.
     pub(crate) fn check(&mut self) {
         self.exchange_letters(4, 1500);
         let (anchor, pulse) = (self.anchor.as_ref().unwrap(), self.pulse.as_ref().unwrap());
@@ -432,11 +434,12 @@ impl Cluster {
             assert!(!lost, "{id:x} {letter:?}");
         }
         assert_eq!(log.problems, Vec::<String>::new());
-        // A later line on a removed letter creates an entry without an outcome, which the next check
-        // reports as open.
+        // A later line on a removed letter creates an entry without an outcome, which the next
+        // check reports as open.
         log.letters.retain(|_, letter| letter.outcome.is_none());
         drop(log);
-        // A process cleans up when it starts. The survivors clean up after processes that they talked to.
+        // A process cleans up when it starts. The survivors clean up after processes that they
+        // talked to.
         let new_process = self.start_process("take", "nothing", "");
         new_process.wait_until("ready");
         self.quit_process(new_process);

@@ -1,12 +1,12 @@
 //! Processes are killed at random moments; the surviving processes must keep the promises.
 //!
 //! Child processes of this binary join a domain and exchange letters. The test kills some of them
-//! with SIGKILL in every scenario, after delays drawn from a seed that it prints. After every round,
-//! the survivors still exchange letters, every letter has an outcome, no letter was received twice,
-//! contents are intact, and memory, descriptors and files are at their initial level.
+//! with SIGKILL in every scenario, after delays drawn from a seed that it prints. After every
+//! round, the survivors still exchange letters, every letter has an outcome, no letter was received
+//! twice, contents are intact, and memory, descriptors and files are at their initial level.
 //!
-//! `FIPA_CRASH_SEED` repeats the random decisions of a run, but not its timing. `FIPA_CRASH_KILLS` is
-//! the minimum number of kills. The soak is a longer run:
+//! `FIPA_CRASH_SEED` repeats the random decisions of a run, but not its timing. `FIPA_CRASH_KILLS`
+//! is the minimum number of kills. The soak is a longer run:
 //! `cargo test --release --test crash -- --ignored --nocapture soak`.
 
 #![expect(clippy::unwrap_used, reason = "a failed precondition fails the test")]

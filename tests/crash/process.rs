@@ -1,10 +1,10 @@
 //! A child process: an agent that sends and receives according to its role and to commands, and
 //! prints a line for every event.
 //!
-//! Output: `ready`; `at ADDRESS` of a gateway; `sent ID TO` before a letter is sent; `out ID OUTCOME`
-//! after its outcome; `took ID` for a received letter with intact content; `corrupt ID` for other
-//! content; `loaned` after all loans; `done TOKEN` after a command; `bye` at the end. A letter to
-//! several receivers has one ID for each, in their order; its content has the first.
+//! Output: `ready`; `at ADDRESS` of a gateway; `sent ID TO` before a letter is sent; `out ID
+//! OUTCOME` after its outcome; `took ID` for a received letter with intact content; `corrupt ID`
+//! for other content; `loaned` after all loans; `done TOKEN` after a command; `bye` at the end. A
+//! letter to several receivers has one ID for each, in their order; its content has the first.
 //!
 //! Input: `send TOKEN TO COUNT SIZE`, `drop`, `quit`. The process ends when its input ends.
 

@@ -1,14 +1,14 @@
 //! Acknowledged letters through shared memory, compared with iceoryx2's own request-response.
 //!
-//! Two threads spin. In a round, the sender writes the payload and sends it, the receiver takes it and
-//! answers, and the sender receives the answer. `letter` is a parcel through the transport, from
-//! dispatch to conclusion. `loaned` is the same with content in loaned memory that is not written.
-//! `raw` is a bare iceoryx2 request of the same size and its response. `window` keeps eight rounds
-//! under way.
+//! Two threads spin. In a round, the sender writes the payload and sends it, the receiver takes it
+//! and answers, and the sender receives the answer. `letter` is a parcel through the transport,
+//! from dispatch to conclusion. `loaned` is the same with content in loaned memory that is not
+//! written. `raw` is a bare iceoryx2 request of the same size and its response. `window` keeps
+//! eight rounds under way.
 //!
 //! A round with 32 receivers ends when all have answered. `32 letters` are short ones. `32, one
-//! content` fills content that is stored once and to which each letter refers. `32 copies` sends the
-//! same content in separate letters. `fill` only fills that content and releases it.
+//! content` fills content that is stored once and to which each letter refers. `32 copies` sends
+//! the same content in separate letters. `fill` only fills that content and releases it.
 //!
 //! Blocks of rounds of all kinds alternate, so that other load on the machine affects all kinds
 //! alike. Compare the percentiles of one run with each other, and not those of different runs.
@@ -54,7 +54,8 @@ type RawPending = PendingResponse<ipc_threadsafe::Service, [u8], RawHeader, RawA
 type RawServer = Server<ipc_threadsafe::Service, [u8], RawHeader, RawAck, ()>;
 
 fn main() {
-    // `cargo bench` passes `--bench` and the arguments after `--`: the number of blocks of each kind.
+    // `cargo bench` passes `--bench` and the arguments after `--`: the number of blocks of each
+    // kind.
     let mut blocks = std::env::args().filter_map(|argument| argument.parse().ok());
     let blocks: usize = blocks.next_back().unwrap_or(40);
     let directory = tempfile::tempdir().expect("a directory");

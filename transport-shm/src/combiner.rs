@@ -8,8 +8,8 @@ use parking_lot::{Mutex, MutexGuard};
 ///
 /// A thread that fails to take the lock sets `wanted`, retries once and returns. The holder of the
 /// lock checks `wanted` after unlocking. Both access `wanted` with a swap, so the two swaps have an
-/// order: either the holder finds `wanted` set, or the retry happens after the unlock. No request is
-/// lost, and no thread waits.
+/// order: either the holder finds `wanted` set, or the retry happens after the unlock. No request
+/// is lost, and no thread waits.
 #[derive(Debug)]
 pub(crate) struct Combiner<T> {
     work: Mutex<T>,

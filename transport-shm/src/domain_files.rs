@@ -34,7 +34,8 @@ pub struct Cleaned {
     pub alive: usize,
     /// Number of dead processes whose files were removed.
     pub removed: usize,
-    /// Number of dead processes whose files could not be removed, or that another process removes now.
+    /// Number of dead processes whose files could not be removed, or that another process removes
+    /// now.
     pub failed: usize,
 }
 
@@ -142,7 +143,8 @@ impl DomainFiles {
     }
 
     /// Keeps other processes from cleaning up, but not from taking this lock, until the result is
-    /// dropped. Taken to create files outside of [`DomainFiles::lock`].
+    /// dropped. Taken to create files outside of [`DomainFiles::lock`]. Senders of this process
+    /// wait meanwhile.
     pub(crate) fn lock_shared(&self) -> Result<OwnedFd, ShmError> {
         self.locked(FlockOperation::NonBlockingLockShared, || {
             SHARED_LOCK_TIMEOUT
@@ -153,13 +155,13 @@ impl DomainFiles {
     fn locked(
         &self,
         how: FlockOperation,
-        patience: impl Fn() -> Duration,
+        timeout: impl Fn() -> Duration,
     ) -> Result<OwnedFd, ShmError> {
         let root = &self.config.root;
         let lock_timed_out = self.lock_timed_out.load(Ordering::Relaxed);
         let locked = lock(root, how, || match lock_timed_out {
             true => Duration::ZERO,
-            false => patience(),
+            false => timeout(),
         });
         let busy = matches!(locked, Err(Errno::WOULDBLOCK));
         self.lock_timed_out.store(busy, Ordering::Relaxed);
@@ -169,8 +171,8 @@ impl DomainFiles {
         })
     }
 
-    /// Removes the access of other users to files that iceoryx2 0.10 leaves open to them. The caller
-    /// must hold the lock and have created a node.
+    /// Removes the access of other users to files that iceoryx2 0.10 leaves open to them. The
+    /// caller must hold the lock and have created a node.
     pub(crate) fn restrict_permissions(&self) -> Result<(), ShmError> {
         for file in files_in(Path::new(SHM)) {
             let name = file.file_name();
@@ -179,7 +181,8 @@ impl DomainFiles {
                 continue;
             }
             let path = file.path();
-            // Opened before the check: in a directory that any user may write to, a name proves nothing.
+            // Opened before the check: in a directory that any user may write to, a name proves
+            // nothing.
             let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
             let closed = open(&path, flags, Mode::empty()).and_then(|file| {
                 let found = fstat(&file)?;
@@ -241,8 +244,8 @@ impl DomainFiles {
             .min(CLEANUP_TIMEOUT)
     }
 
-    /// Whether there seem to be files of dead processes. Checked without the lock; an error counts as
-    /// true, and `clean` reports it.
+    /// Whether there seem to be files of dead processes. Checked without the lock; an error counts
+    /// as true, and `clean` reports it.
     pub(crate) fn has_dead(&self) -> bool {
         !self.count().is_ok_and(|(_, dead)| dead == 0)
     }
@@ -322,7 +325,8 @@ impl DomainFiles {
             let lock = self.lock()?;
             self.remove_orphaned_connections();
             drop(lock);
-            // A process releases its side of connections with dead ones only when it polls its mailbox.
+            // A process releases its side of connections with dead ones only when it polls its
+            // mailbox.
             self.ring_all()?;
         }
         Ok(cleaned)
@@ -343,8 +347,8 @@ impl DomainFiles {
     }
 
     /// Removes empty files of processes that were killed between creating a file and extending it.
-    /// iceoryx2 0.10 waits without limit for such a file to grow. The caller must hold the lock, under
-    /// which no other process creates connections or services.
+    /// iceoryx2 0.10 waits without limit for such a file to grow. The caller must hold the lock,
+    /// under which no other process creates connections or services.
     fn remove_empty_files(&self, nodes: &[NodeState<Svc>]) {
         let prefix = self.prefix();
         let mut ports = Vec::new();
@@ -387,8 +391,8 @@ impl DomainFiles {
         for file in files_in(&self.config.root.join("nodes")) {
             let name = file.file_name();
             let name = name.to_string_lossy();
-            // A directory is named by the number alone; the files that show whether the node is alive
-            // are named by prefix, number and suffix.
+            // A directory is named by the number alone; the files that show whether the node is
+            // alive are named by prefix, number and suffix.
             let id = name.strip_prefix(&prefix).unwrap_or(&name);
             let id = id.split('.').next().unwrap_or_default();
             if !id.is_empty() && id.bytes().all(|b| b.is_ascii_digit()) && !whole.contains(id) {
@@ -397,9 +401,9 @@ impl DomainFiles {
         }
     }
 
-    /// Removes the services that no node claims to use. A process leaves one if it is killed between
-    /// creating a service and tagging it, or while it removes one. The caller must hold the lock,
-    /// under which no process creates a service.
+    /// Removes the services that no node claims to use. A process leaves one if it is killed
+    /// between creating a service and tagging it, or while it removes one. The caller must hold the
+    /// lock, under which no process creates a service.
     ///
     /// iceoryx2 0.10 also leaves one if the process that removes the last node from a service is
     /// killed before it locks the service: a later process finds no node to remove, and so does not
@@ -442,9 +446,9 @@ impl DomainFiles {
     }
 
     /// Removes connections of ports that no process has any more. iceoryx2 0.10 leaves one if a
-    /// process is killed between creating its file and recording its own end: then neither end is the
-    /// last to close. The caller must hold the lock, under which no process creates a port. A port is
-    /// tagged before it connects, and as long as it exists.
+    /// process is killed between creating its file and recording its own end: then neither end is
+    /// the last to close. The caller must hold the lock, under which no process creates a port. A
+    /// port is tagged before it connects, and as long as it exists.
     ///
     /// A living process that still has such a connection open keeps its memory and does not need
     /// the file.
@@ -583,8 +587,8 @@ fn remove_files(directory: &Path, prefix: &str) {
 }
 
 impl Drop for DomainFiles {
-    /// The last owner in the process removes the remaining files, also if content was held for longer
-    /// than the endpoint was open.
+    /// The last owner in the process removes the remaining files, also if content was held for
+    /// longer than the endpoint was open.
     fn drop(&mut self) {
         if self.member && self.owner.is_this() && self.config.root.exists() {
             self.closing.store(true, Ordering::SeqCst);

@@ -187,8 +187,8 @@ impl Endpoint {
         !self.files.iter().any(missing)
     }
 
-    /// Removes what is left of these files after closing: iceoryx2 keeps the files of a mailbox while
-    /// content from it is held.
+    /// Removes what is left of these files after closing: iceoryx2 keeps the files of a mailbox
+    /// while content from it is held.
     pub(crate) fn remove_files(&self) {
         for file in &self.files {
             // Mostly missing already.
@@ -286,8 +286,8 @@ impl Endpoint {
         self.waiting.load(Ordering::SeqCst) > 0
     }
 
-    /// Takes parcels from the mailbox and collects answers. Returns whether there was any. If another
-    /// thread works, that one makes another pass instead.
+    /// Takes parcels from the mailbox and collects answers. Returns whether there was any. If
+    /// another thread works, that one makes another pass instead.
     pub(crate) fn work(self: &Arc<Self>) -> bool {
         self.inbox.work(|inbox| match (inbox, self.sink.get()) {
             (Some(inbox), Some(sink)) => self.work_once(inbox, &**sink),
@@ -558,7 +558,8 @@ impl Endpoint {
         let mut concluded = Vec::new();
         let peers = {
             let mut inbox = self.inbox.lock();
-            // First the mailbox closes, then peers detect the end, then the own letters are concluded.
+            // First the mailbox closes, then peers detect the end, then the own letters are
+            // concluded.
             *inbox = None;
             *self.presence.write() = None;
             let peers = std::mem::take(&mut *self.peers.write());

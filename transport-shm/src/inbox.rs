@@ -391,8 +391,8 @@ impl AsRef<[u8]> for BorrowedContent {
         // SAFETY: the range is in the payload of the request in `_held`, which stays mapped as long
         // as that exists: the server keeps the connection of an ended sender while content is held
         // there, and `BorrowLimits::begin` bounds the number of such connections below the number
-        // that it keeps. An honest sender does not write there after sending; see the crate's section
-        // on trust.
+        // that it keeps. An honest sender does not write there after sending; see the crate's
+        // section on trust.
         unsafe { self.bytes.0.as_ref() }
     }
 }

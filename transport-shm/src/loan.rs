@@ -165,9 +165,9 @@ impl LoanedContent for ShmLoan {
         let loan = &*self.0;
         // SAFETY: the range is within the payload (checked by `Loan::new`). The unsent request owns
         // the payload, and it is not sent before `freeze`, which registers the content with the
-        // outbox. Nothing else refers to the range: this is the only `ShmLoan` of the loan, borrowed
-        // mutably. The bytes are initialized: pages of a shared mapping that the kernel or an
-        // earlier request has filled.
+        // outbox. Nothing else refers to the range: this is the only `ShmLoan` of the loan,
+        // borrowed mutably. The bytes are initialized: pages of a shared mapping that the kernel or
+        // an earlier request has filled.
         unsafe { std::slice::from_raw_parts_mut(loan.content_start(), loan.content) }
     }
 
@@ -185,8 +185,8 @@ impl AsRef<[u8]> for Frozen {
         let loan = &*self.0;
         // SAFETY: the range is within the payload (checked by `Loan::new`). The request or the
         // pending response in the loan owns the memory, and `self.0` keeps the loan. If sending
-        // fails and iceoryx2 takes the memory back, the outbox keeps it mapped and unchanged as long
-        // as the loan exists (see `Outbox::send_loan`). No process writes there: `ShmLoan` is
+        // fails and iceoryx2 takes the memory back, the outbox keeps it mapped and unchanged as
+        // long as the loan exists (see `Outbox::send_loan`). No process writes there: `ShmLoan` is
         // consumed, `Outbox::send_loan` leaves the content out, and receivers only read it.
         unsafe { std::slice::from_raw_parts(loan.content_start(), loan.content) }
     }

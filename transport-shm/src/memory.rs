@@ -66,8 +66,8 @@ impl Budget {
         self.capacity
     }
 
-    /// Checks that there is room to open an endpoint. The caller must hold the domain's lock, so that
-    /// no other starting process of the domain uses the same room.
+    /// Checks that there is room to open an endpoint. The caller must hold the domain's lock, so
+    /// that no other starting process of the domain uses the same room.
     pub(crate) fn check_start(&self) -> Result<(), ShmError> {
         let free = free_bytes().unwrap_or(0);
         if free < START {
@@ -154,8 +154,8 @@ impl Budget {
     }
 }
 
-/// Locks a directory until the result is dropped, by polling. A stopped process may hold the lock, so
-/// the wait ends after `patience()`, which is evaluated on each retry.
+/// Locks a directory until the result is dropped, by polling. A stopped process may hold the lock,
+/// so the wait ends after `timeout()`, which is evaluated on each retry.
 ///
 /// The result is a lock of the directory that has this path now: the previous holder may have
 /// removed the directory, and another process may have created and locked a new one.
@@ -165,7 +165,7 @@ impl Budget {
 pub(crate) fn lock(
     path: &Path,
     how: FlockOperation,
-    patience: impl Fn() -> Duration,
+    timeout: impl Fn() -> Duration,
 ) -> rustix::io::Result<OwnedFd> {
     let flags = OFlags::DIRECTORY | OFlags::RDONLY | OFlags::CLOEXEC;
     let opened = || open(path, flags, Mode::empty());
@@ -182,7 +182,7 @@ pub(crate) fn lock(
                 directory = opened()?;
             }
             Err(Errno::INTR) => {}
-            Err(Errno::WOULDBLOCK) if began.elapsed() < patience() => {
+            Err(Errno::WOULDBLOCK) if began.elapsed() < timeout() => {
                 std::thread::sleep(pause);
                 pause = (pause * 2).min(LAST_PAUSE);
             }
@@ -235,8 +235,8 @@ fn free_bytes() -> std::io::Result<u64> {
 /// `start` must be in memory that is mapped for writing and stays mapped during the call; any other
 /// range gives an error.
 pub(crate) fn populate(start: *const u8, len: usize) -> Result<(), WayError> {
-    // Aligned to the kernel's pages: it refuses other ranges with `INVAL`, which is also the error of
-    // a kernel without this advice.
+    // Aligned to the kernel's pages: it refuses other ranges with `INVAL`, which is also the error
+    // of a kernel without this advice.
     let page = page_size();
     let first = (start as usize) & !(page - 1);
     let end = (start as usize).saturating_add(len);
@@ -308,8 +308,8 @@ impl Mapping {
 
 impl Drop for Mapping {
     fn drop(&mut self) {
-        // SAFETY: `new` has mapped this range. No reference into it is left: each one borrows from a
-        // value that owns this mapping.
+        // SAFETY: `new` has mapped this range. No reference into it is left: each one borrows from
+        // a value that owns this mapping.
         let _ = unsafe { munmap(self.start.0.as_ptr().cast(), self.len) };
     }
 }

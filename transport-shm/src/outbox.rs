@@ -41,15 +41,16 @@ static NO_CONTENT: Bytes = Bytes::new();
 /// # Memory
 /// The memory of requests comes from segments. iceoryx2 creates a larger segment when needed, each
 /// with room for as many chunks as can be in use. Only pages that were populated before are written
-/// ([`populate`]): in a new segment the pages of all chunk headers, which iceoryx2 writes, and in each
-/// chunk the pages of the longest payload so far.
+/// ([`populate`]): in a new segment the pages of all chunk headers, which iceoryx2 writes, and in
+/// each chunk the pages of the longest payload so far.
 ///
 /// # Sending never takes memory back
-/// `RequestMut::send` drops the request, and its memory, when it fails. That must not happen to loaned
-/// memory, which other processes and the application read. With the settings here, it cannot fail:
-/// the backpressure strategy is `DiscardData` without a handler and without overflow, so a full or
-/// closed mailbox is `Ok` with no receiver reached; degradation is ignored; and the number of active
-/// requests is checked before. If it fails all the same, [`Outbox::send_loan`] retires the outbox.
+/// `RequestMut::send` drops the request, and its memory, when it fails. That must not happen to
+/// loaned memory, which other processes and the application read. With the settings here, it cannot
+/// fail: the backpressure strategy is `DiscardData` without a handler and without overflow, so a
+/// full or closed mailbox is `Ok` with no receiver reached; degradation is ignored; and the number
+/// of active requests is checked before. If it fails all the same, [`Outbox::send_loan`] retires
+/// the outbox.
 #[derive(Debug)]
 pub(crate) struct Outbox {
     client: MailClient,
@@ -159,7 +160,8 @@ impl Outbox {
             .set_request_degradation_handler(|_, _| DegradationAction::Ignore)
             .set_response_degradation_handler(|_, _| DegradationAction::Ignore);
         let (client, shortage) = storage::with_shortage(|| builder.create());
-        // If there is no room for its connections, iceoryx2 creates a client that reaches no receiver.
+        // If there is no room for its connections, iceoryx2 creates a client that reaches no
+        // receiver.
         if let Some(shortage) = shortage {
             return Err(shortage_error(shortage));
         }
@@ -282,8 +284,8 @@ impl Outbox {
         // SAFETY: `room` ends where the payload does. The request was just taken, so nothing else
         // refers to its payload.
         unsafe { write(payload, room, &pieces, written) };
-        // SAFETY: every byte of the payload is initialized: by `write`, or by the kernel or an earlier
-        // request, because it is memory of a shared mapping.
+        // SAFETY: every byte of the payload is initialized: by `write`, or by the kernel or an
+        // earlier request, because it is memory of a shared mapping.
         let filled = unsafe { request.assume_init() };
         let pending = filled.send().map_err(send_error)?;
         if pending.number_of_server_connections() == 0 {
@@ -355,11 +357,11 @@ impl Outbox {
         Ok(loan.take())
     }
 
-    /// Sends loaned memory. Returns `false` if iceoryx2 unexpectedly refuses, which takes the memory
-    /// back. The application and other processes may still read it, so the outbox is then retired
-    /// and loans nothing any more. Hence the memory is not overwritten, no larger segment replaces
-    /// its segment (which is the current one, as the caller has checked), and the loan keeps the
-    /// outbox and so the segment.
+    /// Sends loaned memory. Returns `false` if iceoryx2 unexpectedly refuses, which takes the
+    /// memory back. The application and other processes may still read it, so the outbox is then
+    /// retired and loans nothing any more. Hence the memory is not overwritten, no larger segment
+    /// replaces its segment (which is the current one, as the caller has checked), and the loan
+    /// keeps the outbox and so the segment.
     fn send_loan(
         &self,
         loan: &Arc<Loan>,
@@ -372,9 +374,9 @@ impl Outbox {
         *request.user_header_mut() = header;
         let room = start..loan.payload_len();
         // SAFETY: `room` ends where the payload does, which the request just taken owns. Other
-        // references exist only to the content, which is not written: `ContentWrite::InPlace` leaves it
-        // out, and the front, which begins at `start`, ends where the content begins, as the caller
-        // has checked. The request is taken once, so no other thread writes to the rest.
+        // references exist only to the content, which is not written: `ContentWrite::InPlace`
+        // leaves it out, and the front, which begins at `start`, ends where the content begins, as
+        // the caller has checked. The request is taken once, so no other thread writes to the rest.
         unsafe { write(loan.payload(), room, pieces, ContentWrite::InPlace(content)) };
         // SAFETY: front, content and tail are written. The rest was initialized by the kernel or an
         // earlier request, because it is memory of a shared mapping.
@@ -651,8 +653,8 @@ enum ContentWrite<'a> {
 /// check compares them with what is written.
 ///
 /// # Safety
-/// The room must be in memory that may be written, and nothing else may refer to the parts of it that
-/// are written.
+/// The room must be in memory that may be written, and nothing else may refer to the parts of it
+/// that are written.
 unsafe fn write(
     start: NonNull<u8>,
     room: Range<usize>,
@@ -671,9 +673,9 @@ unsafe fn write(
         let most = end.saturating_sub(at);
         assert!(piece.len() <= most, "pieces have the lengths of the header");
         if is_written {
-            // SAFETY: the assertion above shows that the piece fits behind `place`, in memory that may
-            // be written according to the caller. The piece does not overlap it, because nothing
-            // else refers to that memory.
+            // SAFETY: the assertion above shows that the piece fits behind `place`, in memory that
+            // may be written according to the caller. The piece does not overlap it, because
+            // nothing else refers to that memory.
             unsafe { place.copy_from_nonoverlapping(piece.as_ptr(), piece.len()) };
         }
         at += piece.len();

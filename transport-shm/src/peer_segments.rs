@@ -38,7 +38,8 @@ struct PeerSegment {
     reading: Mutex<ReadState>,
 }
 
-/// The content being read and its number of readers. While there are any, this process holds the lock.
+/// The content being read and its number of readers. While there are any, this process holds the
+/// lock.
 struct ReadState {
     readers: usize,
     /// `None` if the segment is not fully allocated any more.
@@ -158,10 +159,11 @@ pub(crate) struct SegmentContent {
 
 impl AsRef<[u8]> for SegmentContent {
     fn as_ref(&self) -> &[u8] {
-        // SAFETY: `PeerSegment::begin` has checked that the mapping has room for `len` bytes and that
-        // the file has all pages of the mapping. The mapping exists as long as the segment. The
-        // file is not shortened while this process holds the lock, which it does until this is
-        // dropped. An honest sender does not write there meanwhile; see the crate's section on trust.
+        // SAFETY: `PeerSegment::begin` has checked that the mapping has room for `len` bytes and
+        // that the file has all pages of the mapping. The mapping exists as long as the segment.
+        // The file is not shortened while this process holds the lock, which it does until this is
+        // dropped. An honest sender does not write there meanwhile; see the crate's section on
+        // trust.
         unsafe { std::slice::from_raw_parts(self.segment.file.content(), self.len) }
     }
 }

@@ -16,8 +16,8 @@ const NEVER: u64 = u64::MAX;
 
 /// Another process.
 ///
-/// Its end is final. [`Peer::end`] first sets `ended`, then stops the outbox from accepting letters;
-/// and an outbox is opened, under the same lock, only while `ended` is false. So once
+/// Its end is final. [`Peer::end`] first sets `ended`, then stops the outbox from accepting
+/// letters; and an outbox is opened, under the same lock, only while `ended` is false. So once
 /// [`Peer::collect`] has found the outbox of an ended process empty, no letter is lost with it.
 pub(crate) struct Peer {
     incarnation: Incarnation,
@@ -170,8 +170,8 @@ impl Peer {
     }
 
     /// Returns the process if its mailbox may still contain letters of this outbox. The outbox must
-    /// then stay open: iceoryx2 0.10 does not release memory of requests that a receiver finds after
-    /// their sender has closed.
+    /// then stay open: iceoryx2 0.10 does not release memory of requests that a receiver finds
+    /// after their sender has closed.
     pub(crate) fn untaken(&self) -> Option<&PeerProcess> {
         let waiting = self
             .outbox

@@ -16,8 +16,8 @@ use crate::segment::{ContentReference, SegmentFile};
 /// Maximum number of segments of a process.
 const MAX_SEGMENTS: usize = 8;
 
-/// Fraction of the domain's capacity, as a divisor, that idle segments of a process may use. The next
-/// content then finds its pages allocated.
+/// Fraction of the domain's capacity, as a divisor, that idle segments of a process may use. The
+/// next content then finds its pages allocated.
 const IDLE_PART: u64 = 16;
 
 /// The segments of this process.
@@ -128,7 +128,8 @@ impl Pool {
                 }
             }
         };
-        // Numbers are unique in the process: peers may still have segments of an earlier endpoint open.
+        // Numbers are unique in the process: peers may still have segments of an earlier endpoint
+        // open.
         static LAST_NUMBER: AtomicU64 = AtomicU64::new(0);
         let number = LAST_NUMBER.fetch_add(1, Ordering::Relaxed) + 1;
         let made = self.make_file(number, room);
@@ -319,8 +320,8 @@ impl Segment {
     }
 }
 
-/// Room of a segment for content of this length. At most a quarter larger, so that contents of similar
-/// length can reuse it.
+/// Room of a segment for content of this length. At most a quarter larger, so that contents of
+/// similar length can reuse it.
 fn room_for(len: usize) -> usize {
     let step = (len / 8).next_power_of_two().max(PAGE);
     len.checked_next_multiple_of(step).unwrap_or(len)
@@ -373,10 +374,11 @@ struct Frozen(LoanedSegment);
 impl AsRef<[u8]> for Frozen {
     fn as_ref(&self) -> &[u8] {
         let LoanedSegment { segment, len, .. } = &self.0;
-        // SAFETY: the range is in the segment's mapping, which has room for `len` bytes and exists as
-        // long as the segment. No process writes there: the `SharedContentLoan` is consumed, and the
-        // segment becomes idle, and can be loaned again, only when this is dropped. Until then this
-        // process holds the lock, also after its transport is closed, so the file is not shortened.
+        // SAFETY: the range is in the segment's mapping, which has room for `len` bytes and exists
+        // as long as the segment. No process writes there: the `SharedContentLoan` is consumed, and
+        // the segment becomes idle, and can be loaned again, only when this is dropped. Until then
+        // this process holds the lock, also after its transport is closed, so the file is not
+        // shortened.
         unsafe { std::slice::from_raw_parts(segment.file.content(), *len) }
     }
 }

@@ -240,7 +240,8 @@ impl Presence {
     /// Counts that the doorbell has been cleared. The caller polls afterwards.
     pub(crate) fn count_wakeup(&self) {
         self.page.words().wakeups.fetch_add(1, Ordering::SeqCst);
-        // A peer that has read the previous count has stored its parcel before the poll that follows.
+        // A peer that has read the previous count stored its parcel before that, so the poll that
+        // follows finds it.
         fence(Ordering::SeqCst);
     }
 }
@@ -270,8 +271,8 @@ impl Drop for PollGuard<'_> {
 }
 
 /// Time to wait before ringing at a process that polled recently. Such a process is about to check
-/// for the answer, and a wake-up costs both sides more than this wait. A process that sleeps between
-/// letters is rung at once.
+/// for the answer, and a wake-up costs both sides more than this wait. A process that sleeps
+/// between letters is rung at once.
 pub(crate) const POLL_GRACE: Duration = Duration::from_nanos(1500);
 
 /// Number of checks of the status page between two reads of the clock.
@@ -290,8 +291,8 @@ impl Drop for Presence {
 pub(crate) struct Doorbell(File);
 
 impl Doorbell {
-    /// Removes bytes from the FIFO. Returns whether it is empty: then it becomes readable again only
-    /// by the next ring.
+    /// Removes bytes from the FIFO. Returns whether it is empty: then it becomes readable again
+    /// only by the next ring.
     pub(crate) fn clear(&self) -> bool {
         let mut bytes = [0; 512];
         // A short read emptied the FIFO, and an error means that it was empty, so no second system
@@ -374,7 +375,8 @@ impl PeerProcess {
         })
     }
 
-    /// Number of times the process has polled its mailbox until it was empty; 0 if it does not listen yet.
+    /// Number of times the process has polled its mailbox until it was empty; 0 if it does not
+    /// listen yet.
     pub(crate) fn polls(&self) -> u64 {
         load(&self.page.words().polls)
     }
@@ -387,14 +389,15 @@ impl PeerProcess {
     /// Whether the process will poll without being rung at: because it is polling, or because this
     /// process has rung and the wake-up is still pending.
     ///
-    /// The latter holds while `wakeups` is the same as before this process rang. The peer increments
-    /// it between clearing its doorbell and polling, so a poll is still to come. Rings of other
-    /// processes do not count, so a process that is killed before it rings causes no missed wake-up.
+    /// The latter holds while `wakeups` is the same as before this process rang. The peer
+    /// increments it between clearing its doorbell and polling, so a poll is still to come. Rings
+    /// of other processes do not count, so a process that is killed before it rings causes no
+    /// missed wake-up.
     pub(crate) fn is_awake(&self) -> bool {
         fence(Ordering::SeqCst);
         let words = self.page.words();
-        // Only relaxed loads are allowed on memory that is mapped for reading. The fence provides the
-        // order that `begin_polling` and `count_wakeup` rely on.
+        // Only relaxed loads are allowed on memory that is mapped for reading. The fence provides
+        // the order that `begin_polling` and `count_wakeup` rely on.
         if words.pollers.load(Ordering::Relaxed) != 0 {
             self.polled_at_last_check.store(true, Ordering::Relaxed);
             return true;
@@ -554,7 +557,8 @@ mod tests {
         let paths = ProcessPaths::new(root.path(), "fipatest-presence");
         std::fs::create_dir(paths.directory()).unwrap();
         let (gone, hidden) = (Incarnation::from_u64(1), Incarnation::from_u64(2));
-        // A symbolic link to itself gives an error other than `NotFound`, as a lack of descriptors does.
+        // A symbolic link to itself gives an error other than `NotFound`, as a lack of descriptors
+        // does.
         symlink(paths.liveness_fifo(hidden), paths.liveness_fifo(hidden)).unwrap();
         assert!(!paths.is_alive(gone));
         assert!(paths.is_alive(hidden));

@@ -2,8 +2,8 @@
 //!
 //! A request goes to another process in shared memory and an answer comes back. There is no
 //! directory and no envelope. The end of a peer is not detected, files of killed processes are not
-//! cleaned up, and memory is bounded only by the size of `/dev/shm`, which is checked before a larger
-//! segment is created. Feature `raw`.
+//! cleaned up, and memory is bounded only by the size of `/dev/shm`, which is checked before a
+//! larger segment is created. Feature `raw`.
 
 use std::fmt;
 use std::hint::spin_loop;
@@ -71,8 +71,8 @@ pub struct RawNode {
 }
 
 impl RawNode {
-    /// Creates a node. Uses only the directory, the prefix and the capacity of the configuration, and
-    /// creates the directory if it is missing.
+    /// Creates a node. Uses only the directory, the prefix and the capacity of the configuration,
+    /// and creates the directory if it is missing.
     ///
     /// # Errors
     /// Returns an error if the configuration is invalid or iceoryx2 cannot create the node.
@@ -116,11 +116,11 @@ impl RawNode {
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
             .map_err(cannot("create the server"))?;
-        let (heard, tell) = self.events(name, ["requests", "answers"])?;
+        let (listener, notifier) = self.events(name, ["requests", "answers"])?;
         Ok(RawServer {
             server,
-            heard,
-            tell,
+            listener,
+            notifier,
         })
     }
 
@@ -143,11 +143,11 @@ impl RawNode {
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
             .map_err(cannot("create the client"))?;
-        let (heard, tell) = self.events(name, ["answers", "requests"])?;
+        let (listener, notifier) = self.events(name, ["answers", "requests"])?;
         Ok(RawClient {
             client,
-            heard,
-            tell,
+            listener,
+            notifier,
             room: AtomicUsize::new(FIRST),
             budget: &self.budget,
         })
@@ -157,15 +157,15 @@ impl RawNode {
     fn events(
         &self,
         name: &str,
-        [heard, told]: [&str; 2],
+        [received, sent]: [&str; 2],
     ) -> Result<(Listener<Svc>, Notifier<Svc>), RawError> {
         let event = |which| {
             let builder = self.node.service_builder(&service_name(name, which)?);
             let event = builder.event().open_or_create();
             event.map_err(cannot("create the event"))
         };
-        let listener = event(heard)?.listener_builder().create();
-        let notifier = event(told)?.notifier_builder().create();
+        let listener = event(received)?.listener_builder().create();
+        let notifier = event(sent)?.notifier_builder().create();
         Ok((
             listener.map_err(cannot("create the listener"))?,
             notifier.map_err(cannot("create the notifier"))?,
@@ -187,8 +187,8 @@ fn service_name(name: &str, part: &str) -> Result<ServiceName, RawError> {
 #[derive(Debug)]
 pub struct RawServer {
     server: Server<Svc, [u8], Header, Answer, ()>,
-    heard: Listener<Svc>,
-    tell: Notifier<Svc>,
+    listener: Listener<Svc>,
+    notifier: Notifier<Svc>,
 }
 
 impl RawServer {
@@ -202,7 +202,7 @@ impl RawServer {
             if let Some(request) = request {
                 return Ok(RawRequest(request));
             }
-            pause(&self.heard, wait)?;
+            pause(&self.listener, wait)?;
         }
     }
 
@@ -213,7 +213,7 @@ impl RawServer {
     pub fn answer(&self, request: RawRequest, wait: Wait) -> Result<(), RawError> {
         let sent = request.0.send_copy([1; size_of::<Ack>()]);
         sent.map_err(cannot("answer"))?;
-        tell(&self.tell, wait)
+        notify(&self.notifier, wait)
     }
 }
 
@@ -233,8 +233,8 @@ impl RawRequest {
 #[derive(Debug)]
 pub struct RawClient<'a> {
     client: Client<Svc, [u8], Header, Answer, ()>,
-    heard: Listener<Svc>,
-    tell: Notifier<Svc>,
+    listener: Listener<Svc>,
+    notifier: Notifier<Svc>,
     /// Length in bytes of the longest payload that fits the current segment.
     room: AtomicUsize,
     budget: &'a Budget,
@@ -270,7 +270,7 @@ impl RawClient<'_> {
         if pending.number_of_server_connections() == 0 {
             return Err(cannot("send")("the server's mailbox is full or closed"));
         }
-        tell(&self.tell, wait)?;
+        notify(&self.notifier, wait)?;
         Ok(RawPending(pending))
     }
 
@@ -285,7 +285,7 @@ impl RawClient<'_> {
             .map_err(cannot("receive an answer"))?
             .is_none()
         {
-            pause(&self.heard, wait)?;
+            pause(&self.listener, wait)?;
         }
         Ok(())
     }
@@ -306,18 +306,18 @@ impl RawLoan {
 #[derive(Debug)]
 pub struct RawPending(PendingResponse<Svc, [u8], Header, Answer, ()>);
 
-fn pause(heard: &Listener<Svc>, wait: Wait) -> Result<(), RawError> {
+fn pause(listener: &Listener<Svc>, wait: Wait) -> Result<(), RawError> {
     match wait {
         Wait::Spin => spin_loop(),
         Wait::Block => {
-            let woken = heard.blocking_wait(|_| {});
+            let woken = listener.blocking_wait(|_| {});
             woken.map_err(cannot("wait for the event"))?;
         }
     }
     Ok(())
 }
 
-fn tell(notifier: &Notifier<Svc>, wait: Wait) -> Result<(), RawError> {
+fn notify(notifier: &Notifier<Svc>, wait: Wait) -> Result<(), RawError> {
     if wait == Wait::Block {
         notifier.notify().map_err(cannot("notify"))?;
     }

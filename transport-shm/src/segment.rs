@@ -7,16 +7,16 @@
 //! the receiving one.
 //!
 //! # Locking
-//! Every reader holds a shared lock (flock) on the file. The sender holds one, too, while the content
-//! is loaned, held or under way. Only the holder of the exclusive lock may begin another content or
-//! shorten the file: the sender or, after its end, the process that cleans up. Locks end with their
-//! process, so a killed process does not keep a segment from being reused.
+//! Every reader holds a shared lock (flock) on the file. The sender holds one, too, while the
+//! content is loaned, held or under way. Only the holder of the exclusive lock may begin another
+//! content or shorten the file: the sender or, after its end, the process that cleans up. Locks end
+//! with their process, so a killed process does not keep a segment from being reused.
 //!
 //! A letter that its sender has abandoned may still be in a mailbox. So every content has a
 //! generation, which changes only under the exclusive lock, and a reader that has taken the shared
 //! lock compares it with the reference. For the same reason a reader checks the file's length and
-//! allocated blocks under the lock: it reads neither beyond the end nor pages that do not exist, which
-//! the read would have to allocate.
+//! allocated blocks under the lock: it reads neither beyond the end nor pages that do not exist,
+//! which the read would have to allocate.
 
 use std::fs::File;
 use std::io;
@@ -104,12 +104,12 @@ impl SegmentFile {
     fn header(&self) -> &SegmentHeader {
         // SAFETY: the mapping exists as long as self, is aligned to a page and longer than a
         // `SegmentHeader`, of which every bit pattern is valid. Every process accesses these words
-        // atomically. Processes that map the segment for reading only load them, relaxed, which Rust
-        // allows on read-only memory for words of at most 8 bytes on 64-bit targets. The page exists:
-        // the file is shortened only under the exclusive lock, by its sender, which does not call this
-        // afterwards, or after the sender's end. All other callers hold the lock. This assumes that the
-        // processes of this user follow the locking rules; one that does not can also end this process
-        // with a signal.
+        // atomically. Processes that map the segment for reading only load them, relaxed, which
+        // Rust allows on read-only memory for words of at most 8 bytes on 64-bit targets. The page
+        // exists: the file is shortened only under the exclusive lock, by its sender, which does
+        // not call this afterwards, or after the sender's end. All other callers hold the lock.
+        // This assumes that the processes of this user follow the locking rules; one that does not
+        // can also end this process with a signal.
         unsafe { self.mapping.start().cast::<SegmentHeader>().as_ref() }
     }
 
@@ -140,8 +140,8 @@ impl SegmentFile {
     /// Releases the lock. Returns whether the sender requested a notice.
     pub(crate) fn unlock(&self) -> bool {
         // Read after the unlock: the sender requests the notice before it tries to lock, so either
-        // its lock succeeds or the request is seen here. Read from the file and not from the mapping,
-        // because the page may not exist without the lock.
+        // its lock succeeds or the request is seen here. Read from the file and not from the
+        // mapping, because the page may not exist without the lock.
         let mut requested = [0; size_of::<AtomicU32>()];
         let at = offset_of!(SegmentHeader, notice_requested) as u64;
         self.lock(FlockOperation::Unlock).is_ok()
@@ -155,7 +155,8 @@ impl SegmentFile {
         self.header().notice_requested.store(1, Ordering::SeqCst);
     }
 
-    /// Shortens the file to nothing, unless a reader holds the lock. No process reads it afterwards.
+    /// Shortens the file to nothing, unless a reader holds the lock. No process reads it
+    /// afterwards.
     pub(crate) fn empty(&self) -> bool {
         self.lock(FlockOperation::NonBlockingLockExclusive).is_ok() && self.file.set_len(0).is_ok()
     }
@@ -188,8 +189,8 @@ impl SegmentFile {
 
 /// Removes a segment of a process that has ended. Processes that read it keep its memory.
 pub(crate) fn remove(path: &Path) {
-    // Emptied first: the memory of a file that is only unlinked stays allocated as long as a process
-    // has it mapped, even if no process reads it.
+    // Emptied first: the memory of a file that is only unlinked stays allocated as long as a
+    // process has it mapped, even if no process reads it.
     if let Ok((file, found)) = open_owned(path, File::options().write(true))
         // A hard link to another file of this user must not cause that file to be emptied.
         && found.nlink() == 1

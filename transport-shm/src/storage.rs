@@ -76,11 +76,11 @@ pub(crate) struct Storage<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: b
     file: SharedMemory,
 }
 
-// SAFETY: `data` points into memory that every process of the domain may use concurrently, and `T` is
-// `Send`. `file` is a mapping and a descriptor, which belong to the process and not to a thread.
+// SAFETY: `data` points into memory that every process of the domain may use concurrently, and `T`
+// is `Send`. `file` is a mapping and a descriptor, which belong to the process and not to a thread.
 unsafe impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Send for Storage<T, SPARSE> {}
-// SAFETY: a shared `Storage` gives out only shared references to `T`, which is `Sync`. The only other
-// mutable state of `file` is an atomic flag.
+// SAFETY: a shared `Storage` gives out only shared references to `T`, which is `Sync`. The only
+// other mutable state of `file` is an atomic flag.
 unsafe impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Sync for Storage<T, SPARSE> {}
 
 /// The beginning of a file. The memory that `T` manages follows.
@@ -104,9 +104,9 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Storage<T, SPARS
     }
 
     fn version(&self) -> &AtomicU64 {
-        // SAFETY: the mapping begins with a `Data<T>`, is long enough (`new`), aligned to a page and
-        // exists as long as self. The page is allocated. After the creating process has initialized
-        // the word, every process accesses it only atomically.
+        // SAFETY: the mapping begins with a `Data<T>`, is long enough (`new`), aligned to a page
+        // and exists as long as self. The page is allocated. After the creating process has
+        // initialized the word, every process accesses it only atomically.
         unsafe { &(*self.data.as_ptr()).version }
     }
 
@@ -200,8 +200,8 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> DynamicStorage<T
     }
 
     fn get(&self) -> &T {
-        // SAFETY: the value is in the mapping, as for `version`. A `Storage` is returned only after its
-        // value was initialized, which `try_open` checks by the version. `T` is `Sync`.
+        // SAFETY: the value is in the mapping, as for `version`. A `Storage` is returned only after
+        // its value was initialized, which `try_open` checks by the version. `T` is `Sync`.
         unsafe { &*self.value() }
     }
 
@@ -411,7 +411,8 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Builder<'_, T, S
             return Err(E::InitializationNotYetFinalized);
         }
         let storage = Storage::new(self.name, file).ok_or(E::InternalError)?;
-        // Only relaxed loads are allowed on memory that is mapped for reading; the fence adds the order.
+        // Only relaxed loads are allowed on memory that is mapped for reading; the fence adds the
+        // order.
         let version = storage.version().load(Ordering::Relaxed);
         fence(Ordering::Acquire);
         if version == 0 {
@@ -456,8 +457,8 @@ pub(crate) struct Shortage {
     pub(crate) error: Errno,
 }
 
-/// Calls `make`, and returns the last failed allocation of pages in it. iceoryx2 does not report that
-/// reason, and creates a port without its connections if there is no room for them.
+/// Calls `make`, and returns the last failed allocation of pages in it. iceoryx2 does not report
+/// that reason, and creates a port without its connections if there is no room for them.
 pub(crate) fn with_shortage<R>(make: impl FnOnce() -> R) -> (R, Option<Shortage>) {
     LAST_SHORTAGE.set(None);
     let made = make();
@@ -532,8 +533,8 @@ fn with_mapped(
 
 impl MappedFile {
     fn take(&self, part: Range<usize>) -> Result<(), Errno> {
-        // SAFETY: the caller holds the lock of `MAPPED`. A storage removes its entry before it closes
-        // its file (the order of its fields), so the descriptor is open during the call.
+        // SAFETY: the caller holds the lock of `MAPPED`. A storage removes its entry before it
+        // closes its file (the order of its fields), so the descriptor is open during the call.
         let file = unsafe { BorrowedFd::borrow_raw(self.descriptor) };
         allocate_pages(file, part)
     }
@@ -579,7 +580,8 @@ mod tests {
         assert_eq!(allocate_all(behind), Err(Errno::FAULT));
         allocate_all(base + 5000).unwrap();
         assert!(taken() >= storage.file.size());
-        // Another storage finds the value; only the one that created the file can allocate its pages.
+        // Another storage finds the value; only the one that created the file can allocate its
+        // pages.
         let other = Builder::<u64, true>::new(storage.name())
             .open(AccessMode::ReadWrite)
             .unwrap();

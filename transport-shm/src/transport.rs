@@ -74,8 +74,8 @@ impl ShmTransport {
         self.endpoint.load().tally().read()
     }
 
-    /// Starts a cleanup in the background if the domain contains files of dead processes. Not needed
-    /// for processes that this one talks to: the kernel notifies this process of their end.
+    /// Starts a cleanup in the background if the domain contains files of dead processes. Not
+    /// needed for processes that this one talks to: the kernel notifies this process of their end.
     pub fn tidy(&self) {
         self.endpoint.load().clean_soon();
     }
@@ -92,8 +92,8 @@ impl ShmTransport {
     /// for up to some seconds. The sink must not call this from one of its methods.
     ///
     /// # Errors
-    /// Returns the errors of [`new`](Self::new). The transport then neither sends nor receives until
-    /// a retry succeeds.
+    /// Returns the errors of [`new`](Self::new). The transport then neither sends nor receives
+    /// until a retry succeeds.
     pub fn rejoin(&self) -> Result<bool, ShmError> {
         let mut listening = self.listening.lock();
         let before = self.endpoint.load_full();

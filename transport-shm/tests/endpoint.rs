@@ -191,8 +191,8 @@ fn a_stopped_lock_holder_blocks_neither_dispatch_nor_close() {
     assert_eq!(domain.files(), Vec::<String>::new());
 }
 
-/// A process that waits for the lock of a directory must not clean up in a new directory that another
-/// process has created and locked in its place.
+/// A process that waits for the lock of a directory must not clean up in a new directory that
+/// another process has created and locked in its place.
 #[test]
 fn a_waiter_for_a_removed_directorys_lock_does_not_clean_up_the_new_directory() {
     let domain = TestDomain::new();
@@ -294,7 +294,8 @@ fn a_domain_whose_files_were_removed_is_joined_again() {
     for sink in [&one_sink, &two_sink] {
         sink.arrived.lock().unwrap().clear();
     }
-    // Dropping the last content of the previous mailbox makes iceoryx2 remove the file of the current one.
+    // Dropping the last content of the previous mailbox makes iceoryx2 remove the file of the
+    // current one.
     for endpoint in [&one, &two] {
         let needed = !endpoint.is_there();
         assert_eq!(endpoint.rejoin().unwrap(), needed);

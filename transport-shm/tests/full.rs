@@ -161,7 +161,8 @@ fn start(domain: &TestDomain, seed: u64) -> Child {
         .unwrap()
 }
 
-/// Acts as a program outside of the domain: fills the file system except for some pages, and frees it.
+/// Acts as a program outside of the domain: fills the file system except for some pages, and frees
+/// it.
 fn fill_and_empty(stop: &AtomicBool, mut rng: Rng) -> u64 {
     let path = "/dev/shm/other_program";
     let mut filled = 0;

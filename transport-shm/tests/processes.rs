@@ -1,4 +1,5 @@
-//! Several processes, some of which are killed. Each test starts its own processes from this binary.
+//! Several processes, some of which are killed. Each test starts its own processes from this
+//! binary.
 
 #![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
 #![allow(clippy::print_stdout, reason = "processes report their observations")]
@@ -26,8 +27,8 @@ struct Process {
 
 impl Process {
     /// Roles: `receive` keeps what arrives, and `drop` drops it; `tell` also prints the position of
-    /// its content; `send` sends to a process in a loop, and `many` does so with content for several
-    /// receivers; `clean` cleans up and ends.
+    /// its content; `send` sends to a process in a loop, and `many` does so with content for
+    /// several receivers; `clean` cleans up and ends.
     fn start(domain: &TestDomain, role: &str, to: Incarnation) -> Self {
         let config = domain.config();
         let child = Command::new(std::env::current_exe().unwrap())
@@ -183,7 +184,8 @@ fn receivers_in_two_processes_read_the_same_memory() {
         assert_eq!(reported, Some(expected.clone()));
     }
     assert_eq!(sender.counters().referring, 2);
-    // A receiver that is killed while it holds the content does not keep the memory from being reused.
+    // A receiver that is killed while it holds the content does not keep the memory from being
+    // reused.
     for receiver in &mut receivers {
         receiver.kill();
     }
@@ -404,8 +406,8 @@ fn cleanup_dead_removes_the_files_of_killed_processes() {
     assert_eq!(domain.files(), Vec::<String>::new());
 }
 
-/// iceoryx2 leaves a connection like this if its creator is killed before it records its own end: the
-/// state in the file is that of no end, so neither end is the last to close.
+/// iceoryx2 leaves a connection like this if its creator is killed before it records its own end:
+/// the state in the file is that of no end, so neither end is the last to close.
 #[test]
 fn a_connection_without_ports_is_removed() {
     let domain = TestDomain::new();

@@ -39,8 +39,8 @@ impl Allowance {
         enough
     }
 
-    /// Takes `amount` tokens for something that cannot be refused any more. Returns the time until the
-    /// bucket is no longer negative, if it is; at most one second, whatever the amount.
+    /// Takes `amount` tokens for something that cannot be refused any more. Returns the time until
+    /// the bucket is no longer negative, if it is; at most one second, whatever the amount.
     pub fn spend(&mut self, amount: f64, per_second: f64, now: Instant) -> Option<Duration> {
         self.refill(per_second, now);
         self.left = (self.left - amount).max(-per_second);

@@ -55,7 +55,8 @@ struct Plan {
 }
 
 impl Faulty {
-    /// Wraps `inner`. Each dispatch gets one of the faults with its rate (0 to 1), drawn from `seed`.
+    /// Wraps `inner`. Each dispatch gets one of the faults with its rate (0 to 1), drawn from
+    /// `seed`.
     pub fn new(inner: Arc<dyn Transport>, seed: u64, rates: &[(Fault, f64)]) -> Self {
         let random = fastrand::Rng::with_seed(seed);
         Self {

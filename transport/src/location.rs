@@ -39,8 +39,8 @@ impl Kind {
         Self::Udt,
     ];
 
-    /// Whether this project has a transport of this kind. The directory may contain locations of other
-    /// kinds; letters to them fail as [unsupported](crate::FailureReason::Unsupported).
+    /// Whether this project has a transport of this kind. The directory may contain locations of
+    /// other kinds; letters to them fail as [unsupported](crate::FailureReason::Unsupported).
     #[must_use]
     pub const fn is_supported(self) -> bool {
         !matches!(self, Self::Udt)
@@ -59,8 +59,8 @@ impl Kind {
         }
     }
 
-    /// Whether locations of this kind lead only to processes of this host. Such locations are neither
-    /// announced to other hosts nor accepted from them.
+    /// Whether locations of this kind lead only to processes of this host. Such locations are
+    /// neither announced to other hosts nor accepted from them.
     #[must_use]
     pub const fn is_host_local(self) -> bool {
         matches!(self, Self::Shm | Self::Unix)
@@ -156,8 +156,8 @@ impl FromStr for Signature {
 /// Written `kind://address`, then `;signature` unless the protocol is frames (it may be omitted for
 /// `udt`, over which only fipa_services is supported), then `#incarnation` if known:
 /// `tcp://10.0.0.2:7788#00abcdef01234567`, `tcp://10.0.0.3:6789;fipa-services`,
-/// `tcp://10.0.0.4:6789;jade`. The transport defines the meaning of `address`. Ports are reused, so a
-/// transport that finds another incarnation than the known one at a location reports that no
+/// `tcp://10.0.0.4:6789;jade`. The transport defines the meaning of `address`. Ports are reused, so
+/// a transport that finds another incarnation than the known one at a location reports that no
 /// receiver was reached.
 ///
 /// Cheap to clone.
@@ -212,8 +212,8 @@ impl Location {
     /// Sets the signature.
     ///
     /// # Errors
-    /// Returns an error if this kind of transport does not support it: TCP supports every signature,
-    /// UDT only that of fipa_services, and all others only frames.
+    /// Returns an error if this kind of transport does not support it: TCP supports every
+    /// signature, UDT only that of fipa_services, and all others only frames.
     pub fn with_signature(mut self, signature: Signature) -> Result<Self, LocationError> {
         let is_spoken = match self.kind {
             Kind::Tcp => true,

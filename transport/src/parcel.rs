@@ -37,9 +37,9 @@ pub struct Parcel {
     /// highest lower sequence that was open (without an outcome) in the sender's process when it
     /// dispatched this copy.
     pub after: u64,
-    /// Number of the hand-over, chosen by the service that hands the letter over and higher for each
-    /// of its hand-overs. A report repeats the number of the latest hand-over of its letter by the
-    /// service that the report goes to. 0 in credits.
+    /// Number of the hand-over, chosen by the service that hands the letter over and higher for
+    /// each of its hand-overs. A report repeats the number of the latest hand-over of its letter by
+    /// the service that the report goes to. 0 in credits.
     pub transfer: u64,
     /// Remaining time until the letter's deadline. Time in transit is not subtracted, because hosts
     /// need not have synchronized clocks.
@@ -81,7 +81,7 @@ pub enum Report {
         /// Whether an attempt by this service, or by a later one, may have delivered the letter.
         uncertain: bool,
     },
-    /// The letter is handed back, because its receiver's registration has left this host. Neither this
-    /// service nor a later one has delivered it.
+    /// The letter is handed back, because its receiver's registration has left this host. Neither
+    /// this service nor a later one has delivered it.
     Moved,
 }

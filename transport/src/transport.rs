@@ -20,9 +20,10 @@ use crate::{FailureReason, Kind, Location, Parcel, Signature, Stream};
 ///    of the parcel has reached the other side, and that none will. In doubt, the conclusion is
 ///    [`Conclusion::Unconfirmed`] or [`Abandoned::Unconfirmed`]. The parcel of an attempt uses at
 ///    most one connection, and is not sent after the attempt was concluded as not sent.
-/// 3. **Answers come from the receiving sink.** `Accepted` is reported only after the receiving sink
-///    has returned it; the transport acknowledges nothing on its behalf. The sink gets the parcel of
-///    an attempt once. If a copy reaches it all the same, its verdict does not answer the attempt.
+/// 3. **Answers come from the receiving sink.** `Accepted` is reported only after the receiving
+///    sink has returned it; the transport acknowledges nothing on its behalf. The sink gets the
+///    parcel of an attempt once. If a copy reaches it all the same, its verdict does not answer the
+///    attempt.
 /// 4. **Order.** Parcels dispatched to one location arrive in the order of the calls, or do not
 ///    arrive.
 /// 5. **No callback from a call.** The transport does not call a sink from within `dispatch`,
@@ -40,9 +41,9 @@ pub trait Transport: Send + Sync + 'static {
     /// Maximum length of a letter in bytes. A longer one fails with [`WayFault::TooLarge`].
     fn max_letter(&self) -> usize;
 
-    /// Whether the sink must answer arrivals at once. A delivery core that does not have the outcome
-    /// yet then answers [`Answer::Custody`] and sends a report later, so that a slow next hop does
-    /// not occupy slots of this transport.
+    /// Whether the sink must answer arrivals at once. A delivery core that does not have the
+    /// outcome yet then answers [`Answer::Custody`] and sends a report later, so that a slow next
+    /// hop does not occupy slots of this transport.
     fn answers_at_once(&self) -> bool;
 
     /// Starts to listen and passes all arrivals to `sink`. Called once, before all other methods.
@@ -63,19 +64,19 @@ pub trait Transport: Send + Sync + 'static {
     /// attempt.
     fn abandon(&self, attempt: AttemptId) -> Abandoned;
 
-    /// Answers an arrival for which the sink returned [`Verdict::Later`]. Unknown tickets are ignored,
-    /// because the peer may have disconnected.
+    /// Answers an arrival for which the sink returned [`Verdict::Later`]. Unknown tickets are
+    /// ignored, because the peer may have disconnected.
     fn answer(&self, ticket: Ticket, answer: Answer);
 
-    /// Performs pending work on the calling thread without blocking. Returns whether there was any. A
-    /// caller that waits for a letter or an outcome may call this in a short loop before it sleeps,
-    /// but need not.
+    /// Performs pending work on the calling thread without blocking. Returns whether there was any.
+    /// A caller that waits for a letter or an outcome may call this in a short loop before it
+    /// sleeps, but need not.
     fn drive(&self) -> bool {
         false
     }
 
-    /// Loans `len` bytes for the content of a letter to `to`. `None` if this transport cannot send such
-    /// memory without a copy. `head_room` is the length of everything before the content and
+    /// Loans `len` bytes for the content of a letter to `to`. `None` if this transport cannot send
+    /// such memory without a copy. `head_room` is the length of everything before the content and
     /// `tail_room` of everything after it, in bytes.
     ///
     /// # Errors
@@ -119,8 +120,8 @@ pub trait LoanedContent: Send {
     /// The writable bytes. Their initial values are arbitrary.
     fn content_mut(&mut self) -> &mut [u8];
 
-    /// Returns the bytes as content of a letter. The transport that loaned them recognizes them in a
-    /// dispatch to a location they were loaned for, and copies nothing.
+    /// Returns the bytes as content of a letter. The transport that loaned them recognizes them in
+    /// a dispatch to a location they were loaned for, and copies nothing.
     fn freeze(self: Box<Self>) -> Bytes;
 }
 
@@ -138,8 +139,9 @@ pub trait Sink: Send + Sync {
     /// Handles a parcel that arrived. The verdict determines the answer to the sender.
     fn arrived(&self, arrival: Arrival) -> Verdict;
 
-    /// Handles a letter of a legacy peer, which has no parcel header and gets no answer. The transport
-    /// has converted its envelope to the standard dialect; the envelope names the receiver.
+    /// Handles a letter of a legacy peer, which has no parcel header and gets no answer. The
+    /// transport has converted its envelope to the standard dialect; the envelope names the
+    /// receiver.
     fn arrived_unframed(&self, letter: Letter, via: Kind, from: LegacySource);
 
     /// Handles the end of an attempt.
@@ -220,7 +222,8 @@ pub struct Arriving<'a> {
 /// The message transport service that handed a parcel over.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Hop {
-    /// Location for reports and credits about the parcel, with the incarnation of the service there.
+    /// Location for reports and credits about the parcel, with the incarnation of the service
+    /// there.
     pub location: Location,
     /// The proof of that service's identity.
     pub principal: Principal,
@@ -234,8 +237,8 @@ impl Hop {
     }
 }
 
-/// The identity that a link proves for the service at its other end. Services are told apart only by
-/// this, and not by their own claims.
+/// The identity that a link proves for the service at its other end. Services are told apart only
+/// by this, and not by their own claims.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Principal {
     /// A process of this user on this host: the link is shared memory, a Unix domain socket, or

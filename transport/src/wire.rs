@@ -1,9 +1,9 @@
 //! The fixed layout of a parcel in a mailbox and in a network frame.
 //!
 //! A parcel is a [`ParcelHeader`] followed by a body: the receiver's name, then the content of the
-//! [`Body`]. All integers are little-endian. A letter is its envelope, then the message in its three
-//! pieces ([`Payload`]). [`write_report`] defines the bytes of a report. Credits and predecessors
-//! have only the name.
+//! [`Body`]. All integers are little-endian. A letter is its envelope, then the message in its
+//! three pieces ([`Payload`]). [`write_report`] defines the bytes of a report. Credits and
+//! predecessors have only the name.
 //!
 //! All input may come from a hostile peer: lengths are checked against the available bytes before
 //! they are used, and no memory is allocated according to them.
@@ -97,8 +97,8 @@ impl Pieces<'_> {
 }
 
 impl ParcelHeader {
-    /// Returns the header of a parcel, and its body as pieces to be written after the header, in order
-    /// and without empty ones. The memory of a letter is shared, not copied.
+    /// Returns the header of a parcel, and its body as pieces to be written after the header, in
+    /// order and without empty ones. The memory of a letter is shared, not copied.
     ///
     /// # Errors
     /// Returns an error if the name, or a piece other than the content, is longer than the header

@@ -263,8 +263,8 @@ pub fn shared_content_arrives_at_all_receivers(fixture: &dyn Fixture) {
     );
 }
 
-/// Each of many dispatches without a pause is refused at once or concluded, and each accepted parcel
-/// arrives once.
+/// Each of many dispatches without a pause is refused at once or concluded, and each accepted
+/// parcel arrives once.
 pub fn a_flood_is_bounded_and_every_attempt_concluded(fixture: &dyn Fixture) {
     let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
     let mut taken = Vec::new();
