@@ -61,7 +61,7 @@ pub(crate) struct Endpoint {
     budget: Arc<Budget>,
     /// Segments of this process and of others.
     pool: Arc<Pool>,
-    library: Arc<PeerSegments>,
+    peer_segments: Arc<PeerSegments>,
     tally: Arc<Tally>,
     // Last: the last owner removes the domain's files.
     domain: Arc<DomainFiles>,
@@ -78,7 +78,7 @@ impl Endpoint {
         // Before `domain` is dropped: after a failure, its last owner takes the lock to clean up.
         drop(lock);
         let endpoint = opened?;
-        endpoint.clean_soon();
+        endpoint.start_cleanup();
         Ok(endpoint)
     }
 
@@ -115,10 +115,10 @@ impl Endpoint {
         });
         let node = node.map_err(|e| failed("cannot create a node", format!("{e:?}"), shortage))?;
         domain.restrict_permissions()?;
-        let library = Arc::new(PeerSegments::new(domain.clone()));
+        let peer_segments = Arc::new(PeerSegments::new(domain.clone()));
         let wakeup = (doorbell.clone(), presence.polls());
         let (inbox, shortage) = storage::with_shortage(|| {
-            Inbox::create(&config, &node, wakeup, tally.clone(), library.clone())
+            Inbox::create(&config, &node, wakeup, tally.clone(), peer_segments.clone())
         });
         let inbox =
             inbox.map_err(|reason| failed("cannot create the mailbox", reason, shortage))?;
@@ -148,7 +148,7 @@ impl Endpoint {
             cleaning: AtomicBool::new(false),
             budget,
             pool: Arc::new(pool),
-            library,
+            peer_segments,
             tally,
             domain,
         }))
@@ -253,9 +253,9 @@ impl Endpoint {
         loop {
             let mut answered = self.answered.lock();
             let peers = self.peers.read();
-            let lively = |one| peers.get(one).is_some_and(|peer| peer.was_polling());
+            let polled_recently = |one| peers.get(one).is_some_and(|peer| peer.was_polling());
             answered.retain(|one| !peers.get(one).is_some_and(|peer| peer.is_awake()));
-            if !answered.iter().any(lively) {
+            if !answered.iter().any(polled_recently) {
                 return;
             }
             drop((peers, answered));
@@ -495,12 +495,12 @@ impl Endpoint {
         // Takes its last letters and answers.
         self.work();
         self.wake_answered();
-        self.library.forget(incarnation);
-        self.clean_soon();
+        self.peer_segments.forget(incarnation);
+        self.start_cleanup();
     }
 
-    /// Starts a cleanup in the background, if none runs.
-    pub(crate) fn clean_soon(self: &Arc<Self>) {
+    /// Starts a cleanup in the background. If one runs, it is repeated afterwards.
+    pub(crate) fn start_cleanup(self: &Arc<Self>) {
         self.dirty.fetch_add(1, Ordering::SeqCst);
         if self.is_closed() || self.cleaning.swap(true, Ordering::SeqCst) {
             return;

@@ -71,7 +71,7 @@ impl Inbox {
         node: &Node<Svc>,
         (doorbell, polls): (Arc<Doorbell>, PollCounter),
         tally: Arc<Tally>,
-        library: Arc<PeerSegments>,
+        peer_segments: Arc<PeerSegments>,
     ) -> Result<Self, String> {
         let name = ServiceName::new(&mailbox_name(config.incarnation)).map_err(debug)?;
         let service = node
@@ -112,7 +112,7 @@ impl Inbox {
                 waiting: AtomicBool::new(false),
                 doorbell,
                 tally: tally.clone(),
-                library,
+                peer_segments,
             }),
             polls,
             tally,
@@ -293,14 +293,16 @@ impl Inbox {
         parcel: &ParcelHeader,
     ) -> Result<Bytes, Answer> {
         let len = usize::try_from(parcel.content_len()).unwrap_or(usize::MAX);
-        let library = &self.borrows.library;
-        let content = library.read(sender, reference, len).map_err(|e| match e {
-            ReadError::Gone => {
-                let detail = "its content does not exist any more";
-                Answer::failed(FailureReason::Refused, detail)
-            }
-            ReadError::NoRoom => Answer::Busy,
-        })?;
+        let peer_segments = &self.borrows.peer_segments;
+        let content = peer_segments
+            .read(sender, reference, len)
+            .map_err(|e| match e {
+                ReadError::Gone => {
+                    let detail = "its content does not exist any more";
+                    Answer::failed(FailureReason::Refused, detail)
+                }
+                ReadError::NoRoom => Answer::Busy,
+            })?;
         if !self.borrows.begin_segment() {
             count(&self.tally.copied_full);
             return Ok(Bytes::copy_from_slice(content.as_ref()));
@@ -369,7 +371,7 @@ struct BorrowedRequest {
 
 impl Drop for BorrowedRequest {
     fn drop(&mut self) {
-        if !self.borrows.library.owner().is_this() {
+        if !self.borrows.peer_segments.owner().is_this() {
             // In a forked child, a release would take the memory from the parent.
             std::mem::forget(self.active.get_mut().take());
             return;
@@ -427,7 +429,7 @@ struct BorrowLimits {
     doorbell: Arc<Doorbell>,
     tally: Arc<Tally>,
     // Last: the last owner of content removes the domain's files, which the segments' owner does.
-    library: Arc<PeerSegments>,
+    peer_segments: Arc<PeerSegments>,
 }
 
 impl BorrowLimits {

@@ -68,7 +68,7 @@ impl PeerSegments {
         Ok(SegmentContent {
             segment,
             len,
-            library: Arc::clone(self),
+            peer_segments: Arc::clone(self),
         })
     }
 
@@ -154,7 +154,7 @@ impl PeerSegment {
 pub(crate) struct SegmentContent {
     segment: Arc<PeerSegment>,
     len: usize,
-    library: Arc<PeerSegments>,
+    peer_segments: Arc<PeerSegments>,
 }
 
 impl AsRef<[u8]> for SegmentContent {
@@ -170,22 +170,24 @@ impl AsRef<[u8]> for SegmentContent {
 
 impl Drop for SegmentContent {
     fn drop(&mut self) {
-        if !self.library.owner().is_this() {
+        if !self.peer_segments.owner().is_this() {
             // In a forked child the lock belongs to the parent.
             return;
         }
         let Self {
-            segment, library, ..
+            segment,
+            peer_segments,
+            ..
         } = self;
         let Some(waited_for) = segment.end() else {
             return;
         };
         if waited_for {
-            library.domain.paths().ring_once(segment.sender);
+            peer_segments.domain.paths().ring_once(segment.sender);
         }
         if !segment.file.is_linked() {
             // The sender has ended, or has removed the segment.
-            library.forget_segment(segment);
+            peer_segments.forget_segment(segment);
         }
     }
 }

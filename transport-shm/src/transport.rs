@@ -77,7 +77,7 @@ impl ShmTransport {
     /// Starts a cleanup in the background if the domain contains files of dead processes. Not
     /// needed for processes that this one talks to: the kernel notifies this process of their end.
     pub fn tidy(&self) {
-        self.endpoint.load().clean_soon();
+        self.endpoint.load().start_cleanup();
     }
 
     /// Whether other processes can find the mailbox. False if another program has removed the

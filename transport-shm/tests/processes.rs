@@ -517,7 +517,7 @@ fn an_unused_mailbox_is_removed() {
     wait_for("mailbox", || !made_since(".port_tag").is_empty());
     receiver.kill();
     assert_eq!(made_since(".dynamic").len(), 1);
-    // The files that are removed before: its ports, and its node's claim.
+    // The files that the process removes earlier: its ports, and its node's claim.
     for end in [".data", ".port_tag", ".service_tag"] {
         for file in made_since(end) {
             std::fs::remove_file(file).unwrap();

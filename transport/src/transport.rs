@@ -372,7 +372,8 @@ pub enum WayFault {
     WrongIncarnation,
     /// The letter is longer than this transport's limit.
     TooLarge,
-    /// The window for the location is full. Answers to earlier parcels make room.
+    /// The window for the location is full, or memory is temporarily short. A later attempt may
+    /// succeed.
     Congested,
     /// The connection broke, or the other process ended, before an answer came.
     Broken,
