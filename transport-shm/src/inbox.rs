@@ -250,7 +250,7 @@ impl Inbox {
         };
         let most = self.max_letter.saturating_add(Parcel::MAX_NAME) as u64;
         if parcel.body_len() > most {
-            let detail = format!("the maximum here is {} bytes", self.max_letter);
+            let detail = format!("max_letter of the receiver is {} bytes", self.max_letter);
             return refused(active, FailureReason::TooLarge, &detail);
         }
         if let Some(reference) = header.reference() {
@@ -298,7 +298,7 @@ impl Inbox {
             .read(sender, reference, len)
             .map_err(|e| match e {
                 ReadError::Gone => {
-                    let detail = "its content does not exist any more";
+                    let detail = "the content of the letter does not exist any more";
                     Answer::failed(FailureReason::Refused, detail)
                 }
                 ReadError::NoRoom => Answer::Busy,

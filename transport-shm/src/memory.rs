@@ -114,7 +114,7 @@ impl Budget {
                 WayFault::TooLarge,
                 format_args!(
                     "{need} bytes of shared memory are needed, and the capacity of this domain is {}; \
-                     raise capacity of transport.shm",
+                     raise transport.shm.capacity",
                     self.capacity
                 ),
             ));
@@ -125,7 +125,7 @@ impl Budget {
                 WayFault::Congested,
                 format_args!(
                     "{need} more bytes of shared memory are needed, and {used} of this domain's {} \
-                     are in use; raise capacity of transport.shm",
+                     are in use; raise transport.shm.capacity",
                     self.capacity
                 ),
             ));

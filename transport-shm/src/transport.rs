@@ -244,7 +244,7 @@ impl ShmTransport {
         }
         Err(WayError::new(
             WayFault::TooLarge,
-            format_args!("the letter has {len} bytes, and max_letter of transport.shm is {most}"),
+            format_args!("the letter has {len} bytes, and transport.shm.max_letter is {most}"),
         ))
     }
 }
