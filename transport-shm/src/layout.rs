@@ -262,7 +262,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn answers_survive_and_foreign_ones_are_refused() {
+    fn answers_round_trip_and_malformed_ones_are_refused() {
         let long = "é".repeat(200);
         for answer in [
             Answer::Accepted,
@@ -291,10 +291,10 @@ mod tests {
     }
 
     #[test]
-    fn places_are_aligned_and_bounded() {
-        let places = PieceOffsets::for_lengths(13, 100, 1).expect("fits");
+    fn offsets_are_aligned_and_bounded() {
+        let offsets = PieceOffsets::for_lengths(13, 100, 1).expect("fits");
         assert_eq!(
-            places,
+            offsets,
             PieceOffsets {
                 start: 3,
                 content: 16,

@@ -29,10 +29,10 @@
 //! states its safety argument; no other crate of this project contains `unsafe`.
 //!
 //! # Trust
-//! Processes of one domain run as one user and trust each other not to be malicious. Even so, no
-//! memory that another process can still change is parsed: headers, names and envelopes are copied
-//! into private memory first. Only content is read in place; two reads of it give the same bytes
-//! only if the sender is honest.
+//! Processes of one domain run as one user, so each of them can already read and end the others.
+//! Even so, no memory that another process can still change is parsed: headers, names and envelopes
+//! are copied into private memory first. Only content is read in place; two reads of it give the
+//! same bytes only if the sender is honest.
 
 mod combiner;
 mod config;

@@ -566,7 +566,7 @@ mod tests {
     }
 
     #[test]
-    fn sparse_files_have_the_pages_that_were_asked_for() {
+    fn sparse_files_have_the_requested_pages() {
         let (storage, path) = sparse();
         let taken = || std::fs::metadata(&path).unwrap().blocks() as usize * 512;
         // The kernel allocates whole pages, and the file need not end with one.
@@ -594,7 +594,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_initialized_is_neither_opened_nor_left() {
+    fn an_uninitialized_file_is_neither_opened_nor_left() {
         let name = format!("fipatest-{}", Incarnation::random());
         let name = FileName::try_from(name.as_str()).unwrap();
         let builder = || Builder::<u64, false>::new(&name);
@@ -611,7 +611,7 @@ mod tests {
     }
 
     #[test]
-    fn too_large_a_file_is_an_error_that_is_remembered() {
+    fn a_file_larger_than_the_file_system_is_a_reported_error() {
         let name = format!("fipatest-{}", Incarnation::random());
         let name = FileName::try_from(name.as_str()).unwrap();
         let found = rustix::fs::statvfs(crate::memory::SHM).unwrap();
