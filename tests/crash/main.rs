@@ -1,41 +1,44 @@
-//! Processes that are killed at every moment, and what must be true of those who live.
+//! Processes are killed at random moments; the surviving processes must keep the promises.
 //!
-//! Real processes of this very binary join a domain and exchange letters; some are killed with
-//! SIGKILL, in every cell of a matrix of who and when, after delays drawn from a seed that is
-//! printed. After every round: the survivors still talk, every letter has an outcome, none was
-//! taken twice, contents are whole, and memory, descriptors and files are back where they began.
+//! Child processes of this binary join a domain and exchange letters. The test kills some of them
+//! with SIGKILL in every scenario, after delays drawn from a seed that it prints. After every
+//! round, the survivors still exchange letters, every letter has an outcome, no letter was received
+//! twice, contents are intact, and memory, descriptors and files are at their initial level.
 //!
-//! `FIPA_CRASH_SEED` repeats a run's decisions (the machine's are its own); `FIPA_CRASH_KILLS` is
-//! how many processes are killed at least. The soak is a longer run of the same:
+//! `FIPA_CRASH_SEED` repeats the random decisions of a run, but not its timing. `FIPA_CRASH_KILLS`
+//! is the minimum number of kills. The soak is a longer run:
 //! `cargo test --release --test crash -- --ignored --nocapture soak`.
 
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
-#![expect(clippy::print_stdout, reason = "seeds and rounds, when a run fails")]
+#![expect(clippy::unwrap_used, reason = "a failed precondition fails the test")]
+#![expect(
+    clippy::print_stdout,
+    reason = "prints seeds and rounds of failed runs"
+)]
 
-mod actor;
-mod cells;
-mod stage;
+mod cluster;
+mod process;
+mod scenarios;
 
 use std::time::Instant;
 
-use cells::{CELLS, Cell};
-use stage::Stage;
+use cluster::Cluster;
+use scenarios::{SCENARIOS, Scenario};
 
 #[test]
 #[ignore = "started by the other tests"]
-fn a_process_of_its_own() {
-    if let Ok(part) = std::env::var(actor::PART) {
-        actor::play(&part);
+fn process_entry() {
+    if let Ok(role) = std::env::var(process::ROLE) {
+        process::run(&role);
     }
 }
 
 #[test]
-fn survivors_notice_nothing() {
+fn survivors_keep_working_while_other_processes_are_killed() {
     run(300, 2, false);
 }
 
 #[test]
-#[ignore = "takes a quarter of an hour; see CONTRIBUTING"]
+#[ignore = "takes 15 minutes; see CONTRIBUTING"]
 fn soak() {
     run(5000, 4, true);
 }
@@ -44,22 +47,22 @@ fn number(variable: &str) -> Option<u64> {
     std::env::var(variable).ok()?.parse().ok()
 }
 
-/// Rounds of all cells on some stages at the same time, until enough processes have been killed.
-/// `tells` of every round, for who watches; else only of the one that fails.
-fn run(kills: u64, stages: u64, tells: bool) {
+/// Runs rounds of all scenarios on several clusters in parallel until enough processes have been
+/// killed. With `verbose`, prints every round, otherwise only a failed one.
+fn run(kills: u64, clusters: u64, verbose: bool) {
     let seed = number("FIPA_CRASH_SEED").unwrap_or_else(|| fastrand::u64(..));
     let kills = number("FIPA_CRASH_KILLS").unwrap_or(kills);
     println!("FIPA_CRASH_SEED={seed} FIPA_CRASH_KILLS={kills}");
     std::thread::scope(|scope| {
-        let stages: Vec<_> = (0..stages)
-            .map(|stage| {
-                let random = fastrand::Rng::with_seed(seed.wrapping_add(stage));
-                let quota = kills.div_ceil(stages) as usize;
-                scope.spawn(move || act(stage, random, quota, tells))
+        let clusters: Vec<_> = (0..clusters)
+            .map(|cluster| {
+                let random = fastrand::Rng::with_seed(seed.wrapping_add(cluster));
+                let quota = kills.div_ceil(clusters) as usize;
+                scope.spawn(move || run_cluster(cluster, random, quota, verbose))
             })
             .collect();
-        for stage in stages {
-            if let Err(panic) = stage.join() {
+        for cluster in clusters {
+            if let Err(panic) = cluster.join() {
                 println!("failed with FIPA_CRASH_SEED={seed}");
                 std::panic::resume_unwind(panic);
             }
@@ -67,35 +70,38 @@ fn run(kills: u64, stages: u64, tells: bool) {
     });
 }
 
-fn act(number: u64, mut random: fastrand::Rng, kills: usize, tells: bool) {
-    let mut stage = Stage::new();
+fn run_cluster(number: u64, mut random: fastrand::Rng, kills: usize, verbose: bool) {
+    let mut cluster = Cluster::new();
     let began = Instant::now();
     let mut rounds = 0;
-    while stage.kills < kills {
-        let mut cells: Vec<(&str, Cell)> = CELLS.to_vec();
-        random.shuffle(&mut cells);
-        for (name, cell) in cells {
+    while cluster.kills < kills {
+        let mut scenarios: Vec<(&str, Scenario)> = SCENARIOS.to_vec();
+        random.shuffle(&mut scenarios);
+        for (name, scenario) in scenarios {
             let round = Round {
-                tells,
+                verbose,
                 line: format!(
-                    "stage {number}, round {rounds}, {} killed, {:.0?}: {name}",
-                    stage.kills,
+                    "cluster {number}, round {rounds}, {} killed, {:.0?}: {name}",
+                    cluster.kills,
                     began.elapsed()
                 ),
             };
-            cell(&mut stage, &mut random);
-            stage.check();
+            scenario(&mut cluster, &mut random);
+            cluster.check();
             drop(round);
             rounds += 1;
         }
     }
-    println!("stage {number}: {} killed in {rounds} rounds", stage.kills);
-    stage.close();
+    println!(
+        "cluster {number}: {} killed in {rounds} rounds",
+        cluster.kills
+    );
+    cluster.close();
 }
 
-/// Says what was played when it ends.
+/// Prints the round and its result when dropped.
 struct Round {
-    tells: bool,
+    verbose: bool,
     line: String,
 }
 
@@ -103,7 +109,7 @@ impl Drop for Round {
     fn drop(&mut self) {
         let outcome = match std::thread::panicking() {
             true => "FAILED",
-            false if self.tells => "ok",
+            false if self.verbose => "ok",
             false => return,
         };
         println!("{} ... {outcome}", self.line);

@@ -1,19 +1,19 @@
-//! Acknowledged letters through shared memory, beside iceoryx2's own request-response.
+//! Acknowledged letters through shared memory, compared with iceoryx2's own request-response.
 //!
-//! Two threads, both spinning; a round is: the sender writes the payload and sends, the receiver
-//! takes it and answers, the sender has the answer. `letter` is a parcel through the transport,
-//! from dispatch to conclusion; `loaned` is the same with content that is written by nobody, in
-//! memory that was loaned; `raw` is a bare iceoryx2 request of the same size and its response.
-//! `window` keeps eight rounds under way.
+//! Two threads spin. In a round, the sender writes the payload and sends it, the receiver takes it
+//! and answers, and the sender receives the answer. `letter` is a parcel through the transport,
+//! from dispatch to conclusion. `loaned` is the same with content in loaned memory that is not
+//! written. `raw` is a bare iceoryx2 request of the same size and its response. `window` keeps
+//! eight rounds under way.
 //!
-//! A round of what is sent to 32 receivers ends when all have answered: `letters`, short ones; `one
-//! content`, that lies in memory once, filled and referred to by each letter; `copies`, the same as
-//! letters of their own. `fill` is that memory alone, filled and given back.
+//! A round with 32 receivers ends when all have answered. `32 letters` are short ones. `32, one
+//! content` fills content that is stored once and to which each letter refers. `32 copies` sends
+//! the same content in separate letters. `fill` only fills that content and releases it.
 //!
-//! Blocks of rounds of all kinds take turns, so that whatever else the machine does strikes all
-//! alike: compare the percentiles with each other, and never times of different runs.
+//! Blocks of rounds of all kinds alternate, so that other load on the machine affects all kinds
+//! alike. Compare the percentiles of one run with each other, and not those of different runs.
 
-#![expect(clippy::print_stdout, reason = "what is measured is printed")]
+#![expect(clippy::print_stdout, reason = "prints the measurements")]
 
 use std::collections::VecDeque;
 use std::hint::{black_box, spin_loop};
@@ -36,17 +36,17 @@ use iceoryx2::prelude::{
     ServiceName, SignalHandlingMode, ipc_threadsafe,
 };
 
-/// How many rounds are measured before another kind has its turn.
+/// Number of rounds of one kind that are measured before the next kind.
 const BLOCK: usize = 500;
 
-/// How many rounds are under way in `window`.
+/// Number of rounds under way in `window`.
 const WINDOW: usize = 8;
 
-/// Name, envelope and head of a message; and what follows the content.
+/// Length of name, envelope and head of a message, and of the part after the content.
 const FRONT: usize = 8 + 80 + 120;
 const TAIL: usize = 1;
 
-/// An answer of iceoryx2's as long as the transport's.
+/// An iceoryx2 answer of the same length as the transport's.
 type RawAck = [u8; 184];
 type RawHeader = [u64; 13];
 type RawClient = Client<ipc_threadsafe::Service, [u8], RawHeader, RawAck, ()>;
@@ -54,45 +54,49 @@ type RawPending = PendingResponse<ipc_threadsafe::Service, [u8], RawHeader, RawA
 type RawServer = Server<ipc_threadsafe::Service, [u8], RawHeader, RawAck, ()>;
 
 fn main() {
-    // `cargo bench` passes `--bench`, and what was given behind `--`: how many blocks of each.
+    // `cargo bench` passes `--bench` and the arguments after `--`: the number of blocks of each
+    // kind.
     let mut blocks = std::env::args().filter_map(|argument| argument.parse().ok());
     let blocks: usize = blocks.next_back().unwrap_or(40);
     let directory = tempfile::tempdir().expect("a directory");
-    let (raw, ours) = (Raw::new(directory.path()), Ours::new(directory.path()));
-    let crowd = Crowd::new(directory.path());
-    let (raw, ours, crowd) = (&raw, &ours, &crowd);
+    let (raw, pair) = (
+        Raw::new(directory.path()),
+        TransportPair::new(directory.path()),
+    );
+    let many = OneToMany::new(directory.path());
+    let (raw, pair, many) = (&raw, &pair, &many);
     let large = Bytes::from(vec![7; 1 << 20]);
     let mut kinds = Vec::new();
     for size in [100, 1 << 10, 64 << 10, 1 << 20] {
         let payload = vec![7; FRONT + size + TAIL];
         let letter = parcel(Bytes::from(vec![7; size]));
         let round = move || raw.end(raw.begin(&payload));
-        kinds.push(Measured::new("raw", size, RAW, 1, round));
-        let round = move || ours.round(letter.clone());
-        kinds.push(Measured::new("letter", size, OURS, 1, round));
+        kinds.push(Measurement::new("raw", size, RAW, 1, round));
+        let round = move || pair.round(letter.clone());
+        kinds.push(Measurement::new("letter", size, PAIR, 1, round));
     }
     for size in [1 << 10, 1 << 20, 4 << 20] {
-        let round = move || ours.round(ours.loaned(size));
-        kinds.push(Measured::new("loaned", size, OURS, 1, round));
+        let round = move || pair.round(pair.loaned(size));
+        kinds.push(Measurement::new("loaned", size, PAIR, 1, round));
     }
     let size = 1 << 10;
     let payload = vec![7; FRONT + size + TAIL];
     let round = move || raw.many(&payload, BLOCK);
-    kinds.push(Measured::new("raw window", size, RAW, BLOCK, round));
+    kinds.push(Measurement::new("raw window", size, RAW, BLOCK, round));
     let letter = parcel(Bytes::from(vec![7; size]));
-    let round = move || ours.many(&letter, BLOCK);
-    kinds.push(Measured::new("window", size, OURS, BLOCK, round));
+    let round = move || pair.many(&letter, BLOCK);
+    kinds.push(Measurement::new("window", size, PAIR, BLOCK, round));
 
     let size = large.len();
-    let fill = || drop(crowd.filled(&large));
-    kinds.push(Measured::new("fill", size, CROWD, 1, fill));
+    let fill = || drop(many.filled(&large));
+    kinds.push(Measurement::new("fill", size, MANY, 1, fill));
     let short = parcel(Bytes::from(vec![7; 100]));
-    let letters = move || crowd.round(&short);
-    kinds.push(Measured::new("32 letters", 100, CROWD, 1, letters));
-    let once = || crowd.round(&parcel(crowd.filled(&large)));
-    kinds.push(Measured::new("32, one content", size, CROWD, 1, once));
-    let copies = || crowd.round(&parcel(large.clone()));
-    kinds.push(Measured::new("32 copies", size, CROWD, 1, copies));
+    let letters = move || many.round(&short);
+    kinds.push(Measurement::new("32 letters", 100, MANY, 1, letters));
+    let once = || many.round(&parcel(many.filled(&large)));
+    kinds.push(Measurement::new("32, one content", size, MANY, 1, once));
+    let copies = || many.round(&parcel(large.clone()));
+    kinds.push(Measurement::new("32 copies", size, MANY, 1, copies));
 
     let turn = AtomicUsize::new(RAW);
     std::thread::scope(|scope| {
@@ -100,8 +104,8 @@ fn main() {
             loop {
                 match turn.load(Ordering::Acquire) {
                     RAW => raw.serve(),
-                    OURS => ours.serve(),
-                    CROWD => crowd.serve(),
+                    PAIR => pair.serve(),
+                    MANY => many.serve(),
                     _ => return,
                 }
             }
@@ -118,24 +122,24 @@ fn main() {
     report(&mut kinds);
 }
 
-/// Whom the receiving thread serves.
+/// The endpoints that the receiving thread serves.
 const RAW: usize = 0;
-const OURS: usize = 1;
-const CROWD: usize = 2;
+const PAIR: usize = 1;
+const MANY: usize = 2;
 const END: usize = 3;
 
-/// A kind of round, and how long each took.
-struct Measured<'a> {
+/// A kind of round and its measured times.
+struct Measurement<'a> {
     name: &'static str,
     size: usize,
     turn: usize,
-    /// How many letters a call of `round` moves.
+    /// Number of letters that a call of `round` sends.
     letters: usize,
     round: Box<dyn FnMut() + 'a>,
     times: Vec<Duration>,
 }
 
-impl<'a> Measured<'a> {
+impl<'a> Measurement<'a> {
     fn new(
         name: &'static str,
         size: usize,
@@ -154,7 +158,7 @@ impl<'a> Measured<'a> {
     }
 
     fn measure(&mut self, counts: bool) {
-        // What is long is done less often.
+        // Long rounds are repeated less often.
         let rounds = (BLOCK / self.letters).min((256 << 20) / self.size).max(1);
         for _ in 0..rounds {
             let began = Instant::now();
@@ -167,7 +171,7 @@ impl<'a> Measured<'a> {
     }
 }
 
-fn report(kinds: &mut [Measured<'_>]) {
+fn report(kinds: &mut [Measurement<'_>]) {
     println!("microseconds per letter   size      p50      p90      p99    p99.9   p50 to raw");
     let mut raw = Vec::new();
     for kind in kinds {
@@ -188,7 +192,7 @@ fn report(kinds: &mut [Measured<'_>]) {
     }
 }
 
-/// Counts what was accepted.
+/// Counts the accepted letters.
 #[derive(Default)]
 struct Count(AtomicU64);
 
@@ -226,24 +230,24 @@ fn parcel(content: Bytes) -> Parcel {
     }
 }
 
-/// Two endpoints of a transport.
-struct Ours {
+/// Two endpoints of the transport.
+struct TransportPair {
     sender: ShmTransport,
     sent: Arc<Count>,
     receiver: ShmTransport,
     to: Location,
-    // After the endpoints, which have tasks here.
-    _domain: Domain,
+    // After the endpoints, whose tasks run here.
+    _domain: BenchDomain,
 }
 
-/// A domain of its own, for endpoints.
-struct Domain {
+/// A domain with a unique name.
+struct BenchDomain {
     root: std::path::PathBuf,
     prefix: String,
     runtime: tokio::runtime::Runtime,
 }
 
-impl Domain {
+impl BenchDomain {
     fn new(directory: &std::path::Path) -> Self {
         let prefix = format!("fipabench-{}", Incarnation::random());
         Self {
@@ -267,19 +271,19 @@ impl Domain {
     }
 }
 
-/// A sender, and many who receive the same.
-struct Crowd {
+/// A sender, and receivers of the same content.
+struct OneToMany {
     sender: ShmTransport,
     sent: Arc<Count>,
     receivers: Vec<ShmTransport>,
     locations: Vec<Location>,
-    // After the endpoints, which have tasks here.
-    _domain: Domain,
+    // After the endpoints, whose tasks run here.
+    _domain: BenchDomain,
 }
 
-impl Crowd {
+impl OneToMany {
     fn new(directory: &std::path::Path) -> Self {
-        let domain = Domain::new(directory);
+        let domain = BenchDomain::new(directory);
         let (sender, sent) = domain.endpoint();
         let receivers: Vec<_> = (0..32).map(|_| domain.endpoint().0).collect();
         Self {
@@ -297,7 +301,7 @@ impl Crowd {
         }
     }
 
-    /// Content for many, written as an application writes it.
+    /// Content for several receivers, written as an application writes it.
     fn filled(&self, content: &[u8]) -> Bytes {
         let loan = self.sender.loan_for_many(content.len()).expect("room");
         let mut loan = loan.expect("long enough");
@@ -317,9 +321,9 @@ impl Crowd {
     }
 }
 
-impl Ours {
+impl TransportPair {
     fn new(directory: &std::path::Path) -> Self {
-        let domain = Domain::new(directory);
+        let domain = BenchDomain::new(directory);
         let (sender, sent) = domain.endpoint();
         let (receiver, _) = domain.endpoint();
         let to = receiver.location();
@@ -338,7 +342,7 @@ impl Ours {
 
     fn loaned(&self, size: usize) -> Parcel {
         let loan = self.sender.loan(&self.to, FRONT, size, TAIL).expect("room");
-        parcel(loan.expect("shared memory loans").freeze())
+        parcel(loan.expect("shared memory supports loans").freeze())
     }
 
     fn round(&self, parcel: Parcel) {
@@ -416,7 +420,7 @@ impl Raw {
     }
 
     fn serve(&self) {
-        // Several times, as the transport does between two looks at whose turn it is.
+        // Several times, as the transport does between two checks of `turn`.
         for _ in 0..8 {
             match self.server.receive().expect("requests") {
                 Some(request) => request.send_copy([1; 184]).expect("a response"),
@@ -448,7 +452,7 @@ impl Raw {
     }
 }
 
-/// Removes what a bare iceoryx2 leaves in shared memory.
+/// Removes the files that a bare iceoryx2 leaves in shared memory.
 struct Leftovers(String);
 
 impl Drop for Leftovers {

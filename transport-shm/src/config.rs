@@ -1,4 +1,4 @@
-//! What the transport needs to know, and how it is checked.
+//! Configuration and its checks, and the error of opening an endpoint.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -12,42 +12,42 @@ use iceoryx2::prelude::{Config, FileName, Path, SemanticString};
 /// differ in both.
 #[derive(Debug, Clone)]
 pub struct ShmConfig {
-    /// The domain's private directory. Created with mode 0700 when it is not there; must belong
-    /// to this user and be closed to everybody else.
+    /// Private directory of the domain. Created with mode 0700 if it is missing; must belong to
+    /// this user and be closed to other users.
     pub root: PathBuf,
-    /// What the names of all shared memory of this domain begin with: 1 to
+    /// Prefix of the names of all shared memory files of this domain: 1 to
     /// [`ShmConfig::MAX_PREFIX`] ASCII letters, digits, `-` and `_`.
     pub prefix: String,
-    /// The incarnation of this process's message transport service.
+    /// Incarnation of this process's message transport service. Must be known.
     pub incarnation: Incarnation,
-    /// Largest letter in bytes, sent or taken.
+    /// Maximum length of a letter in bytes, sent or received. 1 to 2^40.
     pub max_letter: usize,
-    /// How much shared memory, in bytes, the processes of this domain may use together.
+    /// Maximum shared memory, in bytes, that all processes of this domain use together.
     pub capacity: u64,
-    /// How many processes may have this mailbox open at the same time.
+    /// Maximum number of processes that have this mailbox open at the same time. 1 to 4096.
     pub max_clients: usize,
-    /// How many other processes are kept in mind at the same time: opened mailboxes, bells.
+    /// Maximum number of other processes whose mailbox and doorbell are kept open. 1 to 4096.
     pub max_peers: usize,
-    /// How many parcels to one process may be without an answer, and how many of its parcels a
-    /// receiver can hold.
+    /// Maximum number of unanswered parcels to one process, and of parcels of one sender that a
+    /// receiver holds. 2 to 128.
     pub window: usize,
-    /// How many loans for one process may be out, from loaning until the last [`bytes::Bytes`] of
-    /// the content is dropped. Less than `window`.
+    /// Maximum number of loans for one process, each counted until the last [`bytes::Bytes`] of
+    /// its content is dropped. At least 1 and less than `window`.
     pub max_loans: usize,
-    /// How many contents in all may be held in other processes' memory; further ones are copied.
+    /// Maximum number of contents held in the memory of other processes; further ones are copied.
     pub max_borrowed: usize,
-    /// Content shorter than this, in bytes, is always copied: cheaper than holding a slot.
+    /// Content shorter than this, in bytes, is always copied: a copy costs less than a held slot.
     pub copy_below: usize,
-    /// Content of a letter to several receivers lies in memory once for all of them from this
-    /// length on, in bytes: shorter content is copied for each, which is cheaper.
+    /// Minimum length, in bytes, of content that is stored once for several receivers. Shorter
+    /// content is copied for each receiver, which costs less. At least 1.
     pub share_from: usize,
 }
 
 impl ShmConfig {
-    /// Longest prefix, in bytes.
+    /// Maximum length of the prefix in bytes.
     pub const MAX_PREFIX: usize = 64;
 
-    /// The defaults: letters of 64 MiB, 256 MiB for the domain, 64 processes.
+    /// Returns the defaults: letters of 64 MiB, 256 MiB for the domain, 64 processes.
     #[must_use]
     pub fn new(
         root: impl Into<PathBuf>,
@@ -70,16 +70,16 @@ impl ShmConfig {
         }
     }
 
-    /// How many senders' connections the receiver keeps after the sender is gone, because content
-    /// is still read there.
+    /// Number of connections that the receiver keeps after their senders have ended, because
+    /// content in them is still read.
     pub(crate) const EXPIRED_CONNECTIONS: usize = 64;
 
-    /// From how many senders content is held in place at the same time. iceoryx2 ends the process
-    /// when more connections with held content expire than it keeps; the distance to
-    /// [`Self::EXPIRED_CONNECTIONS`] is for connections that it fails to let go.
+    /// Maximum number of senders from which content is held in place at the same time. iceoryx2
+    /// ends the process when more connections with held content expire than it keeps. The margin
+    /// to [`Self::EXPIRED_CONNECTIONS`] covers connections that iceoryx2 fails to release.
     pub(crate) const MAX_LENDERS: usize = 32;
 
-    /// The configuration for iceoryx2.
+    /// Checks the configuration and returns the one for iceoryx2.
     pub(crate) fn iceoryx(&self) -> Result<Config, ShmError> {
         let wrong = |what: String| ShmError::Configuration(what);
         let prefix_is_fine = (1..=Self::MAX_PREFIX).contains(&self.prefix.len())
@@ -95,7 +95,7 @@ impl ShmConfig {
             )));
         }
         if !self.incarnation.is_known() {
-            return Err(wrong("the incarnation of this process is missing".into()));
+            return Err(wrong("the incarnation of this process is not set".into()));
         }
         for (name, value, least, most) in [
             ("max_letter", self.max_letter, 1, 1 << 40),
@@ -107,7 +107,7 @@ impl ShmConfig {
         ] {
             if !(least..=most).contains(&value) {
                 return Err(wrong(format!(
-                    "{name} is {value}, and must be {least} to {most}"
+                    "{name} is {value}; it must be {least} to {most}"
                 )));
             }
         }
@@ -117,108 +117,108 @@ impl ShmConfig {
             .filter(|path| path.len() <= 160)
             .ok_or_else(|| {
                 wrong(format!(
-                    "the directory {:?} cannot be used: an absolute path of at most 160 ASCII characters is needed",
+                    "the directory {:?} is not an absolute path of at most 160 ASCII characters",
                     self.root
                 ))
             })?;
         let mut config = Config::default();
         config.global.set_root_path(&root);
         config.global.prefix = FileName::new(format!("{}_", self.prefix).as_bytes())
-            .map_err(|_| wrong(format!("the prefix {:?} makes no file name", self.prefix)))?;
-        // Dead processes are cleaned up after their letters have been taken: see `domain`.
+            .map_err(|_| wrong(format!("the prefix {:?} is not a file name", self.prefix)))?;
+        // Dead processes are cleaned up after their letters have been taken: see `domain_files`.
         config.global.node.cleanup_dead_nodes_on_creation = false;
         config.global.node.cleanup_dead_nodes_on_destruction = false;
         config.global.service.cleanup_dead_nodes_on_open = false;
-        // For what a process was making when it was killed, others wait in vain this long.
+        // iceoryx2 waits this long for a structure that a killed process left unfinished.
         config.global.creation_timeout = Duration::from_millis(200);
         let mail = &mut config.defaults.request_response;
         mail.server_expired_connection_buffer = Self::EXPIRED_CONNECTIONS;
-        // A client has one server, whose expired connection holds answers at most.
+        // A client has one server, whose expired connection holds only answers.
         mail.client_expired_connection_buffer = 2;
         Ok(config)
     }
 }
 
-/// Why the transport cannot be used.
+/// The error of opening or cleaning up an endpoint's domain.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ShmError {
-    /// The configuration makes no sense.
-    #[error("shared memory is configured wrongly: {0}")]
+    /// The configuration is invalid.
+    #[error("invalid configuration of shared memory: {0}")]
     Configuration(String),
-    /// There is no shared memory file system, or it is too small.
+    /// The shared memory file system has too little free space.
     #[error(
-        "shared memory needs at least {needed} free bytes in {path}, and there are {free}: enlarge it \
+        "{path} has {free} free bytes, and shared memory needs at least {needed}; enlarge it \
          (mount -o remount,size=512M {path}; for containers --shm-size=512m) or remove the transport \"shm\""
     )]
     NoRoom {
-        /// Where shared memory lies.
+        /// Mount point of shared memory.
         path: &'static str,
-        /// How many bytes are needed to begin with.
+        /// Free bytes that an endpoint needs to start.
         needed: u64,
-        /// How many are free.
+        /// Bytes that are free.
         free: u64,
     },
     /// The shared memory file system became full while the endpoint was opened.
     #[error(
-        "{path} is full: {needed} more bytes are needed there ({source}): enlarge it \
+        "{path} is full: cannot allocate {needed} more bytes ({source}); enlarge it \
          (mount -o remount,size=512M {path}; for containers --shm-size=512m) or remove the transport \"shm\""
     )]
     Full {
-        /// Where shared memory lies.
+        /// Mount point of shared memory.
         path: &'static str,
-        /// How many bytes could not be had.
+        /// Bytes that could not be allocated.
         needed: u64,
-        /// What the operating system said.
+        /// The error of the operating system.
         source: std::io::Error,
     },
-    /// Something about a file or directory.
+    /// An operation on a file or directory failed.
     #[error("{what} {path}: {source}")]
     File {
-        /// What could not be done.
+        /// The failed operation, such as `cannot lock`.
         what: &'static str,
-        /// To which file or directory.
+        /// The file or directory.
         path: PathBuf,
-        /// What the operating system said.
+        /// The error of the operating system.
         source: std::io::Error,
     },
-    /// Another process keeps the domain locked.
+    /// Another process holds the lock of the domain.
     #[error(
-        "the lock on {path} was not to be had: another process holds it and does not let go (is one \
-         stopped, state T in ps?)"
+        "timed out waiting for the lock on {path}, which another process holds; retry, or check for \
+         a stopped process (state T in ps)"
     )]
     Busy {
-        /// The directory.
+        /// The locked directory.
         path: PathBuf,
     },
-    /// The domain's directory is not private.
+    /// The directory of the domain is not private.
     #[error(
-        "the directory {path} {problem}; it must be a directory of this user with mode 0700, because whoever \
-         can write there can read every letter"
+        "the directory {path} {problem}; it must be a directory of this user with mode 0700, because \
+         any user with write access to it can read every letter"
     )]
     NotPrivate {
         /// The directory.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The problem, such as `has mode 0755`.
         problem: String,
     },
-    /// iceoryx2 refused.
+    /// An iceoryx2 operation failed.
     #[error(
-        "{what}: {reason} (shared memory of prefix {prefix:?}; often the limit of open files is too low: \
-         an endpoint needs about 20, and about 10 more for each process it talks to)"
+        "{what}: {reason} (shared memory prefix {prefix:?}); the limit of open files may be too low: \
+         an endpoint needs about 20, and about 10 more for each process it talks to"
     )]
     Iceoryx {
-        /// What could not be done.
+        /// The failed operation, such as `cannot create a node`.
         what: &'static str,
-        /// What iceoryx2 said.
+        /// The error of iceoryx2.
         reason: String,
-        /// The domain's prefix.
+        /// The prefix of the domain.
         prefix: String,
     },
 }
 
 impl ShmError {
-    /// Whether a file or directory was not there.
+    /// Whether a file or directory was missing.
     pub(crate) fn is_missing_file(&self) -> bool {
         matches!(self, Self::File { source, .. } if source.kind() == std::io::ErrorKind::NotFound)
     }

@@ -1,4 +1,4 @@
-//! An endpoint: who is known, and who does what when.
+//! The endpoint of a process: its mailbox, its peers, polling, wake-ups and cleanup.
 
 use std::collections::BTreeMap;
 use std::io::ErrorKind;
@@ -15,69 +15,70 @@ use iceoryx2::prelude::{ServiceName, SignalHandlingMode};
 use parking_lot::{Mutex, RwLock};
 use tokio::runtime::Handle;
 
+use crate::combiner::Combiner;
 use crate::counters::{Tally, count};
-use crate::domain::{Domain, file_error};
+use crate::domain_files::{DomainFiles, file_error};
+use crate::errors::retired;
 use crate::fork::Owner;
 use crate::inbox::{Inbox, mailbox_name};
 use crate::layout::Svc;
-use crate::library::Library;
 use crate::loan::ShmLoan;
 use crate::memory::{Budget, SHM};
 use crate::outbox::{Opening, Outbox, Posted};
+use crate::peer_segments::PeerSegments;
 use crate::peers::Peer;
 use crate::pool::Pool;
-use crate::presence::{Bell, GLANCE, Neighbour, Presence, wait_for_looks};
-use crate::shift::Shift;
+use crate::presence::{Doorbell, POLL_GRACE, PeerProcess, Presence, wait_for_polls};
 use crate::storage::{self, Shortage};
 use crate::{ShmConfig, ShmError};
 
-/// What a transport and its tasks share.
+/// The state that a transport and its tasks share.
 pub(crate) struct Endpoint {
     config: ShmConfig,
-    /// Files by which others find this process.
+    /// The files by which other processes find this one.
     files: Vec<PathBuf>,
     owner: Owner,
     runtime: Handle,
     sink: OnceLock<Arc<dyn Sink>>,
     closed: AtomicBool,
-    /// The mailbox; whoever has it looks after answers, too.
-    inbox: Shift<Option<Inbox>>,
-    /// How many parcels have no answer yet.
+    /// The mailbox. The thread that works on it also collects answers.
+    inbox: Combiner<Option<Inbox>>,
+    /// Number of unanswered parcels.
     waiting: Arc<AtomicUsize>,
-    /// Who has been answered, and has not been made to look for it yet.
+    /// Senders that have an answer and have not been woken for it.
     answered: Mutex<Vec<Incarnation>>,
-    /// A peer has ended that is not forgotten yet.
+    /// Whether a peer has ended and is still in `peers`.
     ended: AtomicBool,
     peers: RwLock<BTreeMap<Incarnation, Arc<Peer>>>,
-    /// Counts uses of peers, to find the one not used for longest.
+    /// Counts uses of peers, to find the least recently used one.
     uses: AtomicU64,
     node: Mutex<Option<Node<Svc>>>,
     presence: RwLock<Option<Presence>>,
-    bell: Arc<Bell>,
-    /// How often cleaning up was asked for.
+    doorbell: Arc<Doorbell>,
+    /// Number of requests for a cleanup.
     dirty: AtomicU64,
     cleaning: AtomicBool,
     budget: Arc<Budget>,
-    /// Content of this process for many, and that of others.
+    /// Segments of this process and of others.
     pool: Arc<Pool>,
-    library: Arc<Library>,
+    peer_segments: Arc<PeerSegments>,
     tally: Arc<Tally>,
-    // Last: ends with the process's last trace.
-    domain: Arc<Domain>,
+    // Last: the last owner removes the domain's files.
+    domain: Arc<DomainFiles>,
 }
 
 impl Endpoint {
     pub(crate) fn open(config: ShmConfig, runtime: Handle) -> Result<Arc<Self>, ShmError> {
-        let domain = Domain::new(&config)?;
+        let domain = DomainFiles::new(&config)?;
         let budget = Arc::new(Budget::new(&config));
-        // Under the lock, so that nobody takes what is half made for the traces of the dead.
+        // Under the lock, so that no other process takes unfinished files for those of a dead one.
         let lock = domain.enter()?;
-        let domain = Arc::new(domain.joined());
+        let domain = Arc::new(domain.for_endpoint());
         let opened = Self::open_locked(config, runtime, budget, Arc::clone(&domain));
-        // Before the domain, whose last owner takes the lock to clean up when nothing was opened.
+        // Before `domain` is dropped: after a failure, its last owner takes the lock to clean up.
         drop(lock);
         let endpoint = opened?;
-        endpoint.clean_soon();
+        endpoint.start_cleanup();
         Ok(endpoint)
     }
 
@@ -85,13 +86,13 @@ impl Endpoint {
         config: ShmConfig,
         runtime: Handle,
         budget: Arc<Budget>,
-        domain: Arc<Domain>,
+        domain: Arc<DomainFiles>,
     ) -> Result<Arc<Self>, ShmError> {
         budget.check_start()?;
         let tally = Arc::new(Tally::default());
-        let presence = Presence::create(domain.names().clone(), config.incarnation)
-            .map_err(|e| file_error("cannot make files in", domain.names().directory(), e))?;
-        let bell = presence.bell().clone();
+        let presence = Presence::create(domain.paths().clone(), config.incarnation)
+            .map_err(|e| file_error("cannot create files in", domain.paths().directory(), e))?;
+        let doorbell = presence.doorbell().clone();
         let failed = |what: &'static str, reason: String, shortage: Option<Shortage>| {
             if let Some(shortage) = shortage {
                 return ShmError::Full {
@@ -106,19 +107,21 @@ impl Endpoint {
                 prefix: config.prefix.clone(),
             }
         };
-        let (node, shortage) = storage::watch(|| {
+        let (node, shortage) = storage::with_shortage(|| {
             NodeBuilder::new()
                 .config(domain.iceoryx())
                 .signal_handling_mode(SignalHandlingMode::Disabled)
                 .create::<Svc>()
         });
-        let node = node.map_err(|e| failed("cannot make a node", format!("{e:?}"), shortage))?;
-        domain.close_to_others()?;
-        let library = Arc::new(Library::new(domain.clone()));
-        let told = (bell.clone(), presence.looks());
-        let (inbox, shortage) =
-            storage::watch(|| Inbox::create(&config, &node, told, tally.clone(), library.clone()));
-        let inbox = inbox.map_err(|reason| failed("cannot make the mailbox", reason, shortage))?;
+        let node = node.map_err(|e| failed("cannot create a node", format!("{e:?}"), shortage))?;
+        domain.restrict_permissions()?;
+        let peer_segments = Arc::new(PeerSegments::new(domain.clone()));
+        let wakeup = (doorbell.clone(), presence.polls());
+        let (inbox, shortage) = storage::with_shortage(|| {
+            Inbox::create(&config, &node, wakeup, tally.clone(), peer_segments.clone())
+        });
+        let inbox =
+            inbox.map_err(|reason| failed("cannot create the mailbox", reason, shortage))?;
         let pool = Pool::new(
             config.incarnation,
             config.share_from,
@@ -132,7 +135,7 @@ impl Endpoint {
             runtime,
             sink: OnceLock::new(),
             closed: AtomicBool::new(false),
-            inbox: Shift::new(Some(inbox)),
+            inbox: Combiner::new(Some(inbox)),
             waiting: Arc::default(),
             answered: Mutex::default(),
             ended: AtomicBool::new(false),
@@ -140,12 +143,12 @@ impl Endpoint {
             uses: AtomicU64::new(0),
             node: Mutex::new(Some(node)),
             presence: RwLock::new(Some(presence)),
-            bell,
+            doorbell,
             dirty: AtomicU64::new(0),
             cleaning: AtomicBool::new(false),
             budget,
             pool: Arc::new(pool),
-            library,
+            peer_segments,
             tally,
             domain,
         }))
@@ -163,8 +166,8 @@ impl Endpoint {
         &self.runtime
     }
 
-    pub(crate) fn bell(&self) -> &Arc<Bell> {
-        &self.bell
+    pub(crate) fn doorbell(&self) -> &Arc<Doorbell> {
+        &self.doorbell
     }
 
     pub(crate) fn pool(&self) -> &Arc<Pool> {
@@ -175,7 +178,7 @@ impl Endpoint {
         &self.tally
     }
 
-    /// Whether others can find this process, as far as can be told.
+    /// Whether all files exist by which other processes find this one.
     pub(crate) fn is_there(&self) -> bool {
         let missing = |file: &PathBuf| {
             let found = std::fs::symlink_metadata(file);
@@ -184,11 +187,11 @@ impl Endpoint {
         !self.files.iter().any(missing)
     }
 
-    /// Removes what is left of these files after closing: iceoryx2 leaves a mailbox while content
-    /// from it is held.
+    /// Removes what is left of these files after closing: iceoryx2 keeps the files of a mailbox
+    /// while content from it is held.
     pub(crate) fn remove_files(&self) {
         for file in &self.files {
-            // Mostly they are gone.
+            // Mostly missing already.
             let _ = std::fs::remove_file(file);
         }
     }
@@ -197,12 +200,12 @@ impl Endpoint {
         self.closed.load(Ordering::SeqCst)
     }
 
-    /// Who is told from now on; `false` if somebody is already, or nobody may any more.
-    pub(crate) fn tell_to(&self, sink: Arc<dyn Sink>) -> bool {
+    /// Sets the sink. Returns false if there is one already or the endpoint is closed.
+    pub(crate) fn set_sink(&self, sink: Arc<dyn Sink>) -> bool {
         !self.is_closed() && self.sink.set(sink).is_ok()
     }
 
-    /// Works on the calling thread; meanwhile nobody needs to ring.
+    /// Works on the calling thread. Peers do not ring meanwhile. Returns whether there was work.
     pub(crate) fn drive(self: &Arc<Self>) -> bool {
         if !self.owner.is_this() {
             return false;
@@ -212,13 +215,14 @@ impl Endpoint {
             return false;
         };
         let mut found = false;
-        for _ in 0..ROUNDS {
-            let looking = presence.looking();
-            // Several times, so that in a caller's loop the page says "looking" most of the time.
-            found |= (0..LOOKS).any(|_| self.work());
+        for _ in 0..MAX_ROUNDS {
+            let polling = presence.begin_polling();
+            // Several times, so that the page states "polling" most of the time in a caller's loop.
+            found |= (0..POLLS_PER_ROUND).any(|_| self.work());
             self.wait_for_answered();
-            drop(looking);
-            // What is found now is worked on while the page says so again.
+            drop(polling);
+            // Work that arrived meanwhile is done in the next round, in which the page states
+            // "polling" again.
             if !self.has_work() {
                 self.wake_answered();
                 return found;
@@ -229,39 +233,39 @@ impl Endpoint {
         found
     }
 
-    /// Works because the bell has been rung, and was silenced.
-    pub(crate) fn work_after_bell(self: &Arc<Self>) {
-        let looked_after = self.presence.read().as_ref().is_some_and(|presence| {
-            presence.heard();
-            presence.is_looking()
+    /// Works after a wake-up. The caller has cleared the doorbell.
+    pub(crate) fn work_after_wakeup(self: &Arc<Self>) {
+        let polling_elsewhere = self.presence.read().as_ref().is_some_and(|presence| {
+            presence.count_wakeup();
+            presence.is_polling()
         });
         self.pool.trim_if_waiting();
-        // Whoever is at it is not disturbed.
-        if !looked_after {
+        // A thread that polls does the work.
+        if !polling_elsewhere {
             self.work();
             self.wake_answered();
         }
     }
 
-    /// Gives those who were answered a moment to look by themselves, or to send something more.
+    /// Gives answered senders a moment to poll by themselves or to send more.
     fn wait_for_answered(&self) {
         let mut began = None;
         loop {
             let mut answered = self.answered.lock();
             let peers = self.peers.read();
-            let lively = |one| peers.get(one).is_some_and(|peer| peer.was_looking());
+            let polled_recently = |one| peers.get(one).is_some_and(|peer| peer.was_polling());
             answered.retain(|one| !peers.get(one).is_some_and(|peer| peer.is_awake()));
-            if !answered.iter().any(lively) {
+            if !answered.iter().any(polled_recently) {
                 return;
             }
             drop((peers, answered));
-            if began.get_or_insert_with(Instant::now).elapsed() > GLANCE || self.has_work() {
+            if began.get_or_insert_with(Instant::now).elapsed() > POLL_GRACE || self.has_work() {
                 return;
             }
         }
     }
 
-    /// Makes those look for an answer who do not by themselves.
+    /// Wakes the answered senders that are not polling.
     fn wake_answered(self: &Arc<Self>) {
         let answered = std::mem::take(&mut *self.answered.lock());
         for sender in answered {
@@ -269,7 +273,7 @@ impl Endpoint {
         }
     }
 
-    /// Whether `work` would find something. When another thread is working, that one looks again.
+    /// Whether `work` would find something. False if another thread works, which then looks again.
     fn has_work(&self) -> bool {
         self.inbox.has_any(|inbox| {
             inbox.as_ref().is_some_and(Inbox::has_parcels)
@@ -282,8 +286,8 @@ impl Endpoint {
         self.waiting.load(Ordering::SeqCst) > 0
     }
 
-    /// Looks into the mailbox and after answers. Says whether there was anything. When another
-    /// thread is at it, that one looks again.
+    /// Takes parcels from the mailbox and collects answers. Returns whether there was any. If
+    /// another thread works, that one makes another pass instead.
     pub(crate) fn work(self: &Arc<Self>) -> bool {
         self.inbox.work(|inbox| match (inbox, self.sink.get()) {
             (Some(inbox), Some(sink)) => self.work_once(inbox, &**sink),
@@ -305,18 +309,18 @@ impl Endpoint {
                 self.peers.write().remove(&incarnation);
             }
             found |= !concluded.is_empty();
-            tell(sink, concluded);
+            report_conclusions(sink, concluded);
         }
         found
     }
 
-    /// Makes a process look for its answers.
+    /// Wakes a process so that it collects its answers.
     fn wake(self: &Arc<Self>, sender: Incarnation) {
         let rung = match self.peer(sender) {
             Ok(peer) => peer.wake(),
-            // It has ended and needs no answer, or too many are known already.
+            // The process has ended and needs no answer, or too many peers are open already.
             Err(_) => {
-                self.domain.names().ring_once(sender);
+                self.domain.paths().ring_once(sender);
                 true
             }
         };
@@ -335,11 +339,11 @@ impl Endpoint {
         if self.sink.get().is_none() {
             return Err(closed());
         }
-        // A second try when the outbox takes nothing any more.
+        // The second attempt opens a new outbox if the first one was retired.
         for _ in 0..2 {
             let peer = self.peer_at(to)?;
             match self.outbox(&peer)?.post(attempt, parcel)? {
-                Posted::Yes => {
+                Posted::Sent => {
                     count(&self.tally.sent);
                     if peer.wake() {
                         count(&self.tally.rung);
@@ -349,13 +353,10 @@ impl Endpoint {
                 Posted::Retired => peer.renew(),
             }
         }
-        Err(WayError::new(
-            WayFault::Congested,
-            "the connection is being renewed",
-        ))
+        Err(retired())
     }
 
-    /// Ends an attempt. The parcel lies in the other process's mailbox, and may be taken.
+    /// Abandons an attempt. The parcel is in the other process's mailbox, which may still take it.
     pub(crate) fn abandon(&self, attempt: AttemptId) -> Abandoned {
         let peers = self.peers.read();
         let _known = peers.values().any(|peer| peer.abandon(attempt));
@@ -384,7 +385,7 @@ impl Endpoint {
         }
     }
 
-    /// Opens a mailbox if that was not done before.
+    /// Returns the outbox to a peer; opens its mailbox if necessary.
     fn outbox(&self, peer: &Peer) -> Result<Arc<Outbox>, WayError> {
         peer.outbox(|| {
             let node = self.node.lock();
@@ -407,18 +408,21 @@ impl Endpoint {
 
     fn peer_at(self: &Arc<Self>, to: &Location) -> Result<Arc<Peer>, WayError> {
         let incarnation: Incarnation = to.address().parse().map_err(|e| {
-            WayError::new(WayFault::Unreachable, format_args!("not a mailbox: {e}"))
+            WayError::new(
+                WayFault::Unreachable,
+                format_args!("not the address of a mailbox: {e}"),
+            )
         })?;
         if to.incarnation().is_known() && to.incarnation() != incarnation {
             return Err(WayError::new(
                 WayFault::WrongIncarnation,
-                format_args!("the mailbox is that of {incarnation}"),
+                format_args!("the mailbox belongs to incarnation {incarnation}"),
             ));
         }
         self.peer(incarnation)
     }
 
-    /// A process, looked for if it was not known before.
+    /// Returns a peer; opens its files if necessary.
     fn peer(self: &Arc<Self>, incarnation: Incarnation) -> Result<Arc<Peer>, WayError> {
         let now = self.uses.fetch_add(1, Ordering::Relaxed);
         if let Some(peer) = self.peers.read().get(&incarnation) {
@@ -439,7 +443,7 @@ impl Endpoint {
                 WayError::new(
                     WayFault::Congested,
                     format_args!(
-                        "letters to {} processes are without an answer (max_peers)",
+                        "letters to {} processes are unanswered; raise max_peers",
                         self.config.max_peers
                     ),
                 )
@@ -448,21 +452,21 @@ impl Endpoint {
                 oldest.end();
             }
         }
-        let names = self.domain.names();
-        let neighbour = Neighbour::open(names, incarnation).map_err(|e| match e.kind() {
+        let paths = self.domain.paths();
+        let process = PeerProcess::open(paths, incarnation).map_err(|e| match e.kind() {
             ErrorKind::NotFound => WayError::new(
                 WayFault::Unreachable,
                 format_args!(
                     "no process {incarnation} in {}",
-                    names.directory().display()
+                    paths.directory().display()
                 ),
             ),
             _ => WayError::new(
                 WayFault::Congested,
-                format_args!("the files of process {incarnation} cannot be opened: {e}"),
+                format_args!("cannot open the files of process {incarnation}: {e}"),
             ),
         })?;
-        let peer = Arc::new(Peer::new(incarnation, neighbour));
+        let peer = Arc::new(Peer::new(incarnation, process));
         let endpoint = Arc::downgrade(self);
         let ended = move || {
             if let Some(endpoint) = endpoint.upgrade() {
@@ -472,7 +476,7 @@ impl Endpoint {
         peer.watch(&self.runtime, ended).map_err(|e| {
             WayError::new(
                 WayFault::Congested,
-                format_args!("the process {incarnation} cannot be watched: {e}"),
+                format_args!("cannot watch process {incarnation}: {e}"),
             )
         })?;
         peer.mark_used(now);
@@ -480,7 +484,7 @@ impl Endpoint {
         Ok(peer)
     }
 
-    /// A process has ended: concludes what waits for it, and removes its traces.
+    /// Handles the end of a process: concludes the letters to it, and cleans up after it.
     pub(crate) fn peer_ended(self: &Arc<Self>, incarnation: Incarnation) {
         let peer = self.peers.read().get(&incarnation).cloned();
         if let Some(peer) = peer {
@@ -488,31 +492,31 @@ impl Endpoint {
             self.ended.store(true, Ordering::SeqCst);
             count(&self.tally.peers_gone);
         }
-        // Its last letters are taken, and its answers.
+        // Takes its last letters and answers.
         self.work();
         self.wake_answered();
-        self.library.forget(incarnation);
-        self.clean_soon();
+        self.peer_segments.forget(incarnation);
+        self.start_cleanup();
     }
 
-    /// Removes the traces of dead processes, after the living have taken their letters.
-    pub(crate) fn clean_soon(self: &Arc<Self>) {
+    /// Starts a cleanup in the background. If one runs, it is repeated afterwards.
+    pub(crate) fn start_cleanup(self: &Arc<Self>) {
         self.dirty.fetch_add(1, Ordering::SeqCst);
         if self.is_closed() || self.cleaning.swap(true, Ordering::SeqCst) {
             return;
         }
         let endpoint = Arc::downgrade(self);
-        // On a thread of its own: it takes milliseconds of file system calls, and waits.
+        // On a blocking thread: it takes milliseconds of file system calls, and waits.
         self.runtime.spawn_blocking(move || {
             loop {
                 let Some(now) = endpoint.upgrade() else {
                     return;
                 };
                 let seen = now.dirty.load(Ordering::SeqCst);
-                let turn = now.domain.turn(now.config.incarnation);
+                let cleanup_delay = now.domain.cleanup_delay(now.config.incarnation);
                 drop(now);
-                // One after the other: mostly, the first one does it for all.
-                std::thread::sleep(turn);
+                // Processes clean up one after the other; mostly the first one removes everything.
+                std::thread::sleep(cleanup_delay);
                 let Some(now) = endpoint.upgrade().filter(|now| !now.is_closed()) else {
                     return;
                 };
@@ -526,7 +530,7 @@ impl Endpoint {
                 let Some(now) = endpoint.upgrade().filter(|now| !now.is_closed()) else {
                     return;
                 };
-                // What fails is tried again at the next occasion, by this process or another.
+                // A failed cleanup is repeated at the next occasion, by this process or another.
                 if alive > 0 {
                     let _ = now.domain.clean(false);
                 }
@@ -539,22 +543,23 @@ impl Endpoint {
         });
     }
 
-    /// Closes the endpoint. Must not be called by the sink while it is told something.
+    /// Closes the endpoint. The sink must not call this from one of its methods.
     pub(crate) fn close(&self) {
         if !self.owner.is_this() || self.closed.swap(true, Ordering::SeqCst) {
             return;
         }
-        // While others still know that this process is there.
+        // While other processes still consider this process alive.
         self.pool.close();
-        // What others have not taken yet they must take before the way it came is gone.
+        // Peers must take the remaining parcels before the outboxes are closed.
         let peers: Vec<_> = self.peers.read().values().cloned().collect();
         peers.iter().for_each(|peer| peer.retire());
-        wait_for_looks(peers.iter().filter_map(|peer| peer.untaken()), || false);
+        wait_for_polls(peers.iter().filter_map(|peer| peer.untaken()), || false);
         drop(peers);
         let mut concluded = Vec::new();
         let peers = {
             let mut inbox = self.inbox.lock();
-            // First nothing more is taken, then others are told, then our own letters end.
+            // First the mailbox closes, then peers detect the end, then the own letters are
+            // concluded.
             *inbox = None;
             *self.presence.write() = None;
             let peers = std::mem::take(&mut *self.peers.write());
@@ -566,20 +571,20 @@ impl Endpoint {
         drop(peers);
         *self.node.lock() = None;
         if let Some(sink) = self.sink.get() {
-            tell(&**sink, concluded);
+            report_conclusions(&**sink, concluded);
         }
-        // Nobody to report to; what cannot be removed is removed by the next who starts.
+        // The error has no receiver; the next process that starts removes what is left.
         let _ = self.domain.leave();
     }
 }
 
-/// How often [`Endpoint::drive`] looks at a time: a microsecond or two.
-const LOOKS: usize = 8;
+/// Number of polls in one round of [`Endpoint::drive`]; they take one to two microseconds.
+const POLLS_PER_ROUND: usize = 8;
 
-/// How often [`Endpoint::drive`] begins again when there is more.
-const ROUNDS: usize = 4;
+/// Maximum number of rounds of [`Endpoint::drive`] while there is work.
+const MAX_ROUNDS: usize = 4;
 
-fn tell(sink: &dyn Sink, concluded: Vec<(AttemptId, Conclusion)>) {
+fn report_conclusions(sink: &dyn Sink, concluded: Vec<(AttemptId, Conclusion)>) {
     for (attempt, conclusion) in concluded {
         sink.concluded(attempt, conclusion);
     }

@@ -1,4 +1,4 @@
-//! The receiving side: this process's mailbox.
+//! The receiving side: the mailbox of this process.
 
 use std::ptr::NonNull;
 use std::sync::Arc;
@@ -16,27 +16,27 @@ use parking_lot::Mutex;
 
 use crate::ShmConfig;
 use crate::counters::{Tally, count};
-use crate::layout::{Ack, Active, BlankAck, Header, MailServer, Places, Svc};
-use crate::library::{Borrowed, Library, NotRead};
-use crate::memory::Address;
-use crate::presence::{Bell, Looks};
-use crate::segment::Reference;
+use crate::layout::{Ack, Active, Header, MailServer, PieceOffsets, Svc, UninitAck};
+use crate::memory::MappedPtr;
+use crate::peer_segments::{PeerSegments, ReadError, SegmentContent};
+use crate::presence::{Doorbell, PollCounter};
+use crate::segment::ContentReference;
 use crate::storage;
 
-/// How many parcels are taken before anything else is looked at.
+/// Maximum number of parcels that are taken before other work gets a turn.
 const BATCH: usize = 64;
 
-/// How many answers may be on their way to all senders together.
+/// Maximum number of answers under way to all senders together.
 const ANSWERS: usize = 1024;
 
 const _: () = assert!(ANSWERS <= storage::MAX_CHUNKS);
 
-/// The name of the mailbox of a process.
+/// Name of the mailbox of a process.
 pub(crate) fn mailbox_name(of: Incarnation) -> String {
     format!("fipa/mail/{of}")
 }
 
-/// The location of the mailbox of a process.
+/// Location of the mailbox of a process.
 pub(crate) fn location_of(of: Incarnation) -> Location {
     let address = of.to_string();
     match Location::new(Kind::Shm, &address) {
@@ -49,8 +49,8 @@ pub(crate) fn location_of(of: Incarnation) -> Location {
 pub(crate) struct Inbox {
     server: MailServer,
     service_hash: String,
-    lending: Arc<Lending>,
-    looks: Looks,
+    borrows: Arc<BorrowLimits>,
+    polls: PollCounter,
     tally: Arc<Tally>,
     max_letter: usize,
     copy_below: usize,
@@ -60,18 +60,18 @@ pub(crate) struct Inbox {
 }
 
 impl Inbox {
-    /// The name of its service among the files of the domain.
+    /// Name of the mailbox's service in the files of the domain.
     pub(crate) fn service_hash(&self) -> &str {
         &self.service_hash
     }
 
-    /// Makes the mailbox.
+    /// Creates the mailbox.
     pub(crate) fn create(
         config: &ShmConfig,
         node: &Node<Svc>,
-        (bell, looks): (Arc<Bell>, Looks),
+        (doorbell, polls): (Arc<Doorbell>, PollCounter),
         tally: Arc<Tally>,
-        library: Arc<Library>,
+        peer_segments: Arc<PeerSegments>,
     ) -> Result<Self, String> {
         let name = ServiceName::new(&mailbox_name(config.incarnation)).map_err(debug)?;
         let service = node
@@ -85,11 +85,11 @@ impl Inbox {
             .max_loaned_requests(config.max_loans + 1)
             .max_response_buffer_size(1)
             .max_borrowed_responses_per_pending_response(1)
-            // A full mailbox refuses; nothing that was put in is pushed out.
+            // A full mailbox refuses a parcel and does not overwrite another one.
             .enable_safe_overflow_for_requests(false)
-            // An answer that nobody waits for any more gives way.
+            // A new answer may overwrite one that its sender has not received.
             .enable_safe_overflow_for_responses(true)
-            // What the sender has abandoned is not delivered.
+            // An abandoned parcel is not delivered.
             .enable_fire_and_forget_requests(false)
             .create()
             .map_err(debug)?;
@@ -105,16 +105,16 @@ impl Inbox {
         Ok(Self {
             server,
             service_hash: service.service_hash().as_str().to_owned(),
-            lending: Arc::new(Lending {
+            borrows: Arc::new(BorrowLimits {
                 per_sender: config.window - 1,
                 total: config.max_borrowed,
                 held: Mutex::default(),
                 waiting: AtomicBool::new(false),
-                bell,
+                doorbell,
                 tally: tally.clone(),
-                library,
+                peer_segments,
             }),
-            looks,
+            polls,
             tally,
             max_letter: config.max_letter,
             copy_below: config.copy_below,
@@ -124,8 +124,8 @@ impl Inbox {
         })
     }
 
-    /// Takes what is in the mailbox and answers it. Says whether there was anything, and adds
-    /// who should look for an answer.
+    /// Takes the parcels in the mailbox and answers them. Returns whether there was any, and adds
+    /// their senders to `answered`.
     pub(crate) fn drain(&mut self, sink: &dyn Sink, answered: &Mutex<Vec<Incarnation>>) -> bool {
         for done in 0..BATCH {
             match self.server.receive() {
@@ -138,13 +138,13 @@ impl Inbox {
                     }
                 }
                 Ok(None) => {
-                    self.looks.one_more();
+                    self.polls.increment();
                     return done > 0;
                 }
                 Err(ReceiveError::ExceedsMaxBorrows) => {
-                    // Cannot happen as long as iceoryx2 counts as `Lending` does. Nothing is
-                    // lost: the next content given back rings the bell.
-                    self.lending.waiting.store(true, Ordering::SeqCst);
+                    // Cannot happen while iceoryx2 counts as `BorrowLimits` does. No parcel is
+                    // lost: the next release of content rings the doorbell.
+                    self.borrows.waiting.store(true, Ordering::SeqCst);
                     return done > 0;
                 }
                 Err(ReceiveError::ConnectionFailure(_)) => {
@@ -153,12 +153,12 @@ impl Inbox {
                 }
             }
         }
-        // There may be more; others get their turn first.
-        self.lending.bell.ring();
+        // There may be more; other work gets a turn first.
+        self.borrows.doorbell.ring();
         true
     }
 
-    /// Whether something is in the mailbox, as far as it can be told.
+    /// Whether the mailbox probably contains a parcel.
     pub(crate) fn has_parcels(&self) -> bool {
         self.server.has_requests().unwrap_or(false)
     }
@@ -168,8 +168,8 @@ impl Inbox {
         // A copy in private memory: the sender could still change the original.
         let header: Header = *active.user_header();
         let sender = header.sender();
-        // Before the parcel is handed over: without an answer it must not be accepted. The sender
-        // of what is dropped here is told that it was.
+        // Loaned before the parcel is handed over: a parcel that cannot be answered must not be
+        // accepted. If it is dropped here, iceoryx2 reports that to the sender.
         let Ok(answer) = active.loan_uninit() else {
             count(&self.tally.refused);
             return Some(sender);
@@ -201,16 +201,16 @@ impl Inbox {
             Verdict::Now(answer) => answer,
             Verdict::Later => Answer::failed(
                 FailureReason::Refused,
-                "answered later, which this transport does not allow",
+                "the receiver deferred its answer, which shared memory does not support",
             ),
         };
         self.reply(answer, &verdict, &header);
-        // Only now: dropping the request closes the way back.
+        // After the reply: dropping the request closes the channel of the response.
         drop(owner);
         Some(sender)
     }
 
-    /// The location of a sender, who is mostly the one before.
+    /// Location of a sender. Cached, because consecutive parcels mostly have the same sender.
     fn location_of_sender(&mut self, sender: Incarnation) -> Location {
         match &self.last_sender {
             Some(location) if location.incarnation() == sender => location.clone(),
@@ -218,13 +218,15 @@ impl Inbox {
         }
     }
 
-    fn reply(&self, blank: BlankAck, answer: &Answer, header: &Header) {
-        // It fails when the sender is gone, who then has no use for it.
-        let _ = blank.write_payload(Ack::new(answer, header.token())).send();
+    fn reply(&self, uninit: UninitAck, answer: &Answer, header: &Header) {
+        // Fails if the sender has ended, which then needs no answer.
+        let _ = uninit
+            .write_payload(Ack::new(answer, header.token()))
+            .send();
     }
 
-    /// Takes the pages of all answers, at the first one, whose own page is there from the start.
-    fn prepare_answers(&mut self, first: &BlankAck) -> bool {
+    /// Allocates the pages of all answers at the first one, whose own page is allocated already.
+    fn prepare_answers(&mut self, first: &UninitAck) -> bool {
         if !self.answers_ready {
             let chunk = std::ptr::from_ref(first.header()) as usize;
             self.answers_ready = storage::allocate_all(chunk).is_ok();
@@ -232,88 +234,90 @@ impl Inbox {
         self.answers_ready
     }
 
-    /// The parcel or the refusal, and what owns the memory that its content may lie in.
-    fn read(&self, header: &Header, active: Active) -> (Result<Parcel, Answer>, Owner) {
+    /// Reads the parcel or refuses it. Also returns the owner of the memory that holds its content.
+    fn read(&self, header: &Header, active: Active) -> (Result<Parcel, Answer>, RequestOwner) {
         let refused = |active, reason, detail: &str| {
             let refusal = Answer::failed(reason, detail);
-            (Err(refusal), Owner::Unshared(active))
+            (Err(refusal), RequestOwner::Unshared(active))
         };
         let Some(parcel) = header.parcel() else {
             return refused(active, FailureReason::Refused, "malformed header");
         };
         let payload = active.payload();
-        let Some(places) = Places::announced(header, &parcel, payload.len()) else {
-            let detail = "the lengths do not add up";
+        let Some(offsets) = PieceOffsets::announced(header, &parcel, payload.len()) else {
+            let detail = "the lengths in the header contradict each other";
             return refused(active, FailureReason::Refused, detail);
         };
         let most = self.max_letter.saturating_add(Parcel::MAX_NAME) as u64;
         if parcel.body_len() > most {
-            let detail = format!("{} bytes are the most here", self.max_letter);
+            let detail = format!("max_letter of the receiver is {} bytes", self.max_letter);
             return refused(active, FailureReason::TooLarge, &detail);
         }
         if let Some(reference) = header.reference() {
-            let around = &payload[places.start..places.end];
+            let around = &payload[offsets.start..offsets.end];
             let mut front = Bytes::copy_from_slice(around);
-            let tail = front.split_off(places.content - places.start);
-            let content = match self.content_for_many(header.sender(), reference, &parcel) {
+            let tail = front.split_off(offsets.content - offsets.start);
+            let content = match self.segment_content(header.sender(), reference, &parcel) {
                 Ok(content) => content,
-                Err(answer) => return (Err(answer), Owner::Unshared(active)),
+                Err(answer) => return (Err(answer), RequestOwner::Unshared(active)),
             };
             let parcel = parcel.parcel_of_pieces(front, content, tail);
             let parcel = parcel.map_err(|e| Answer::failed(FailureReason::Refused, e.to_string()));
-            return (parcel, Owner::Unshared(active));
+            return (parcel, RequestOwner::Unshared(active));
         }
-        let content = &payload[places.content..places.tail];
-        let (parcel, owner) = if self.may_lend(content.len(), &active) {
-            // What is copied, in one piece of memory.
+        let content = &payload[offsets.content..offsets.tail];
+        let (parcel, owner) = if self.try_begin_borrow(content.len(), &active) {
+            // Front and tail, copied into one allocation.
             let around = [
-                &payload[places.start..places.content],
-                &payload[places.tail..places.end],
+                &payload[offsets.start..offsets.content],
+                &payload[offsets.tail..offsets.end],
             ];
             let mut front = Bytes::from(around.concat());
-            let tail = front.split_off(places.content - places.start);
-            let (content, held) = self.lend(NonNull::from(content), active);
+            let tail = front.split_off(offsets.content - offsets.start);
+            let (content, held) = self.borrow_content(NonNull::from(content), active);
             let parcel = parcel.parcel_of_pieces(front, content, tail);
-            (parcel, Owner::Shared(held))
+            (parcel, RequestOwner::Shared(held))
         } else {
-            let body = Bytes::copy_from_slice(&payload[places.start..places.end]);
-            (parcel.parcel(body), Owner::Unshared(active))
+            let body = Bytes::copy_from_slice(&payload[offsets.start..offsets.end]);
+            (parcel.parcel(body), RequestOwner::Unshared(active))
         };
         let parcel = parcel.map_err(|e| Answer::failed(FailureReason::Refused, e.to_string()));
         (parcel, owner)
     }
 
-    /// Content that lies in a segment of its sender, read there unless too much is.
-    fn content_for_many(
+    /// Content in a segment of its sender: in place, or copied if too much is held in place.
+    fn segment_content(
         &self,
         sender: Incarnation,
-        reference: Reference,
+        reference: ContentReference,
         parcel: &ParcelHeader,
     ) -> Result<Bytes, Answer> {
         let len = usize::try_from(parcel.content_len()).unwrap_or(usize::MAX);
-        let library = &self.lending.library;
-        let content = library.read(sender, reference, len).map_err(|e| match e {
-            NotRead::Gone => {
-                let detail = "its content is not there any more";
-                Answer::failed(FailureReason::Refused, detail)
-            }
-            NotRead::NoRoom => Answer::Busy,
-        })?;
-        if !self.lending.begin_one() {
+        let peer_segments = &self.borrows.peer_segments;
+        let content = peer_segments
+            .read(sender, reference, len)
+            .map_err(|e| match e {
+                ReadError::Gone => {
+                    let detail = "the content of the letter does not exist any more";
+                    Answer::failed(FailureReason::Refused, detail)
+                }
+                ReadError::NoRoom => Answer::Busy,
+            })?;
+        if !self.borrows.begin_segment() {
             count(&self.tally.copied_full);
             return Ok(Bytes::copy_from_slice(content.as_ref()));
         }
         count(&self.tally.in_place);
-        Ok(Bytes::from_owner(ForMany {
+        Ok(Bytes::from_owner(BorrowedSegmentContent {
             content,
-            lending: self.lending.clone(),
+            borrows: self.borrows.clone(),
         }))
     }
 
-    /// Whether content is handed out in place. If so, it is counted as handed out.
-    fn may_lend(&self, len: usize, active: &Active) -> bool {
+    /// Whether content is handed out in place. If so, it is counted as held.
+    fn try_begin_borrow(&self, len: usize, active: &Active) -> bool {
         let small = len < self.copy_below;
-        if !small && self.lending.begin(active.origin().value()) {
+        if !small && self.borrows.begin(active.origin().value()) {
             return true;
         }
         if len > 0 {
@@ -326,17 +330,21 @@ impl Inbox {
         false
     }
 
-    /// Content, in place. It must lie in the payload of `active`, and [`Self::may_lend`] must
-    /// have said so.
-    fn lend(&self, content: NonNull<[u8]>, active: Active) -> (Bytes, Arc<Held>) {
+    /// Hands out content in place. It must lie in the payload of `active`, and
+    /// [`Self::try_begin_borrow`] must have returned true for it.
+    fn borrow_content(
+        &self,
+        content: NonNull<[u8]>,
+        active: Active,
+    ) -> (Bytes, Arc<BorrowedRequest>) {
         count(&self.tally.in_place);
-        let held = Arc::new(Held {
+        let held = Arc::new(BorrowedRequest {
             sender: active.origin().value(),
             active: Mutex::new(Some(active)),
-            lending: self.lending.clone(),
+            borrows: self.borrows.clone(),
         });
-        let bytes = Bytes::from_owner(Content {
-            bytes: Address(content),
+        let bytes = Bytes::from_owner(BorrowedContent {
+            bytes: MappedPtr(content),
             _held: held.clone(),
         });
         (bytes, held)
@@ -347,85 +355,86 @@ fn debug(error: impl std::fmt::Debug) -> String {
     format!("{error:?}")
 }
 
-/// Who keeps a request: this side alone, or together with whoever has the content.
+/// The owner of a request: this function alone, or together with the handed-out content.
 #[expect(dead_code, reason = "owned until it is dropped")]
-enum Owner {
+enum RequestOwner {
     Unshared(Active),
-    Shared(Arc<Held>),
+    Shared(Arc<BorrowedRequest>),
 }
 
 /// A request whose content is read in place.
-struct Held {
+struct BorrowedRequest {
     active: Mutex<Option<Active>>,
     sender: u128,
-    lending: Arc<Lending>,
+    borrows: Arc<BorrowLimits>,
 }
 
-impl Drop for Held {
+impl Drop for BorrowedRequest {
     fn drop(&mut self) {
-        if !self.lending.library.owner().is_this() {
-            // In a forked child: giving it back would take it from the parent.
+        if !self.borrows.peer_segments.owner().is_this() {
+            // In a forked child, a release would take the memory from the parent.
             std::mem::forget(self.active.get_mut().take());
             return;
         }
-        // First the memory, then the count: what is counted as free must be free.
+        // The memory first, then the count: a slot that counts as free must be free.
         drop(self.active.get_mut().take());
-        self.lending.end(self.sender);
+        self.borrows.end(self.sender);
     }
 }
 
-/// Content in a sender's memory.
-struct Content {
-    bytes: Address<[u8]>,
-    _held: Arc<Held>,
+/// Content in the payload of a sender's request.
+struct BorrowedContent {
+    bytes: MappedPtr<[u8]>,
+    _held: Arc<BorrowedRequest>,
 }
 
-impl AsRef<[u8]> for Content {
+impl AsRef<[u8]> for BorrowedContent {
     fn as_ref(&self) -> &[u8] {
-        // SAFETY: the range lies in the payload of the request in `_held`, which stays mapped as
-        // long as that lives: the server keeps connections of senders that are gone while content
-        // is held there, and never more of them than it can (`Lending::begin`). An honest sender
-        // does not write there after sending; see the crate's documentation on trust.
+        // SAFETY: the range is in the payload of the request in `_held`, which stays mapped as long
+        // as that exists: the server keeps the connection of an ended sender while content is held
+        // there, and `BorrowLimits::begin` bounds the number of such connections below the number
+        // that it keeps. An honest sender does not write there after sending; see the crate's
+        // section on trust.
         unsafe { self.bytes.0.as_ref() }
     }
 }
 
-/// Content in a sender's segment.
-struct ForMany {
-    content: Borrowed,
-    lending: Arc<Lending>,
+/// Content in a sender's segment, counted as held.
+struct BorrowedSegmentContent {
+    content: SegmentContent,
+    borrows: Arc<BorrowLimits>,
 }
 
-impl AsRef<[u8]> for ForMany {
+impl AsRef<[u8]> for BorrowedSegmentContent {
     fn as_ref(&self) -> &[u8] {
         self.content.as_ref()
     }
 }
 
-impl Drop for ForMany {
+impl Drop for BorrowedSegmentContent {
     fn drop(&mut self) {
-        let _held = self.lending.held.lock();
-        self.lending.tally.borrowed.fetch_sub(1, Ordering::Relaxed);
+        let _held = self.borrows.held.lock();
+        self.borrows.tally.borrowed.fetch_sub(1, Ordering::Relaxed);
     }
 }
 
-/// How much content is read in place.
-struct Lending {
+/// Limits on the content that is held in place.
+struct BorrowLimits {
     per_sender: usize,
     total: usize,
-    /// Of which senders, and how much of each. Few enough to be looked through.
+    /// Number of contents for each sender. The list is short enough for a linear search.
     held: Mutex<Vec<(u128, usize)>>,
-    /// The mailbox could not be drained until something is given back.
+    /// Whether the mailbox cannot be drained until content is released.
     waiting: AtomicBool,
-    bell: Arc<Bell>,
+    doorbell: Arc<Doorbell>,
     tally: Arc<Tally>,
-    // Last: whoever held content longest removes the domain's traces, which the library does.
-    library: Arc<Library>,
+    // Last: the last owner of content removes the domain's files, which the segments' owner does.
+    peer_segments: Arc<PeerSegments>,
 }
 
-impl Lending {
-    /// One more content in a segment, which takes no slot of its sender.
-    fn begin_one(&self) -> bool {
+impl BorrowLimits {
+    /// Counts one more content in a segment, which takes no slot of its sender. False at the limit.
+    fn begin_segment(&self) -> bool {
         let _held = self.held.lock();
         let few = self.tally.borrowed.load(Ordering::Relaxed) < self.total as u64;
         if few {
@@ -434,10 +443,10 @@ impl Lending {
         few
     }
 
-    /// One more content of this sender, if that leaves a slot free for its next letter.
+    /// Counts one more content of this sender, if a slot stays free for its next letter.
     fn begin(&self, sender: u128) -> bool {
         let mut held = self.held.lock();
-        // Changed under the lock only.
+        // Changed only under the lock.
         if self.tally.borrowed.load(Ordering::Relaxed) >= self.total as u64 {
             return false;
         }
@@ -461,7 +470,7 @@ impl Lending {
         }
         drop(held);
         if self.waiting.swap(false, Ordering::SeqCst) {
-            self.bell.ring();
+            self.doorbell.ring();
         }
     }
 }

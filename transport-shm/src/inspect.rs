@@ -1,40 +1,40 @@
-//! Looking at a domain without taking part.
+//! Inspection of a domain without joining it.
 
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use crate::domain::{Domain, file_error, files_in};
+use crate::domain_files::{DomainFiles, file_error, files_in};
 use crate::memory::{Budget, SHM};
 use crate::{ShmConfig, ShmError};
 
-/// How many files that are open to others are named.
+/// Maximum number of exposed files in a report.
 const MAX_EXPOSED: usize = 16;
 
-/// What [`inspect`] found.
+/// The result of [`inspect`].
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Inspection {
-    /// Processes of the domain that are there.
+    /// Number of processes of the domain that run.
     pub alive: usize,
-    /// Processes that are not, whose traces are; at least.
+    /// Lower bound of the number of dead processes whose files still exist.
     pub dead: usize,
-    /// What the domain takes in shared memory, in bytes.
+    /// Shared memory that the domain uses, in bytes.
     pub used: u64,
-    /// What is free there, in bytes.
+    /// Free shared memory, in bytes.
     pub free: u64,
-    /// How large it is, in bytes.
+    /// Size of the shared memory file system, in bytes.
     pub total: u64,
-    /// Files of the domain that other users may open; at most 16 are named.
+    /// Files of the domain that other users may open, at most 16.
     pub exposed: Vec<PathBuf>,
 }
 
-/// Looks at a domain without changing anything. For tools.
+/// Reports on a domain without changing it. For tools.
 ///
 /// # Errors
-/// When the configuration makes no sense, or there is no shared memory.
+/// Returns an error if the configuration is invalid or `/dev/shm` cannot be read.
 pub fn inspect(config: &ShmConfig) -> Result<Inspection, ShmError> {
-    let domain = Domain::new(config)?;
+    let domain = DomainFiles::new(config)?;
     let shm = rustix::fs::statvfs(SHM)
-        .map_err(|e| file_error("cannot ask for the size of", Path::new(SHM), e))?;
+        .map_err(|e| file_error("cannot read the size of", Path::new(SHM), e))?;
     let (alive, dead) = domain.count()?;
     let prefix = format!("{}_", config.prefix);
     let exposed = files_in(Path::new(SHM))

@@ -1,4 +1,4 @@
-//! What lies in shared memory: the header of a request, the answer, and the types of the ports.
+//! Layout of shared memory: the header of a request, the answer, and the types of the ports.
 
 use std::mem::MaybeUninit;
 
@@ -14,27 +14,27 @@ use iceoryx2::request_mut_uninit::RequestMutUninit;
 use iceoryx2::response_mut_uninit::ResponseMutUninit;
 use zerocopy::{FromBytes, IntoBytes};
 
-use crate::segment::Reference;
+use crate::segment::ContentReference;
 pub(crate) use crate::variant::Svc;
 
 pub(crate) type MailClient = Client<Svc, [u8], Header, Ack, ()>;
 pub(crate) type MailServer = Server<Svc, [u8], Header, Ack, ()>;
-pub(crate) type Blank = RequestMutUninit<Svc, [MaybeUninit<u8>], Header, Ack, ()>;
-pub(crate) type Filled = RequestMut<Svc, [u8], Header, Ack, ()>;
+pub(crate) type UninitRequest = RequestMutUninit<Svc, [MaybeUninit<u8>], Header, Ack, ()>;
+pub(crate) type InitRequest = RequestMut<Svc, [u8], Header, Ack, ()>;
 pub(crate) type Pending = PendingResponse<Svc, [u8], Header, Ack, ()>;
 pub(crate) type Active = ActiveRequest<Svc, [u8], Header, Ack, ()>;
-pub(crate) type BlankAck = ResponseMutUninit<Svc, MaybeUninit<Ack>, ()>;
+pub(crate) type UninitAck = ResponseMutUninit<Svc, MaybeUninit<Ack>, ()>;
 
-/// Contents begin at multiples of this.
+/// Alignment of contents in bytes.
 pub(crate) const ALIGNMENT: usize = 8;
 
-/// The version of this layout. Another one is another type to iceoryx2, and refused there.
+/// Version of this layout. iceoryx2 refuses other versions, because their types have other names.
 const VERSION: u32 = 3;
 
-/// What stands in front of every parcel.
+/// The user header of every request.
 ///
-/// The payload behind it is: `start` bytes of nothing, so that the content is aligned; then the
-/// parcel's body, without its content when that lies in a segment.
+/// The payload that follows has `start` unused bytes, so that the content is aligned, then the
+/// parcel's body. The body omits the content if that is in a segment.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, ZeroCopySend)]
 #[type_name("fipa-mail-header-3")]
@@ -43,7 +43,7 @@ pub(crate) struct Header {
     start: u32,
     sender: u64,
     token: u64,
-    /// Where the content lies; 0 when it is in the payload.
+    /// Number of the segment that holds the content; 0 if the content is in the payload.
     segment: u64,
     generation: u64,
     parcel: [u8; HEADER_LEN],
@@ -64,7 +64,7 @@ impl Default for Header {
 }
 
 impl Header {
-    /// `token` comes back in the answer.
+    /// Creates a header for content in the payload. The answer repeats `token`.
     pub(crate) fn new(parcel: &ParcelHeader, start: u32, sender: Incarnation, token: u64) -> Self {
         let mut bytes = [0; HEADER_LEN];
         bytes.copy_from_slice(parcel.as_bytes());
@@ -79,8 +79,8 @@ impl Header {
         }
     }
 
-    /// The same, of a parcel whose content lies in a segment.
-    pub(crate) fn referring(self, to: Option<Reference>) -> Self {
+    /// Adds a reference to content in a segment, if there is one.
+    pub(crate) fn referring(self, to: Option<ContentReference>) -> Self {
         match to {
             Some(to) => Self {
                 segment: to.segment,
@@ -91,9 +91,9 @@ impl Header {
         }
     }
 
-    /// Where the content lies, if not in the payload.
-    pub(crate) fn reference(&self) -> Option<Reference> {
-        (self.segment != 0).then_some(Reference {
+    /// The reference to the content, if it is in a segment.
+    pub(crate) fn reference(&self) -> Option<ContentReference> {
+        (self.segment != 0).then_some(ContentReference {
             segment: self.segment,
             generation: self.generation,
         })
@@ -111,7 +111,7 @@ impl Header {
         self.start as usize
     }
 
-    /// The parcel's header, when this is one of ours.
+    /// The parcel's header. `None` if the version or the sender is invalid.
     pub(crate) fn parcel(&self) -> Option<ParcelHeader> {
         if self.version != VERSION || !self.sender().is_known() {
             return None;
@@ -143,7 +143,7 @@ const RETURNED: u8 = 6;
 const MOVED: u8 = 7;
 
 impl Ack {
-    /// The answer to the parcel with this token.
+    /// Encodes the answer to the parcel with this token.
     pub(crate) fn new(answer: &Answer, token: u64) -> Self {
         let mut ack = Self {
             code: 0,
@@ -174,13 +174,13 @@ impl Ack {
                 ack.detail[..detail.len()].copy_from_slice(detail);
                 ack.detail_len = detail.len() as u8;
             }
-            // Answers that this version does not know: the sender learns that there was one.
+            // An answer unknown to this version keeps code 0: the sender learns that there was one.
             _ => {}
         }
         ack
     }
 
-    /// The answer, when it makes sense and is about the parcel with this token.
+    /// Decodes the answer. `None` if it is malformed or for another token.
     pub(crate) fn answer(&self, token: u64) -> Option<Answer> {
         if self.token != token {
             return None;
@@ -206,18 +206,18 @@ impl Ack {
     }
 }
 
-/// Where the pieces of a body lie in a payload.
+/// Offsets of the pieces of a body in a payload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Places {
+pub(crate) struct PieceOffsets {
     pub(crate) start: usize,
     pub(crate) content: usize,
     pub(crate) tail: usize,
     pub(crate) end: usize,
 }
 
-impl Places {
-    /// The places for pieces of these lengths, the content aligned. `None` when they are more
-    /// than memory can hold.
+impl PieceOffsets {
+    /// Offsets for pieces of these lengths, with the content aligned. `None` if their sum
+    /// overflows.
     pub(crate) fn for_lengths(front: usize, content: usize, tail: usize) -> Option<Self> {
         let at = front.checked_next_multiple_of(ALIGNMENT)?;
         let tail_at = at.checked_add(content)?;
@@ -229,7 +229,7 @@ impl Places {
         })
     }
 
-    /// The places that a received header announces, when they fit a payload of this length.
+    /// Offsets according to a received header. `None` if they exceed a payload of this length.
     pub(crate) fn announced(
         header: &Header,
         parcel: &ParcelHeader,
@@ -358,7 +358,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn answers_survive_and_foreign_ones_are_refused() {
+    fn answers_round_trip_and_malformed_ones_are_refused() {
         let long = "é".repeat(200);
         for answer in [
             Answer::Accepted,
@@ -387,18 +387,18 @@ mod tests {
     }
 
     #[test]
-    fn places_are_aligned_and_bounded() {
-        let places = Places::for_lengths(13, 100, 1).expect("fits");
+    fn offsets_are_aligned_and_bounded() {
+        let offsets = PieceOffsets::for_lengths(13, 100, 1).expect("fits");
         assert_eq!(
-            places,
-            Places {
+            offsets,
+            PieceOffsets {
                 start: 3,
                 content: 16,
                 tail: 116,
                 end: 117
             }
         );
-        assert_eq!(Places::for_lengths(usize::MAX, 1, 1), None);
-        assert_eq!(Places::for_lengths(8, usize::MAX, 1), None);
+        assert_eq!(PieceOffsets::for_lengths(usize::MAX, 1, 1), None);
+        assert_eq!(PieceOffsets::for_lengths(8, usize::MAX, 1), None);
     }
 }

@@ -8,70 +8,70 @@ use bytes::Bytes;
 use fipa_transport::LoanedContent;
 use parking_lot::Mutex;
 
-use crate::layout::{Blank, Pending};
-use crate::memory::Address;
+use crate::layout::{Pending, UninitRequest};
+use crate::memory::MappedPtr;
 use crate::outbox::Outbox;
 
-/// One loan: a request of which the content's place has been handed out.
+/// A request whose content range has been handed out.
 ///
-/// Lives as long as anybody can read the content, whether it has been sent or not: the request,
-/// or after sending the pending response, owns the memory.
+/// Exists as long as the content can be read, before and after sending: first the request, then the
+/// pending response owns the memory.
 #[derive(Debug)]
 pub(crate) struct Loan {
-    /// The payload: `front` bytes for what stands in front, then the content, then the rest.
+    /// The payload: `front` bytes for the pieces before the content, the content, then the rest.
     ///
-    /// Through it, the content is written only by `ShmLoan`, of which there is one, before it is
-    /// shared, and only read afterwards; front and tail are written only by whoever takes the
-    /// blank request out of the state, of whom there is one.
-    payload: Address<u8>,
+    /// The content is written through this pointer only by the single `ShmLoan`, before it is
+    /// shared, and only read afterwards. Front and tail are written only by the caller that takes
+    /// the request out of the state, which succeeds once.
+    payload: MappedPtr<u8>,
     front: usize,
     content: usize,
     payload_len: usize,
-    /// Which memory segment of the outbox this lies in.
+    /// Number of the outbox's memory segment that contains the payload.
     pub(crate) segment: u64,
-    /// Whether the pending response waits in the outbox.
+    /// Whether the pending response is queued in the outbox.
     pub(crate) queued: AtomicBool,
     state: Mutex<State>,
-    // After the state: gives the place among the loans back when the memory is back.
-    outbox: Place,
+    // After the state: the loan is counted as ended when its memory has been returned.
+    outbox: LoanSlot,
 }
 
 #[derive(Debug)]
 enum State {
-    Blank(Blank),
+    Unsent(UninitRequest),
     Sent(Pending),
-    /// The request could not be sent and iceoryx2 took the memory back; see [`Outbox`].
+    /// Sending failed and iceoryx2 took the memory back; see [`Outbox`].
     Lost,
 }
 
 impl Loan {
-    /// The payload of `blank` must be at least `front + content` bytes long.
+    /// Creates a loan. The payload of `request` must have at least `front + content` bytes.
     pub(crate) fn new(
-        mut blank: Blank,
+        mut request: UninitRequest,
         front: usize,
         content: usize,
         segment: u64,
         outbox: Arc<Outbox>,
     ) -> Self {
-        let payload = blank.payload_mut();
+        let payload = request.payload_mut();
         let payload_len = payload.len();
         assert!(
             front + content <= payload_len,
-            "a loan as long as it was asked for"
+            "a loan has the requested length"
         );
         Self {
-            payload: Address(NonNull::from(payload).cast()),
+            payload: MappedPtr(NonNull::from(payload).cast()),
             front,
             content,
             payload_len,
             segment,
             queued: AtomicBool::new(false),
-            state: Mutex::new(State::Blank(blank)),
-            outbox: Place(outbox),
+            state: Mutex::new(State::Unsent(request)),
+            outbox: LoanSlot(outbox),
         }
     }
 
-    /// Where the content begins: what it is recognised by.
+    /// Address of the content, by which the content is recognized.
     pub(crate) fn address(&self) -> usize {
         self.content_start() as usize
     }
@@ -80,17 +80,17 @@ impl Loan {
         self.payload.0.as_ptr().wrapping_add(self.front)
     }
 
-    /// Whether `content` is all of this loan's content.
+    /// Whether `content` is the whole content of this loan.
     pub(crate) fn is(&self, content: &Bytes) -> bool {
         content.as_ptr() as usize == self.address() && content.len() == self.content
     }
 
-    /// Whether pieces of these lengths have room around the content.
+    /// Whether pieces of these lengths fit around the content.
     pub(crate) fn has_room(&self, front: usize, tail: usize) -> bool {
         front <= self.front && tail <= self.payload_len - self.front - self.content
     }
 
-    /// How much may be written from where the payload begins.
+    /// Length of the payload in bytes.
     pub(crate) fn payload_len(&self) -> usize {
         self.payload_len
     }
@@ -103,11 +103,11 @@ impl Loan {
         self.payload.0
     }
 
-    /// Takes the request to be sent, once.
-    pub(crate) fn take(&self) -> Option<Blank> {
+    /// Takes the request for sending. `None` after the first call.
+    pub(crate) fn take(&self) -> Option<UninitRequest> {
         let mut state = self.state.lock();
         match std::mem::replace(&mut *state, State::Lost) {
-            State::Blank(blank) => Some(blank),
+            State::Unsent(request) => Some(request),
             other => {
                 *state = other;
                 None
@@ -115,12 +115,12 @@ impl Loan {
         }
     }
 
-    /// Keeps the memory alive after sending.
+    /// Stores the pending response, which owns the memory after sending.
     pub(crate) fn sent(&self, pending: Pending) {
         *self.state.lock() = State::Sent(pending);
     }
 
-    /// Looks at the pending response.
+    /// Calls `look` with the pending response, if the request has been sent.
     pub(crate) fn with_pending<T>(&self, look: impl FnOnce(&Pending) -> T) -> Option<T> {
         match &*self.state.lock() {
             State::Sent(pending) => Some(look(pending)),
@@ -128,7 +128,7 @@ impl Loan {
         }
     }
 
-    /// Whether it counts among the outbox's active requests without waiting there.
+    /// Whether the request counts as active in the outbox without being queued there.
     pub(crate) fn is_kept_after_sending(&self) -> bool {
         !self.queued.load(Ordering::Relaxed) && matches!(&*self.state.lock(), State::Sent(_))
     }
@@ -139,35 +139,35 @@ impl Loan {
 }
 
 #[derive(Debug)]
-struct Place(Arc<Outbox>);
+struct LoanSlot(Arc<Outbox>);
 
 impl Drop for Loan {
     fn drop(&mut self) {
         if !self.outbox.0.owner().is_this() {
-            // In a forked child: the request stays the parent's, and so does the outbox.
+            // In a forked child, the request and the outbox belong to the parent.
             std::mem::forget(std::mem::replace(self.state.get_mut(), State::Lost));
             std::mem::forget(Arc::clone(&self.outbox.0));
         }
     }
 }
 
-impl Drop for Place {
+impl Drop for LoanSlot {
     fn drop(&mut self) {
         self.0.loan_ended();
     }
 }
 
-/// What the application fills in.
+/// The writable content.
 pub(crate) struct ShmLoan(pub(crate) Arc<Loan>);
 
 impl LoanedContent for ShmLoan {
     fn content_mut(&mut self) -> &mut [u8] {
         let loan = &*self.0;
-        // SAFETY: the range lies within the payload (checked by `Loan::new`), which the blank
-        // request owns until it is sent, and it cannot be sent before `freeze`: only then can
-        // anybody present the content. Nothing else refers to the range: this is the only
-        // `ShmLoan` of the loan, borrowed mutably. The bytes are initialised as far as Rust is
-        // concerned: pages of a shared mapping that the kernel has filled.
+        // SAFETY: the range is within the payload (checked by `Loan::new`). The unsent request owns
+        // the payload, and it is not sent before `freeze`, which registers the content with the
+        // outbox. Nothing else refers to the range: this is the only `ShmLoan` of the loan,
+        // borrowed mutably. The bytes are initialized: pages of a shared mapping that the kernel or
+        // an earlier request has filled.
         unsafe { std::slice::from_raw_parts_mut(loan.content_start(), loan.content) }
     }
 
@@ -177,17 +177,17 @@ impl LoanedContent for ShmLoan {
     }
 }
 
-/// The content, readable.
+/// The readable content.
 struct Frozen(Arc<Loan>);
 
 impl AsRef<[u8]> for Frozen {
     fn as_ref(&self) -> &[u8] {
         let loan = &*self.0;
-        // SAFETY: within the payload, as above. The memory is owned by the request or the pending
-        // response in the loan, which this keeps alive; when sending fails so that iceoryx2 takes
-        // it back, the outbox makes sure that it stays mapped and unchanged as long as the loan
-        // lives (see `Outbox::send_loan`). No process writes there: `ShmLoan` is consumed, and
-        // receivers map it for reading.
+        // SAFETY: the range is within the payload (checked by `Loan::new`). The request or the
+        // pending response in the loan owns the memory, and `self.0` keeps the loan. If sending
+        // fails and iceoryx2 takes the memory back, the outbox keeps it mapped and unchanged as
+        // long as the loan exists (see `Outbox::send_loan`). No process writes there: `ShmLoan` is
+        // consumed, `Outbox::send_loan` leaves the content out, and receivers only read it.
         unsafe { std::slice::from_raw_parts(loan.content_start(), loan.content) }
     }
 }

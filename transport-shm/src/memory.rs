@@ -1,9 +1,8 @@
-//! Where room comes from: free space and capacity are checked, and pages taken, before anything
-//! is written.
+//! Checks of free space and capacity, and allocation of pages before they are written.
 //!
-//! Shared memory files are sparse. Writing to a page of one when the file system is full raises
-//! SIGBUS, which ends the process. So pages are asked for with `MADV_POPULATE_WRITE` first, which
-//! reports an error instead. `storage` does the same for what iceoryx2 writes by itself.
+//! Shared memory files are sparse. Writing to a missing page when the file system is full raises
+//! SIGBUS, which ends the process. So pages are first populated with `MADV_POPULATE_WRITE`, which
+//! reports an error instead. `storage` does the same for the pages that iceoryx2 itself writes.
 
 use std::fs::{File, Metadata, OpenOptions};
 use std::os::fd::{AsFd, OwnedFd};
@@ -18,37 +17,37 @@ use rustix::io::Errno;
 use rustix::mm::{Advice, MapFlags, ProtFlags, madvise, mmap, munmap};
 use rustix::param::page_size;
 
-use crate::presence::Names;
+use crate::presence::ProcessPaths;
 use crate::storage::{self, Shortage};
 use crate::{ShmConfig, ShmError};
 
-/// Where POSIX shared memory lies on Linux.
+/// Mount point of POSIX shared memory on Linux.
 pub(crate) const SHM: &str = "/dev/shm";
 
-/// Room that is left to others and to small files.
+/// Free bytes that are left for other programs and small files.
 const MARGIN: u64 = 256 << 10;
 
-/// What an endpoint needs to begin with.
+/// Free bytes that an endpoint needs to start.
 const START: u64 = 1 << 20;
 
-/// Length of the first part of every file of ours, in bytes: whole pages on most machines, a part of
-/// one on those with larger pages.
+/// Length of the first part of every file of this crate, in bytes. With larger kernel pages, a part
+/// of one page.
 pub(crate) const PAGE: usize = 4096;
 
-/// How long to wait for others who are taking memory.
-const PATIENCE: Duration = Duration::from_millis(200);
+/// Timeout of the lock under which processes allocate memory.
+const LOCK_TIMEOUT: Duration = Duration::from_millis(200);
 
-/// How long to wait before asking for a lock again: longer each time, because many who wait would
-/// otherwise take more of the processor than whom they wait for.
+/// Pause before a retry of a lock, doubled each time. Many waiters would otherwise use more of the
+/// processor than the process they wait for.
 const FIRST_PAUSE: Duration = Duration::from_micros(200);
 const LAST_PAUSE: Duration = Duration::from_millis(4);
 
-/// The share of one domain in this host's shared memory.
+/// The share of one domain in the shared memory of this host.
 #[derive(Debug)]
 pub(crate) struct Budget {
     prefix: String,
     capacity: u64,
-    /// Locked by whoever takes memory.
+    /// Locked while a process allocates memory.
     directory: PathBuf,
 }
 
@@ -57,7 +56,7 @@ impl Budget {
         Self {
             prefix: format!("{}_", config.prefix),
             capacity: config.capacity,
-            directory: Names::new(&config.root, &config.prefix)
+            directory: ProcessPaths::new(&config.root, &config.prefix)
                 .directory()
                 .to_owned(),
         }
@@ -67,8 +66,8 @@ impl Budget {
         self.capacity
     }
 
-    /// Whether an endpoint can be opened at all. To be called under the domain's lock, so that no
-    /// other process of the domain that starts takes the same room.
+    /// Checks that there is room to open an endpoint. The caller must hold the domain's lock, so
+    /// that no other starting process of the domain uses the same room.
     pub(crate) fn check_start(&self) -> Result<(), ShmError> {
         let free = free_bytes().unwrap_or(0);
         if free < START {
@@ -81,41 +80,41 @@ impl Budget {
         Ok(())
     }
 
-    /// Whether `need` more bytes can be taken now, and excludes others of the domain from taking
-    /// any until the result is dropped: then the pages must be there ([`populate`]).
+    /// Checks that `need` more bytes can be allocated, and locks out other processes of the domain
+    /// until the result is dropped. The pages must be allocated before that ([`populate`]).
     ///
-    /// Who has the domain's lock may ask for this one, but not the other way round.
+    /// A holder of the domain's lock may take this lock, but not the other way round.
     pub(crate) fn reserve(&self, need: u64) -> Result<OwnedFd, WayError> {
-        let turn = self.turn().map_err(|e| {
+        let lock_directory = self.lock_directory().map_err(|e| {
             WayError::new(
                 WayFault::Congested,
                 format_args!(
-                    "cannot lock {} to take memory: {e}",
+                    "cannot lock {} to allocate memory: {e}",
                     self.directory.display()
                 ),
             )
         })?;
         self.check(need)?;
-        Ok(turn)
+        Ok(lock_directory)
     }
 
-    /// The lock, on the directory itself: no file is left behind by it.
-    fn turn(&self) -> rustix::io::Result<OwnedFd> {
+    /// Locks the directory itself, so that no lock file remains.
+    fn lock_directory(&self) -> rustix::io::Result<OwnedFd> {
         lock(
             &self.directory,
             FlockOperation::NonBlockingLockExclusive,
-            || PATIENCE,
+            || LOCK_TIMEOUT,
         )
     }
 
-    /// Whether `need` more bytes could be taken now.
+    /// Checks that `need` more bytes can be allocated now.
     pub(crate) fn check(&self, need: u64) -> Result<(), WayError> {
         if need > self.capacity {
             return Err(WayError::new(
                 WayFault::TooLarge,
                 format_args!(
-                    "{need} bytes of shared memory are needed, and this domain has a capacity of {}: \
-                     raise capacity of transport.shm",
+                    "{need} bytes of shared memory are needed, and the capacity of this domain is {}; \
+                     raise transport.shm.capacity",
                     self.capacity
                 ),
             ));
@@ -126,19 +125,20 @@ impl Budget {
                 WayFault::Congested,
                 format_args!(
                     "{need} more bytes of shared memory are needed, and {used} of this domain's {} \
-                     are in use: raise capacity of transport.shm",
+                     are in use; raise transport.shm.capacity",
                     self.capacity
                 ),
             ));
         }
-        let free = free_bytes().map_err(|e| no_room(need, &format!("cannot be asked: {e}")))?;
+        let free =
+            free_bytes().map_err(|e| no_room_error(need, &format!("cannot be read ({e})")))?;
         if free < need.saturating_add(MARGIN) {
-            return Err(no_room(need, &format!("has {free} free")));
+            return Err(no_room_error(need, &format!("has {free} free bytes")));
         }
         Ok(())
     }
 
-    /// What the files of this domain take, in bytes.
+    /// Memory that the files of this domain use, in bytes.
     pub(crate) fn used(&self) -> u64 {
         let Ok(files) = std::fs::read_dir(SHM) else {
             return 0;
@@ -147,26 +147,25 @@ impl Budget {
             .flatten()
             .filter(|file| file.file_name().to_string_lossy().starts_with(&self.prefix))
             .filter_map(|file| file.metadata().ok())
-            // Everybody may put files here; those of others are not this domain's.
-            .filter(is_ours)
+            // Any user may create files here; those of other users do not count.
+            .filter(is_owned)
             .map(|metadata| metadata.blocks() * 512)
             .sum()
     }
 }
 
-/// Locks a directory until the result is dropped, in a way that does not block. Somebody who has the
-/// lock and was stopped must not stop everybody else: he is waited for as long as `patience` says,
-/// which is asked again and again.
+/// Locks a directory until the result is dropped, by polling. A stopped process may hold the lock,
+/// so the wait ends after `timeout()`, which is evaluated on each retry.
 ///
-/// It is the directory of that name that is locked: whoever had the lock before may have removed
-/// it, and somebody else have made, and locked, a new one.
+/// The result is a lock of the directory that has this path now: the previous holder may have
+/// removed the directory, and another process may have created and locked a new one.
 ///
 /// # Errors
-/// `WOULDBLOCK` when somebody else still has it then, `NOENT` when it is gone.
+/// `WOULDBLOCK` if another process still holds the lock then, `NOENT` if the directory is missing.
 pub(crate) fn lock(
     path: &Path,
     how: FlockOperation,
-    patience: impl Fn() -> Duration,
+    timeout: impl Fn() -> Duration,
 ) -> rustix::io::Result<OwnedFd> {
     let flags = OFlags::DIRECTORY | OFlags::RDONLY | OFlags::CLOEXEC;
     let opened = || open(path, flags, Mode::empty());
@@ -183,7 +182,7 @@ pub(crate) fn lock(
                 directory = opened()?;
             }
             Err(Errno::INTR) => {}
-            Err(Errno::WOULDBLOCK) if began.elapsed() < patience() => {
+            Err(Errno::WOULDBLOCK) if began.elapsed() < timeout() => {
                 std::thread::sleep(pause);
                 pause = (pause * 2).min(LAST_PAUSE);
             }
@@ -192,37 +191,38 @@ pub(crate) fn lock(
     }
 }
 
-fn is_ours(found: &Metadata) -> bool {
+fn is_owned(found: &Metadata) -> bool {
     found.uid() == rustix::process::geteuid().as_raw()
 }
 
-/// Opens a file of shared memory that another process of this user has made.
+/// Opens a shared memory file that another process of this user has created.
 ///
-/// The directory is everybody's. What others put there under such a name, they could shorten while
-/// it is mapped here; so nothing is followed, waited for or used but a file of this user.
-pub(crate) fn open_ours(
+/// Any user may create files in the directory, and could shorten a file of their own while it is
+/// mapped here. So symbolic links are not followed, FIFOs are not waited for, and files of other
+/// users are refused.
+pub(crate) fn open_owned(
     path: &Path,
     options: &mut OpenOptions,
 ) -> std::io::Result<(File, Metadata)> {
     let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits();
     let file = options.custom_flags(flags as i32).open(path)?;
     let found = file.metadata()?;
-    if !found.is_file() || !is_ours(&found) {
+    if !found.is_file() || !is_owned(&found) {
         return Err(std::io::ErrorKind::InvalidData.into());
     }
     Ok((file, found))
 }
 
-pub(crate) fn no_room(need: u64, what: &str) -> WayError {
+pub(crate) fn no_room_error(need: u64, what: &str) -> WayError {
     WayError::new(
         WayFault::Congested,
-        format_args!("{need} more bytes of shared memory are needed, and {SHM} {what}: enlarge it"),
+        format_args!("{need} more bytes of shared memory are needed, and {SHM} {what}; enlarge it"),
     )
 }
 
-/// The error of an attempt for which pages could not be allocated.
-pub(crate) fn lacking(shortage: Shortage) -> WayError {
-    no_room(shortage.needed, &format!("is full ({})", shortage.error))
+/// The transport error for pages that could not be allocated.
+pub(crate) fn shortage_error(shortage: Shortage) -> WayError {
+    no_room_error(shortage.needed, &format!("is full ({})", shortage.error))
 }
 
 fn free_bytes() -> std::io::Result<u64> {
@@ -230,56 +230,56 @@ fn free_bytes() -> std::io::Result<u64> {
     Ok(stat.f_bavail.saturating_mul(stat.f_frsize))
 }
 
-/// Takes the pages of `len` bytes at `start`, so that writing there cannot fail.
+/// Allocates the pages of `len` bytes at `start`, so that writing there cannot fail.
 ///
-/// `start` must be in the memory of an outbox, which is mapped for writing and stays mapped during
-/// the call; a range that is not merely gives an error.
+/// `start` must be in memory that is mapped for writing and stays mapped during the call; any other
+/// range gives an error.
 pub(crate) fn populate(start: *const u8, len: usize) -> Result<(), WayError> {
-    // The kernel's pages: it refuses what does not begin with one, which must not be taken for the
-    // refusal of a kernel that cannot do it at all.
+    // Aligned to the kernel's pages: it refuses other ranges with `INVAL`, which is also the error
+    // of a kernel without this advice.
     let page = page_size();
     let first = (start as usize) & !(page - 1);
     let end = (start as usize).saturating_add(len);
     let len = end.saturating_sub(first).next_multiple_of(page);
     loop {
-        // SAFETY: MADV_POPULATE_WRITE changes nothing that a program can see: it makes the kernel
-        // provide pages as a write would, keeping their contents, and reports an error where a
-        // write would fault. No reference is made from the pointer.
+        // SAFETY: MADV_POPULATE_WRITE makes the kernel provide pages as a write would. It keeps
+        // their contents, and it reports an error where a write would fault and for a range that is
+        // not mapped. No reference is created from the pointer.
         let done = unsafe { madvise(first as *mut _, len, Advice::LinuxPopulateWrite) };
         return match done {
             Ok(()) => Ok(()),
             Err(Errno::INTR | Errno::AGAIN) => continue,
-            // Before Linux 5.14.
+            // The kernel is older than Linux 5.14.
             Err(Errno::INVAL) => storage::allocate(start as usize..end)
-                .map_err(|e| no_room(len as u64, &format!("is full ({e})"))),
-            Err(e) => Err(no_room(len as u64, &format!("is full ({e})"))),
+                .map_err(|e| no_room_error(len as u64, &format!("is full ({e})"))),
+            Err(e) => Err(no_room_error(len as u64, &format!("is full ({e})"))),
         };
     }
 }
 
-/// Where something lies in memory that is mapped. Says nothing of who may read or write there, and
-/// keeps nothing mapped: whoever makes a reference of it answers for both.
+/// An address in mapped memory. It neither keeps the memory mapped nor allows access to it: each
+/// block that creates a reference from it must ensure both.
 #[derive(Debug)]
-pub(crate) struct Address<T: ?Sized>(pub(crate) NonNull<T>);
+pub(crate) struct MappedPtr<T: ?Sized>(pub(crate) NonNull<T>);
 
-// SAFETY: a number, as far as this type goes. Mapped memory belongs to the process and not to a
-// thread, and nothing can be done with the address without an `unsafe` block of its own. Beside it
-// in a struct, what keeps the memory mapped has to be `Send` and `Sync` for itself, and the compiler
-// sees to that.
-unsafe impl<T: ?Sized> Send for Address<T> {}
+// SAFETY: the value is only an address. Mapped memory belongs to the process and not to a thread,
+// and each access through the address needs an `unsafe` block of its own. The fields beside it in a
+// struct, which keep the memory mapped, must be `Send` and `Sync` themselves, and the compiler
+// checks that.
+unsafe impl<T: ?Sized> Send for MappedPtr<T> {}
 // SAFETY: as above; a shared address can only be copied.
-unsafe impl<T: ?Sized> Sync for Address<T> {}
+unsafe impl<T: ?Sized> Sync for MappedPtr<T> {}
 
-/// A file of shared memory that this process has mapped, from its beginning.
+/// A shared mapping of a file from its beginning.
 #[derive(Debug)]
 pub(crate) struct Mapping {
-    start: Address<u8>,
+    start: MappedPtr<u8>,
     len: usize,
 }
 
 impl Mapping {
     pub(crate) fn new(file: impl AsFd, len: usize, protection: ProtFlags) -> std::io::Result<Self> {
-        // SAFETY: the kernel chooses where to map, so no memory in use is touched.
+        // SAFETY: the kernel chooses the address of the mapping, so no memory in use is changed.
         let start = unsafe {
             mmap(
                 std::ptr::null_mut(),
@@ -292,7 +292,7 @@ impl Mapping {
         }?;
         let start = NonNull::new(start.cast()).ok_or(std::io::ErrorKind::OutOfMemory)?;
         Ok(Self {
-            start: Address(start),
+            start: MappedPtr(start),
             len,
         })
     }
@@ -308,8 +308,8 @@ impl Mapping {
 
 impl Drop for Mapping {
     fn drop(&mut self) {
-        // SAFETY: mapped by `new` with this length, and nothing refers to it any more: whoever
-        // lends a part of it lends for no longer than it keeps the mapping.
+        // SAFETY: `new` has mapped this range. No reference into it is left: each one borrows from
+        // a value that owns this mapping.
         let _ = unsafe { munmap(self.start.0.as_ptr().cast(), self.len) };
     }
 }

@@ -1,4 +1,4 @@
-//! The sending side of one other process's mailbox.
+//! The sending side of another process's mailbox.
 
 use std::collections::{HashMap, VecDeque};
 use std::ops::Range;
@@ -15,39 +15,42 @@ use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, PortFact
 use parking_lot::Mutex;
 
 use crate::counters::{Tally, count};
-use crate::domain::Domain;
-use crate::fault::{
+use crate::domain_files::DomainFiles;
+use crate::errors::{
     create_error, loan_error, open_error, retired, send_error, too_large, window_full, wire_error,
 };
 use crate::fork::Owner;
-use crate::layout::{ALIGNMENT, Ack, Blank, Filled, Header, MailClient, Pending, Places, Svc};
+use crate::layout::{
+    ALIGNMENT, Ack, Header, InitRequest, MailClient, Pending, PieceOffsets, Svc, UninitRequest,
+};
 use crate::loan::{Loan, ShmLoan};
-use crate::memory::{Budget, lacking, populate};
+use crate::memory::{Budget, populate, shortage_error};
 use crate::pool::Pool;
 use crate::storage;
 
-/// Bytes of the first, small memory segment's chunks, headers included.
+/// Length in bytes of the chunks of the first memory segment, headers included.
 const FIRST_CHUNK: usize = 4096;
 
-/// What creating a client and its connection takes at most, with a window of 128.
+/// Upper bound of the memory for a client and its connection, with a window of 128.
 const OPENING: u64 = 1 << 20;
 
 static NO_CONTENT: Bytes = Bytes::new();
 
-/// A client of another process's mailbox, and what was sent there and not answered yet.
+/// A client of another process's mailbox, and the parcels sent there that are unanswered.
 ///
 /// # Memory
-/// A request's memory comes from segments that iceoryx2 makes larger ones of when needed, each
-/// with room for as many chunks as can be in use. Only pages that were asked for are written
-/// ([`populate`]): of a new segment those with the chunks' headers, which iceoryx2 writes, and of
-/// each chunk as far as it was ever used.
+/// The memory of requests comes from segments. iceoryx2 creates a larger segment when needed, each
+/// with room for as many chunks as can be in use. Only pages that were populated before are written
+/// ([`populate`]): in a new segment the pages of all chunk headers, which iceoryx2 writes, and in
+/// each chunk the pages of the longest payload so far.
 ///
 /// # Sending never takes memory back
-/// `RequestMut::send` drops the request when it fails, and the memory with it. That must not
-/// happen to loaned memory, which others read. With the settings chosen here it cannot fail:
-/// back-pressure is `DiscardData` without a handler and without overflow, so a full or closed
-/// mailbox is `Ok` with nobody reached; degradation is ignored; and the number of active requests
-/// is checked before. Should it ever fail all the same, [`Outbox::send_loan`] retires the outbox.
+/// `RequestMut::send` drops the request, and its memory, when it fails. That must not happen to
+/// loaned memory, which other processes and the application read. With the settings here, it cannot
+/// fail: the backpressure strategy is `DiscardData` without a handler and without overflow, so a
+/// full or closed mailbox is `Ok` with no receiver reached; degradation is ignored; and the number
+/// of active requests is checked before. If it fails all the same, [`Outbox::send_loan`] retires
+/// the outbox.
 #[derive(Debug)]
 pub(crate) struct Outbox {
     client: MailClient,
@@ -56,15 +59,15 @@ pub(crate) struct Outbox {
     max_loans: usize,
     chunks: usize,
     state: Mutex<State>,
-    waiting: Waiting,
+    waiting: UnansweredCount,
     loans: AtomicUsize,
     retired: AtomicBool,
     token: AtomicU64,
     budget: Arc<Budget>,
     pool: Arc<Pool>,
     tally: Arc<Tally>,
-    // After the client: the last of the process to go removes the domain's traces.
-    domain: Arc<Domain>,
+    // After the client: the last owner in the process removes the domain's files.
+    domain: Arc<DomainFiles>,
 }
 
 #[derive(Debug, Default)]
@@ -74,21 +77,21 @@ struct State {
     segment: Segment,
 }
 
-/// What is known of the current memory segment.
+/// The state of the current memory segment.
 #[derive(Debug, Default)]
 struct Segment {
-    /// Counts the segments.
+    /// Sequence number of the segment.
     number: u64,
     /// Address of the first chunk.
     base: usize,
-    /// Distance of chunks.
+    /// Distance between chunks in bytes.
     stride: usize,
-    /// Longest payload that fits a chunk.
+    /// Length of the longest payload that fits a chunk.
     room: usize,
-    /// Whether the headers of all chunks have their pages. Until then no chunk but the first is
-    /// ever loaned: iceoryx2 loans the chunk that was returned last.
+    /// Whether the pages of all chunk headers are allocated. Until then only the first chunk is
+    /// loaned, because iceoryx2 loans the chunk that was returned last.
     headers_ready: bool,
-    /// By number of a chunk, how many bytes of its payload have their pages.
+    /// For each chunk, the number of bytes of its payload whose pages are allocated.
     ready: Vec<usize>,
 }
 
@@ -96,40 +99,40 @@ struct Segment {
 struct Sent {
     attempt: AttemptId,
     token: u64,
-    memory: Memory,
+    memory: SentMemory,
 }
 
 #[derive(Debug)]
-enum Memory {
+enum SentMemory {
     Own(Pending),
     Loaned(Arc<Loan>),
     Referring {
         pending: Pending,
-        /// The content for many that it refers to.
+        /// Keeps the content in a segment that the letter refers to.
         _content: Bytes,
     },
 }
 
-/// What became of a dispatch.
+/// The result of a dispatch.
 pub(crate) enum Posted {
-    /// It is in the mailbox.
-    Yes,
-    /// This outbox takes nothing any more.
+    /// The parcel is in the mailbox.
+    Sent,
+    /// The outbox is retired and has not taken the parcel.
     Retired,
 }
 
-/// The shared parts that an outbox is opened with.
+/// The arguments of [`Outbox::open`].
 pub(crate) struct Opening<'a> {
     pub(crate) node: &'a Node<Svc>,
     pub(crate) service: &'a ServiceName,
     pub(crate) own: Incarnation,
-    /// How many parcels of all outboxes have no answer yet.
+    /// Number of unanswered parcels of all outboxes.
     pub(crate) waiting: Arc<AtomicUsize>,
     pub(crate) max_loans: usize,
     pub(crate) budget: Arc<Budget>,
     pub(crate) pool: Arc<Pool>,
     pub(crate) tally: Arc<Tally>,
-    pub(crate) domain: Arc<Domain>,
+    pub(crate) domain: Arc<DomainFiles>,
 }
 
 impl Outbox {
@@ -156,26 +159,31 @@ impl Outbox {
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .set_request_degradation_handler(|_, _| DegradationAction::Ignore)
             .set_response_degradation_handler(|_, _| DegradationAction::Ignore);
-        let (client, shortage) = storage::watch(|| builder.create());
-        // iceoryx2 makes a client that reaches nobody when its connections have no room.
+        let (client, shortage) = storage::with_shortage(|| builder.create());
+        // If there is no room for its connections, iceoryx2 creates a client that reaches no
+        // receiver.
         if let Some(shortage) = shortage {
-            return Err(lacking(shortage));
+            return Err(shortage_error(shortage));
         }
         let client = client.map_err(create_error)?;
-        let start = getrandom::u64()
-            .map_err(|e| WayError::new(WayFault::Closed, format_args!("no random numbers: {e}")))?;
+        let start = getrandom::u64().map_err(|e| {
+            WayError::new(
+                WayFault::Closed,
+                format_args!("cannot get random numbers: {e}"),
+            )
+        })?;
         let outbox = Self {
             client,
             own: opening.own,
             window,
-            // One is left for letters that were not loaned.
+            // One slot stays free for letters that were not loaned.
             max_loans: opening
                 .max_loans
                 .min(most_loans.saturating_sub(1))
                 .min(window - 1),
             chunks: 2 * window + most_loans,
             state: Mutex::default(),
-            waiting: Waiting {
+            waiting: UnansweredCount {
                 here: AtomicUsize::new(0),
                 of_all: opening.waiting,
             },
@@ -187,24 +195,24 @@ impl Outbox {
             tally: opening.tally,
             domain: opening.domain,
         };
-        // Takes the pages of the first segment.
+        // Allocates the pages of the first segment.
         drop(outbox.take(&mut outbox.state.lock(), 1)?);
         Ok(outbox)
     }
 
-    /// How many parcels have no answer yet.
+    /// Number of unanswered parcels.
     pub(crate) fn waiting(&self) -> usize {
         self.waiting.here.load(Ordering::Acquire)
     }
 
-    /// Whether nothing would be lost by closing it.
+    /// Whether the outbox can be closed without losing anything.
     pub(crate) fn is_idle(&self) -> bool {
         self.waiting() == 0 && self.loans.load(Ordering::Acquire) == 0
     }
 
-    /// From now on it takes no letters. What waits still waits.
+    /// Stops accepting letters. Unanswered ones still get their answers.
     pub(crate) fn retire(&self) {
-        // Under the lock that letters are put in under: when this returns, none is on its way.
+        // Under the lock of `post`: when this returns, no parcel is being sent.
         let _state = self.state.lock();
         self.retired.store(true, Ordering::Release);
     }
@@ -226,16 +234,17 @@ impl Outbox {
             None => content.len(),
         };
         let front = usize::try_from(header.front_len()).unwrap_or(usize::MAX);
-        let places = Places::for_lengths(front, content_here, tail).ok_or_else(too_large)?;
+        let offsets = PieceOffsets::for_lengths(front, content_here, tail).ok_or_else(too_large)?;
         let token = self.token.fetch_add(1, Ordering::Relaxed);
 
         let mut state = self.state.lock();
         if self.is_retired() {
             return Ok(Posted::Retired);
         }
-        // Before it is sent: the answer may be there before this returns, and whoever hears the
-        // bell looks for it only where one is waited for; then behind the lock that is held here.
-        let expected = self.waiting.one_more();
+        // Counted before it is sent: the answer may arrive before this returns, and the thread that
+        // gets the wake-up looks for answers only if the count is not 0. It then waits for the lock
+        // held here.
+        let unanswered = self.waiting.increment();
         if let Some(loan) = self.loan_of(&mut state, content) {
             let fits = loan.has_room(front, tail) && loan.segment == state.segment.number;
             match fits
@@ -243,51 +252,57 @@ impl Outbox {
                 .transpose()?
                 .flatten()
             {
-                Some(blank) => {
+                Some(request) => {
                     let start = loan.front() - front;
                     let header = Header::new(&header, offset(start)?, self.own, token);
-                    if !self.send_loan(&loan, blank, header, start, &pieces, content)? {
+                    if !self.send_loan(&loan, request, header, start, &pieces, content)? {
                         return Ok(Posted::Retired);
                     }
                     count(&self.tally.loans_sent);
-                    self.queue(&mut state, attempt, token, Memory::Loaned(loan), expected);
-                    return Ok(Posted::Yes);
+                    self.queue(
+                        &mut state,
+                        attempt,
+                        token,
+                        SentMemory::Loaned(loan),
+                        unanswered,
+                    );
+                    return Ok(Posted::Sent);
                 }
                 None => count(&self.tally.loans_copied),
             }
         }
-        let mut blank = self.take(&mut state, places.end)?;
-        let header = Header::new(&header, offset(places.start)?, self.own, token);
-        *blank.user_header_mut() = header.referring(reference);
-        let payload = blank.payload_mut();
-        let room = places.start..payload.len();
+        let mut request = self.take(&mut state, offsets.end)?;
+        let header = Header::new(&header, offset(offsets.start)?, self.own, token);
+        *request.user_header_mut() = header.referring(reference);
+        let payload = request.payload_mut();
+        let room = offsets.start..payload.len();
         let payload = NonNull::from(payload).cast();
         let written = match reference {
-            Some(_) => Content::Elsewhere(content),
-            None => Content::Here,
+            Some(_) => ContentWrite::Elsewhere(content),
+            None => ContentWrite::Here,
         };
-        // SAFETY: `room` ends where the payload does. Nothing refers to the payload of a request
-        // just taken.
+        // SAFETY: `room` ends where the payload does. The request was just taken, so nothing else
+        // refers to its payload.
         unsafe { write(payload, room, &pieces, written) };
-        // SAFETY: what was not just written is memory of a shared mapping, filled by the kernel or
-        // by earlier requests; every value is a byte.
-        let filled = unsafe { blank.assume_init() };
+        // SAFETY: every byte of the payload is initialized: by `write`, or by the kernel or an
+        // earlier request, because it is memory of a shared mapping.
+        let filled = unsafe { request.assume_init() };
         let pending = filled.send().map_err(send_error)?;
         if pending.number_of_server_connections() == 0 {
-            return Err(self.nobody_reached(&pending));
+            return Err(self.not_delivered(&pending));
         }
         let memory = match reference {
             Some(_) => {
                 count(&self.tally.referring);
-                Memory::Referring {
+                SentMemory::Referring {
                     pending,
                     _content: content.clone(),
                 }
             }
-            None => Memory::Own(pending),
+            None => SentMemory::Own(pending),
         };
-        self.queue(&mut state, attempt, token, memory, expected);
-        Ok(Posted::Yes)
+        self.queue(&mut state, attempt, token, memory, unanswered);
+        Ok(Posted::Sent)
     }
 
     fn queue(
@@ -295,18 +310,18 @@ impl Outbox {
         state: &mut State,
         attempt: AttemptId,
         token: u64,
-        memory: Memory,
-        expected: Expected<'_>,
+        memory: SentMemory,
+        unanswered: UnansweredGuard<'_>,
     ) {
         state.queue.push_back(Sent {
             attempt,
             token,
             memory,
         });
-        expected.will_come();
+        unanswered.keep();
     }
 
-    fn nobody_reached(&self, pending: &Pending) -> WayError {
+    fn not_delivered(&self, pending: &Pending) -> WayError {
         if pending.is_connected() {
             WayError::new(
                 WayFault::Congested,
@@ -320,7 +335,7 @@ impl Outbox {
         }
     }
 
-    /// The loan that this is the content of.
+    /// The loan whose content this is.
     fn loan_of(&self, state: &mut State, content: &Bytes) -> Option<Arc<Loan>> {
         if content.is_empty() || state.loans.is_empty() {
             return None;
@@ -329,8 +344,8 @@ impl Outbox {
         loan.is(content).then_some(loan)
     }
 
-    /// Takes the request out of a loan if it can be sent now for certain.
-    fn ready_loan(&self, state: &State, loan: &Loan) -> Result<Option<Blank>, WayError> {
+    /// Takes the request out of a loan if iceoryx2 will accept it now.
+    fn ready_loan(&self, state: &State, loan: &Loan) -> Result<Option<UninitRequest>, WayError> {
         let kept = |loan: &Weak<Loan>| {
             loan.upgrade()
                 .is_some_and(|loan| loan.is_kept_after_sending())
@@ -342,28 +357,30 @@ impl Outbox {
         Ok(loan.take())
     }
 
-    /// Sends loaned memory. `false` when iceoryx2 refuses against all expectation, and has taken
-    /// the memory back. Others may still read it, so this outbox then loans nothing any more:
-    /// nobody overwrites the memory, no larger segment replaces the one it lies in (which is the
-    /// current one: the caller has made sure), and the loan keeps the outbox with the segment.
+    /// Sends loaned memory. Returns `false` if iceoryx2 unexpectedly refuses, which takes the
+    /// memory back. The application and other processes may still read it, so the outbox is then
+    /// retired and loans nothing any more. Hence the memory is not overwritten, no larger segment
+    /// replaces its segment (which is the current one, as the caller has checked), and the loan
+    /// keeps the outbox and so the segment.
     fn send_loan(
         &self,
         loan: &Arc<Loan>,
-        mut blank: Blank,
+        mut request: UninitRequest,
         header: Header,
         start: usize,
         pieces: &Pieces<'_>,
         content: &Bytes,
     ) -> Result<bool, WayError> {
-        *blank.user_header_mut() = header;
+        *request.user_header_mut() = header;
         let room = start..loan.payload_len();
-        // SAFETY: `room` ends where the payload does, which the request just taken owns. The
-        // content, which is all that anybody else refers to, is not written: the front, which
-        // begins at `start`, ends where it begins, as the caller has checked, and what is in place
-        // is left out. Whoever has taken the request is the only one to write to the rest.
-        unsafe { write(loan.payload(), room, pieces, Content::InPlace(content)) };
-        // SAFETY: front, content and tail are written; the rest is memory of a shared mapping.
-        let filled: Filled = unsafe { blank.assume_init() };
+        // SAFETY: `room` ends where the payload does, which the request just taken owns. Other
+        // references exist only to the content, which is not written: `ContentWrite::InPlace`
+        // leaves it out, and the front, which begins at `start`, ends where the content begins, as
+        // the caller has checked. The request is taken once, so no other thread writes to the rest.
+        unsafe { write(loan.payload(), room, pieces, ContentWrite::InPlace(content)) };
+        // SAFETY: front, content and tail are written. The rest was initialized by the kernel or an
+        // earlier request, because it is memory of a shared mapping.
+        let filled: InitRequest = unsafe { request.assume_init() };
         match filled.send() {
             Ok(pending) if pending.number_of_server_connections() > 0 => {
                 loan.sent(pending);
@@ -371,7 +388,7 @@ impl Outbox {
                 Ok(true)
             }
             Ok(pending) => {
-                let error = self.nobody_reached(&pending);
+                let error = self.not_delivered(&pending);
                 loan.sent(pending);
                 Err(error)
             }
@@ -389,7 +406,7 @@ impl Outbox {
         len: usize,
         tail_room: usize,
     ) -> Result<ShmLoan, WayError> {
-        let places = Places::for_lengths(head_room, len, tail_room).ok_or_else(too_large)?;
+        let offsets = PieceOffsets::for_lengths(head_room, len, tail_room).ok_or_else(too_large)?;
         let mut state = self.state.lock();
         if self.is_retired() {
             return Err(retired());
@@ -398,16 +415,16 @@ impl Outbox {
             return Err(WayError::new(
                 WayFault::Congested,
                 format_args!(
-                    "{} loans to this process are out already: send or drop one, or raise max_loans",
+                    "{} loans to this process are already out; send or drop one, or raise max_loans",
                     self.max_loans
                 ),
             ));
         }
-        let blank = self.take(&mut state, places.end)?;
+        let request = self.take(&mut state, offsets.end)?;
         self.loans.fetch_add(1, Ordering::AcqRel);
         let loan = Loan::new(
-            blank,
-            places.content,
+            request,
+            offsets.content,
             len,
             state.segment.number,
             self.clone(),
@@ -415,7 +432,7 @@ impl Outbox {
         Ok(ShmLoan(Arc::new(loan)))
     }
 
-    /// From now on the content of this loan is recognised.
+    /// Makes the content of this loan recognizable.
     pub(crate) fn register(&self, loan: &Arc<Loan>) {
         let mut state = self.state.lock();
         state.loans.retain(|_, loan| loan.strong_count() > 0);
@@ -430,24 +447,24 @@ impl Outbox {
         self.loans.fetch_sub(1, Ordering::AcqRel);
     }
 
-    /// A request with a payload of this length, all of whose pages are there.
-    fn take(&self, state: &mut State, len: usize) -> Result<Blank, WayError> {
+    /// Takes a request with a payload of this length, all of whose pages are allocated.
+    fn take(&self, state: &mut State, len: usize) -> Result<UninitRequest, WayError> {
         let segment = &mut state.segment;
         let grows = len > segment.room;
-        // Until the pages are there, nobody else takes any.
-        let mut _turn = None;
+        // Keeps other processes from allocating until the pages are allocated here.
+        let mut _lock = None;
         if grows {
             let headers = self.chunks.saturating_mul(FIRST_CHUNK) as u64;
             let need = (len as u64).saturating_add(headers);
-            _turn = Some(self.budget.reserve(need)?);
+            _lock = Some(self.budget.reserve(need)?);
         }
-        let (blank, shortage) = storage::watch(|| self.client.loan_slice_uninit(len));
-        let mut blank = blank.map_err(|error| match shortage {
-            Some(shortage) => lacking(shortage),
+        let (request, shortage) = storage::with_shortage(|| self.client.loan_slice_uninit(len));
+        let mut request = request.map_err(|error| match shortage {
+            Some(shortage) => shortage_error(shortage),
             None => loan_error(error),
         })?;
-        let chunk = std::ptr::from_ref(blank.header()) as usize;
-        let payload = blank.payload_mut().as_ptr().cast::<u8>();
+        let chunk = std::ptr::from_ref(request.header()) as usize;
+        let payload = request.payload_mut().as_ptr().cast::<u8>();
         let head = payload as usize - chunk;
         let known = !grows
             && chunk >= segment.base
@@ -474,25 +491,25 @@ impl Outbox {
         if *ready < len {
             let missing = len - *ready;
             if missing > 2 * FIRST_CHUNK && !grows {
-                _turn = Some(self.budget.reserve(missing as u64)?);
+                _lock = Some(self.budget.reserve(missing as u64)?);
             }
             populate(payload.wrapping_add(*ready), missing)?;
             *ready = len;
         }
-        Ok(blank)
+        Ok(request)
     }
 
-    /// Takes the answers that are there. `ended` says that the other process is gone, so that no
+    /// Collects the available answers. `ended` states that the other process has ended, so that no
     /// further answer comes.
     pub(crate) fn collect(&self, ended: bool, concluded: &mut Vec<(AttemptId, Conclusion)>) {
         if self.waiting() == 0 {
             return;
         }
-        // The receiver answers in order, or drops what it does not answer.
+        // The receiver answers in order, or drops parcels unanswered.
         while let Some((sent, conclusion)) = self.concluded(ended) {
             sent.forget();
             concluded.push((sent.attempt, conclusion));
-            // Dropped outside of the lock: the last owner of a letter.
+            // Dropped outside of the lock: this may be the last owner of a letter.
         }
     }
 
@@ -500,11 +517,11 @@ impl Outbox {
         let mut state = self.state.lock();
         let conclusion = state.queue.front()?.conclusion(ended)?;
         let sent = state.queue.pop_front()?;
-        self.waiting.one_less();
+        self.waiting.decrement();
         Some((sent, conclusion))
     }
 
-    /// Whether there is an answer, probably.
+    /// Whether an answer is probably available.
     pub(crate) fn has_answer(&self) -> bool {
         self.waiting() > 0
             && self
@@ -515,7 +532,7 @@ impl Outbox {
                 .is_some_and(Sent::has_answer)
     }
 
-    /// Forgets an attempt, and says whether it was here.
+    /// Abandons an attempt. Returns whether the attempt was here.
     pub(crate) fn abandon(&self, attempt: AttemptId) -> bool {
         if self.waiting() == 0 {
             return false;
@@ -524,44 +541,44 @@ impl Outbox {
         let place = state.queue.iter().position(|sent| sent.attempt == attempt);
         let sent = place.and_then(|place| state.queue.remove(place));
         if sent.is_some() {
-            self.waiting.one_less();
+            self.waiting.decrement();
         }
         drop(state);
         sent.inspect(Sent::forget).is_some()
     }
 }
 
-/// How many parcels have no answer yet.
+/// Number of unanswered parcels.
 #[derive(Debug)]
-struct Waiting {
+struct UnansweredCount {
     here: AtomicUsize,
     of_all: Arc<AtomicUsize>,
 }
 
-/// An answer is waited for from now on; not any more when this is dropped.
-struct Expected<'a>(&'a Waiting);
+/// Counts a parcel as unanswered until it is dropped.
+struct UnansweredGuard<'a>(&'a UnansweredCount);
 
-impl Expected<'_> {
-    /// The parcel is on its way: it is waited for until it is collected.
-    fn will_come(self) {
+impl UnansweredGuard<'_> {
+    /// The parcel has been sent: it stays counted until its answer is collected.
+    fn keep(self) {
         std::mem::forget(self);
     }
 }
 
-impl Drop for Expected<'_> {
+impl Drop for UnansweredGuard<'_> {
     fn drop(&mut self) {
-        self.0.one_less();
+        self.0.decrement();
     }
 }
 
-impl Waiting {
-    fn one_more(&self) -> Expected<'_> {
+impl UnansweredCount {
+    fn increment(&self) -> UnansweredGuard<'_> {
         self.here.fetch_add(1, Ordering::AcqRel);
         self.of_all.fetch_add(1, Ordering::AcqRel);
-        Expected(self)
+        UnansweredGuard(self)
     }
 
-    fn one_less(&self) {
+    fn decrement(&self) {
         self.here.fetch_sub(1, Ordering::AcqRel);
         self.of_all.fetch_sub(1, Ordering::AcqRel);
     }
@@ -571,16 +588,16 @@ impl Sent {
     fn has_answer(&self) -> bool {
         let look = PendingResponse::has_response;
         match &self.memory {
-            Memory::Own(pending) | Memory::Referring { pending, .. } => look(pending),
-            Memory::Loaned(loan) => loan.with_pending(look).unwrap_or(false),
+            SentMemory::Own(pending) | SentMemory::Referring { pending, .. } => look(pending),
+            SentMemory::Loaned(loan) => loan.with_pending(look).unwrap_or(false),
         }
     }
 
     fn conclusion(&self, ended: bool) -> Option<Conclusion> {
         let look = |pending: &Pending| self.conclusion_of(pending, ended);
         match &self.memory {
-            Memory::Own(pending) | Memory::Referring { pending, .. } => look(pending),
-            Memory::Loaned(loan) => loan.with_pending(look).flatten(),
+            SentMemory::Own(pending) | SentMemory::Referring { pending, .. } => look(pending),
+            SentMemory::Loaned(loan) => loan.with_pending(look).flatten(),
         }
     }
 
@@ -594,7 +611,7 @@ impl Sent {
         let mut answer = pending.receive();
         let dropped = matches!(answer, Ok(None)) && !pending.is_connected();
         if dropped {
-            // It may have been answered in between.
+            // The answer may have come in between.
             answer = pending.receive();
         }
         match answer {
@@ -602,64 +619,70 @@ impl Sent {
                 Some(answer) => Conclusion::Answered(answer),
                 None => Conclusion::Unconfirmed(WayError::new(
                     WayFault::Incompatible,
-                    "the answer makes no sense",
+                    "the answer is malformed",
                 )),
             }),
             Ok(None) if ended => broken("the other process ended before it answered".into()),
-            Ok(None) if dropped => broken("the other process dropped it unanswered".into()),
+            Ok(None) if dropped => broken("the other process dropped it without an answer".into()),
             Ok(None) => None,
-            Err(e) => broken(format!("the answer cannot be received: {e:?}")),
+            Err(e) => broken(format!("cannot receive the answer: {e:?}")),
         }
     }
 
     fn forget(&self) {
-        if let Memory::Loaned(loan) = &self.memory {
+        if let SentMemory::Loaned(loan) = &self.memory {
             loan.queued.store(false, Ordering::Relaxed);
         }
     }
 }
 
-/// What of the content is written.
-enum Content<'a> {
-    /// It is written like the rest.
+/// The treatment of the content when a parcel is written.
+enum ContentWrite<'a> {
+    /// Written like the other pieces.
     Here,
-    /// It is in its place already.
+    /// Already in its place: skipped, but its room is counted.
     InPlace(&'a Bytes),
-    /// It lies somewhere else.
+    /// In a segment: skipped.
     Elsewhere(&'a Bytes),
 }
 
-/// Writes pieces behind each other into this room, counted in bytes behind `start`.
+/// Writes pieces one after the other into `room`, a range of offsets from `start` in bytes.
 ///
 /// # Panics
-/// When they are longer than that. Lengths come from other crates, and nothing but this looks at
-/// whether they are those of what is written.
+/// Panics if the pieces are longer than the room. The lengths come from other crates, and only this
+/// check compares them with what is written.
 ///
 /// # Safety
-/// The room must be within memory that may be written, and nothing else may refer to what of it is
-/// written.
-unsafe fn write(start: NonNull<u8>, room: Range<usize>, pieces: &Pieces<'_>, content: Content<'_>) {
+/// The room must be in memory that may be written, and nothing else may refer to the parts of it
+/// that are written.
+unsafe fn write(
+    start: NonNull<u8>,
+    room: Range<usize>,
+    pieces: &Pieces<'_>,
+    content: ContentWrite<'_>,
+) {
     let Range { start: mut at, end } = room;
     for piece in pieces.iter() {
         let place = start.as_ptr().wrapping_add(at);
         let is = |content: &Bytes| std::ptr::eq(&content[..], piece);
         let is_written = match content {
-            Content::Elsewhere(content) if is(content) => continue,
-            Content::InPlace(content) => !is(content),
-            Content::Here | Content::Elsewhere(_) => true,
+            ContentWrite::Elsewhere(content) if is(content) => continue,
+            ContentWrite::InPlace(content) => !is(content),
+            ContentWrite::Here | ContentWrite::Elsewhere(_) => true,
         };
         let most = end.saturating_sub(at);
-        assert!(piece.len() <= most, "pieces as long as the header says");
+        assert!(piece.len() <= most, "pieces have the lengths of the header");
         if is_written {
-            // SAFETY: `place` has room for it, as was just seen, in the memory that the caller
-            // vouches for; a piece is not in that memory, because nothing else refers to it.
+            // SAFETY: the assertion above shows that the piece fits behind `place`, in memory that
+            // may be written according to the caller. The piece does not overlap it, because
+            // nothing else refers to that memory.
             unsafe { place.copy_from_nonoverlapping(piece.as_ptr(), piece.len()) };
         }
         at += piece.len();
     }
 }
 
-/// iceoryx2's header, ours, and the payload's alignment.
+/// Length of iceoryx2's header and `Header`, rounded up to the alignment of the payload.
 fn header_len() -> usize {
     use iceoryx2::service::header::request_response::RequestHeader;
     (size_of::<RequestHeader>() + size_of::<Header>()).next_multiple_of(ALIGNMENT)

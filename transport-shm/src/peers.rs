@@ -1,4 +1,4 @@
-//! The other processes that an endpoint keeps in mind.
+//! The other processes that an endpoint has open.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -9,32 +9,32 @@ use tokio::runtime::Handle;
 use tokio::task::AbortHandle;
 
 use crate::outbox::Outbox;
-use crate::presence::{Neighbour, Watched, has_ended};
+use crate::presence::{PeerProcess, SharedFd, has_ended};
 
-/// No count of looks.
+/// A value that the count of polls does not reach.
 const NEVER: u64 = u64::MAX;
 
 /// Another process.
 ///
-/// Its end is final: [`Peer::end`] first says so, then stops its outbox from taking letters; and
-/// an outbox is only opened, under the same lock, while it has not ended. So once
-/// [`Peer::collect`] has found the outbox of an ended process empty, nothing is forgotten with it.
+/// Its end is final. [`Peer::end`] first sets `ended`, then stops the outbox from accepting
+/// letters; and an outbox is opened, under the same lock, only while `ended` is false. So once
+/// [`Peer::collect`] has found the outbox of an ended process empty, no letter is lost with it.
 pub(crate) struct Peer {
     incarnation: Incarnation,
-    neighbour: Neighbour,
+    process: PeerProcess,
     outbox: Mutex<Option<Arc<Outbox>>>,
     ended: AtomicBool,
-    /// How often the process had looked when a letter to it was abandoned last.
+    /// The count of polls of the process when a letter to it was last abandoned.
     abandoned_at: AtomicU64,
     used: AtomicU64,
     watcher: OnceLock<AbortHandle>,
 }
 
 impl Peer {
-    pub(crate) fn new(incarnation: Incarnation, neighbour: Neighbour) -> Self {
+    pub(crate) fn new(incarnation: Incarnation, process: PeerProcess) -> Self {
         Self {
             incarnation,
-            neighbour,
+            process,
             outbox: Mutex::new(None),
             ended: AtomicBool::new(false),
             abandoned_at: AtomicU64::new(NEVER),
@@ -47,29 +47,29 @@ impl Peer {
         self.incarnation
     }
 
-    /// Whether it will look without being rung at.
+    /// Whether the process will poll without being rung at.
     pub(crate) fn is_awake(&self) -> bool {
-        self.neighbour.is_awake()
+        self.process.is_awake()
     }
 
-    /// Whether it was looking when it was last asked.
-    pub(crate) fn was_looking(&self) -> bool {
-        self.neighbour.was_looking()
+    /// Whether the process was polling at the last check.
+    pub(crate) fn was_polling(&self) -> bool {
+        self.process.was_polling()
     }
 
-    /// Makes it look, unless it is awake. Says whether the bell was rung.
+    /// Rings the process's doorbell unless it is awake. Returns whether it rang.
     pub(crate) fn wake(&self) -> bool {
-        self.neighbour.wake()
+        self.process.wake()
     }
 
-    /// Calls `ended` when the process ends.
+    /// Starts a task that calls `ended` when the process ends.
     pub(crate) fn watch(
         &self,
         runtime: &Handle,
         ended: impl FnOnce() + Send + 'static,
     ) -> std::io::Result<()> {
         let _runtime = runtime.enter();
-        let live = Watched::readable(self.neighbour.live().clone())?;
+        let live = SharedFd::readable(self.process.live().clone())?;
         let task = runtime.spawn(async move {
             while let Ok(mut ready) = live.readable().await {
                 if has_ended(live.get_ref().get()) {
@@ -78,12 +78,12 @@ impl Peer {
                 ready.clear_ready();
             }
         });
-        // Set once, right after making the peer.
+        // Set once, right after the peer is created.
         let _ = self.watcher.set(task.abort_handle());
         Ok(())
     }
 
-    /// The outbox, opened with `open` if necessary.
+    /// Returns the outbox, opened with `open` if necessary.
     pub(crate) fn outbox(
         &self,
         open: impl FnOnce() -> Result<Outbox, WayError>,
@@ -101,11 +101,11 @@ impl Peer {
     fn gone(&self) -> WayError {
         WayError::new(
             WayFault::Unreachable,
-            format_args!("the process {} has ended", self.incarnation),
+            format_args!("process {} has ended", self.incarnation),
         )
     }
 
-    /// Forgets an outbox that takes nothing any more, when all its letters are concluded.
+    /// Drops a retired outbox whose letters are all concluded.
     pub(crate) fn renew(&self) {
         let mut slot = self.outbox.lock();
         if slot
@@ -116,7 +116,7 @@ impl Peer {
         }
     }
 
-    /// The process has ended.
+    /// Marks the process as ended.
     pub(crate) fn end(&self) {
         self.ended.store(true, Ordering::SeqCst);
         if let Some(outbox) = &*self.outbox.lock() {
@@ -124,9 +124,9 @@ impl Peer {
         }
     }
 
-    /// Takes the answers that are there, and says whether this peer can be forgotten.
+    /// Collects the available answers. Returns whether the process has ended and nothing is left.
     pub(crate) fn collect(&self, concluded: &mut Vec<(AttemptId, Conclusion)>) -> bool {
-        // Asked before: an answer that came before the end is found then.
+        // Read first: an answer from before the end is then found below.
         let ended = self.ended.load(Ordering::SeqCst);
         match &*self.outbox.lock() {
             Some(outbox) => {
@@ -137,13 +137,13 @@ impl Peer {
         }
     }
 
-    /// Whether there is an answer to be collected, probably.
+    /// Whether an answer is probably available.
     pub(crate) fn has_answer(&self) -> bool {
         let outbox = self.outbox.lock();
         outbox.as_ref().is_some_and(|outbox| outbox.has_answer())
     }
 
-    /// Gives every letter that waits its conclusion, for a transport that closes.
+    /// Concludes all unanswered letters, for a transport that closes.
     pub(crate) fn close(&self, concluded: &mut Vec<(AttemptId, Conclusion)>) {
         self.end();
         if let Some(outbox) = self.outbox.lock().take() {
@@ -151,38 +151,38 @@ impl Peer {
         }
     }
 
-    /// Forgets an attempt, and says whether it was here.
+    /// Abandons an attempt. Returns whether the attempt was here.
     pub(crate) fn abandon(&self, attempt: AttemptId) -> bool {
         let outbox = self.outbox.lock().clone();
         let abandoned = outbox.is_some_and(|outbox| outbox.abandon(attempt));
         if abandoned {
             self.abandoned_at
-                .store(self.neighbour.looks(), Ordering::Relaxed);
+                .store(self.process.polls(), Ordering::Relaxed);
         }
         abandoned
     }
 
-    /// From now on it takes no letters. What waits still waits.
+    /// Stops the outbox from accepting letters. Unanswered ones still get their answers.
     pub(crate) fn retire(&self) {
         if let Some(outbox) = &*self.outbox.lock() {
             outbox.retire();
         }
     }
 
-    /// The process, when letters may still lie in its mailbox. While they do, the outbox must not
-    /// go: iceoryx2 0.10 never lets go of memory for requests that it finds when their sender has
-    /// gone.
-    pub(crate) fn untaken(&self) -> Option<&Neighbour> {
+    /// Returns the process if its mailbox may still contain letters of this outbox. The outbox must
+    /// then stay open: iceoryx2 0.10 does not release memory of requests that a receiver finds
+    /// after their sender has closed.
+    pub(crate) fn untaken(&self) -> Option<&PeerProcess> {
         let waiting = self
             .outbox
             .lock()
             .as_ref()
             .is_some_and(|it| it.waiting() > 0);
         let abandoned_at = self.abandoned_at.load(Ordering::Relaxed);
-        let looked_since = self.neighbour.looks().wrapping_sub(abandoned_at) >= 2;
-        let abandoned = abandoned_at != NEVER && !looked_since;
+        let polled_since = self.process.polls().wrapping_sub(abandoned_at) >= 2;
+        let abandoned = abandoned_at != NEVER && !polled_since;
         let ended = self.ended.load(Ordering::SeqCst);
-        (!ended && (waiting || abandoned)).then_some(&self.neighbour)
+        (!ended && (waiting || abandoned)).then_some(&self.process)
     }
 
     pub(crate) fn mark_used(&self, now: u64) {
@@ -193,7 +193,7 @@ impl Peer {
         self.used.load(Ordering::Relaxed)
     }
 
-    /// Whether nothing would be lost by forgetting it.
+    /// Whether the peer can be dropped without losing anything.
     pub(crate) fn is_idle(&self) -> bool {
         let outbox = self.outbox.lock();
         let is_idle = outbox.as_ref().is_none_or(|outbox| outbox.is_idle());

@@ -1,4 +1,4 @@
-//! The sending side of content for many: segments, and what they are used for. See `segment`.
+//! The sending side of content for several receivers: segments and their use. See `segment`.
 
 use std::cmp::Reverse;
 use std::io::ErrorKind;
@@ -9,31 +9,31 @@ use bytes::Bytes;
 use fipa_transport::{Incarnation, LoanedContent, WayError, WayFault};
 use parking_lot::Mutex;
 
-use crate::domain::Domain;
-use crate::memory::{Budget, PAGE, no_room, populate};
-use crate::segment::{Reference, SegmentFile};
+use crate::domain_files::DomainFiles;
+use crate::memory::{Budget, PAGE, no_room_error, populate};
+use crate::segment::{ContentReference, SegmentFile};
 
-/// How many segments a process has at most.
+/// Maximum number of segments of a process.
 const MAX_SEGMENTS: usize = 8;
 
-/// Which part of the domain's capacity may lie idle in a process's segments, so that the next
-/// content finds its pages.
+/// Fraction of the domain's capacity, as a divisor, that idle segments of a process may use. The
+/// next content then finds its pages allocated.
 const IDLE_PART: u64 = 16;
 
 /// The segments of this process.
 #[derive(Debug)]
 pub(crate) struct Pool {
     own: Incarnation,
-    /// From which length on content is worth a segment.
-    from: usize,
-    /// How many contents letters can refer to. When there are none, nobody need look.
-    known: AtomicUsize,
-    /// Something is to be given back that somebody still reads.
+    /// Minimum length in bytes of content for a segment.
+    share_from: usize,
+    /// Number of contents that letters can refer to. If it is 0, no lookup is needed.
+    registered: AtomicUsize,
+    /// Whether memory is to be released that another process still reads.
     waiting: AtomicBool,
     state: Mutex<State>,
     budget: Arc<Budget>,
-    // Last: whoever holds content longest removes the domain's traces.
-    domain: Arc<Domain>,
+    // Last: the last owner of content removes the domain's files.
+    domain: Arc<DomainFiles>,
 }
 
 #[derive(Debug, Default)]
@@ -45,17 +45,17 @@ struct State {
 #[derive(Debug)]
 struct Slot {
     segment: Arc<Segment>,
-    purpose: Purpose,
+    usage: Usage,
 }
 
 #[derive(Debug)]
-enum Purpose {
-    /// Nobody in this process holds its content. Others may be reading it.
+enum Usage {
+    /// This process does not hold the content. Other processes may be reading it.
     Idle,
-    /// It is being filled.
+    /// The application is writing the content.
     Loaned,
-    /// Letters can refer to it.
-    Known { len: usize, generation: u64 },
+    /// Letters can refer to the content.
+    Registered { len: usize, generation: u64 },
 }
 
 #[derive(Debug)]
@@ -67,14 +67,14 @@ struct Segment {
 impl Pool {
     pub(crate) fn new(
         own: Incarnation,
-        from: usize,
+        share_from: usize,
         budget: Arc<Budget>,
-        domain: Arc<Domain>,
+        domain: Arc<DomainFiles>,
     ) -> Self {
         Self {
             own,
-            from,
-            known: AtomicUsize::new(0),
+            share_from,
+            registered: AtomicUsize::new(0),
             waiting: AtomicBool::new(false),
             state: Mutex::default(),
             budget,
@@ -82,9 +82,12 @@ impl Pool {
         }
     }
 
-    /// Memory for content of this length, unless it is too short to be worth it.
-    pub(crate) fn loan(self: &Arc<Self>, len: usize) -> Result<Option<ManyLoan>, WayError> {
-        if len < self.from {
+    /// Loans memory for content of this length. `None` if the content is too short for a segment.
+    pub(crate) fn loan(
+        self: &Arc<Self>,
+        len: usize,
+    ) -> Result<Option<SharedContentLoan>, WayError> {
+        if len < self.share_from {
             return Ok(None);
         }
         let mut state = self.state.lock();
@@ -93,9 +96,9 @@ impl Pool {
         }
         let (segment, generation) = match state.begin_idle(len) {
             Some(begun) => begun,
-            None => self.make(&mut state, len)?,
+            None => self.create(&mut state, len)?,
         };
-        Ok(Some(ManyLoan(Taken {
+        Ok(Some(SharedContentLoan(LoanedSegment {
             segment,
             generation,
             len,
@@ -103,21 +106,21 @@ impl Pool {
         })))
     }
 
-    /// A new segment, in place of idle ones where there are too many or too little memory.
-    fn make(&self, state: &mut State, len: usize) -> Result<(Arc<Segment>, u64), WayError> {
+    /// Creates a segment. Replaces idle ones if there are too many or memory is short.
+    fn create(&self, state: &mut State, len: usize) -> Result<(Arc<Segment>, u64), WayError> {
         if state.slots.len() >= MAX_SEGMENTS && !self.drop_idle(state) {
             return Err(WayError::new(
                 WayFault::Congested,
                 format_args!(
-                    "{MAX_SEGMENTS} contents for several receivers are held or still being read"
+                    "{MAX_SEGMENTS} contents for several receivers are already held or being read"
                 ),
             ));
         }
         let room = room_for(len);
         let need = room.saturating_add(PAGE) as u64;
-        let turn = loop {
+        let lock = loop {
             match self.budget.reserve(need) {
-                Ok(turn) => break turn,
+                Ok(lock) => break lock,
                 Err(error) => {
                     if error.fault == WayFault::TooLarge || !self.drop_idle(state) {
                         return Err(error);
@@ -125,32 +128,33 @@ impl Pool {
                 }
             }
         };
-        // Of the process, because others may still know the segments of an endpoint before.
+        // Numbers are unique in the process: peers may still have segments of an earlier endpoint
+        // open.
         static LAST_NUMBER: AtomicU64 = AtomicU64::new(0);
         let number = LAST_NUMBER.fetch_add(1, Ordering::Relaxed) + 1;
         let made = self.make_file(number, room);
-        drop(turn);
+        drop(lock);
         let (file, generation) = made.inspect_err(|_| self.remove(number))?;
         let segment = Arc::new(Segment { number, file });
         state.slots.push(Slot {
             segment: Arc::clone(&segment),
-            purpose: Purpose::Loaned,
+            usage: Usage::Loaned,
         });
         Ok((segment, generation))
     }
 
     fn make_file(&self, number: u64, room: usize) -> Result<(SegmentFile, u64), WayError> {
-        let path = self.domain.names().content(self.own, number);
+        let path = self.domain.paths().segment(self.own, number);
         let cannot = |e: std::io::Error| match e.kind() {
-            ErrorKind::StorageFull => no_room(room as u64, "is full"),
+            ErrorKind::StorageFull => no_room_error(room as u64, "is full"),
             _ => {
-                let text = format_args!("cannot make {}: {e}", path.display());
+                let text = format_args!("cannot create {}: {e}", path.display());
                 WayError::new(WayFault::Exhausted, text)
             }
         };
         let file = SegmentFile::create(&path, room).map_err(cannot)?;
-        // The pages are there; this makes them ones that the sender need not fault in. Before Linux
-        // 5.14 that is not possible, and the sender faults them in.
+        // The pages are allocated; this maps them, which saves page faults of the sender. Before
+        // Linux 5.14 that is not possible, and the sender takes the faults.
         let _ = populate(file.mapping().start().as_ptr(), file.mapping().len());
         let begun = file.begin();
         let generation = begun.ok_or_else(|| cannot(ErrorKind::ResourceBusy.into()))?;
@@ -158,17 +162,17 @@ impl Pool {
     }
 
     /// The reference to this content, if letters can refer to it.
-    pub(crate) fn find(&self, content: &Bytes) -> Option<Reference> {
-        if content.len() < self.from || self.known.load(Ordering::Acquire) == 0 {
+    pub(crate) fn find(&self, content: &Bytes) -> Option<ContentReference> {
+        if content.len() < self.share_from || self.registered.load(Ordering::Acquire) == 0 {
             return None;
         }
         let address = content.as_ptr() as usize;
         let state = self.state.lock();
-        state.slots.iter().find_map(|slot| match slot.purpose {
-            Purpose::Known { len, generation }
+        state.slots.iter().find_map(|slot| match slot.usage {
+            Usage::Registered { len, generation }
                 if slot.segment.address() == address && len == content.len() =>
             {
-                Some(Reference {
+                Some(ContentReference {
                     segment: slot.segment.number,
                     generation,
                 })
@@ -177,19 +181,19 @@ impl Pool {
         })
     }
 
-    /// Whether this content would be copied for each of several receivers, and should not be.
+    /// Whether this content is long enough for a segment but not in one.
     pub(crate) fn copies(&self, content: &Bytes) -> bool {
-        content.len() >= self.from && self.find(content).is_none()
+        content.len() >= self.share_from && self.find(content).is_none()
     }
 
-    /// Somebody rang, perhaps because it has stopped reading what is to be given back.
+    /// Retries a pending release. Called when a doorbell rang: a reader may have stopped.
     pub(crate) fn trim_if_waiting(&self) {
         if self.waiting.swap(false, Ordering::SeqCst) {
             self.trim(&mut self.state.lock());
         }
     }
 
-    /// Gives back what lies idle beyond measure, the largest first.
+    /// Releases idle segments beyond the limit, the largest first.
     fn trim(&self, state: &mut State) {
         if state.closed {
             return;
@@ -203,9 +207,9 @@ impl Pool {
             if beyond == 0 || !slot.is_idle() {
                 return true;
             }
-            // First this, so that whoever reads either has stopped or will say so.
-            slot.segment.file.want();
-            let empty = self.emptied(slot);
+            // Requested first, so that a reader either has stopped or will ring.
+            slot.segment.file.request_notice();
+            let empty = self.release_memory(slot);
             waiting |= !empty;
             if empty {
                 beyond = beyond.saturating_sub(slot.size());
@@ -215,15 +219,15 @@ impl Pool {
         self.waiting.store(waiting, Ordering::SeqCst);
     }
 
-    /// Gives back one idle segment that nobody reads. Says whether there was one.
+    /// Releases one idle segment that is not read. Returns whether there was one.
     fn drop_idle(&self, state: &mut State) -> bool {
         let mut slots = state.slots.iter();
-        let place = slots.position(|slot| slot.is_idle() && self.emptied(slot));
+        let place = slots.position(|slot| slot.is_idle() && self.release_memory(slot));
         place.map(|place| state.slots.swap_remove(place)).is_some()
     }
 
-    /// Gives back the memory of a segment, unless somebody reads it.
-    fn emptied(&self, slot: &Slot) -> bool {
+    /// Releases the memory of a segment, unless it is read.
+    fn release_memory(&self, slot: &Slot) -> bool {
         let empty = slot.segment.file.empty();
         if empty {
             self.remove(slot.segment.number);
@@ -232,36 +236,36 @@ impl Pool {
     }
 
     fn remove(&self, number: u64) {
-        // What cannot be removed now is removed after this process.
-        let _ = std::fs::remove_file(self.domain.names().content(self.own, number));
+        // A file that cannot be removed now is removed after the end of this process.
+        let _ = std::fs::remove_file(self.domain.paths().segment(self.own, number));
     }
 
-    /// Gives back all that is not held in this process; the rest goes when it is dropped. To be
-    /// called before others can take this process for dead.
+    /// Releases all segments that this process does not hold; the others follow when they are
+    /// dropped. Must run before other processes can consider this process dead.
     pub(crate) fn close(&self) {
         let mut state = self.state.lock();
         state.closed = true;
         state.slots.retain(|slot| {
-            if slot.is_idle() && !self.emptied(slot) {
-                // Those who read it keep its memory.
+            if slot.is_idle() && !self.release_memory(slot) {
+                // Processes that read it keep its memory.
                 self.remove(slot.segment.number);
             }
             !slot.is_idle()
         });
     }
 
-    /// From now on letters can refer to this content.
-    fn register(&self, taken: &Taken) {
+    /// Makes the content available to letters.
+    fn register(&self, taken: &LoanedSegment) {
         let (len, generation) = (taken.len, taken.generation);
-        drop(self.change(taken, Purpose::Known { len, generation }));
+        drop(self.change(taken, Usage::Registered { len, generation }));
     }
 
-    /// Nobody in this process has this content any more.
-    fn give_back(&self, taken: &Taken) {
+    /// Releases a content that this process no longer holds.
+    fn release(&self, taken: &LoanedSegment) {
         let segment = &taken.segment;
-        // Nobody else waits for this process.
-        segment.file.let_go();
-        let mut state = self.change(taken, Purpose::Idle);
+        // The result is not needed: only the process's own pool waits for this segment.
+        segment.file.unlock();
+        let mut state = self.change(taken, Usage::Idle);
         if state.closed {
             segment.file.empty();
             self.remove(segment.number);
@@ -272,28 +276,28 @@ impl Pool {
         self.trim(&mut state);
     }
 
-    fn change(&self, taken: &Taken, purpose: Purpose) -> parking_lot::MutexGuard<'_, State> {
+    fn change(&self, taken: &LoanedSegment, usage: Usage) -> parking_lot::MutexGuard<'_, State> {
         let mut state = self.state.lock();
         let mut slots = state.slots.iter_mut();
         if let Some(slot) = slots.find(|slot| slot.segment.number == taken.segment.number) {
-            slot.purpose = purpose;
+            slot.usage = usage;
         }
-        let known = |slot: &&Slot| matches!(slot.purpose, Purpose::Known { .. });
-        let known = state.slots.iter().filter(known).count();
-        self.known.store(known, Ordering::Release);
+        let registered = |slot: &&Slot| matches!(slot.usage, Usage::Registered { .. });
+        let registered = state.slots.iter().filter(registered).count();
+        self.registered.store(registered, Ordering::Release);
         state
     }
 }
 
 impl State {
-    /// The smallest idle segment that has room and that nobody reads, and the generation of the
-    /// content that begins in it.
+    /// Begins content in the smallest idle segment that has room and is not read. Returns the
+    /// segment and the generation of the content.
     fn begin_idle(&mut self, len: usize) -> Option<(Arc<Segment>, u64)> {
         self.slots.sort_by_key(Slot::size);
         let fits = |slot: &&mut Slot| slot.is_idle() && slot.segment.file.room() >= len;
         self.slots.iter_mut().filter(fits).find_map(|slot| {
             let generation = slot.segment.file.begin()?;
-            slot.purpose = Purpose::Loaned;
+            slot.usage = Usage::Loaned;
             Some((Arc::clone(&slot.segment), generation))
         })
     }
@@ -301,10 +305,10 @@ impl State {
 
 impl Slot {
     fn is_idle(&self) -> bool {
-        matches!(self.purpose, Purpose::Idle)
+        matches!(self.usage, Usage::Idle)
     }
 
-    /// What it takes, in bytes.
+    /// Size in bytes.
     fn size(&self) -> u64 {
         self.segment.file.mapping().len() as u64
     }
@@ -316,15 +320,15 @@ impl Segment {
     }
 }
 
-/// How large a segment for content of this length is: at most a quarter larger, so that contents
-/// of about the same length can follow each other in it.
+/// Room of a segment for content of this length. At most a quarter larger, so that contents of
+/// similar length can reuse it.
 fn room_for(len: usize) -> usize {
     let step = (len / 8).next_power_of_two().max(PAGE);
     len.checked_next_multiple_of(step).unwrap_or(len)
 }
 
-/// A content of this process, from when its memory is loaned until nobody here holds it.
-struct Taken {
+/// A content of this process, from the loan of its memory until its last owner here drops it.
+struct LoanedSegment {
     segment: Arc<Segment>,
     generation: u64,
     /// At most the segment's room.
@@ -332,29 +336,29 @@ struct Taken {
     pool: Arc<Pool>,
 }
 
-impl Drop for Taken {
+impl Drop for LoanedSegment {
     fn drop(&mut self) {
-        // In a forked child it stays the parent's.
+        // In a forked child the content belongs to the parent.
         if self.pool.domain.owner().is_this() {
-            self.pool.give_back(self);
+            self.pool.release(self);
         }
     }
 }
 
-/// What the application fills in.
-pub(crate) struct ManyLoan(Taken);
+/// The writable content.
+pub(crate) struct SharedContentLoan(LoanedSegment);
 
-impl LoanedContent for ManyLoan {
+impl LoanedContent for SharedContentLoan {
     fn content_mut(&mut self) -> &mut [u8] {
-        let Taken { segment, len, .. } = &self.0;
-        // SAFETY: the range lies in the segment's mapping, which has room for `len` bytes (the
-        // pool gives out no other) and lives as long as the segment. Nothing else refers to it:
-        // the segment was idle, this is the only `ManyLoan` of it, borrowed mutably, and no letter
-        // refers to this generation before `freeze`. Other processes have it mapped for reading, but
-        // make references into it only under the lock and for the generation that is there, and
-        // this process had the lock alone when it began this one. The pages are there
-        // (`SegmentFile::create`), filled by the kernel or by earlier contents, and the file is not
-        // shortened while this process holds the lock.
+        let LoanedSegment { segment, len, .. } = &self.0;
+        // SAFETY: the range is in the segment's mapping, which has room for `len` bytes (the pool
+        // loans no other segment) and exists as long as the segment. Nothing else refers to it: the
+        // segment was idle, this is its only `SharedContentLoan`, borrowed mutably, and no letter
+        // refers to this generation before `freeze`. Other processes map the segment for reading.
+        // They create references into it only under the lock and for the current generation, and
+        // this process held the exclusive lock when it began this one. The pages are allocated
+        // (`SegmentFile::create`) and initialized by the kernel or by earlier contents. The file is
+        // not shortened while this process holds the lock.
         unsafe { std::slice::from_raw_parts_mut(segment.file.content(), *len) }
     }
 
@@ -364,16 +368,17 @@ impl LoanedContent for ManyLoan {
     }
 }
 
-/// The content, readable.
-struct Frozen(Taken);
+/// The readable content.
+struct Frozen(LoanedSegment);
 
 impl AsRef<[u8]> for Frozen {
     fn as_ref(&self) -> &[u8] {
-        let Taken { segment, len, .. } = &self.0;
-        // SAFETY: in the mapping, as above. Nobody writes there: `ManyLoan` is consumed, and the
-        // segment is idle again, and can be loaned, only when this is dropped. The file is not
-        // shortened either, because this process holds the lock until then, also when its
-        // transport is closed.
+        let LoanedSegment { segment, len, .. } = &self.0;
+        // SAFETY: the range is in the segment's mapping, which has room for `len` bytes and exists
+        // as long as the segment. No process writes there: the `SharedContentLoan` is consumed, and
+        // the segment becomes idle, and can be loaned again, only when this is dropped. Until then
+        // this process holds the lock, also after its transport is closed, so the file is not
+        // shortened.
         unsafe { std::slice::from_raw_parts(segment.file.content(), *len) }
     }
 }

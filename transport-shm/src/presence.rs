@@ -1,14 +1,17 @@
-//! How processes wake each other, and notice each other's end.
+//! Wake-up of processes, and detection of their end.
 //!
 //! Every process has three files of its own, named after its incarnation:
-//! * `live`, a FIFO that it keeps open for writing. Whoever has it open for reading is told by the
-//!   kernel when the last writer ends, however it ends. Nothing is ever written to it.
-//! * `bell`, a FIFO that it reads. A byte means: look into your mailbox, and after your answers.
-//! * a page of shared memory that says whether it is looking already, so that nobody needs to
-//!   ring, and how often it has heard its bell. The page and the bell work together as described
-//!   at [`Presence::looking`] and [`Neighbour::is_awake`].
+//! * The liveness FIFO (`.live`). The process keeps it open for writing, and nothing is written to
+//!   it. A process that has it open for reading is notified by the kernel when the last writer
+//!   ends, however it ends.
+//! * The doorbell (`.bell`), a FIFO that the process reads. A byte makes the process check its
+//!   mailbox and its answers.
+//! * The status page (`.page` in `/dev/shm`). It states whether the process is polling, so that no
+//!   peer needs to ring, and counts how often the process has cleared its doorbell.
+//!   [`Presence::begin_polling`] and [`PeerProcess::is_awake`] describe the protocol between the
+//!   page and the doorbell.
 //!
-//! Besides, while it multicasts, its segments (see `segment`).
+//! A process that sends content to several receivers also has segments (see `segment`).
 
 use std::fs::File;
 use std::io::{self, ErrorKind, Read, Write};
@@ -26,25 +29,25 @@ use rustix::mm::ProtFlags;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
-use crate::domain::files_in;
+use crate::domain_files::files_in;
 use crate::fork::Owner;
-use crate::memory::{Mapping, PAGE, SHM, open_ours};
+use crate::memory::{Mapping, PAGE, SHM, open_owned};
 use crate::segment;
 
-/// Nobody but the owner.
+/// Mode of a file that only its owner may access.
 const PRIVATE: Mode = Mode::RUSR.union(Mode::WUSR);
 
-/// How the names of segments end.
+/// Suffix of the file names of segments.
 const CONTENT: &str = "content";
 
-/// Names of the files of processes.
+/// Paths of the files of processes.
 #[derive(Debug, Clone)]
-pub(crate) struct Names {
+pub(crate) struct ProcessPaths {
     directory: PathBuf,
     prefix: String,
 }
 
-impl Names {
+impl ProcessPaths {
     pub(crate) fn new(root: &Path, prefix: &str) -> Self {
         Self {
             directory: root.join("processes"),
@@ -56,20 +59,20 @@ impl Names {
         &self.directory
     }
 
-    pub(crate) fn live(&self, of: Incarnation) -> PathBuf {
+    pub(crate) fn liveness_fifo(&self, of: Incarnation) -> PathBuf {
         self.directory.join(format!("{}{of}.live", self.prefix))
     }
 
-    pub(crate) fn bell(&self, of: Incarnation) -> PathBuf {
+    pub(crate) fn doorbell(&self, of: Incarnation) -> PathBuf {
         self.directory.join(format!("{}{of}.bell", self.prefix))
     }
 
-    pub(crate) fn page(&self, of: Incarnation) -> PathBuf {
+    pub(crate) fn status_page(&self, of: Incarnation) -> PathBuf {
         Path::new(SHM).join(format!("{}{of}.page", self.prefix))
     }
 
-    /// A segment of content for many.
-    pub(crate) fn content(&self, of: Incarnation, number: u64) -> PathBuf {
+    /// Path of a segment of content for several receivers.
+    pub(crate) fn segment(&self, of: Incarnation, number: u64) -> PathBuf {
         Path::new(SHM).join(format!("{}{of}.{number}.{CONTENT}", self.prefix))
     }
 
@@ -82,14 +85,18 @@ impl Names {
                 segment::remove(&file.path());
             }
         }
-        // What is not there need not be removed, and `live` goes last: as long as it is there,
-        // whoever cleans up comes back for the others.
-        for path in [self.page(of), self.bell(of), self.live(of)] {
+        // The liveness FIFO goes last: as long as it exists, a later cleanup finds the process and
+        // removes the other files. A missing file is not an error.
+        for path in [
+            self.status_page(of),
+            self.doorbell(of),
+            self.liveness_fifo(of),
+        ] {
             let _ = std::fs::remove_file(path);
         }
     }
 
-    /// The processes that have files here.
+    /// Incarnations of the processes that have files in the domain, sorted.
     pub(crate) fn all(&self) -> io::Result<Vec<Incarnation>> {
         let mut found = Vec::new();
         for directory in [self.directory.as_path(), Path::new(SHM)] {
@@ -116,22 +123,22 @@ impl Names {
         Ok(found)
     }
 
-    /// Whether this process is there. To be asked under the domain's lock, or of a process that
-    /// is known to have been there. A process whose files cannot be examined, for example for lack
-    /// of descriptors, counts as alive.
+    /// Whether this process runs. The caller must hold the domain's lock, or be certain that the
+    /// process has started. A process whose files cannot be examined, for example for lack of
+    /// descriptors, counts as alive.
     pub(crate) fn is_alive(&self, of: Incarnation) -> bool {
-        match open_live(&self.live(of)) {
+        match open_liveness_fifo(&self.liveness_fifo(of)) {
             Ok(live) => !has_ended(&live),
-            Err(error) if error.kind() == ErrorKind::NotFound => self.holds_page(of),
+            Err(error) if error.kind() == ErrorKind::NotFound => self.holds_status_page(of),
             Err(_) => true,
         }
     }
 
-    /// Whether this process has its page locked: then it is there, though another program has
+    /// Whether this process has its status page locked. It then runs, although another program has
     /// removed its files from the directory.
-    fn holds_page(&self, of: Incarnation) -> bool {
-        match open_ours(&self.page(of), File::options().read(true)) {
-            // The lock ends with the descriptor, at once.
+    fn holds_status_page(&self, of: Incarnation) -> bool {
+        match open_owned(&self.status_page(of), File::options().read(true)) {
+            // A lock taken here ends at once, with the descriptor.
             Ok((page, _)) => {
                 flock(&page, FlockOperation::NonBlockingLockShared) == Err(Errno::WOULDBLOCK)
             }
@@ -139,154 +146,157 @@ impl Names {
         }
     }
 
-    /// Wakes a process without keeping anything open.
+    /// Rings the doorbell of a process without keeping it open.
     pub(crate) fn ring_once(&self, of: Incarnation) {
-        if let Ok(bell) = open_bell(&self.bell(of)) {
-            ring(&bell);
+        if let Ok(doorbell) = open_doorbell(&self.doorbell(of)) {
+            ring(&doorbell);
         }
     }
 }
 
-/// This process, as others see it.
+/// The files of this process.
 #[derive(Debug)]
 pub(crate) struct Presence {
-    names: Names,
+    paths: ProcessPaths,
     own: Incarnation,
     owner: Owner,
-    bell: Arc<Bell>,
-    page: Arc<Page>,
-    /// Never read: locked for as long as the process lives.
+    doorbell: Arc<Doorbell>,
+    page: Arc<StatusPage>,
+    /// Locked for as long as the process runs; never read.
     _locked: File,
-    // Last: the other files are there as long as this one is open.
+    // Last: the other files exist as long as this one is open.
     _live: File,
 }
 
 impl Presence {
-    /// Makes the files. To be called under the domain's lock.
-    pub(crate) fn create(names: Names, own: Incarnation) -> io::Result<Self> {
-        // Before anything is removed again: what is there already is somebody else's.
-        mknodat(CWD, names.live(own), FileType::Fifo, PRIVATE, 0)?;
-        let created = Self::create_files(&names, own);
+    /// Creates the files. The caller must hold the domain's lock.
+    pub(crate) fn create(paths: ProcessPaths, own: Incarnation) -> io::Result<Self> {
+        // Outside of the cleanup on error: files that exist already belong to another process.
+        mknodat(CWD, paths.liveness_fifo(own), FileType::Fifo, PRIVATE, 0)?;
+        let created = Self::create_files(&paths, own);
         if created.is_err() {
-            names.remove(own);
+            paths.remove(own);
         }
         created
     }
 
-    fn create_files(names: &Names, own: Incarnation) -> io::Result<Self> {
-        let _live = fifo(true).open(names.live(own))?;
-        let bell = names.bell(own);
-        mknodat(CWD, &bell, FileType::Fifo, PRIVATE, 0)?;
-        let bell = open_bell(&bell)?;
+    fn create_files(paths: &ProcessPaths, own: Incarnation) -> io::Result<Self> {
+        let _live = fifo(true).open(paths.liveness_fifo(own))?;
+        let doorbell = paths.doorbell(own);
+        mknodat(CWD, &doorbell, FileType::Fifo, PRIVATE, 0)?;
+        let doorbell = open_doorbell(&doorbell)?;
         let mut page = File::options()
             .read(true)
             .write(true)
             .create_new(true)
             .mode(0o600)
-            .open(names.page(own))?;
-        // Written, not just made longer: a full file system is an error here, and not a signal
-        // later.
+            .open(paths.status_page(own))?;
+        // Written and not only extended: a full file system then causes an error here, and not a
+        // signal later.
         page.write_all(&[0; PAGE]).map_err(|e| {
-            let text = format!("cannot take a page in {SHM}: {e}");
+            let text = format!("cannot allocate the status page in {SHM}: {e}");
             io::Error::new(e.kind(), text)
         })?;
-        // Says that the process runs where another program has removed `live`.
+        // The lock shows that the process runs after another program has removed the liveness FIFO.
         flock(&page, FlockOperation::NonBlockingLockExclusive)?;
         Ok(Self {
-            names: names.clone(),
+            paths: paths.clone(),
             own,
             owner: Owner::this(),
-            bell: Arc::new(Bell(bell)),
-            page: Arc::new(Page::map(&page, ProtFlags::READ | ProtFlags::WRITE)?),
+            doorbell: Arc::new(Doorbell(doorbell)),
+            page: Arc::new(StatusPage::map(&page, ProtFlags::READ | ProtFlags::WRITE)?),
             _locked: page,
             _live,
         })
     }
 
-    pub(crate) fn bell(&self) -> &Arc<Bell> {
-        &self.bell
+    pub(crate) fn doorbell(&self) -> &Arc<Doorbell> {
+        &self.doorbell
     }
 
-    /// Where the process counts its looks.
-    pub(crate) fn looks(&self) -> Looks {
-        Looks(self.page.clone())
+    /// The counter of completed polls.
+    pub(crate) fn polls(&self) -> PollCounter {
+        PollCounter(self.page.clone())
     }
 
-    /// Says to others, until the result is dropped, that they need not ring.
+    /// Announces to other processes, until the guard is dropped, that this process polls and needs
+    /// no wake-up. The caller must poll once more after dropping the guard.
     ///
-    /// Whoever has put something into the mailbox then reads the page, and rings if nobody is
-    /// looking ([`Neighbour::is_awake`]). Between their write and read, and between our write and
-    /// next look, stands a sequentially consistent fence: so either they see that nobody looks,
-    /// and ring, or a look after the drop finds what they put there. There must be such a look.
-    pub(crate) fn looking(&self) -> Looking<'_> {
-        let lookers = &self.page.words().lookers;
-        lookers.fetch_add(1, Ordering::SeqCst);
-        Looking(lookers)
+    /// A peer that has put something into the mailbox reads the page afterwards, and rings if no
+    /// thread polls ([`PeerProcess::is_awake`]). A sequentially consistent fence stands between the
+    /// peer's write and its read, and between the guard's write and the next poll here. So either
+    /// the peer sees that no thread polls, and rings, or the poll after the drop finds the parcel.
+    pub(crate) fn begin_polling(&self) -> PollGuard<'_> {
+        let pollers = &self.page.words().pollers;
+        pollers.fetch_add(1, Ordering::SeqCst);
+        PollGuard(pollers)
     }
 
-    /// Whether some thread says so. If so, it will look once more.
-    pub(crate) fn is_looking(&self) -> bool {
-        self.page.words().lookers.load(Ordering::SeqCst) != 0
+    /// Whether a thread of this process polls. If so, that thread polls once more.
+    pub(crate) fn is_polling(&self) -> bool {
+        self.page.words().pollers.load(Ordering::SeqCst) != 0
     }
 
-    /// The bell has been silenced, and what it rang for is about to be looked at.
-    pub(crate) fn heard(&self) {
-        self.page.words().heard.fetch_add(1, Ordering::SeqCst);
-        // Whoever has read the count from before has put in what is found now.
+    /// Counts that the doorbell has been cleared. The caller polls afterwards.
+    pub(crate) fn count_wakeup(&self) {
+        self.page.words().wakeups.fetch_add(1, Ordering::SeqCst);
+        // A peer that has read the previous count stored its parcel before that, so the poll that
+        // follows finds it.
         fence(Ordering::SeqCst);
     }
 }
 
-/// How often a process has looked into its mailbox, told to others. Counted by one thread at a
-/// time.
+/// The number of completed polls of the mailbox, which other processes can read. Incremented by one
+/// thread at a time.
 #[derive(Debug)]
-pub(crate) struct Looks(Arc<Page>);
+pub(crate) struct PollCounter(Arc<StatusPage>);
 
-impl Looks {
-    /// The mailbox is empty, as far as this look goes.
-    pub(crate) fn one_more(&self) {
-        let looks = &self.0.words().looks;
-        let before = looks.load(Ordering::Relaxed);
-        looks.store(before.wrapping_add(1), Ordering::Release);
+impl PollCounter {
+    /// Counts a poll that found the mailbox empty at its end.
+    pub(crate) fn increment(&self) {
+        let polls = &self.0.words().polls;
+        let before = polls.load(Ordering::Relaxed);
+        polls.store(before.wrapping_add(1), Ordering::Release);
     }
 }
 
-/// A thread of this process is looking.
-pub(crate) struct Looking<'a>(&'a AtomicU32);
+/// Marks that a thread of this process polls.
+pub(crate) struct PollGuard<'a>(&'a AtomicU32);
 
-impl Drop for Looking<'_> {
+impl Drop for PollGuard<'_> {
     fn drop(&mut self) {
         self.0.fetch_sub(1, Ordering::SeqCst);
         fence(Ordering::SeqCst);
     }
 }
 
-/// How long to wait before ringing at somebody who was looking lately: who has just sent
-/// something is about to look for the answer, and a bell costs both sides more than that moment.
-/// Who sleeps between letters is not kept waiting.
-pub(crate) const GLANCE: Duration = Duration::from_nanos(1500);
+/// Time to wait before ringing at a process that polled recently. Such a process is about to check
+/// for the answer, and a wake-up costs both sides more than this wait. A process that sleeps
+/// between letters is rung at once.
+pub(crate) const POLL_GRACE: Duration = Duration::from_nanos(1500);
 
-/// How many looks at a page lie between two looks at the clock.
-const GLANCES: usize = 16;
+/// Number of checks of the status page between two reads of the clock.
+const POLLS_PER_CLOCK_READ: usize = 16;
 
 impl Drop for Presence {
     fn drop(&mut self) {
         if self.owner.is_this() {
-            self.names.remove(self.own);
+            self.paths.remove(self.own);
         }
     }
 }
 
-/// The FIFO that is read by its process and written by others.
+/// The FIFO that its process reads and other processes write.
 #[derive(Debug)]
-pub(crate) struct Bell(File);
+pub(crate) struct Doorbell(File);
 
-impl Bell {
-    /// Takes bytes out. Says whether these were all: then nothing is heard until it is rung again.
-    pub(crate) fn silence(&self) -> bool {
+impl Doorbell {
+    /// Removes bytes from the FIFO. Returns whether it is empty: then it becomes readable again
+    /// only by the next ring.
+    pub(crate) fn clear(&self) -> bool {
         let mut bytes = [0; 512];
-        // Less than asked for was all there was, and an error is that there is nothing; so the
-        // system need not be asked a second time.
+        // A short read emptied the FIFO, and an error means that it was empty, so no second system
+        // call is needed.
         !matches!((&self.0).read(&mut bytes), Ok(taken) if taken == bytes.len())
     }
 
@@ -295,21 +305,22 @@ impl Bell {
     }
 }
 
-impl AsFd for Bell {
+impl AsFd for Doorbell {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.0.as_fd()
     }
 }
 
-/// A shared descriptor that tokio waits for.
+/// A shared descriptor that tokio polls.
 #[derive(Debug)]
-pub(crate) struct Watched<T>(Arc<T>);
+pub(crate) struct SharedFd<T>(Arc<T>);
 
-impl<T: AsFd> Watched<T> {
-    /// To be called in the context of a runtime.
+impl<T: AsFd> SharedFd<T> {
+    /// Registers the descriptor with tokio. The caller must be in the context of a runtime.
     pub(crate) fn readable(shared: Arc<T>) -> io::Result<AsyncFd<Self>> {
-        // SAFETY: an `AsFd` of this crate (a `Bell` or an `OwnedFd`) always lends the same
-        // descriptor, which it owns and does not close before it is dropped; the `Arc` keeps it.
+        // SAFETY: `T` is a `Doorbell` or an `OwnedFd`. Both own their descriptor, always lend the
+        // same one, and do not close it before they are dropped. The `Arc` in `Self(shared)` keeps
+        // the value, and tokio deregisters the descriptor before it drops that `Arc`.
         let registered =
             unsafe { AsyncFd::register_with_interest(Self(shared), Interest::READABLE) };
         registered.map_err(Into::into)
@@ -320,145 +331,149 @@ impl<T: AsFd> Watched<T> {
     }
 }
 
-impl<T: AsFd> AsRawFd for Watched<T> {
+impl<T: AsFd> AsRawFd for SharedFd<T> {
     fn as_raw_fd(&self) -> RawFd {
         self.0.as_fd().as_raw_fd()
     }
 }
 
-/// Another process, as this one sees it.
+/// The open files of another process.
 #[derive(Debug)]
-pub(crate) struct Neighbour {
+pub(crate) struct PeerProcess {
     live: Arc<OwnedFd>,
-    bell: File,
-    page: Page,
-    /// What the page's `heard` was when the bell was rung last.
-    rung: AtomicU64,
-    /// Whether the process was looking when this was asked last.
-    looked: AtomicBool,
+    doorbell: File,
+    page: StatusPage,
+    /// Value of the page's `wakeups` when this process last rang; [`NO_WAKEUP_COUNT`] before that.
+    wakeups_at_ring: AtomicU64,
+    /// Whether the process was polling at the last check.
+    polled_at_last_check: AtomicBool,
 }
 
-/// No count of what was heard.
-const NEVER: u64 = u64::MAX;
+/// A value that `wakeups` does not reach.
+const NO_WAKEUP_COUNT: u64 = u64::MAX;
 
-impl Neighbour {
-    /// Opens the files of a process; `NotFound` when it is not there.
-    pub(crate) fn open(names: &Names, of: Incarnation) -> io::Result<Self> {
-        let live = open_live(&names.live(of))?;
+impl PeerProcess {
+    /// Opens the files of a process. The error is `NotFound` if the process does not run.
+    pub(crate) fn open(paths: &ProcessPaths, of: Incarnation) -> io::Result<Self> {
+        let live = open_liveness_fifo(&paths.liveness_fifo(of))?;
         if has_ended(&live) {
             return Err(ErrorKind::NotFound.into());
         }
-        let (page, found) = open_ours(&names.page(of), File::options().read(true))?;
+        let (page, found) = open_owned(&paths.status_page(of), File::options().read(true))?;
         if found.len() < PAGE as u64 {
             return Err(io::Error::new(
                 ErrorKind::InvalidData,
-                "the page is too short",
+                "the status page is too short",
             ));
         }
         Ok(Self {
             live: Arc::new(live.into()),
-            bell: open_bell(&names.bell(of))?,
-            page: Page::map(&page, ProtFlags::READ)?,
-            rung: AtomicU64::new(NEVER),
-            looked: AtomicBool::new(false),
+            doorbell: open_doorbell(&paths.doorbell(of))?,
+            page: StatusPage::map(&page, ProtFlags::READ)?,
+            wakeups_at_ring: AtomicU64::new(NO_WAKEUP_COUNT),
+            polled_at_last_check: AtomicBool::new(false),
         })
     }
 
-    /// How often the process has looked into its mailbox to the end; 0 when it does not listen
-    /// yet.
-    pub(crate) fn looks(&self) -> u64 {
-        read(&self.page.words().looks)
+    /// Number of times the process has polled its mailbox until it was empty; 0 if it does not
+    /// listen yet.
+    pub(crate) fn polls(&self) -> u64 {
+        load(&self.page.words().polls)
     }
 
-    /// What becomes readable when the process ends.
+    /// The liveness FIFO, which becomes readable when the process ends.
     pub(crate) fn live(&self) -> &Arc<OwnedFd> {
         &self.live
     }
 
-    /// Whether the process will look without being rung at: because it is looking, or because its
-    /// bell rings already.
+    /// Whether the process will poll without being rung at: because it is polling, or because this
+    /// process has rung and the wake-up is still pending.
     ///
-    /// The latter is so when `heard` has not moved since before it was rung: the process moves it
-    /// between silencing its bell and looking, so a look is still to come. Only this process's own
-    /// ringing counts, so nobody who is killed in between leaves a bell that is believed to ring.
+    /// The latter holds while `wakeups` is the same as before this process rang. The peer
+    /// increments it between clearing its doorbell and polling, so a poll is still to come. Rings
+    /// of other processes do not count, so a process that is killed before it rings causes no
+    /// missed wake-up.
     pub(crate) fn is_awake(&self) -> bool {
         fence(Ordering::SeqCst);
         let words = self.page.words();
-        // Relaxed is what may be done to memory that is mapped for reading; the fence is what the
-        // agreement with `looking` and `heard` stands on.
-        if words.lookers.load(Ordering::Relaxed) != 0 {
-            self.looked.store(true, Ordering::Relaxed);
+        // Only relaxed loads are allowed on memory that is mapped for reading. The fence provides
+        // the order that `begin_polling` and `count_wakeup` rely on.
+        if words.pollers.load(Ordering::Relaxed) != 0 {
+            self.polled_at_last_check.store(true, Ordering::Relaxed);
             return true;
         }
-        self.rung.load(Ordering::Relaxed) == words.heard.load(Ordering::Relaxed)
+        self.wakeups_at_ring.load(Ordering::Relaxed) == words.wakeups.load(Ordering::Relaxed)
     }
 
-    /// Whether it was looking when it was last asked.
-    pub(crate) fn was_looking(&self) -> bool {
-        self.looked.load(Ordering::Relaxed)
+    /// Whether the process was polling at the last check.
+    pub(crate) fn was_polling(&self) -> bool {
+        self.polled_at_last_check.load(Ordering::Relaxed)
     }
 
-    /// Makes the process look, unless it is awake. Says whether the bell was rung.
+    /// Rings the doorbell unless the process is awake. Returns whether it rang.
     pub(crate) fn wake(&self) -> bool {
         if self.is_awake() {
             return false;
         }
-        if self.looked.swap(false, Ordering::Relaxed) {
+        if self.polled_at_last_check.swap(false, Ordering::Relaxed) {
             let began = Instant::now();
-            while began.elapsed() < GLANCE {
-                if (0..GLANCES).any(|_| self.is_awake()) {
+            while began.elapsed() < POLL_GRACE {
+                if (0..POLLS_PER_CLOCK_READ).any(|_| self.is_awake()) {
                     return false;
                 }
             }
         }
-        let heard = read(&self.page.words().heard);
-        ring(&self.bell);
-        self.rung.store(heard, Ordering::Relaxed);
+        let wakeups = load(&self.page.words().wakeups);
+        ring(&self.doorbell);
+        self.wakeups_at_ring.store(wakeups, Ordering::Relaxed);
         true
     }
 }
 
-/// How long others have to look into their mailboxes, who may be stopped, or have too little of
-/// the processor.
-const PATIENCE: Duration = Duration::from_secs(1);
+/// Maximum wait for other processes to poll their mailboxes: they may be stopped or short of
+/// processor time.
+const POLL_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// How long those have who do not listen yet, and may never.
-const GRACE: Duration = Duration::from_millis(100);
+/// The same for processes that do not listen yet.
+const START_TIMEOUT: Duration = Duration::from_millis(100);
 
-/// How long to wait before asking again who has looked.
-const STEP: Duration = Duration::from_millis(5);
+/// Pause between two checks of the poll counters.
+const POLL_CHECK_INTERVAL: Duration = Duration::from_millis(5);
 
 /// Waits until these processes have taken everything that is in their mailboxes now, or `stop`
-/// says so. Gives up on those who do not look for too long.
+/// returns true. Gives up on a process that does not poll in time.
 ///
-/// A look that was going on may have passed something by; the one after it has not.
-pub(crate) fn wait_for_looks<'a>(at: impl Iterator<Item = &'a Neighbour>, stop: impl Fn() -> bool) {
-    let mut waited_for: Vec<_> = at.map(|one| (one.looks(), one)).collect();
+/// A poll that was in progress at the start may have missed a parcel, so a second one must follow.
+pub(crate) fn wait_for_polls<'a>(
+    at: impl Iterator<Item = &'a PeerProcess>,
+    stop: impl Fn() -> bool,
+) {
+    let mut waited_for: Vec<_> = at.map(|one| (one.polls(), one)).collect();
     let began = Instant::now();
     loop {
         let waited = began.elapsed();
         waited_for.retain(|(before, one)| {
             let patience = match before {
-                0 => GRACE,
-                _ => PATIENCE,
+                0 => START_TIMEOUT,
+                _ => POLL_TIMEOUT,
             };
-            let has_looked = one.looks().wrapping_sub(*before) >= 2;
-            !has_looked && waited < patience && !has_ended(one.live.as_ref())
+            let has_polled = one.polls().wrapping_sub(*before) >= 2;
+            !has_polled && waited < patience && !has_ended(one.live.as_ref())
         });
         if waited_for.is_empty() || stop() {
             return;
         }
         for (_, one) in &waited_for {
-            ring(&one.bell);
+            ring(&one.doorbell);
         }
-        std::thread::sleep(STEP);
+        std::thread::sleep(POLL_CHECK_INTERVAL);
     }
 }
 
-/// Whether all writers of a FIFO are gone.
+/// Whether all writers of a FIFO have closed it.
 pub(crate) fn has_ended(live: impl AsFd) -> bool {
     let mut byte = [0];
-    // Nobody writes, so there is either nothing yet (an error) or nothing any more.
+    // Nothing is ever written: the read fails while a writer exists and returns 0 afterwards.
     matches!(rustix::io::read(live, &mut byte), Ok(0))
 }
 
@@ -471,78 +486,81 @@ fn fifo(write: bool) -> std::fs::OpenOptions {
     options
 }
 
-fn open_live(path: &Path) -> io::Result<File> {
+fn open_liveness_fifo(path: &Path) -> io::Result<File> {
     fifo(false).open(path)
 }
 
-/// For reading too, also by those who ring: then there is always a reader, and no SIGPIPE.
-fn open_bell(path: &Path) -> io::Result<File> {
+/// Opens a doorbell for reading and writing. A writer that also reads never gets SIGPIPE.
+fn open_doorbell(path: &Path) -> io::Result<File> {
     fifo(true).open(path)
 }
 
-fn ring(mut bell: &File) {
-    // A full FIFO has been rung often enough.
-    let _ = bell.write(&[1]);
+fn ring(mut doorbell: &File) {
+    // A full FIFO is readable, so the error can be ignored.
+    let _ = doorbell.write(&[1]);
 }
 
-/// What stands in a page. Written by its process, read by others.
+/// The status page. Written by its process, read by others.
 #[derive(Debug)]
 #[repr(C)]
-struct Words {
-    /// How many threads of the process are looking.
-    lookers: AtomicU32,
-    /// How often the process has silenced its bell before it looked.
-    heard: AtomicU64,
-    /// What is written often does not disturb those who read the others.
+struct StatusWords {
+    /// Number of threads of the process that poll.
+    pollers: AtomicU32,
+    /// Number of times the process has cleared its doorbell before it polled.
+    wakeups: AtomicU64,
+    /// Keeps `polls`, which changes often, in a cache line of its own.
     _apart: [u64; 6],
-    /// How often the process has found its mailbox empty, or emptied it.
-    looks: AtomicU64,
+    /// Number of times the process has found its mailbox empty, or emptied it.
+    polls: AtomicU64,
 }
 
-/// What another process counts; whatever is done next happens after it was read. On memory that is
-/// mapped for reading only relaxed loads are allowed, so the order is the fence's.
-fn read(count: &AtomicU64) -> u64 {
+/// Loads a counter of another process, with acquire order. Only relaxed loads are allowed on memory
+/// that is mapped for reading, so the fence provides the order.
+fn load(count: &AtomicU64) -> u64 {
     let count = count.load(Ordering::Relaxed);
     fence(Ordering::Acquire);
     count
 }
 
-/// A mapped page.
+/// A mapped status page.
 #[derive(Debug)]
-struct Page(Mapping);
+struct StatusPage(Mapping);
 
-impl Page {
+impl StatusPage {
     fn map(file: &File, protection: ProtFlags) -> io::Result<Self> {
         Mapping::new(file, PAGE, protection).map(Self)
     }
 
-    fn words(&self) -> &Words {
-        // SAFETY: the mapping lives as long as self, is aligned to a page and longer than `Words`,
-        // whose every value is valid, and every process accesses these words atomically only.
-        // Neighbours map it for reading and only load, relaxed, which Rust allows there for words
-        // as long as a pointer. The file is never shortened: its process does not, nobody but this
-        // user can, and who opens it has looked at its length and owner.
-        unsafe { self.0.start().cast::<Words>().as_ref() }
+    fn words(&self) -> &StatusWords {
+        // SAFETY: the mapping exists as long as self, is aligned to a page and longer than
+        // `StatusWords`, of which every bit pattern is valid. Every process accesses these words
+        // atomically. Peers map the page for reading and only load, relaxed, which Rust allows on
+        // read-only memory for words of at most 8 bytes on 64-bit targets. The pages exist: the
+        // process that creates the file writes them first, and `PeerProcess::open` checks the
+        // length and the owner. No process of the domain shortens the file, and other users have no
+        // access to it.
+        unsafe { self.0.start().cast::<StatusWords>().as_ref() }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used, reason = "a test that cannot go on says so")]
+    #![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
 
     use std::os::unix::fs::symlink;
 
     use super::*;
 
     #[test]
-    fn who_cannot_be_looked_at_is_not_dead() {
+    fn a_process_that_cannot_be_examined_counts_as_alive() {
         let root = tempfile::tempdir().unwrap();
-        let names = Names::new(root.path(), "fipatest-presence");
-        std::fs::create_dir(names.directory()).unwrap();
+        let paths = ProcessPaths::new(root.path(), "fipatest-presence");
+        std::fs::create_dir(paths.directory()).unwrap();
         let (gone, hidden) = (Incarnation::from_u64(1), Incarnation::from_u64(2));
-        // What the kernel says instead of what is there, as when too many files are open.
-        symlink(names.live(hidden), names.live(hidden)).unwrap();
-        assert!(!names.is_alive(gone));
-        assert!(names.is_alive(hidden));
+        // A symbolic link to itself gives an error other than `NotFound`, as a lack of descriptors
+        // does.
+        symlink(paths.liveness_fifo(hidden), paths.liveness_fifo(hidden)).unwrap();
+        assert!(!paths.is_alive(gone));
+        assert!(paths.is_alive(hidden));
     }
 }

@@ -1,9 +1,9 @@
-//! Bare iceoryx2 request-response, as this transport uses it: what its speed is compared with.
+//! Bare iceoryx2 request-response with the settings of this transport, for comparison in benches.
 //!
-//! Bytes go from one process to another in shared memory and an answer comes back. There is no
-//! directory, no envelope and no promise: nobody is told when the other side is gone, nothing is
-//! cleaned up after a process that was killed, and there is no bound on memory but the size of
-//! `/dev/shm`, which is checked before a larger segment is made. For benches; feature `raw`.
+//! A request goes to another process in shared memory and an answer comes back. There is no
+//! directory and no envelope. The end of a peer is not detected, files of killed processes are not
+//! cleaned up, and memory is bounded only by the size of `/dev/shm`, which is checked before a
+//! larger segment is created. Feature `raw`.
 
 use std::fmt;
 use std::hint::spin_loop;
@@ -27,29 +27,29 @@ use crate::{ShmConfig, ShmError};
 
 type Svc = ipc_threadsafe::Service;
 
-/// As large as the transport's header.
+/// A user header of the same length as the transport's.
 type Header = [u64; size_of::<layout::Header>() / 8];
 type Answer = [u8; size_of::<Ack>()];
 
-/// How many requests of one client may always be without an answer.
+/// Number of requests of one client that may be unanswered.
 pub const WINDOW: usize = 16;
 
-/// Loans that a client can have besides.
+/// Number of loans that a client can have in addition.
 const LOANS: usize = 2;
 
-/// Length of the first segment's requests.
+/// Length in bytes of requests in the first segment.
 const FIRST: usize = 4096;
 
-/// What whoever waits does meanwhile.
+/// The method of waiting.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Wait {
-    /// Looks again and again.
+    /// Polls in a loop.
     Spin,
-    /// Sleeps until iceoryx2's event says that there is something. Both sides must.
+    /// Sleeps until an iceoryx2 event. Both sides must use it.
     Block,
 }
 
-/// Something that iceoryx2 refused.
+/// An iceoryx2 operation failed.
 #[derive(Debug, thiserror::Error)]
 #[error("bare iceoryx2: cannot {what}: {reason}")]
 pub struct RawError {
@@ -64,25 +64,25 @@ fn cannot<E: fmt::Debug>(what: &'static str) -> impl FnOnce(E) -> RawError {
     }
 }
 
-/// A process's membership.
+/// An iceoryx2 node.
 pub struct RawNode {
     node: Node<Svc>,
     budget: Budget,
 }
 
 impl RawNode {
-    /// Makes a node. Of the configuration only the directory, the prefix and the capacity are
-    /// used, and the directory is made when it is not there.
+    /// Creates a node. Uses only the directory, the prefix and the capacity of the configuration,
+    /// and creates the directory if it is missing.
     ///
     /// # Errors
-    /// When the configuration makes no sense, or iceoryx2 makes no node there.
+    /// Returns an error if the configuration is invalid or iceoryx2 cannot create the node.
     pub fn open(config: &ShmConfig) -> Result<Self, ShmError> {
         let node = NodeBuilder::new()
             .config(&config.iceoryx()?)
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<Svc>()
             .map_err(|error| ShmError::Iceoryx {
-                what: "cannot make a node",
+                what: "cannot create a node",
                 reason: format!("{error:?}"),
                 prefix: config.prefix.clone(),
             })?;
@@ -92,10 +92,10 @@ impl RawNode {
         })
     }
 
-    /// The side that answers. There can be one of a name.
+    /// Creates the answering side. A name can have one.
     ///
     /// # Errors
-    /// When iceoryx2 refuses.
+    /// Returns an error if an iceoryx2 operation fails.
     pub fn serve(&self, name: &str) -> Result<RawServer, RawError> {
         let service = self
             .node
@@ -104,30 +104,30 @@ impl RawNode {
             .request_user_header::<Header>()
             .max_servers(1)
             .max_clients(2)
-            // A request counts until both sides have dropped it, a moment after it was answered.
+            // A request counts until both sides have dropped it, which is shortly after its answer.
             .max_active_requests_per_client(2 * WINDOW)
             .max_loaned_requests(LOANS)
             .max_response_buffer_size(1)
             .enable_safe_overflow_for_requests(false)
             .create()
-            .map_err(cannot("make the service"))?;
+            .map_err(cannot("create the service"))?;
         let server = service
             .server_builder()
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
-            .map_err(cannot("make the server"))?;
-        let (heard, tell) = self.events(name, ["requests", "answers"])?;
+            .map_err(cannot("create the server"))?;
+        let (listener, notifier) = self.events(name, ["requests", "answers"])?;
         Ok(RawServer {
             server,
-            heard,
-            tell,
+            listener,
+            notifier,
         })
     }
 
-    /// The side that asks.
+    /// Creates the requesting side.
     ///
     /// # Errors
-    /// When iceoryx2 refuses, or nobody serves this name.
+    /// Returns an error if an iceoryx2 operation fails or this name has no server.
     pub fn connect(&self, name: &str) -> Result<RawClient<'_>, RawError> {
         let service = self
             .node
@@ -142,33 +142,33 @@ impl RawNode {
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
-            .map_err(cannot("make the client"))?;
-        let (heard, tell) = self.events(name, ["answers", "requests"])?;
+            .map_err(cannot("create the client"))?;
+        let (listener, notifier) = self.events(name, ["answers", "requests"])?;
         Ok(RawClient {
             client,
-            heard,
-            tell,
+            listener,
+            notifier,
             room: AtomicUsize::new(FIRST),
             budget: &self.budget,
         })
     }
 
-    /// What one side listens to, and what the other is told by.
+    /// The events of one side: the one it waits for, and the one that it notifies.
     fn events(
         &self,
         name: &str,
-        [heard, told]: [&str; 2],
+        [received, sent]: [&str; 2],
     ) -> Result<(Listener<Svc>, Notifier<Svc>), RawError> {
         let event = |which| {
             let builder = self.node.service_builder(&service_name(name, which)?);
             let event = builder.event().open_or_create();
-            event.map_err(cannot("make the event"))
+            event.map_err(cannot("create the event"))
         };
-        let listener = event(heard)?.listener_builder().create();
-        let notifier = event(told)?.notifier_builder().create();
+        let listener = event(received)?.listener_builder().create();
+        let notifier = event(sent)?.notifier_builder().create();
         Ok((
-            listener.map_err(cannot("make the listener"))?,
-            notifier.map_err(cannot("make the notifier"))?,
+            listener.map_err(cannot("create the listener"))?,
+            notifier.map_err(cannot("create the notifier"))?,
         ))
     }
 }
@@ -183,46 +183,46 @@ fn service_name(name: &str, part: &str) -> Result<ServiceName, RawError> {
     ServiceName::new(&format!("{name}/{part}")).map_err(cannot("use the name"))
 }
 
-/// The side that takes requests and answers them.
+/// The side that receives requests and answers them.
 #[derive(Debug)]
 pub struct RawServer {
     server: Server<Svc, [u8], Header, Answer, ()>,
-    heard: Listener<Svc>,
-    tell: Notifier<Svc>,
+    listener: Listener<Svc>,
+    notifier: Notifier<Svc>,
 }
 
 impl RawServer {
     /// Waits for the next request.
     ///
     /// # Errors
-    /// When iceoryx2 refuses.
+    /// Returns an error if an iceoryx2 operation fails.
     pub fn receive(&self, wait: Wait) -> Result<RawRequest, RawError> {
         loop {
-            let request = self.server.receive().map_err(cannot("look for requests"))?;
+            let request = self.server.receive().map_err(cannot("receive a request"))?;
             if let Some(request) = request {
                 return Ok(RawRequest(request));
             }
-            pause(&self.heard, wait)?;
+            pause(&self.listener, wait)?;
         }
     }
 
     /// Answers a request.
     ///
     /// # Errors
-    /// When iceoryx2 refuses.
+    /// Returns an error if an iceoryx2 operation fails.
     pub fn answer(&self, request: RawRequest, wait: Wait) -> Result<(), RawError> {
         let sent = request.0.send_copy([1; size_of::<Ack>()]);
         sent.map_err(cannot("answer"))?;
-        tell(&self.tell, wait)
+        notify(&self.notifier, wait)
     }
 }
 
-/// A request that came.
+/// A received request.
 #[derive(Debug)]
 pub struct RawRequest(ActiveRequest<Svc, [u8], Header, Answer, ()>);
 
 impl RawRequest {
-    /// What was sent, in the sender's memory.
+    /// The payload, in the sender's memory.
     #[must_use]
     pub fn payload(&self) -> &[u8] {
         self.0.payload()
@@ -233,59 +233,59 @@ impl RawRequest {
 #[derive(Debug)]
 pub struct RawClient<'a> {
     client: Client<Svc, [u8], Header, Answer, ()>,
-    heard: Listener<Svc>,
-    tell: Notifier<Svc>,
-    /// The longest payload that the present segment has room for.
+    listener: Listener<Svc>,
+    notifier: Notifier<Svc>,
+    /// Length in bytes of the longest payload that fits the current segment.
     room: AtomicUsize,
     budget: &'a Budget,
 }
 
 impl RawClient<'_> {
-    /// Memory for a request, which contains anything.
+    /// Loans memory for a request. Its content is arbitrary.
     ///
     /// # Errors
-    /// When too many requests are out, or there is no room for more.
+    /// Returns an error if too many requests are out, or memory is short.
     pub fn loan(&self, len: usize) -> Result<RawLoan, RawError> {
         if len > self.room.load(Ordering::Relaxed) {
             let room = len.next_power_of_two();
-            // All of them may come to be written, and a full file system would end the process.
+            // Every chunk may be written later, and a full file system would then end the process.
             let most = room.saturating_mul(4 * WINDOW + LOANS);
             let need = u64::try_from(most).unwrap_or(u64::MAX);
-            self.budget.check(need).map_err(cannot("take memory"))?;
+            self.budget.check(need).map_err(cannot("allocate memory"))?;
             self.room.store(room, Ordering::Relaxed);
         }
         let loan = self.client.loan_slice_uninit(len);
         let loan = loan.map_err(cannot("loan memory"))?;
-        // SAFETY: the payload is memory of a shared mapping that the kernel has filled with
-        // zeros, or earlier requests with something; every byte is an `u8`.
+        // SAFETY: every byte of the payload is initialized by the kernel or by an earlier request,
+        // because it is memory of a shared mapping, and every value is a valid `u8`.
         Ok(RawLoan(unsafe { loan.assume_init() }))
     }
 
     /// Sends a request.
     ///
     /// # Errors
-    /// When too many are without an answer.
+    /// Returns an error if too many requests are unanswered.
     pub fn send(&self, loan: RawLoan, wait: Wait) -> Result<RawPending, RawError> {
         let pending = loan.0.send().map_err(cannot("send"))?;
         if pending.number_of_server_connections() == 0 {
-            return Err(cannot("send")("nobody takes it"));
+            return Err(cannot("send")("the server's mailbox is full or closed"));
         }
-        tell(&self.tell, wait)?;
+        notify(&self.notifier, wait)?;
         Ok(RawPending(pending))
     }
 
     /// Waits until a request is answered.
     ///
     /// # Errors
-    /// When iceoryx2 refuses.
+    /// Returns an error if an iceoryx2 operation fails.
     pub fn answered(&self, pending: &RawPending, wait: Wait) -> Result<(), RawError> {
         while pending
             .0
             .receive()
-            .map_err(cannot("look for answers"))?
+            .map_err(cannot("receive an answer"))?
             .is_none()
         {
-            pause(&self.heard, wait)?;
+            pause(&self.listener, wait)?;
         }
         Ok(())
     }
@@ -296,28 +296,28 @@ impl RawClient<'_> {
 pub struct RawLoan(RequestMut<Svc, [u8], Header, Answer, ()>);
 
 impl RawLoan {
-    /// To be written.
+    /// The writable payload.
     pub fn content_mut(&mut self) -> &mut [u8] {
         self.0.payload_mut()
     }
 }
 
-/// A request that was sent.
+/// A sent request.
 #[derive(Debug)]
 pub struct RawPending(PendingResponse<Svc, [u8], Header, Answer, ()>);
 
-fn pause(heard: &Listener<Svc>, wait: Wait) -> Result<(), RawError> {
+fn pause(listener: &Listener<Svc>, wait: Wait) -> Result<(), RawError> {
     match wait {
         Wait::Spin => spin_loop(),
         Wait::Block => {
-            let woken = heard.blocking_wait(|_| {});
+            let woken = listener.blocking_wait(|_| {});
             woken.map_err(cannot("wait for the event"))?;
         }
     }
     Ok(())
 }
 
-fn tell(notifier: &Notifier<Svc>, wait: Wait) -> Result<(), RawError> {
+fn notify(notifier: &Notifier<Svc>, wait: Wait) -> Result<(), RawError> {
     if wait == Wait::Block {
         notifier.notify().map_err(cannot("notify"))?;
     }

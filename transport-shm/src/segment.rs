@@ -1,20 +1,22 @@
-//! Content that lies in shared memory once for all its receivers: what both sides need.
+//! Content that is stored once in shared memory for all its receivers: the file format and its
+//! locking rules, used by both sides.
 //!
-//! A segment is a file of the process that sends: one page with a [`Label`], then room for one
-//! content. Letters refer to it by [`Reference`]; they are ordinary letters in all else, so that
-//! order and acknowledgement stay those of the mailbox. `pool` is the sending side, `library` the
-//! receiving one.
+//! A segment is a file of the sending process: one page with a [`SegmentHeader`], then room for one
+//! content. Letters refer to it by [`ContentReference`]. They are ordinary letters otherwise, so
+//! order and acknowledgment stay those of the mailbox. `pool` is the sending side, `peer_segments`
+//! the receiving one.
 //!
-//! # Who may write when
-//! Whoever reads holds a shared lock (flock) on the file, the sender too as long as the content is
-//! loaned, held or on its way. Only who holds the lock alone, the sender or, after its end, whoever
-//! cleans up, may begin another content or shorten the file. Locks end with their process, so
-//! nobody who was killed keeps a segment from being used again.
+//! # Locking
+//! Every reader holds a shared lock (flock) on the file. The sender holds one, too, while the
+//! content is loaned, held or under way. Only the holder of the exclusive lock may begin another
+//! content or shorten the file: the sender or, after its end, the process that cleans up. Locks end
+//! with their process, so a killed process does not keep a segment from being reused.
 //!
-//! A letter that its sender has given up may still be lying in a mailbox. So every content has a
-//! generation, which moves while the lock is held alone; who has taken the shared lock compares
-//! it with the reference. For the same reason the file's length is asked for under the lock, and
-//! nothing is read beyond it; nor where the file has no pages, which reading would have to take.
+//! A letter that its sender has abandoned may still be in a mailbox. So every content has a
+//! generation, which changes only under the exclusive lock, and a reader that has taken the shared
+//! lock compares it with the reference. For the same reason a reader checks the file's length and
+//! allocated blocks under the lock: it reads neither beyond the end nor pages that do not exist,
+//! which the read would have to allocate.
 
 use std::fs::File;
 use std::io;
@@ -27,27 +29,27 @@ use rustix::fs::{FallocateFlags, FlockOperation, fallocate, flock};
 use rustix::io::Errno;
 use rustix::mm::ProtFlags;
 
-use crate::memory::{Mapping, PAGE, open_ours};
+use crate::memory::{Mapping, PAGE, open_owned};
 
-/// Where a content lies: in which segment of its sender, and as which of its contents.
+/// The position of a content: the segment of its sender, and the generation in that segment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Reference {
+pub(crate) struct ContentReference {
     /// The segment's number among those of its process, from 1.
     pub(crate) segment: u64,
     pub(crate) generation: u64,
 }
 
-/// What stands in the first page of a segment. Written by its process, read by others.
+/// The first page of a segment. Written by its process, read by others.
 #[derive(Debug)]
 #[repr(C)]
-struct Label {
-    /// Which content lies here.
+struct SegmentHeader {
+    /// Generation of the current content.
     generation: AtomicU64,
-    /// Whether whoever stops reading should say so.
-    wanted: AtomicU32,
+    /// Whether a reader that stops must ring the sender's doorbell.
+    notice_requested: AtomicU32,
 }
 
-/// A segment's file, mapped.
+/// A mapped segment file.
 #[derive(Debug)]
 pub(crate) struct SegmentFile {
     file: File,
@@ -55,8 +57,8 @@ pub(crate) struct SegmentFile {
 }
 
 impl SegmentFile {
-    /// A new segment with room for this much content, all of whose pages are there: those who read
-    /// it could otherwise meet one that was never written, and a full file system.
+    /// Creates a segment with room for this many bytes of content and allocates all its pages.
+    /// Otherwise a reader could fault on an unwritten page of a full file system.
     pub(crate) fn create(path: &Path, room: usize) -> io::Result<Self> {
         let file = File::options()
             .read(true)
@@ -74,9 +76,9 @@ impl SegmentFile {
         Ok(Self { file, mapping })
     }
 
-    /// Another process's segment, for reading.
+    /// Opens another process's segment for reading.
     pub(crate) fn open(path: &Path) -> io::Result<Self> {
-        let (file, found) = open_ours(path, File::options().read(true))?;
+        let (file, found) = open_owned(path, File::options().read(true))?;
         let len = usize::try_from(found.len()).unwrap_or(0);
         if len <= PAGE {
             return Err(io::ErrorKind::InvalidData.into());
@@ -85,12 +87,12 @@ impl SegmentFile {
         Ok(Self { file, mapping })
     }
 
-    /// How much content has room.
+    /// Room for content in bytes.
     pub(crate) fn room(&self) -> usize {
         self.mapping.len() - PAGE
     }
 
-    /// Where the content begins: aligned to a page.
+    /// Start of the content, aligned to a page.
     pub(crate) fn content(&self) -> *mut u8 {
         self.mapping.start().as_ptr().wrapping_add(PAGE)
     }
@@ -99,73 +101,77 @@ impl SegmentFile {
         &self.mapping
     }
 
-    fn label(&self) -> &Label {
-        // SAFETY: the mapping lives as long as self, is aligned to a page and longer than a
-        // `Label`, whose every value is valid. Every process accesses these words atomically
-        // only; those that map the segment for reading only load, and relaxed, which is the load
-        // that Rust allows on memory that cannot be written. The page is there: the file is
-        // shortened only by its sender, who does not look here afterwards, or when that has ended,
-        // and only while nobody has the lock, which all others who look here have. A process of
-        // this user that keeps to no lock could end this one in simpler ways.
-        unsafe { self.mapping.start().cast::<Label>().as_ref() }
+    fn header(&self) -> &SegmentHeader {
+        // SAFETY: the mapping exists as long as self, is aligned to a page and longer than a
+        // `SegmentHeader`, of which every bit pattern is valid. Every process accesses these words
+        // atomically. Processes that map the segment for reading only load them, relaxed, which
+        // Rust allows on read-only memory for words of at most 8 bytes on 64-bit targets. The page
+        // exists: the file is shortened only under the exclusive lock, by its sender, which does
+        // not call this afterwards, or after the sender's end. All other callers hold the lock.
+        // This assumes that the processes of this user follow the locking rules; one that does not
+        // can also end this process with a signal.
+        unsafe { self.mapping.start().cast::<SegmentHeader>().as_ref() }
     }
 
-    /// The generation of the content that lies here. To be called under the lock.
+    /// Generation of the current content. The caller must hold the lock.
     pub(crate) fn generation(&self) -> u64 {
-        let generation = self.label().generation.load(Ordering::Relaxed);
-        // The lock orders the content behind it; this says so to the compiler.
+        let generation = self.header().generation.load(Ordering::Relaxed);
+        // The lock orders the content after this load; the fence tells the compiler.
         fence(Ordering::Acquire);
         generation
     }
 
-    /// Begins another content, unless the last one is still read. The lock is shared afterwards.
+    /// Begins another content and returns its generation, unless a reader holds the lock. The
+    /// caller holds the shared lock afterwards.
     pub(crate) fn begin(&self) -> Option<u64> {
         self.lock(FlockOperation::NonBlockingLockExclusive).ok()?;
-        let label = self.label();
-        label.wanted.store(0, Ordering::SeqCst);
-        let generation = label.generation.fetch_add(1, Ordering::SeqCst) + 1;
+        let header = self.header();
+        header.notice_requested.store(0, Ordering::SeqCst);
+        let generation = header.generation.fetch_add(1, Ordering::SeqCst) + 1;
         self.share().ok()?;
         Some(generation)
     }
 
-    /// Takes the lock for reading, unless somebody has it alone.
+    /// Takes the shared lock, unless another process holds the exclusive one.
     pub(crate) fn share(&self) -> io::Result<()> {
         self.lock(FlockOperation::NonBlockingLockShared)
     }
 
-    /// Lets go of the lock. Says whether somebody waits for that.
-    pub(crate) fn let_go(&self) -> bool {
-        // Looked at afterwards: whoever waits has said so before trying to have the lock, so one
-        // of the two is in time. And read, not looked up in memory, because without the lock the
-        // page may not be there any more.
-        let mut wanted = [0; size_of::<AtomicU32>()];
-        let at = offset_of!(Label, wanted) as u64;
+    /// Releases the lock. Returns whether the sender requested a notice.
+    pub(crate) fn unlock(&self) -> bool {
+        // Read after the unlock: the sender requests the notice before it tries to lock, so either
+        // its lock succeeds or the request is seen here. Read from the file and not from the
+        // mapping, because the page may not exist without the lock.
+        let mut requested = [0; size_of::<AtomicU32>()];
+        let at = offset_of!(SegmentHeader, notice_requested) as u64;
         self.lock(FlockOperation::Unlock).is_ok()
-            && self.file.read_exact_at(&mut wanted, at).is_ok()
-            && wanted != [0; size_of::<AtomicU32>()]
+            && self.file.read_exact_at(&mut requested, at).is_ok()
+            && requested != [0; size_of::<AtomicU32>()]
     }
 
-    /// Asks those who read to say when they stop. For the sender, while it has its files.
-    pub(crate) fn want(&self) {
-        self.label().wanted.store(1, Ordering::SeqCst);
+    /// Requests that readers ring the doorbell when they stop. Only the sender calls this, and
+    /// only before it releases the memory.
+    pub(crate) fn request_notice(&self) {
+        self.header().notice_requested.store(1, Ordering::SeqCst);
     }
 
-    /// Gives the memory back, unless it is read. Nobody reads it afterwards.
+    /// Shortens the file to nothing, unless a reader holds the lock. No process reads it
+    /// afterwards.
     pub(crate) fn empty(&self) -> bool {
         self.lock(FlockOperation::NonBlockingLockExclusive).is_ok() && self.file.set_len(0).is_ok()
     }
 
-    /// Whether all of what was mapped is there, so that it can be read. To be called under the
-    /// lock.
-    pub(crate) fn is_whole(&self) -> bool {
+    /// Whether every mapped page is allocated in the file, so that it can be read. The caller must
+    /// hold the lock.
+    pub(crate) fn is_fully_allocated(&self) -> bool {
         let mapped = self.mapping.len() as u64;
         self.file
             .metadata()
             .is_ok_and(|found| found.len() >= mapped && found.blocks() * 512 >= mapped)
     }
 
-    /// Whether the file has a name, by which others could find it.
-    pub(crate) fn is_there(&self) -> bool {
+    /// Whether the file still has a name and content, so that other processes can open it.
+    pub(crate) fn is_linked(&self) -> bool {
         self.file
             .metadata()
             .is_ok_and(|found| found.nlink() > 0 && found.len() > 0)
@@ -181,12 +187,12 @@ impl SegmentFile {
     }
 }
 
-/// Removes a segment of a process that has ended. Whoever still reads keeps its memory.
+/// Removes a segment of a process that has ended. Processes that read it keep its memory.
 pub(crate) fn remove(path: &Path) {
-    // Emptied first: a file that is only unlinked stays as long as somebody has it mapped,
-    // whether it is read or not.
-    if let Ok((file, found)) = open_ours(path, File::options().write(true))
-        // Somebody else's link to another file of this user would have that emptied.
+    // Emptied first: the memory of a file that is only unlinked stays allocated as long as a
+    // process has it mapped, even if no process reads it.
+    if let Ok((file, found)) = open_owned(path, File::options().write(true))
+        // A hard link to another file of this user must not cause that file to be emptied.
         && found.nlink() == 1
         && flock(&file, FlockOperation::NonBlockingLockExclusive).is_ok()
     {
@@ -200,7 +206,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn contents_follow_each_other_when_nobody_reads() {
+    fn a_segment_is_reused_when_it_is_not_read() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("1.content");
         let sender = SegmentFile::create(&path, 5000).unwrap();
@@ -208,65 +214,65 @@ mod tests {
         let reader = SegmentFile::open(&path).unwrap();
         assert!(reader.room() >= 5000);
         reader.share().unwrap();
-        assert!(reader.is_whole());
+        assert!(reader.is_fully_allocated());
         assert_eq!(reader.generation(), 1);
-        assert!(!sender.let_go());
-        // Being read, it is left alone; whoever waits is told.
+        assert!(!sender.unlock());
+        // A segment that is read is not reused, and the reader learns that the sender waits.
         assert_eq!(sender.begin(), None);
-        sender.want();
+        sender.request_notice();
         assert!(!sender.empty());
-        assert!(reader.let_go());
-        // A letter of before does not mistake the next content for its own.
+        assert!(reader.unlock());
+        // A reference to the first content does not match the second one.
         assert_eq!(sender.begin(), Some(2));
         reader.share().unwrap();
         assert_eq!(reader.generation(), 2);
-        assert!(!reader.let_go());
-        sender.let_go();
+        assert!(!reader.unlock());
+        sender.unlock();
         assert!(sender.empty());
-        sender.let_go();
+        sender.unlock();
         reader.share().unwrap();
-        assert!(!reader.is_whole());
-        assert!(!reader.let_go());
-        assert!(!reader.is_there());
+        assert!(!reader.is_fully_allocated());
+        assert!(!reader.unlock());
+        assert!(!reader.is_linked());
         let refused = SegmentFile::open(&path).unwrap_err();
         assert_eq!(refused.kind(), io::ErrorKind::InvalidData);
     }
 
     #[test]
-    fn what_the_dead_leave_is_emptied_unless_it_is_read() {
+    fn a_dead_senders_segment_is_emptied_unless_it_is_read() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("1.content");
         let sender = SegmentFile::create(&path, 5000).unwrap();
         sender.begin().unwrap();
         let reader = SegmentFile::open(&path).unwrap();
         reader.share().unwrap();
-        // Its lock ends with it.
+        // Dropping the sender releases its lock, as the end of its process does.
         drop(sender);
         remove(&path);
         assert!(!path.exists());
-        assert!(reader.is_whole());
-        assert!(!reader.is_there());
+        assert!(reader.is_fully_allocated());
+        assert!(!reader.is_linked());
 
         let sender = SegmentFile::create(&path, 5000).unwrap();
         let reader = SegmentFile::open(&path).unwrap();
         drop(sender);
         remove(&path);
-        assert!(!reader.is_whole());
+        assert!(!reader.is_fully_allocated());
     }
 
     #[test]
-    fn what_reading_would_have_to_take_is_not_read() {
+    fn a_segment_with_missing_pages_is_not_read() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("1.content");
         let sparse = File::create_new(&path).unwrap();
         sparse.set_len(16 * PAGE as u64).unwrap();
         let reader = SegmentFile::open(&path).unwrap();
         reader.share().unwrap();
-        assert!(!reader.is_whole());
+        assert!(!reader.is_fully_allocated());
     }
 
     #[test]
-    fn what_has_another_name_is_not_emptied() {
+    fn a_file_with_another_hard_link_is_not_emptied() {
         let directory = tempfile::tempdir().unwrap();
         let [other, path] = ["other", "1.content"].map(|name| directory.path().join(name));
         std::fs::write(&other, "precious").unwrap();
@@ -277,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn files_of_others_are_not_mapped() {
+    fn short_files_links_and_directories_are_not_mapped() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("1.content");
         std::fs::write(&path, [0; PAGE]).unwrap();

@@ -1,6 +1,6 @@
-//! The files in which iceoryx2 keeps its structures, with pages that are allocated before use.
+//! The files of iceoryx2's structures, with pages that are allocated before use.
 //!
-//! iceoryx2 makes a shared memory file longer and maps it, which allocates no page. Its first write
+//! iceoryx2 extends a shared memory file and maps it, which allocates no page. Its first write
 //! to a page of a full file system then raises SIGBUS and ends the process. No check of the free
 //! space helps: another program can fill the file system between the check and the write.
 //!
@@ -10,7 +10,7 @@
 //! fails with an ordinary error. The format of the files is that of iceoryx2's own storage.
 //!
 //! Memory for payloads is sparse, because it has room for many large letters. Of such a file the
-//! storage allocates only what iceoryx2 writes without being asked ([`HEAD`], [`TAIL`]). The rest is
+//! storage allocates only what iceoryx2 writes on its own ([`HEAD`], [`TAIL`]). The rest is
 //! up to [`memory::populate`](crate::memory::populate) and [`allocate`].
 
 use std::cell::Cell;
@@ -52,48 +52,48 @@ const UNFINISHED: Permission = Permission::OWNER_WRITE;
 /// Permission of a file that is initialized.
 const FINISHED: Permission = Permission::OWNER_READ_WRITE;
 
-/// How long [`Builder::open`] waits before it looks again at a file that is being initialized.
+/// Pause before [`Builder::open`] checks again a file that is being initialized.
 const PAUSE: Duration = Duration::from_millis(1);
 
 /// Bytes at the beginning of a sparse file that are allocated at once: the description of the
 /// memory, and the header of the first chunk, which iceoryx2 writes when it is loaned.
 const HEAD: usize = 8 << 10;
 
-/// Chunks that a sparse file may have at most.
+/// Maximum number of chunks in a sparse file.
 pub(crate) const MAX_CHUNKS: usize = 2048;
 
-/// Bytes at the end of a sparse file that are allocated at once: the list of free chunks, at four
-/// bytes for each, and their alignment.
+/// Bytes at the end of a sparse file that are allocated at once: the list of free chunks, of four
+/// bytes each, and its alignment.
 const TAIL: usize = 4 * MAX_CHUNKS + (8 << 10);
 
-/// A file of iceoryx2. `SPARSE` says whether only a part of its pages is allocated at once.
+/// A file of iceoryx2. If `SPARSE` is true, only a part of its pages is allocated at once.
 #[derive(Debug)]
 pub(crate) struct Storage<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> {
     name: FileName,
     data: NonNull<Data<T>>,
-    // Before the file, which it is the descriptor of.
-    _registered: Option<Registered>,
+    // Before `file`, whose descriptor it stores.
+    _registered: Option<Registration>,
     file: SharedMemory,
 }
 
-// SAFETY: memory that every process of the domain may use at the same time; `T` is `Send`, and the
-// file is only a mapping and a descriptor, which belong to the process.
+// SAFETY: `data` points into memory that every process of the domain may use concurrently, and `T`
+// is `Send`. `file` is a mapping and a descriptor, which belong to the process and not to a thread.
 unsafe impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Send for Storage<T, SPARSE> {}
-// SAFETY: a shared `Storage` gives out shared references to `T`, which is `Sync`. The file's other
-// state is an atomic flag.
+// SAFETY: a shared `Storage` gives out only shared references to `T`, which is `Sync`. The only
+// other mutable state of `file` is an atomic flag.
 unsafe impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Sync for Storage<T, SPARSE> {}
 
-/// What a file begins with. What `T` manages follows.
+/// The beginning of a file. The memory that `T` manages follows.
 #[derive(Debug)]
 #[repr(C)]
 struct Data<T> {
-    /// iceoryx2's version; 0 until the file is initialized.
+    /// Version of iceoryx2; 0 until the file is initialized.
     version: AtomicU64,
     value: MaybeUninit<T>,
 }
 
 impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Storage<T, SPARSE> {
-    /// The data of a mapped file. None if the file is too short.
+    /// Wraps a mapped file. `None` if the file is too short.
     fn new(name: FileName, file: SharedMemory) -> Option<Self> {
         (file.size() >= size_of::<Data<T>>()).then(|| Self {
             name,
@@ -104,14 +104,14 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Storage<T, SPARS
     }
 
     fn version(&self) -> &AtomicU64 {
-        // SAFETY: the mapping begins with a `Data<T>`, is long enough (`new`), aligned to a page and
-        // lives as long as self. Every process accesses the word atomically only, after the one
-        // that made the file has written it. Its page is allocated.
+        // SAFETY: the mapping begins with a `Data<T>`, is long enough (`new`), aligned to a page
+        // and exists as long as self. The page is allocated. After the creating process has
+        // initialized the word, every process accesses it only atomically.
         unsafe { &(*self.data.as_ptr()).version }
     }
 
     fn value(&self) -> *mut T {
-        // SAFETY: in the mapping, as for `version`; no reference is made.
+        // SAFETY: the address is in the mapping, as for `version`. No reference is created.
         let value = unsafe { &raw mut (*self.data.as_ptr()).value };
         value.cast()
     }
@@ -120,9 +120,9 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Storage<T, SPARS
 impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Drop for Storage<T, SPARSE> {
     fn drop(&mut self) {
         if self.file.has_ownership() {
-            // SAFETY: the value is initialized: `make` and `look` give out no other storage, and an
-            // error of theirs drops a file without a value, or a storage without ownership. iceoryx2
-            // sees to it that one process is the owner.
+            // SAFETY: the value is initialized: `create_file` and `open_existing` return no other
+            // storage, and on an error they drop a file without a value, or a storage without
+            // ownership. iceoryx2 ensures that one process is the owner.
             unsafe { self.value().drop_in_place() };
         }
     }
@@ -130,10 +130,10 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Drop for Storage
 
 impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Abandonable for Storage<T, SPARSE> {
     unsafe fn abandon_in_place(mut this: NonNull<Self>) {
-        // SAFETY: the caller vouches for the pointer, and does not use the storage afterwards.
+        // SAFETY: the caller guarantees a valid pointer, and does not use the storage afterwards.
         let this = unsafe { this.as_mut() };
         this._registered = None;
-        // SAFETY: as above.
+        // SAFETY: `file` is a field of that storage, and is not used afterwards either.
         unsafe { SharedMemory::abandon_in_place(NonNull::from_mut(&mut this.file)) };
     }
 }
@@ -146,7 +146,7 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> NamedConcept
     }
 }
 
-/// Names and removes files as iceoryx2 does.
+/// The original storage, which names, lists and removes the files.
 type Original<T> = posix_shared_memory::Storage<T>;
 
 impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> NamedConceptMgmt
@@ -158,7 +158,7 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> NamedConceptMgmt
         name: &FileName,
         config: &Self::Configuration,
     ) -> Result<bool, NamedConceptRemoveError> {
-        // SAFETY: the caller's promise is the same.
+        // SAFETY: the caller gives the same guarantee.
         unsafe { Original::<T>::remove_cfg(name, config) }
     }
 
@@ -200,8 +200,8 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> DynamicStorage<T
     }
 
     fn get(&self) -> &T {
-        // SAFETY: in the mapping, as for `version`; a `Storage` is only given out after its value
-        // was initialized, which `open` sees by the version. What processes share is `Sync`.
+        // SAFETY: the value is in the mapping, as for `version`. A `Storage` is returned only after
+        // its value was initialized, which `try_open` checks by the version. `T` is `Sync`.
         unsafe { &*self.value() }
     }
 
@@ -209,12 +209,12 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> DynamicStorage<T
         config: &mut Self::Configuration,
         type_name: &str,
     ) {
-        // SAFETY: the caller's promise is the same.
+        // SAFETY: the caller gives the same guarantee.
         unsafe { Original::<T>::__internal_set_type_name_in_config(config, type_name) };
     }
 }
 
-/// Makes or opens a [`Storage`].
+/// Creates or opens a [`Storage`].
 #[derive(Debug)]
 pub(crate) struct Builder<'builder, T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> {
     name: FileName,
@@ -287,12 +287,12 @@ impl<'builder, T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool>
     }
 
     fn open(self, access: AccessMode) -> Result<Storage<T, SPARSE>, DynamicStorageOpenError> {
-        self.look(access)
+        self.open_existing(access)
     }
 
     fn open_or_create(mut self) -> Result<Storage<T, SPARSE>, DynamicStorageOpenOrCreateError> {
         loop {
-            match self.look(AccessMode::ReadWrite) {
+            match self.open_existing(AccessMode::ReadWrite) {
                 Err(DynamicStorageOpenError::DoesNotExist) => {}
                 found => return Ok(found?),
             }
@@ -319,7 +319,7 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Builder<'_, T, S
             .size(len)
             .permission(UNFINISHED)
             .zero_memory(false)
-            // Until the value is there, the file is removed when it is dropped.
+            // Owned until the value is initialized: an error removes the file.
             .has_ownership(true)
             .create()
             .map_err(|error| match error {
@@ -334,9 +334,9 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Builder<'_, T, S
             false => (0..len, len..len),
         };
         for part in [head, tail].into_iter().filter(|part| !part.is_empty()) {
-            // SAFETY: the descriptor is that of `file`, which stays open during the call.
+            // SAFETY: the descriptor belongs to `file`, which stays open during the call.
             let fd = unsafe { BorrowedFd::borrow_raw(descriptor(&file)) };
-            take_pages(fd, part).map_err(|_| DynamicStorageCreateError::InternalError)?;
+            allocate_pages(fd, part).map_err(|_| DynamicStorageCreateError::InternalError)?;
         }
         self.initialize(&file)?;
         let permission = match self.open_to_all {
@@ -348,21 +348,21 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Builder<'_, T, S
         if !self.owned {
             file.release_ownership();
         }
-        let registered = SPARSE.then(|| Registered::new(&file));
+        let registered = SPARSE.then(|| Registration::new(&file));
         let mut storage =
             Storage::new(self.name, file).ok_or(DynamicStorageCreateError::InternalError)?;
         storage._registered = registered;
         Ok(storage)
     }
 
-    /// Writes what the file begins with.
+    /// Initializes the value and the version.
     fn initialize(&mut self, file: &SharedMemory) -> Result<(), DynamicStorageCreateError> {
         let data: NonNull<Data<T>> = file.base_address().cast();
         let data = data.as_ptr();
         // SAFETY: the mapping is aligned to a page and longer than a `Data<T>`, whose pages are
-        // allocated. No other process can open the file for reading yet, and this one has no other
-        // reference. A new file is filled with zeros, which are a valid version and a valid
-        // `MaybeUninit`.
+        // allocated. Other processes of the domain do not use the file before it has its final
+        // permission, and this process has no other reference. A new file is filled with zeros,
+        // which are a valid version and a valid `MaybeUninit`.
         let data = unsafe { &mut *data };
         let rest = std::ptr::from_mut(data).wrapping_add(1).cast::<u8>();
         let rest = NonNull::new(rest).ok_or(DynamicStorageCreateError::InternalError)?;
@@ -375,11 +375,14 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Builder<'_, T, S
         Ok(())
     }
 
-    /// Opens the file. Waits for the process that is making it as long as the timeout says.
-    fn look(&self, access: AccessMode) -> Result<Storage<T, SPARSE>, DynamicStorageOpenError> {
+    /// Opens the file. Waits up to the timeout for the process that initializes it.
+    fn open_existing(
+        &self,
+        access: AccessMode,
+    ) -> Result<Storage<T, SPARSE>, DynamicStorageOpenError> {
         let began = Instant::now();
         loop {
-            match self.look_once(access) {
+            match self.try_open(access) {
                 Err(DynamicStorageOpenError::InitializationNotYetFinalized)
                     if began.elapsed() < self.timeout =>
                 {
@@ -390,7 +393,7 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Builder<'_, T, S
         }
     }
 
-    fn look_once(&self, access: AccessMode) -> Result<Storage<T, SPARSE>, DynamicStorageOpenError> {
+    fn try_open(&self, access: AccessMode) -> Result<Storage<T, SPARSE>, DynamicStorageOpenError> {
         use DynamicStorageOpenError as E;
         let file = SharedMemoryBuilder::new(&self.file_name())
             .open_existing(access)
@@ -402,13 +405,14 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Builder<'_, T, S
                 ) => E::InitializationNotYetFinalized,
                 _ => E::InternalError,
             })?;
-        // Root can open it before the pages are allocated, and must not read there then.
+        // Root can open the file before its pages are allocated, and must not read it then.
         let permission = file.permission().map_err(|_| E::InternalError)?;
         if !permission.has(Permission::OWNER_READ) {
             return Err(E::InitializationNotYetFinalized);
         }
         let storage = Storage::new(self.name, file).ok_or(E::InternalError)?;
-        // Relaxed, as Rust allows it on memory that is mapped for reading only.
+        // Only relaxed loads are allowed on memory that is mapped for reading; the fence adds the
+        // order.
         let version = storage.version().load(Ordering::Relaxed);
         fence(Ordering::Acquire);
         if version == 0 {
@@ -422,18 +426,18 @@ impl<T: Send + Sync + Debug + ZeroCopySend, const SPARSE: bool> Builder<'_, T, S
 }
 
 fn descriptor(file: &SharedMemory) -> RawFd {
-    // SAFETY: the descriptor is used only while the file is open, and not closed.
+    // SAFETY: the callers use the descriptor only while the file is open, and do not close it.
     unsafe { file.file_descriptor().native_handle() }
 }
 
-/// Allocates the pages of a part of a file. Remembers a failure for [`watch`].
-fn take_pages(file: BorrowedFd<'_>, part: Range<usize>) -> Result<(), Errno> {
+/// Allocates the pages of a part of a file. Stores a failure for [`with_shortage`].
+fn allocate_pages(file: BorrowedFd<'_>, part: Range<usize>) -> Result<(), Errno> {
     let len = part.end.saturating_sub(part.start) as u64;
     loop {
         match fallocate(file, FallocateFlags::empty(), part.start as u64, len) {
             Err(Errno::INTR) => {}
             Err(error) => {
-                FAILED.set(Some(Shortage { needed: len, error }));
+                LAST_SHORTAGE.set(Some(Shortage { needed: len, error }));
                 return Err(error);
             }
             Ok(()) => return Ok(()),
@@ -442,44 +446,44 @@ fn take_pages(file: BorrowedFd<'_>, part: Range<usize>) -> Result<(), Errno> {
 }
 
 thread_local! {
-    static FAILED: Cell<Option<Shortage>> = const { Cell::new(None) };
+    static LAST_SHORTAGE: Cell<Option<Shortage>> = const { Cell::new(None) };
 }
 
-/// Pages that could not be allocated.
+/// A failed allocation of pages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Shortage {
-    /// Bytes that were needed.
+    /// Bytes that could not be allocated.
     pub(crate) needed: u64,
     pub(crate) error: Errno,
 }
 
-/// Makes something, and says whether pages could not be allocated for it. iceoryx2 keeps the reason
-/// to itself, and makes a port without its connections when there was no room for them.
-pub(crate) fn watch<R>(make: impl FnOnce() -> R) -> (R, Option<Shortage>) {
-    FAILED.set(None);
+/// Calls `make`, and returns the last failed allocation of pages in it. iceoryx2 does not report
+/// that reason, and creates a port without its connections if there is no room for them.
+pub(crate) fn with_shortage<R>(make: impl FnOnce() -> R) -> (R, Option<Shortage>) {
+    LAST_SHORTAGE.set(None);
     let made = make();
-    (made, FAILED.take())
+    (made, LAST_SHORTAGE.take())
 }
 
-/// The sparse files of this process that are mapped, by the address they are mapped at.
-static MAPPED: Mutex<BTreeMap<usize, Mapped>> = Mutex::new(BTreeMap::new());
+/// The mapped sparse files of this process, by the address of the mapping.
+static MAPPED: Mutex<BTreeMap<usize, MappedFile>> = Mutex::new(BTreeMap::new());
 
 #[derive(Debug)]
-struct Mapped {
+struct MappedFile {
     len: usize,
     descriptor: RawFd,
 }
 
 /// An entry in [`MAPPED`], removed when this is dropped.
 #[derive(Debug)]
-struct Registered {
+struct Registration {
     address: usize,
 }
 
-impl Registered {
+impl Registration {
     fn new(file: &SharedMemory) -> Self {
         let address = file.base_address().as_ptr() as usize;
-        let mapped = Mapped {
+        let mapped = MappedFile {
             len: file.size(),
             descriptor: descriptor(file),
         };
@@ -488,16 +492,16 @@ impl Registered {
     }
 }
 
-impl Drop for Registered {
+impl Drop for Registration {
     fn drop(&mut self) {
         MAPPED.lock().remove(&self.address);
     }
 }
 
-/// Allocates pages of a sparse file of this process: those of this range of addresses.
+/// Allocates the pages of an address range in a sparse file of this process.
 ///
 /// # Errors
-/// `FAULT` if the range is not in such a file, else what the file system says.
+/// Returns `FAULT` if the range is not in such a file, otherwise the error of the file system.
 pub(crate) fn allocate(range: Range<usize>) -> Result<(), Errno> {
     with_mapped(range.start, |base, mapped| {
         if range.end > base.saturating_add(mapped.len) {
@@ -510,16 +514,16 @@ pub(crate) fn allocate(range: Range<usize>) -> Result<(), Errno> {
 /// Allocates all pages of the sparse file of this process that is mapped at this address.
 ///
 /// # Errors
-/// As for [`allocate`].
+/// Returns the errors of [`allocate`].
 pub(crate) fn allocate_all(address: usize) -> Result<(), Errno> {
     with_mapped(address, |_, mapped| mapped.take(0..mapped.len))
 }
 
 fn with_mapped(
     address: usize,
-    with: impl FnOnce(usize, &Mapped) -> Result<(), Errno>,
+    with: impl FnOnce(usize, &MappedFile) -> Result<(), Errno>,
 ) -> Result<(), Errno> {
-    // Under the lock, so that the file stays open.
+    // The lock keeps the file open.
     let mapped = MAPPED.lock();
     match mapped.range(..=address).next_back() {
         Some((base, mapped)) if address - base < mapped.len => with(*base, mapped),
@@ -527,12 +531,12 @@ fn with_mapped(
     }
 }
 
-impl Mapped {
+impl MappedFile {
     fn take(&self, part: Range<usize>) -> Result<(), Errno> {
-        // SAFETY: the caller holds the lock of `MAPPED`. A storage takes its entry out before its
-        // file is closed (the order of its fields), so the descriptor is open until then.
+        // SAFETY: the caller holds the lock of `MAPPED`. A storage removes its entry before it
+        // closes its file (the order of its fields), so the descriptor is open during the call.
         let file = unsafe { BorrowedFd::borrow_raw(self.descriptor) };
-        take_pages(file, part)
+        allocate_pages(file, part)
     }
 }
 
@@ -544,7 +548,7 @@ mod tests {
 
     use super::*;
 
-    /// A sparse file of a mebibyte under a name of its own, removed when it is dropped.
+    /// Creates a sparse file of one MiB with a unique name. It is removed when dropped.
     fn sparse() -> (Storage<u64, true>, std::path::PathBuf) {
         let name = format!("fipatest-{}", Incarnation::random());
         let name = FileName::try_from(name.as_str()).unwrap();
@@ -562,10 +566,10 @@ mod tests {
     }
 
     #[test]
-    fn sparse_files_have_the_pages_that_were_asked_for() {
+    fn sparse_files_have_the_requested_pages() {
         let (storage, path) = sparse();
         let taken = || std::fs::metadata(&path).unwrap().blocks() as usize * 512;
-        // The kernel takes whole pages, and the end of the file need not be one.
+        // The kernel allocates whole pages, and the file need not end with one.
         let at_first = taken();
         assert!((HEAD + TAIL..HEAD + TAIL + (8 << 10)).contains(&at_first));
         let base = storage.file.base_address().as_ptr() as usize;
@@ -576,7 +580,8 @@ mod tests {
         assert_eq!(allocate_all(behind), Err(Errno::FAULT));
         allocate_all(base + 5000).unwrap();
         assert!(taken() >= storage.file.size());
-        // Others find the value; only the process that made the file has its pages.
+        // Another storage finds the value; only the one that created the file can allocate its
+        // pages.
         let other = Builder::<u64, true>::new(storage.name())
             .open(AccessMode::ReadWrite)
             .unwrap();
@@ -589,7 +594,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_initialized_is_neither_opened_nor_left() {
+    fn an_uninitialized_file_is_neither_opened_nor_left() {
         let name = format!("fipatest-{}", Incarnation::random());
         let name = FileName::try_from(name.as_str()).unwrap();
         let builder = || Builder::<u64, false>::new(&name);
@@ -606,21 +611,21 @@ mod tests {
     }
 
     #[test]
-    fn too_large_a_file_is_an_error_that_is_remembered() {
+    fn a_file_larger_than_the_file_system_is_a_reported_error() {
         let name = format!("fipatest-{}", Incarnation::random());
         let name = FileName::try_from(name.as_str()).unwrap();
         let found = rustix::fs::statvfs(crate::memory::SHM).unwrap();
         let total = found.f_blocks * found.f_frsize;
         assert!(total > 0, "a file system without a limit cannot be full");
-        // More than there could be, which the kernel refuses before it takes anything.
+        // More than the file system has, which the kernel refuses before it allocates anything.
         let builder = Builder::<u64, false>::new(&name)
             .supplementary_size(usize::try_from(total).unwrap() + 1)
-            .initializer(|_, _| panic!("there are no pages"));
-        let (made, shortage) = watch(|| builder.create());
+            .initializer(|_, _| panic!("initialized without pages"));
+        let (made, shortage) = with_shortage(|| builder.create());
         assert_eq!(made.err(), Some(DynamicStorageCreateError::InternalError));
         let shortage = shortage.unwrap();
         assert!(shortage.needed > total);
         assert_eq!(shortage.error, Errno::NOSPC);
-        assert_eq!(watch(|| ()).1, None);
+        assert_eq!(with_shortage(|| ()).1, None);
     }
 }

@@ -1,4 +1,4 @@
-//! The endpoint as a [`Transport`].
+//! The [`Transport`] of this crate.
 
 use std::fmt;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,32 +15,31 @@ use tokio::io::unix::AsyncFd;
 use tokio::runtime::Handle;
 use tokio::task::AbortHandle;
 
-use crate::domain::file_error;
+use crate::domain_files::file_error;
 use crate::endpoint::Endpoint;
 use crate::inbox::location_of;
-use crate::presence::{Bell, Watched};
+use crate::presence::{Doorbell, SharedFd};
 use crate::{ShmConfig, ShmCounters, ShmError};
 
 /// Letters through the shared memory of this host.
 ///
-/// Works by itself, on tasks of the runtime it was given, which sleep until somebody rings. A
-/// caller that wants to be faster calls [`Transport::drive`] in a loop: while it does, others need
-/// not ring.
+/// Tasks on the given runtime receive letters; they sleep until a peer rings. A caller that needs
+/// lower latency calls [`Transport::drive`] in a loop; peers do not ring meanwhile.
 ///
 /// Content that arrives is read in place, in the sender's memory, and stays there until the last
-/// `Bytes` of it is dropped. Only a bounded number of contents is held so; beyond it, and when it
-/// is small, content is copied ([`ShmTransport::counters`]).
+/// `Bytes` of it is dropped. The number of contents held that way is bounded. Further content, and
+/// short content, is copied ([`ShmTransport::counters`]).
 ///
-/// Content may be held for longer than the transport is open. The last traces of the process then
-/// vanish when it is dropped.
+/// Content may be held for longer than the transport is open. The last files of the process are
+/// then removed when it is dropped.
 pub struct ShmTransport {
-    /// Another one after the domain was [joined again](Self::rejoin).
+    /// Replaced when the domain is [joined again](Self::rejoin).
     endpoint: ArcSwap<Endpoint>,
     listening: Mutex<Listening>,
     closed: AtomicBool,
 }
 
-/// Is locked while endpoints change.
+/// The sink and its task. Locked while the endpoint is replaced.
 #[derive(Default)]
 struct Listening {
     sink: Option<Arc<dyn Sink>>,
@@ -48,13 +47,13 @@ struct Listening {
 }
 
 impl ShmTransport {
-    /// Opens the endpoint of this process: from now on others can find it.
+    /// Opens the endpoint of this process. Other processes can then find it.
     ///
     /// The runtime must have its I/O driver enabled.
     ///
     /// # Errors
-    /// When the configuration makes no sense, the directory is not private, or shared memory
-    /// cannot be had. Nothing is left open then.
+    /// Returns an error if the configuration is invalid, the directory is not private, or shared
+    /// memory cannot be allocated. Nothing is left open then.
     pub fn new(config: ShmConfig, runtime: Handle) -> Result<Self, ShmError> {
         Ok(Self {
             endpoint: ArcSwap::new(Endpoint::open(config, runtime)?),
@@ -63,38 +62,38 @@ impl ShmTransport {
         })
     }
 
-    /// Where this endpoint can be reached.
+    /// Location of this endpoint's mailbox.
     #[must_use]
     pub fn location(&self) -> Location {
         location_of(self.endpoint.load().config().incarnation)
     }
 
-    /// What happened so far, since the domain was last [joined again](Self::rejoin).
+    /// Counters since the endpoint was opened or last [joined again](Self::rejoin).
     #[must_use]
     pub fn counters(&self) -> ShmCounters {
         self.endpoint.load().tally().read()
     }
 
-    /// Processes of this domain may have ended: removes what dead ones have left, if there is
-    /// anything, in the background. Need not be called for processes that this one talks to,
-    /// whose end the kernel tells.
+    /// Starts a cleanup in the background if the domain contains files of dead processes. Not
+    /// needed for processes that this one talks to: the kernel notifies this process of their end.
     pub fn tidy(&self) {
-        self.endpoint.load().clean_soon();
+        self.endpoint.load().start_cleanup();
     }
 
-    /// Whether other processes can find the mailbox. False when another program has removed the
+    /// Whether other processes can find the mailbox. False if another program has removed the
     /// directory of the domain, or files in it or in `/dev/shm`.
     #[must_use]
     pub fn is_there(&self) -> bool {
         self.endpoint.load().is_there()
     }
 
-    /// Joins the domain again if its files were removed, and says whether that was necessary.
+    /// Joins the domain again if its files were removed. Returns whether that was necessary.
     /// Letters under way are concluded as when the transport closes; content stays readable. Blocks
-    /// for up to some seconds. Must not be called by the sink while it is told something.
+    /// for up to some seconds. The sink must not call this from one of its methods.
     ///
     /// # Errors
-    /// As [`new`](Self::new); nothing can be sent or received then, until it was tried again.
+    /// Returns the errors of [`new`](Self::new). The transport then neither sends nor receives
+    /// until a retry succeeds.
     pub fn rejoin(&self) -> Result<bool, ShmError> {
         let mut listening = self.listening.lock();
         let before = self.endpoint.load_full();
@@ -105,13 +104,13 @@ impl ShmTransport {
         if let Some(task) = listening.task.take() {
             task.abort();
         }
-        // First, because both have files of the same names.
+        // Closed first, because both endpoints use the same file names.
         before.close();
         before.remove_files();
         let endpoint = Endpoint::open(before.config().clone(), before.runtime().clone())?;
         if let Some(sink) = listening.sink.clone() {
-            let begun = begin(&endpoint, sink);
-            listening.task = Some(begun.map_err(|source| {
+            let started = start_listening(&endpoint, sink);
+            listening.task = Some(started.map_err(|source| {
                 endpoint.close();
                 file_error("cannot listen in", &before.config().root, source)
             })?);
@@ -120,12 +119,12 @@ impl ShmTransport {
         Ok(true)
     }
 
-    /// While the domain is being joined again, an attempt fails as one that is worth repeating.
-    fn joining(&self, error: WayError) -> WayError {
+    /// Replaces the error of a closed endpoint by a retriable one while the domain is joined again.
+    fn retriable_while_rejoining(&self, error: WayError) -> WayError {
         match error.fault {
             WayFault::Closed if !self.closed.load(Ordering::SeqCst) => WayError::new(
                 WayFault::Congested,
-                "the domain is being joined again after its files were removed",
+                "joining the domain again after its files were removed",
             ),
             _ => error,
         }
@@ -144,7 +143,7 @@ impl Drop for ShmTransport {
     fn drop(&mut self) {
         let endpoint = self.endpoint.load_full();
         if !endpoint.owner().is_this() {
-            // In a forked child: dropping it would remove what the parent uses.
+            // In a forked child, a drop would remove files that the parent uses.
             std::mem::forget(endpoint);
             return;
         }
@@ -171,8 +170,8 @@ impl Transport for ShmTransport {
         if listening.sink.is_some() || endpoint.is_closed() {
             return Err(ListenError::OpenedBefore);
         }
-        let begun = begin(&endpoint, Arc::clone(&sink));
-        let task = begun.map_err(|source| ListenError::Bind {
+        let started = start_listening(&endpoint, Arc::clone(&sink));
+        let task = started.map_err(|source| ListenError::Bind {
             address: self.location().to_string(),
             source,
         })?;
@@ -186,7 +185,7 @@ impl Transport for ShmTransport {
             self.check_len(letter.len())?;
         }
         let posted = self.endpoint.load().post(attempt, to, &parcel);
-        posted.map_err(|error| self.joining(error))
+        posted.map_err(|error| self.retriable_while_rejoining(error))
     }
 
     fn abandon(&self, attempt: AttemptId) -> Abandoned {
@@ -194,7 +193,7 @@ impl Transport for ShmTransport {
     }
 
     fn answer(&self, _ticket: Ticket, _answer: Answer) {
-        // Every arrival has been answered at once, so every ticket is unknown.
+        // `arrived` always answers at once, so no ticket is pending.
     }
 
     fn drive(&self) -> bool {
@@ -210,7 +209,7 @@ impl Transport for ShmTransport {
     ) -> Result<Option<Box<dyn LoanedContent>>, WayError> {
         self.check_len(len)?;
         let loan = self.endpoint.load().loan(to, head_room, len, tail_room);
-        let loan = loan.map_err(|error| self.joining(error))?;
+        let loan = loan.map_err(|error| self.retriable_while_rejoining(error))?;
         Ok(Some(Box::new(loan)))
     }
 
@@ -224,14 +223,14 @@ impl Transport for ShmTransport {
         self.endpoint.load().pool().copies(content)
     }
 
-    /// Must not be called by the sink while it is told something.
+    /// Closes the transport. The sink must not call this from one of its methods.
     fn close(&self) {
         self.closed.store(true, Ordering::SeqCst);
         let mut listening = self.listening.lock();
         if let Some(task) = listening.task.take() {
             task.abort();
         }
-        // The sink may own what owns this.
+        // The sink may own the value that owns this transport.
         listening.sink = None;
         self.endpoint.load().close();
     }
@@ -245,35 +244,35 @@ impl ShmTransport {
         }
         Err(WayError::new(
             WayFault::TooLarge,
-            format_args!("{len} bytes, and max_letter of transport.shm is {most}"),
+            format_args!("the letter has {len} bytes, and transport.shm.max_letter is {most}"),
         ))
     }
 }
 
-/// Tells the sink from now on.
-fn begin(endpoint: &Arc<Endpoint>, sink: Arc<dyn Sink>) -> std::io::Result<AbortHandle> {
-    let bell = {
+/// Sets the sink and starts the task that receives.
+fn start_listening(endpoint: &Arc<Endpoint>, sink: Arc<dyn Sink>) -> std::io::Result<AbortHandle> {
+    let doorbell = {
         let _runtime = endpoint.runtime().enter();
-        Watched::readable(endpoint.bell().clone())
+        SharedFd::readable(endpoint.doorbell().clone())
     }?;
-    endpoint.tell_to(sink);
-    let task = answer_the_bell(bell, Arc::downgrade(endpoint));
+    endpoint.set_sink(sink);
+    let task = serve_doorbell(doorbell, Arc::downgrade(endpoint));
     let task = endpoint.runtime().spawn(task).abort_handle();
-    // What came before.
-    endpoint.bell().ring();
+    // Letters may have arrived already.
+    endpoint.doorbell().ring();
     Ok(task)
 }
 
-/// Works whenever somebody rings. Ends with the transport.
-async fn answer_the_bell(bell: AsyncFd<Watched<Bell>>, endpoint: Weak<Endpoint>) {
-    while let Ok(mut ready) = bell.readable().await {
-        // First silenced, then looked: who rings during the look is heard afterwards.
-        if bell.get_ref().get().silence() {
+/// Works after each ring. Ends with the transport.
+async fn serve_doorbell(doorbell: AsyncFd<SharedFd<Doorbell>>, endpoint: Weak<Endpoint>) {
+    while let Ok(mut ready) = doorbell.readable().await {
+        // Cleared before the work: a ring during the work wakes the task again.
+        if doorbell.get_ref().get().clear() {
             ready.clear_ready();
         }
         let Some(endpoint) = endpoint.upgrade() else {
             return;
         };
-        endpoint.work_after_bell();
+        endpoint.work_after_wakeup();
     }
 }

@@ -1,4 +1,4 @@
-//! The variant of iceoryx2 that this transport uses.
+//! The iceoryx2 service variant of this transport.
 
 use std::fmt::Debug;
 
@@ -17,7 +17,7 @@ use iceoryx2_cal::{
 
 use crate::storage::Storage;
 
-/// Memory for payloads.
+/// Memory of payloads.
 type Payloads<A> = Memory<A, Storage<AllocatorDetails<A>, true>>;
 
 /// `ipc_threadsafe::Service`, except that the pages of its files are allocated before use.

@@ -1,14 +1,14 @@
-//! The rules of every transport.
+//! The conformance suite of all transports.
 
 mod common;
 
 use std::sync::Arc;
 
-use common::Place;
+use common::TestDomain;
 use fipa_transport::conformance::Fixture;
 use fipa_transport::{Incarnation, Location, Transport};
 
-struct Shm(Place);
+struct Shm(TestDomain);
 
 impl Fixture for Shm {
     fn endpoint(&self) -> Arc<dyn Transport> {
@@ -20,4 +20,4 @@ impl Fixture for Shm {
     }
 }
 
-fipa_transport::conformance_tests!(Shm(Place::new()));
+fipa_transport::conformance_tests!(Shm(TestDomain::new()));

@@ -1,6 +1,6 @@
-//! An endpoint's life: opening, driving, closing.
+//! Opening, driving, rejoining and closing of an endpoint.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on says so")]
+#![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
 
 mod common;
 
@@ -12,30 +12,30 @@ use std::sync::mpsc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use common::{Place, Told, attempt, parcel, wait_for};
+use common::{RecordingSink, TestDomain, attempt, parcel, wait_for};
 use fipa_transport::{Answer, Conclusion, Incarnation, Transport, WayFault};
 use fipa_transport_shm::{ShmConfig, ShmError, ShmTransport, cleanup_dead};
 
 #[test]
-fn nothing_is_left_behind() {
-    let place = Place::new();
-    let (one, told) = place.listening();
-    let (other, got) = place.listening();
+fn closing_removes_all_files() {
+    let domain = TestDomain::new();
+    let (one, sink) = domain.listening();
+    let (other, got) = domain.listening();
     one.dispatch(attempt(), &other.location(), parcel(vec![1; 9000].into()))
         .unwrap();
-    wait_for("answer", || told.conclusions() == 1);
-    assert!(!place.traces().is_empty());
-    // Content that is held keeps what it lies in.
+    wait_for("answer", || sink.conclusions() == 1);
+    assert!(!domain.files().is_empty());
+    // Content that is held keeps its memory and files.
     got.arrived.lock().unwrap().clear();
     one.close();
     other.close();
-    assert_eq!(place.traces(), Vec::<String>::new());
+    assert_eq!(domain.files(), Vec::<String>::new());
     one.close();
 }
 
 #[test]
-fn domains_do_not_meet() {
-    let (here, there) = (Place::new(), Place::new());
+fn domains_are_isolated() {
+    let (here, there) = (TestDomain::new(), TestDomain::new());
     let (one, _) = here.listening();
     let (other, _) = there.listening();
     let refused = one
@@ -46,9 +46,9 @@ fn domains_do_not_meet() {
 
 #[test]
 fn many_threads_drive_one_endpoint() {
-    let place = Place::new();
-    let (one, told) = place.listening();
-    let (other, got) = place.listening();
+    let domain = TestDomain::new();
+    let (one, sink) = domain.listening();
+    let (other, got) = domain.listening();
     let done = AtomicBool::new(false);
     std::thread::scope(|scope| {
         for endpoint in [&one, &one, &other, &other] {
@@ -61,13 +61,13 @@ fn many_threads_drive_one_endpoint() {
         for number in 0..2000 {
             let mut parcel = parcel(Bytes::new());
             parcel.sequence = number + 1;
-            // Full at times.
+            // The window is full at times.
             wait_for("room", || {
                 one.dispatch(attempt(), &other.location(), parcel.clone())
                     .is_ok()
             });
         }
-        wait_for("answers", || told.conclusions() == 2000);
+        wait_for("answers", || sink.conclusions() == 2000);
         done.store(true, Ordering::Relaxed);
     });
     let arrived = got.arrived.lock().unwrap();
@@ -77,11 +77,11 @@ fn many_threads_drive_one_endpoint() {
 
 #[test]
 fn a_full_window_is_an_error() {
-    let place = Place::new();
-    let (sender, _) = place.listening();
-    // Not listening, so it answers nothing.
-    let receiver = place.endpoint();
-    let window = place.config().window;
+    let domain = TestDomain::new();
+    let (sender, _) = domain.listening();
+    // Does not listen, so it answers nothing.
+    let receiver = domain.endpoint();
+    let window = domain.config().window;
     for _ in 0..window {
         sender
             .dispatch(attempt(), &receiver.location(), parcel(Bytes::new()))
@@ -92,12 +92,12 @@ fn a_full_window_is_an_error() {
 }
 
 #[test]
-fn peers_are_bounded_and_the_oldest_forgotten() {
-    let place = Place::new();
-    let mut config = place.config();
+fn peers_are_bounded_and_the_least_recently_used_is_closed() {
+    let domain = TestDomain::new();
+    let mut config = domain.config();
     config.max_peers = 2;
-    let (sender, told) = place.listening_with(config);
-    let receivers: Vec<_> = (0..4).map(|_| place.listening()).collect();
+    let (sender, sink) = domain.listening_with(config);
+    let receivers: Vec<_> = (0..4).map(|_| domain.listening()).collect();
     for (sent, (receiver, _)) in receivers.iter().chain(&receivers).enumerate() {
         sender
             .dispatch(
@@ -106,7 +106,7 @@ fn peers_are_bounded_and_the_oldest_forgotten() {
                 parcel(vec![3; 2000].into()),
             )
             .unwrap();
-        wait_for("answer", || told.conclusions() == sent + 1);
+        wait_for("answer", || sink.conclusions() == sent + 1);
     }
     for (_, got) in &receivers {
         assert_eq!(got.arrivals(), 2);
@@ -116,11 +116,11 @@ fn peers_are_bounded_and_the_oldest_forgotten() {
 
 #[test]
 fn wrong_configurations_and_open_directories_are_refused() {
-    let place = Place::new();
-    let handle = place.runtime.handle();
+    let domain = TestDomain::new();
+    let handle = domain.runtime.handle();
     let refused = |config: ShmConfig| ShmTransport::new(config, handle.clone()).unwrap_err();
     for prefix in ["", "with/slash", "ümlaut", &"x".repeat(65)] {
-        let config = ShmConfig::new(place.directory.path(), prefix, Incarnation::random());
+        let config = ShmConfig::new(domain.directory.path(), prefix, Incarnation::random());
         assert!(
             matches!(refused(config), ShmError::Configuration(_)),
             "{prefix}"
@@ -129,45 +129,45 @@ fn wrong_configurations_and_open_directories_are_refused() {
     let config = ShmConfig::new("relative", "fine", Incarnation::random());
     assert!(matches!(refused(config), ShmError::Configuration(_)));
 
-    let open = place.directory.path().join("open");
+    let open = domain.directory.path().join("open");
     std::fs::create_dir(&open).unwrap();
     std::fs::set_permissions(&open, std::fs::Permissions::from_mode(0o755)).unwrap();
-    let config = ShmConfig::new(&open, &place.prefix, Incarnation::random());
+    let config = ShmConfig::new(&open, &domain.prefix, Incarnation::random());
     assert!(matches!(refused(config), ShmError::NotPrivate { .. }));
 
     let outside = tempfile::tempdir().unwrap();
     let link = outside.path().join("link");
-    let private = place.directory.path().join("private");
+    let private = domain.directory.path().join("private");
     std::fs::create_dir(&private).unwrap();
     std::fs::set_permissions(&private, std::fs::Permissions::from_mode(0o700)).unwrap();
     std::os::unix::fs::symlink(&private, &link).unwrap();
-    let config = ShmConfig::new(&link, &place.prefix, Incarnation::random());
+    let config = ShmConfig::new(&link, &domain.prefix, Incarnation::random());
     assert!(matches!(refused(config), ShmError::NotPrivate { .. }));
-    assert_eq!(place.traces(), Vec::<String>::new());
+    assert_eq!(domain.files(), Vec::<String>::new());
 }
 
 #[test]
-fn what_cannot_be_opened_waits_for_nobody_and_harms_nobody() {
-    let place = Place::new();
-    let config = place.config();
-    let (one, _) = place.listening_with(config.clone());
-    // Its files are there already.
-    let again = ShmTransport::new(config, place.runtime.handle().clone());
+fn a_failed_open_neither_blocks_nor_affects_other_endpoints() {
+    let domain = TestDomain::new();
+    let config = domain.config();
+    let (one, _) = domain.listening_with(config.clone());
+    // Its files exist already.
+    let again = ShmTransport::new(config, domain.runtime.handle().clone());
     assert!(matches!(again.unwrap_err(), ShmError::File { .. }));
-    let (other, told) = place.listening();
+    let (other, sink) = domain.listening();
     other
         .dispatch(attempt(), &one.location(), parcel(Bytes::new()))
         .unwrap();
-    wait_for("answer", || told.conclusions() == 1);
+    wait_for("answer", || sink.conclusions() == 1);
 }
 
 #[test]
-fn who_has_the_lock_and_was_stopped_holds_up_neither_letters_nor_the_end() {
-    let place = Place::new();
-    let (one, _) = place.listening();
-    let (other, told) = place.listening();
-    let root = place.directory.path().join("domain");
-    // What processes do when they start, end or clean up; but this one does not go on.
+fn a_stopped_lock_holder_blocks_neither_dispatch_nor_close() {
+    let domain = TestDomain::new();
+    let (one, _) = domain.listening();
+    let (other, sink) = domain.listening();
+    let root = domain.directory.path().join("domain");
+    // Starting, ending and cleaning processes take this lock; this holder does not release it.
     let stopped = File::open(&root).unwrap();
     stopped.lock().unwrap();
     let (done, finished) = mpsc::channel();
@@ -183,50 +183,52 @@ fn who_has_the_lock_and_was_stopped_holds_up_neither_letters_nor_the_end() {
     let refused = refused.join().unwrap().unwrap_err();
     assert_eq!(refused.fault, WayFault::Congested);
     assert!(refused.detail.contains("stopped"), "{refused}");
-    assert_eq!(told.conclusions(), 0);
-    // It goes on, and whoever comes next removes what was left.
+    assert_eq!(sink.conclusions(), 0);
+    // After the release, the next process removes what was left.
     drop(stopped);
-    let (next, _) = place.listening();
+    let (next, _) = domain.listening();
     next.close();
-    assert_eq!(place.traces(), Vec::<String>::new());
+    assert_eq!(domain.files(), Vec::<String>::new());
 }
 
-/// Whoever waits for the lock of a directory that is removed meanwhile must not clean up in the one
-/// that somebody else has made, and locked, in its place.
+/// A process that waits for the lock of a directory must not clean up in a new directory that
+/// another process has created and locked in its place.
 #[test]
-fn who_waited_too_long_does_not_clean_up_after_those_who_start_anew() {
-    let place = Place::new();
-    place.endpoint().close();
-    let config = place.config();
+fn a_waiter_for_a_removed_directorys_lock_does_not_clean_up_the_new_directory() {
+    let domain = TestDomain::new();
+    domain.endpoint().close();
+    let config = domain.config();
     let root = config.root.clone();
-    let leaving = File::open(&root).unwrap();
-    leaving.lock().unwrap();
+    let previous = File::open(&root).unwrap();
+    previous.lock().unwrap();
     let waiting = std::thread::spawn(move || cleanup_dead(&config));
     let is_open = |directory: &Path| {
         let open = std::fs::read_dir("/proc/self/fd").unwrap().flatten();
         let open = open.filter_map(|file| std::fs::read_link(file.path()).ok());
         open.filter(|file| file == directory).count() == 2
     };
-    wait_for("whoever waits", || is_open(&root));
-    // Somebody starts anew, and has come as far as making this.
+    wait_for("the waiting process", || is_open(&root));
+    // Another process starts and has created this directory so far.
     std::fs::remove_dir(&root).unwrap();
     std::fs::create_dir(&root).unwrap();
     let starting = File::open(&root).unwrap();
     starting.lock().unwrap();
     let nodes = root.join("nodes");
     std::fs::create_dir(&nodes).unwrap();
-    drop(leaving);
-    wait_for("whoever waited", || waiting.is_finished() || is_open(&root));
+    drop(previous);
+    wait_for("the end of the wait", || {
+        waiting.is_finished() || is_open(&root)
+    });
     assert!(nodes.exists());
     drop(starting);
     waiting.join().unwrap().unwrap();
-    // Nobody came.
+    // No process has joined.
     assert!(!nodes.exists());
 }
 
-/// Sends a letter until it was taken: those before fail, as others may not have joined again.
-fn until_answered(from: (&ShmTransport, &Told), to: &ShmTransport) {
-    wait_for("letter that is taken", || {
+/// Sends letters until one is accepted. Earlier ones fail if a process has not rejoined yet.
+fn send_until_accepted(from: (&ShmTransport, &RecordingSink), to: &ShmTransport) {
+    wait_for("an accepted letter", || {
         let one = attempt();
         let content = Bytes::from(vec![3; 9000]);
         if from
@@ -246,24 +248,24 @@ fn until_answered(from: (&ShmTransport, &Told), to: &ShmTransport) {
 
 #[test]
 fn a_domain_whose_files_were_removed_is_joined_again() {
-    let place = Place::new();
-    let (one, one_told) = place.listening();
-    let (two, two_told) = place.listening();
-    until_answered((&one, &one_told), &two);
-    let held = two_told.content(0);
+    let domain = TestDomain::new();
+    let (one, one_sink) = domain.listening();
+    let (two, two_sink) = domain.listening();
+    send_until_accepted((&one, &one_sink), &two);
+    let held = two_sink.content(0);
     assert!(one.is_there() && !one.rejoin().unwrap());
     for round in 0..3 {
-        let root = place.config().root;
+        let root = domain.config().root;
         match round {
             0 => std::fs::remove_dir_all(&root).unwrap(),
-            1 => std::fs::rename(&root, place.directory.path().join("away")).unwrap(),
+            1 => std::fs::rename(&root, domain.directory.path().join("away")).unwrap(),
             // As at the end of a login session, by systemd's RemoveIPC.
             _ => {
                 for file in std::fs::read_dir("/dev/shm").unwrap().flatten() {
                     if file
                         .file_name()
                         .to_string_lossy()
-                        .starts_with(&place.prefix)
+                        .starts_with(&domain.prefix)
                     {
                         std::fs::remove_file(file.path()).unwrap();
                     }
@@ -272,62 +274,63 @@ fn a_domain_whose_files_were_removed_is_joined_again() {
         }
         assert!(!one.is_there() && !two.is_there());
         assert!(one.rejoin().unwrap());
-        // Between the two, a third process starts, and cleans up.
-        let (three, three_told) = place.listening();
-        until_answered((&one, &one_told), &three);
+        // Before the second one rejoins, a third process starts and cleans up.
+        let (three, three_sink) = domain.listening();
+        send_until_accepted((&one, &one_sink), &three);
         assert!(two.rejoin().unwrap());
         assert!(one.is_there() && two.is_there());
         for (from, to) in [
-            ((&*one, &*one_told), &two),
-            ((&two, &two_told), &one),
-            ((&three, &three_told), &two),
-            ((&two, &two_told), &three),
+            ((&*one, &*one_sink), &two),
+            ((&two, &two_sink), &one),
+            ((&three, &three_sink), &two),
+            ((&two, &two_sink), &three),
         ] {
-            until_answered(from, to);
+            send_until_accepted(from, to);
         }
         three.close();
     }
     assert_eq!(held[..], [3; 9000]);
     drop(held);
-    for told in [&one_told, &two_told] {
-        told.arrived.lock().unwrap().clear();
+    for sink in [&one_sink, &two_sink] {
+        sink.arrived.lock().unwrap().clear();
     }
-    // With the last content of a mailbox before, iceoryx2 removes the file of the present one.
+    // Dropping the last content of the previous mailbox makes iceoryx2 remove the file of the
+    // current one.
     for endpoint in [&one, &two] {
         let needed = !endpoint.is_there();
         assert_eq!(endpoint.rejoin().unwrap(), needed);
         assert!(endpoint.is_there());
     }
-    until_answered((&one, &one_told), &two);
-    until_answered((&two, &two_told), &one);
-    for told in [&one_told, &two_told] {
-        told.arrived.lock().unwrap().clear();
+    send_until_accepted((&one, &one_sink), &two);
+    send_until_accepted((&two, &two_sink), &one);
+    for sink in [&one_sink, &two_sink] {
+        sink.arrived.lock().unwrap().clear();
     }
     one.close();
     two.close();
-    assert!(!one.rejoin().unwrap(), "a closed one stays so");
-    std::fs::remove_dir_all(place.directory.path().join("away")).unwrap();
-    assert_eq!(place.traces(), Vec::<String>::new());
+    assert!(!one.rejoin().unwrap(), "a closed transport stays closed");
+    std::fs::remove_dir_all(domain.directory.path().join("away")).unwrap();
+    assert_eq!(domain.files(), Vec::<String>::new());
 }
 
 #[test]
-fn a_process_whose_directory_was_removed_is_not_taken_for_dead() {
-    let place = Place::new();
-    let (one, _) = place.listening();
-    let (two, _) = place.listening();
-    let write_for_many = || {
+fn a_process_whose_directory_was_removed_counts_as_alive() {
+    let domain = TestDomain::new();
+    let (one, _) = domain.listening();
+    let (two, _) = domain.listening();
+    let write_shared = || {
         let mut loan = one.loan_for_many(100_000).unwrap().unwrap();
         loan.content_mut().fill(5);
         loan.freeze()
     };
-    // Leaves a segment that is not in use, which is emptied after the end of its process.
-    drop(write_for_many());
-    std::fs::remove_dir_all(place.config().root).unwrap();
-    let (three, _) = place.listening();
-    let cleaned = cleanup_dead(&place.config()).unwrap();
+    // Leaves an idle segment, which is emptied after the end of its process.
+    drop(write_shared());
+    std::fs::remove_dir_all(domain.config().root).unwrap();
+    let (three, _) = domain.listening();
+    let cleaned = cleanup_dead(&domain.config()).unwrap();
     assert_eq!((cleaned.alive, cleaned.removed), (3, 0), "{cleaned:?}");
-    // A bus error, if the segment was emptied.
-    assert_eq!(write_for_many()[..], [5; 100_000]);
+    // An emptied segment would cause a bus error here.
+    assert_eq!(write_shared()[..], [5; 100_000]);
     for endpoint in [one, two, three] {
         endpoint.close();
     }

@@ -1,14 +1,14 @@
-//! A `/dev/shm` that another program fills while processes start, talk and leave: no process ends
-//! by a signal.
+//! Another program fills `/dev/shm` while processes start, send and leave. No process ends by a
+//! signal.
 //!
-//! `FIPA_FULL_SECONDS` is how long the test takes (30 by default), `FIPA_FULL_SEED` repeats the
-//! decisions of a run, but not the machine's.
+//! `FIPA_FULL_SECONDS` is the running time in seconds (default 30). `FIPA_FULL_SEED` repeats the
+//! random decisions of a run, but not its timing.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on says so")]
+#![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
 #![allow(
     clippy::print_stdout,
     clippy::print_stderr,
-    reason = "processes report what they did"
+    reason = "processes report their results"
 )]
 
 mod common;
@@ -21,7 +21,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use common::{FRONT, Place, Told, attempt, location_of, parcel, wait_for};
+use common::{FRONT, RecordingSink, TestDomain, attempt, location_of, parcel, wait_for};
 use fastrand::Rng;
 use fipa_transport::{Answer, Conclusion, Incarnation, Transport};
 use fipa_transport_shm::{ShmConfig, ShmError, ShmTransport, cleanup_dead};
@@ -43,7 +43,7 @@ fn a_full_file_system_ends_no_process() {
 }
 
 #[test]
-#[ignore = "is run by the other test in namespaces of its own"]
+#[ignore = "run by the other test in namespaces of its own"]
 fn inside_a_full_file_system_ends_no_process() {
     fipa_testbed::enter();
     fipa_testbed::run(&format!("mount -t tmpfs -o size={SIZE} tmpfs /dev/shm"));
@@ -51,9 +51,9 @@ fn inside_a_full_file_system_ends_no_process() {
     let seed = from_env("FIPA_FULL_SEED").unwrap_or_else(|| fastrand::u64(..));
     println!("seed {seed}, {seconds} s");
     let mut rng = Rng::with_seed(seed);
-    let place = Place::new();
+    let domain = TestDomain::new();
     let stop = Arc::new(AtomicBool::new(false));
-    let outsider = {
+    let other_program = {
         let (stop, rng) = (stop.clone(), rng.fork());
         std::thread::spawn(move || fill_and_empty(&stop, rng))
     };
@@ -63,37 +63,37 @@ fn inside_a_full_file_system_ends_no_process() {
     while Instant::now() < end {
         running.retain_mut(|child| !sum.has_ended(child));
         while running.len() < PROCESSES {
-            running.push(start(&place, rng.u64(..)));
+            running.push(start(&domain, rng.u64(..)));
         }
         std::thread::sleep(Duration::from_millis(5));
     }
-    wait_for("processes to leave", || {
+    wait_for("the end of the processes", || {
         running.retain_mut(|child| !sum.has_ended(child));
         running.is_empty()
     });
     stop.store(true, Ordering::SeqCst);
-    sum.filled = outsider.join().unwrap();
+    sum.filled = other_program.join().unwrap();
     println!("{sum:?}");
-    assert_eq!(sum.signals, Vec::<i32>::new(), "deaths by signal, {sum:?}");
+    assert_eq!(sum.signals, Vec::<i32>::new(), "ended by a signal, {sum:?}");
     assert_eq!(sum.failed, 0, "{sum:?}");
     assert!(sum.delivered > 0 && sum.refused > 0, "{sum:?}");
     assert!(sum.started > 0 && sum.not_started > 0, "{sum:?}");
 
-    // Afterwards everything works, and nothing is left.
-    let cleaned = cleanup_dead(&place.config()).unwrap();
+    // Afterwards everything works, and no file remains.
+    let cleaned = cleanup_dead(&domain.config()).unwrap();
     assert_eq!(cleaned.alive, 0);
-    let (sender, told) = place.listening();
-    let (receiver, _got) = place.listening();
+    let (sender, sink) = domain.listening();
+    let (receiver, _got) = domain.listening();
     let one = attempt();
     let content = vec![1; 300_000].into();
     sender
         .dispatch(one, &receiver.location(), parcel(content))
         .unwrap();
-    wait_for("answer", || told.conclusion_of(one).is_some());
+    wait_for("answer", || sink.conclusion_of(one).is_some());
     let accepted = Some(Conclusion::Answered(Answer::Accepted));
-    assert_eq!(told.conclusion_of(one), accepted);
+    assert_eq!(sink.conclusion_of(one), accepted);
     drop((sender, receiver, _got));
-    assert_eq!(place.traces(), Vec::<String>::new());
+    assert_eq!(domain.files(), Vec::<String>::new());
 }
 
 fn from_env(name: &str) -> Option<u64> {
@@ -101,22 +101,22 @@ fn from_env(name: &str) -> Option<u64> {
     Some(text.parse().unwrap())
 }
 
-/// What all processes did.
+/// The results of all processes.
 #[derive(Debug, Default)]
 struct Sum {
-    /// How often the file system was filled.
+    /// Number of times the file system was filled.
     filled: u64,
-    /// Endpoints that were opened, and that were not for lack of room.
+    /// Endpoints that were opened, and that were not because of missing room.
     started: u64,
     not_started: u64,
-    /// Letters that were answered, and attempts that failed.
+    /// Answered letters, and failed attempts.
     delivered: u64,
     refused: u64,
-    /// Processes that ended by themselves.
+    /// Processes that exited.
     ended: u64,
-    /// Those of them that found something wrong.
+    /// Exited processes that reported a failure.
     failed: u64,
-    /// Signals that ended the others.
+    /// Signals that ended the other processes.
     signals: Vec<i32>,
 }
 
@@ -148,15 +148,10 @@ impl Sum {
     }
 }
 
-fn start(place: &Place, seed: u64) -> Child {
-    let config = place.config();
+fn start(domain: &TestDomain, seed: u64) -> Child {
+    let config = domain.config();
     Command::new(std::env::current_exe().unwrap())
-        .args([
-            "--ignored",
-            "--exact",
-            "--nocapture",
-            "a_process_of_its_own",
-        ])
+        .args(["--ignored", "--exact", "--nocapture", "process_entry"])
         .env(
             ROLE,
             format!("{} {} {seed}", config.root.display(), config.prefix),
@@ -166,9 +161,10 @@ fn start(place: &Place, seed: u64) -> Child {
         .unwrap()
 }
 
-/// A program that is not of the domain: fills the file system except for some pages, and frees it.
+/// Acts as a program outside of the domain: fills the file system except for some pages, and frees
+/// it.
 fn fill_and_empty(stop: &AtomicBool, mut rng: Rng) -> u64 {
-    let path = "/dev/shm/outsider";
+    let path = "/dev/shm/other_program";
     let mut filled = 0;
     while !stop.load(Ordering::SeqCst) {
         let file = File::create(path).unwrap();
@@ -177,7 +173,7 @@ fn fill_and_empty(stop: &AtomicBool, mut rng: Rng) -> u64 {
             1 => rng.u64(..16),
             _ => rng.u64(..512),
         };
-        // What others free or take meanwhile makes it a little more or less.
+        // Concurrent allocations of other processes change the result by a little.
         let mut taken = 0;
         while let free = statvfs("/dev/shm").unwrap().f_bavail
             && free > left
@@ -196,15 +192,15 @@ fn fill_and_empty(stop: &AtomicBool, mut rng: Rng) -> u64 {
     filled
 }
 
-/// Lets other threads run for up to this many microseconds.
+/// Sleeps for less than this many microseconds.
 fn pause(rng: &mut Rng, most: u64) {
     std::thread::sleep(Duration::from_micros(rng.u64(..most)));
 }
 
-/// What the test starts several times.
+/// The test process, started several times.
 #[test]
-#[ignore = "is started by another test"]
-fn a_process_of_its_own() {
+#[ignore = "started by another test"]
+fn process_entry() {
     let role = std::env::var(ROLE).unwrap();
     let words: Vec<&str> = role.split(' ').collect();
     let mut rng = Rng::with_seed(words[2].parse().unwrap());
@@ -225,8 +221,8 @@ fn a_process_of_its_own() {
             }
         };
         started += 1;
-        let told = Arc::new(Told::default());
-        endpoint.listen(told.clone()).unwrap();
+        let sink = Arc::new(RecordingSink::default());
+        endpoint.listen(sink.clone()).unwrap();
         for _ in 0..rng.u8(10..60) {
             match send(&endpoint, words[0], words[1], &mut rng) {
                 Ok(true) => {}
@@ -234,24 +230,24 @@ fn a_process_of_its_own() {
                 Err(()) => refused += 1,
             }
             if rng.u8(..8) == 0 {
-                told.arrived.lock().unwrap().clear();
+                sink.arrived.lock().unwrap().clear();
             }
         }
-        let concluded = told.concluded.lock().unwrap();
+        let concluded = sink.concluded.lock().unwrap();
         let answers = concluded.iter();
         let answers = answers.filter(|(_, what)| matches!(what, Conclusion::Answered(_)));
         delivered += answers.count();
         drop(concluded);
         if rng.u8(..4) == 0 {
             println!("\nreport {started} {not_started} {delivered} {refused}");
-            // Without leaving: as after a crash, others clean up.
+            // Without closing, as after a crash: other processes clean up.
             std::process::exit(0);
         }
     }
     println!("\nreport {started} {not_started} {delivered} {refused}");
 }
 
-/// Whether the reason is a full file system, or that others hold the lock for too long.
+/// Whether the cause is a full file system, or a lock that another process holds for too long.
 fn is_full(error: &ShmError) -> bool {
     match error {
         ShmError::NoRoom { .. } | ShmError::Full { .. } | ShmError::Busy { .. } => true,
@@ -260,7 +256,7 @@ fn is_full(error: &ShmError) -> bool {
     }
 }
 
-/// Sends a letter to any process. `Ok(false)` if there is none.
+/// Sends a letter to a random process. `Ok(false)` if there is none.
 fn send(from: &ShmTransport, root: &str, prefix: &str, rng: &mut Rng) -> Result<bool, ()> {
     let files = std::fs::read_dir(format!("{root}/processes")).map_err(|_| ())?;
     let prefix = format!("{prefix}_");

@@ -1,46 +1,12 @@
-//! Whose memory content lies in, and how much of it there is.
+//! The memory that contains content, and the limits on its amount.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on says so")]
+#![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
 
 mod common;
 
-use std::fs;
-
 use bytes::Bytes;
-use common::{FRONT, Place, attempt, parcel, wait_for};
+use common::{FRONT, TestDomain, attempt, mapping_of, parcel, wait_for};
 use fipa_transport::{Answer, Conclusion, Transport, WayFault};
-
-/// The file that a piece of this process's memory is mapped from, if any.
-fn mapped_from(bytes: &[u8]) -> Option<String> {
-    let address = bytes.as_ptr() as usize;
-    let maps = fs::read_to_string("/proc/self/maps").unwrap();
-    let line = maps.lines().find(|line| {
-        let range = line.split(' ').next().unwrap();
-        let (start, end) = range.split_once('-').unwrap();
-        let start = usize::from_str_radix(start, 16).unwrap();
-        let end = usize::from_str_radix(end, 16).unwrap();
-        (start..end).contains(&address) && address + bytes.len() <= end
-    });
-    let file = line.unwrap().split_whitespace().nth(5);
-    file.filter(|file| file.starts_with('/')).map(str::to_owned)
-}
-
-/// Position of a piece of memory in the file it is mapped from.
-fn position(bytes: &[u8]) -> usize {
-    let address = bytes.as_ptr() as usize;
-    let maps = fs::read_to_string("/proc/self/maps").unwrap();
-    let mut places = maps.lines().filter_map(|line| {
-        let mut fields = line.split_whitespace();
-        let (start, end) = fields.next()?.split_once('-')?;
-        let start = usize::from_str_radix(start, 16).ok()?;
-        let end = usize::from_str_radix(end, 16).ok()?;
-        let offset = usize::from_str_radix(fields.nth(1)?, 16).ok()?;
-        (start..end)
-            .contains(&address)
-            .then(|| address - start + offset)
-    });
-    places.next().unwrap()
-}
 
 fn pattern(len: usize) -> Bytes {
     (0..len)
@@ -51,19 +17,23 @@ fn pattern(len: usize) -> Bytes {
 
 #[test]
 fn loaned_content_is_never_copied() {
-    let place = Place::new();
-    let (sender, sent) = place.listening();
-    let (receiver, got) = place.listening();
+    let domain = TestDomain::new();
+    let (sender, sent) = domain.listening();
+    let (receiver, got) = domain.listening();
     for (number, len) in [2000, 4 << 20, 16 << 20].into_iter().enumerate() {
         let loan = sender.loan(&receiver.location(), FRONT, len, 1);
-        let mut loan = loan.unwrap().expect("shared memory loans");
+        let mut loan = loan.unwrap().expect("shared memory supports loans");
         assert_eq!(loan.content_mut().len(), len);
         loan.content_mut().copy_from_slice(&pattern(len));
         let content = loan.freeze();
-        let from = mapped_from(&content).expect("loaned memory is shared");
+        let from = mapping_of(&content);
+        let path = from
+            .path
+            .as_deref()
+            .expect("loaned memory is mapped from a file");
         assert!(
-            from.starts_with(&format!("/dev/shm/{}", place.prefix)),
-            "{from}"
+            path.starts_with(&format!("/dev/shm/{}", domain.prefix)),
+            "{path}"
         );
 
         sender
@@ -72,10 +42,9 @@ fn loaned_content_is_never_copied() {
         wait_for("letter", || got.arrivals() == number + 1);
         let received = got.content(number);
         assert_eq!(received, pattern(len));
-        // The same bytes of the same file, mapped a second time: not a copy.
+        // The same bytes of the same file, mapped a second time, and not a copy.
         assert_ne!(received.as_ptr(), content.as_ptr());
-        assert_eq!(mapped_from(&received), Some(from));
-        assert_eq!(position(&received), position(&content));
+        assert_eq!(mapping_of(&received), from);
         assert_eq!(received.as_ptr() as usize % 8, 0);
     }
     wait_for("answers", || sent.conclusions() == 3);
@@ -86,11 +55,11 @@ fn loaned_content_is_never_copied() {
 }
 
 #[test]
-fn loaned_content_can_be_sent_again_and_elsewhere() {
-    let place = Place::new();
-    let (sender, sent) = place.listening();
-    let (first, got_first) = place.listening();
-    let (second, got_second) = place.listening();
+fn loaned_content_can_be_sent_again_and_to_another_receiver() {
+    let domain = TestDomain::new();
+    let (sender, sent) = domain.listening();
+    let (first, got_first) = domain.listening();
+    let (second, got_second) = domain.listening();
     let mut loan = sender
         .loan(&first.location(), FRONT, 5000, 1)
         .unwrap()
@@ -119,10 +88,10 @@ fn loaned_content_can_be_sent_again_and_elsewhere() {
 }
 
 #[test]
-fn a_front_longer_than_announced_is_copied() {
-    let place = Place::new();
-    let (sender, _) = place.listening();
-    let (receiver, got) = place.listening();
+fn a_letter_with_a_longer_front_than_announced_is_copied() {
+    let domain = TestDomain::new();
+    let (sender, _) = domain.listening();
+    let (receiver, got) = domain.listening();
     let mut loan = sender
         .loan(&receiver.location(), 8, 5000, 1)
         .unwrap()
@@ -138,16 +107,16 @@ fn a_front_longer_than_announced_is_copied() {
 
 #[test]
 fn a_loan_outlives_larger_ones_and_its_transport() {
-    let place = Place::new();
-    let (sender, _) = place.listening();
-    let (receiver, got) = place.listening();
+    let domain = TestDomain::new();
+    let (sender, _) = domain.listening();
+    let (receiver, got) = domain.listening();
     let mut small = sender
         .loan(&receiver.location(), FRONT, 2000, 1)
         .unwrap()
         .unwrap();
     small.content_mut().copy_from_slice(&pattern(2000));
     let small = small.freeze();
-    // Takes a new segment; what is sent from the old one is copied, see `Outbox::send_loan`.
+    // Creates a new segment; content in the old one is copied when sent, see `Outbox::send_loan`.
     let large = sender
         .loan(&receiver.location(), FRONT, 1 << 20, 1)
         .unwrap()
@@ -165,15 +134,18 @@ fn a_loan_outlives_larger_ones_and_its_transport() {
 
 #[test]
 fn loans_are_bounded_and_leave_room_for_letters() {
-    let place = Place::new();
-    let (sender, sent) = place.listening();
-    let (receiver, _) = place.listening();
+    let domain = TestDomain::new();
+    let (sender, sent) = domain.listening();
+    let (receiver, _) = domain.listening();
     let to = receiver.location();
-    let most = place.config().max_loans;
+    let most = domain.config().max_loans;
     let loans: Vec<_> = (0..most)
         .map(|_| sender.loan(&to, FRONT, 100, 1).unwrap().unwrap())
         .collect();
-    let refused = sender.loan(&to, FRONT, 100, 1).err().expect("no more");
+    let refused = sender
+        .loan(&to, FRONT, 100, 1)
+        .err()
+        .expect("the limit is reached");
     assert_eq!(refused.fault, WayFault::Congested);
     sender
         .dispatch(attempt(), &to, parcel(Bytes::new()))
@@ -185,13 +157,13 @@ fn loans_are_bounded_and_leave_room_for_letters() {
 
 #[test]
 fn held_content_is_bounded_and_then_copied() {
-    let place = Place::new();
-    let mut config = place.config();
+    let domain = TestDomain::new();
+    let mut config = domain.config();
     config.max_borrowed = 5;
-    let (receiver, got) = place.listening_with(config);
-    let (sender, sent) = place.listening();
+    let (receiver, got) = domain.listening_with(config);
+    let (sender, sent) = domain.listening();
     let to = receiver.location();
-    // More than a window: none of them may wait for content to be given back.
+    // More than a window: no letter may wait for the release of content.
     for number in 0..40 {
         let one = attempt();
         sender
@@ -221,13 +193,13 @@ fn held_content_is_bounded_and_then_copied() {
 }
 
 #[test]
-fn one_slot_of_a_sender_stays_free() {
-    let place = Place::new();
-    let mut config = place.config();
+fn one_slot_of_each_sender_stays_free() {
+    let domain = TestDomain::new();
+    let mut config = domain.config();
     config.window = 4;
     config.max_loans = 2;
-    let (receiver, _got) = place.listening_with(config);
-    let (sender, sent) = place.listening();
+    let (receiver, _got) = domain.listening_with(config);
+    let (sender, sent) = domain.listening();
     for _ in 0..12 {
         let one = attempt();
         sender
@@ -240,10 +212,10 @@ fn one_slot_of_a_sender_stays_free() {
 }
 
 #[test]
-fn small_content_is_copied_and_holds_nothing() {
-    let place = Place::new();
-    let (receiver, got) = place.listening();
-    let (sender, _) = place.listening();
+fn small_content_is_copied_and_holds_no_slot() {
+    let domain = TestDomain::new();
+    let (receiver, got) = domain.listening();
+    let (sender, _) = domain.listening();
     sender
         .dispatch(attempt(), &receiver.location(), parcel(pattern(10)))
         .unwrap();
@@ -254,18 +226,18 @@ fn small_content_is_copied_and_holds_nothing() {
 }
 
 #[test]
-fn capacity_is_an_error_and_not_a_signal() {
-    let place = Place::new();
-    let mut config = place.config();
+fn exceeding_the_capacity_is_an_error_and_not_a_signal() {
+    let domain = TestDomain::new();
+    let mut config = domain.config();
     config.capacity = 8 << 20;
-    let (sender, sent) = place.listening_with(config);
-    let (receiver, _got) = place.listening();
+    let (sender, sent) = domain.listening_with(config);
+    let (receiver, _got) = domain.listening();
     let to = receiver.location();
     let refused = sender
         .dispatch(attempt(), &to, parcel(pattern(9 << 20)))
         .unwrap_err();
     assert_eq!(refused.fault, WayFault::TooLarge);
-    // The receiver keeps what it got, so every letter takes new memory.
+    // The receiver keeps every letter, so each one takes new memory.
     let mut taken = 0;
     let refused = loop {
         match sender.dispatch(attempt(), &to, parcel(pattern(1 << 20))) {
@@ -286,21 +258,21 @@ fn capacity_is_an_error_and_not_a_signal() {
 
 #[test]
 fn content_outlives_both_transports() {
-    let place = Place::new();
-    let (receiver, got) = place.listening();
-    let (sender, _) = place.listening();
+    let domain = TestDomain::new();
+    let (receiver, got) = domain.listening();
+    let (sender, _) = domain.listening();
     sender
         .dispatch(attempt(), &receiver.location(), parcel(pattern(100_000)))
         .unwrap();
     wait_for("letter", || got.arrivals() == 1);
     let content = got.content(0);
     got.arrived.lock().unwrap().clear();
-    assert!(mapped_from(&content).is_some());
+    assert!(mapping_of(&content).path.is_some());
     sender.close();
     receiver.close();
     assert_eq!(content, pattern(100_000));
     drop((sender, receiver));
     let elsewhere = std::thread::spawn(move || content == pattern(100_000));
     assert!(elsewhere.join().unwrap());
-    assert_eq!(place.traces(), Vec::<String>::new());
+    assert_eq!(domain.files(), Vec::<String>::new());
 }

@@ -1,10 +1,8 @@
-//! Several processes, some of which are killed. Every test starts its own from this binary.
+//! Several processes, some of which are killed. Each test starts its own processes from this
+//! binary.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on says so")]
-#![allow(
-    clippy::print_stdout,
-    reason = "processes tell each other what they see"
-)]
+#![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
+#![allow(clippy::print_stdout, reason = "processes report their observations")]
 
 mod common;
 
@@ -14,27 +12,28 @@ use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 
 use bytes::Bytes;
-use common::{Place, attempt, location_of, parcel, wait_for};
+use common::{TestDomain, attempt, location_of, mapping_of, parcel, wait_for};
 use fipa_transport::{Answer, Conclusion, Incarnation, Transport, WayFault};
 use fipa_transport_shm::{ShmConfig, ShmTransport, cleanup_dead};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
 const ROLE: &str = "FIPA_SHM_TEST_ROLE";
 
-/// A process of its own, killed in the end.
+/// A child process, killed at the end.
 struct Process {
     child: Child,
     incarnation: Incarnation,
 }
 
 impl Process {
-    /// Roles: `receive` what comes and keep it, or `drop` it; `tell` where its content lies, besides; `send` to
-    /// a process without end, or `many`, which is content for many; `clean` up, and end.
-    fn start(place: &Place, role: &str, to: Incarnation) -> Self {
-        let config = place.config();
+    /// Roles: `receive` keeps what arrives, and `drop` drops it; `tell` also prints the position of
+    /// its content; `send` sends to a process in a loop, and `many` does so with content for
+    /// several receivers; `clean` cleans up and ends.
+    fn start(domain: &TestDomain, role: &str, to: Incarnation) -> Self {
+        let config = domain.config();
         let child = Command::new(std::env::current_exe().unwrap())
             .args(["--ignored", "--exact", "--nocapture"])
-            .arg("a_process_of_its_own")
+            .arg("process_entry")
             .env(
                 ROLE,
                 format!(
@@ -62,13 +61,13 @@ impl Process {
         assert!(done.success());
     }
 
-    /// SIGKILL.
+    /// Sends SIGKILL and waits for the end.
     fn kill(&mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
     }
 
-    /// Waits until it can be reached.
+    /// Waits until the process can be reached.
     fn wait_until_up(&self, from: &ShmTransport) {
         let to = location_of(self.incarnation);
         wait_for("process", || {
@@ -79,7 +78,7 @@ impl Process {
 
 impl Drop for Process {
     fn drop(&mut self) {
-        // Killed already, or not.
+        // Fails if it has been killed already.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
@@ -87,8 +86,8 @@ impl Drop for Process {
 
 #[test]
 #[ignore = "started by the other tests"]
-fn a_process_of_its_own() {
-    let role = std::env::var(ROLE).expect("started by another test");
+fn process_entry() {
+    let role = std::env::var(ROLE).expect("the other tests set it");
     let mut words = role.split(' ');
     let mut word = || words.next().unwrap();
     let role = word();
@@ -103,28 +102,28 @@ fn a_process_of_its_own() {
         .build()
         .unwrap();
     let endpoint = ShmTransport::new(config, runtime.handle().clone()).unwrap();
-    let told = Arc::new(common::Told::default());
-    endpoint.listen(told.clone()).unwrap();
+    let sink = Arc::new(common::RecordingSink::default());
+    endpoint.listen(sink.clone()).unwrap();
     let content = Bytes::from(vec![7; 5000]);
     let mut seen = 0;
     loop {
         match role {
             "receive" => std::thread::park(),
             "drop" => {
-                told.arrived.lock().unwrap().clear();
+                sink.arrived.lock().unwrap().clear();
                 std::thread::sleep(std::time::Duration::from_millis(1));
             }
             "tell" => {
-                wait_for_ever(|| told.arrivals() > seen);
-                let content = told.content(seen);
+                wait_without_limit(|| sink.arrivals() > seen);
+                let content = sink.content(seen);
                 seen += 1;
                 if !content.is_empty() {
                     let sum: u64 = content.iter().map(|byte| u64::from(*byte)).sum();
-                    println!("\nLIES {} {} {sum}", lies(&content), content.len());
+                    println!("\nPOSITION {} {} {sum}", position(&content), content.len());
                 }
             }
             "many" => {
-                // All are held or read already.
+                // All segments are held or read.
                 let Ok(Some(mut loan)) = endpoint.loan_for_many(100_000) else {
                     std::thread::yield_now();
                     continue;
@@ -133,7 +132,7 @@ fn a_process_of_its_own() {
                 let _ = endpoint.dispatch(attempt(), &to, parcel(loan.freeze()));
             }
             _ => {
-                // Full, or gone.
+                // The mailbox is full, or its process has ended.
                 if endpoint
                     .dispatch(attempt(), &to, parcel(content.clone()))
                     .is_err()
@@ -145,35 +144,24 @@ fn a_process_of_its_own() {
     }
 }
 
-fn wait_for_ever(condition: impl Fn() -> bool) {
+fn wait_without_limit(condition: impl Fn() -> bool) {
     while !condition() {
         std::thread::sleep(std::time::Duration::from_millis(1));
     }
 }
 
-/// Where content lies: device and number of the file, and the place in it.
-fn lies(content: &[u8]) -> String {
-    let address = content.as_ptr() as usize;
-    let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
-    let place = maps.lines().find_map(|line| {
-        let mut fields = line.split_whitespace();
-        let (start, end) = fields.next()?.split_once('-')?;
-        let start = usize::from_str_radix(start, 16).ok()?;
-        let end = usize::from_str_radix(end, 16).ok()?;
-        let offset = usize::from_str_radix(fields.nth(1)?, 16).ok()?;
-        let (device, inode) = (fields.next()?, fields.next()?);
-        let here = (start..end).contains(&address) && address + content.len() <= end;
-        here.then(|| format!("{device} {inode} {}", address - start + offset))
-    });
-    place.unwrap()
+/// Device, inode and offset of content in memory, as one line of text.
+fn position(content: &[u8]) -> String {
+    let at = mapping_of(content);
+    format!("{} {} {}", at.device, at.inode, at.offset)
 }
 
 #[test]
 fn receivers_in_two_processes_read_the_same_memory() {
-    let place = Place::new();
-    let (sender, sent) = place.listening();
-    let nobody = Incarnation::from_u64(1);
-    let mut receivers = [(); 2].map(|()| Process::start(&place, "tell", nobody));
+    let domain = TestDomain::new();
+    let (sender, sent) = domain.listening();
+    let unused = Incarnation::from_u64(1);
+    let mut receivers = [(); 2].map(|()| Process::start(&domain, "tell", unused));
     for receiver in &receivers {
         receiver.wait_until_up(&sender);
     }
@@ -184,7 +172,7 @@ fn receivers_in_two_processes_read_the_same_memory() {
         .for_each(|(at, byte)| *byte = (at % 251) as u8);
     let content = loan.freeze();
     let sum: u64 = content.iter().map(|byte| u64::from(*byte)).sum();
-    let expected = format!("LIES {} {} {sum}", lies(&content), content.len());
+    let expected = format!("POSITION {} {} {sum}", position(&content), content.len());
     for receiver in &mut receivers {
         let to = location_of(receiver.incarnation);
         let one = attempt();
@@ -192,32 +180,33 @@ fn receivers_in_two_processes_read_the_same_memory() {
         wait_for("answer", || sent.conclusion_of(one).is_some());
         let lines = BufReader::new(receiver.child.stdout.take().unwrap()).lines();
         let mut lines = lines.map_while(Result::ok);
-        let told = lines.find(|line| line.starts_with("LIES"));
-        assert_eq!(told, Some(expected.clone()));
+        let reported = lines.find(|line| line.starts_with("POSITION"));
+        assert_eq!(reported, Some(expected.clone()));
     }
     assert_eq!(sender.counters().referring, 2);
-    // Killed while they hold it, they do not keep it from being used again.
+    // A receiver that is killed while it holds the content does not keep the memory from being
+    // reused.
     for receiver in &mut receivers {
         receiver.kill();
     }
-    let before = lies(&content);
+    let before = position(&content);
     drop(content);
     let again = sender.loan_for_many(1 << 20).unwrap().unwrap().freeze();
-    assert_eq!(lies(&again), before);
+    assert_eq!(position(&again), before);
 }
 
 #[test]
-fn content_for_many_of_a_killed_sender_stays_as_long_as_it_is_read() {
-    let place = Place::new();
-    let (receiver, got) = place.listening();
+fn shared_content_of_a_killed_sender_stays_while_it_is_read() {
+    let domain = TestDomain::new();
+    let (receiver, got) = domain.listening();
     let own = receiver.location().incarnation();
-    let mut sender = Process::start(&place, "many", own);
+    let mut sender = Process::start(&domain, "many", own);
     wait_for("letters", || got.arrivals() >= 8);
     sender.kill();
-    wait_for("notice", || receiver.counters().peers_gone == 1);
+    wait_for("the detected end", || receiver.counters().peers_gone == 1);
     let dead = sender.incarnation.to_string();
     wait_for("removal", || {
-        !place.traces().iter().any(|file| file.contains(&dead))
+        !domain.files().iter().any(|file| file.contains(&dead))
     });
     for number in 0..got.arrivals() {
         assert!(got.content(number).iter().all(|byte| *byte == 7));
@@ -229,14 +218,14 @@ fn content_for_many_of_a_killed_sender_stays_as_long_as_it_is_read() {
         !maps.contains(&format!("{dead}."))
     });
     receiver.close();
-    assert_eq!(place.traces(), Vec::<String>::new());
+    assert_eq!(domain.files(), Vec::<String>::new());
 }
 
 #[test]
-fn a_killed_receiver_leaves_no_attempt_open() {
-    let place = Place::new();
-    let (sender, sent) = place.listening();
-    let mut receiver = Process::start(&place, "receive", Incarnation::from_u64(1));
+fn attempts_to_a_killed_receiver_are_concluded() {
+    let domain = TestDomain::new();
+    let (sender, sent) = domain.listening();
+    let mut receiver = Process::start(&domain, "receive", Incarnation::from_u64(1));
     receiver.wait_until_up(&sender);
     wait_for("answer", || sent.conclusions() == 1);
     let to = location_of(receiver.incarnation);
@@ -261,28 +250,28 @@ fn a_killed_receiver_leaves_no_attempt_open() {
         .unwrap_err();
     assert_eq!(refused.fault, WayFault::Unreachable);
     assert_eq!(sender.counters().peers_gone, 1);
-    // The survivor removes what the dead one left, while it lives itself.
+    // The survivor removes the files of the dead process while it runs.
     let dead = receiver.incarnation.to_string();
     wait_for("removal", || {
-        !place.traces().iter().any(|file| file.contains(&dead))
+        !domain.files().iter().any(|file| file.contains(&dead))
     });
     sender.close();
-    assert_eq!(place.traces(), Vec::<String>::new());
+    assert_eq!(domain.files(), Vec::<String>::new());
 }
 
 #[test]
-fn content_of_a_killed_sender_stays() {
-    let place = Place::new();
-    let (receiver, got) = place.listening();
+fn content_of_a_killed_sender_stays_readable() {
+    let domain = TestDomain::new();
+    let (receiver, got) = domain.listening();
     let own = receiver.location().incarnation();
-    let mut sender = Process::start(&place, "send", own);
-    // More than are taken at a time, so that it is known.
+    let mut sender = Process::start(&domain, "send", own);
+    // More than one batch, so that the receiver has the sender open as a peer.
     wait_for("letters", || got.arrivals() > 64);
     sender.kill();
-    wait_for("notice", || receiver.counters().peers_gone == 1);
+    wait_for("the detected end", || receiver.counters().peers_gone == 1);
     let dead = sender.incarnation.to_string();
     wait_for("removal", || {
-        !place.traces().iter().any(|file| file.contains(&dead))
+        !domain.files().iter().any(|file| file.contains(&dead))
     });
     assert!(receiver.counters().borrowed > 0);
     for number in 0..got.arrivals() {
@@ -290,18 +279,18 @@ fn content_of_a_killed_sender_stays() {
     }
     got.arrived.lock().unwrap().clear();
     receiver.close();
-    assert_eq!(place.traces(), Vec::<String>::new());
+    assert_eq!(domain.files(), Vec::<String>::new());
 }
 
 #[test]
 fn a_receiver_survives_more_killed_senders_than_it_has_connections() {
-    let place = Place::new();
-    let (receiver, got) = place.listening();
+    let domain = TestDomain::new();
+    let (receiver, got) = domain.listening();
     let own = receiver.location().incarnation();
     for _ in 0..18 {
-        // Four at a time, killed in the middle of sending.
+        // Four at a time, killed while they send.
         let mut senders: Vec<_> = (0..4)
-            .map(|_| Process::start(&place, "send", own))
+            .map(|_| Process::start(&domain, "send", own))
             .collect();
         wait_for("letters", || got.arrivals() > 8);
         for sender in &mut senders {
@@ -309,7 +298,7 @@ fn a_receiver_survives_more_killed_senders_than_it_has_connections() {
         }
         got.arrived.lock().unwrap().clear();
     }
-    let (sender, sent) = place.listening();
+    let (sender, sent) = domain.listening();
     let one = attempt();
     sender
         .dispatch(one, &receiver.location(), parcel(vec![1; 5000].into()))
@@ -324,19 +313,19 @@ fn a_receiver_survives_more_killed_senders_than_it_has_connections() {
     sender.close();
     receiver.close();
     drop((sender, receiver));
-    cleanup_dead(&place.config()).unwrap();
-    assert_eq!(place.traces(), Vec::<String>::new());
+    cleanup_dead(&domain.config()).unwrap();
+    assert_eq!(domain.files(), Vec::<String>::new());
 }
 
 #[test]
-fn the_dead_are_cleaned_up_after_when_their_last_letters_have_been_taken() {
-    let place = Place::new();
-    let mut receiver = Process::start(&place, "drop", Incarnation::from_u64(1));
+fn cleanup_waits_until_the_last_letters_of_dead_processes_are_taken() {
+    let domain = TestDomain::new();
+    let mut receiver = Process::start(&domain, "drop", Incarnation::from_u64(1));
     let connected = |file: &String| file.ends_with(".connection");
-    let connections = || place.traces().iter().filter(|file| connected(file)).count();
-    let mut sender = Process::start(&place, "send", receiver.incarnation);
+    let connections = || domain.files().iter().filter(|file| connected(file)).count();
+    let mut sender = Process::start(&domain, "send", receiver.incarnation);
     wait_for("connection", || connections() >= 2);
-    // Too busy to look for longer than anybody might think it takes.
+    // Stopped, so that it does not poll for a while.
     receiver.signal("-STOP");
     std::thread::sleep(std::time::Duration::from_millis(50));
     sender.kill();
@@ -345,20 +334,20 @@ fn the_dead_are_cleaned_up_after_when_their_last_letters_have_been_taken() {
             std::thread::sleep(std::time::Duration::from_millis(300));
             receiver.signal("-CONT");
         });
-        let cleaned = cleanup_dead(&place.config()).unwrap();
+        let cleaned = cleanup_dead(&domain.config()).unwrap();
         assert_eq!((cleaned.alive, cleaned.failed), (1, 0));
     });
     wait_for("end of the connection", || connections() == 0);
     receiver.kill();
-    cleanup_dead(&place.config()).unwrap();
-    assert_eq!(place.traces(), Vec::<String>::new());
+    cleanup_dead(&domain.config()).unwrap();
+    assert_eq!(domain.files(), Vec::<String>::new());
 }
 
 #[test]
-fn whoever_leaves_waits_until_its_last_letters_have_been_taken() {
-    let place = Place::new();
-    let mut receiver = Process::start(&place, "drop", Incarnation::from_u64(1));
-    let (sender, sent) = place.listening();
+fn close_waits_until_the_last_letters_are_taken() {
+    let domain = TestDomain::new();
+    let mut receiver = Process::start(&domain, "drop", Incarnation::from_u64(1));
+    let (sender, sent) = domain.listening();
     receiver.wait_until_up(&sender);
     wait_for("answer", || sent.conclusions() == 1);
     receiver.signal("-STOP");
@@ -381,48 +370,48 @@ fn whoever_leaves_waits_until_its_last_letters_have_been_taken() {
     });
     assert_eq!(sent.conclusions(), 3);
     wait_for("end of the connection", || {
-        !place
-            .traces()
+        !domain
+            .files()
             .iter()
             .any(|file| file.ends_with(".connection"))
     });
     receiver.kill();
-    cleanup_dead(&place.config()).unwrap();
-    assert_eq!(place.traces(), Vec::<String>::new());
+    cleanup_dead(&domain.config()).unwrap();
+    assert_eq!(domain.files(), Vec::<String>::new());
 }
 
 #[test]
-fn a_tool_removes_what_the_dead_have_left() {
-    let place = Place::new();
-    let mut receiver = Process::start(&place, "receive", Incarnation::from_u64(1));
-    let mut sender = Process::start(&place, "send", receiver.incarnation);
-    // Both are up, and have a connection.
+fn cleanup_dead_removes_the_files_of_killed_processes() {
+    let domain = TestDomain::new();
+    let mut receiver = Process::start(&domain, "receive", Incarnation::from_u64(1));
+    let mut sender = Process::start(&domain, "send", receiver.incarnation);
+    // Both processes run and are connected.
     wait_for("connection", || {
-        place
-            .traces()
+        domain
+            .files()
             .iter()
             .filter(|file| file.ends_with(".connection"))
             .count()
             >= 2
     });
-    let cleaned = cleanup_dead(&place.config()).unwrap();
+    let cleaned = cleanup_dead(&domain.config()).unwrap();
     assert_eq!((cleaned.alive, cleaned.removed), (2, 0));
-    // So that neither cleans up after the other.
+    // Stopped, so that neither cleans up after the other.
     sender.signal("-STOP");
     receiver.kill();
     sender.kill();
-    assert!(!place.traces().is_empty());
-    let cleaned = cleanup_dead(&place.config()).unwrap();
+    assert!(!domain.files().is_empty());
+    let cleaned = cleanup_dead(&domain.config()).unwrap();
     assert_eq!((cleaned.alive, cleaned.removed, cleaned.failed), (0, 2, 0));
-    assert_eq!(place.traces(), Vec::<String>::new());
+    assert_eq!(domain.files(), Vec::<String>::new());
 }
 
-/// What iceoryx2 leaves of a connection whose maker was killed before it said which end it is: a
-/// file whose state is that of no end, so that neither is the last to go.
+/// iceoryx2 leaves a connection like this if its creator is killed before it records its own end:
+/// the state in the file is that of no end, so neither end is the last to close.
 #[test]
-fn a_connection_that_nobody_has_an_end_of_is_removed() {
-    let place = Place::new();
-    let ((sender, sent), (receiver, got)) = (place.listening(), place.listening());
+fn a_connection_without_ports_is_removed() {
+    let domain = TestDomain::new();
+    let ((sender, sent), (receiver, got)) = (domain.listening(), domain.listening());
     let exchange = || {
         let one = attempt();
         let content = vec![1; 5000].into();
@@ -437,14 +426,14 @@ fn a_connection_that_nobody_has_an_end_of_is_removed() {
     };
     exchange();
     let connections = || {
-        let mut found = place.traces();
+        let mut found = domain.files();
         found.retain(|file| file.ends_with(".connection"));
         found
     };
     let of_the_living = connections();
     assert_eq!(of_the_living.len(), 2);
     for file in &of_the_living {
-        // The end of somebody who is gone in place of the second, then of the first.
+        // First the second end, then the first end is that of a missing port.
         let name = file.strip_suffix(".connection").unwrap();
         let (first, _) = name.rsplit_once('_').unwrap();
         let (front, _) = first.rsplit_once('_').unwrap();
@@ -456,20 +445,20 @@ fn a_connection_that_nobody_has_an_end_of_is_removed() {
         }
     }
     assert!(connections().len() > 2);
-    cleanup_dead(&place.config()).unwrap();
+    cleanup_dead(&domain.config()).unwrap();
     assert_eq!(connections(), of_the_living);
     exchange();
-    // What it holds is content in the sender's memory.
+    // The recorded content is in the sender's memory.
     drop(got.arrived.lock().unwrap().split_off(0));
     sender.close();
     receiver.close();
     drop((sender, receiver));
-    assert_eq!(place.traces(), Vec::<String>::new());
+    assert_eq!(domain.files(), Vec::<String>::new());
 }
 
-/// With few descriptors left, of which another thread takes one now and then.
+/// Cleans up with few free descriptors, of which another thread takes one now and then.
 fn clean_without_descriptors(config: &ShmConfig) {
-    // What is opened gets the lowest number that is free.
+    // A new descriptor gets the lowest free number.
     let free = std::fs::File::open("/dev/null").unwrap().as_raw_fd();
     let free = u64::try_from(free).unwrap();
     let limits = getrlimit(Resource::Nofile);
@@ -485,75 +474,75 @@ fn clean_without_descriptors(config: &ShmConfig) {
             ..limits
         };
         setrlimit(Resource::Nofile, limit).unwrap();
-        // Refused, or done.
+        // May fail or succeed.
         let _ = cleanup_dead(config);
     }
 }
 
-/// Who cannot open a file must not take its owner for dead.
+/// A process that cannot open a file must not consider its owner dead.
 #[test]
-fn who_has_no_descriptors_left_removes_nothing_of_the_living() {
-    let place = Place::new();
-    let (receiver, _) = place.listening();
+fn a_cleanup_without_free_descriptors_keeps_the_files_of_living_processes() {
+    let domain = TestDomain::new();
+    let (receiver, _) = domain.listening();
     let exchange = || {
-        let (sender, told) = place.listening();
+        let (sender, sink) = domain.listening();
         let (to, sent) = (receiver.location(), attempt());
         sender.dispatch(sent, &to, parcel(Bytes::new())).unwrap();
-        wait_for("answer", || told.conclusion_of(sent).is_some());
+        wait_for("answer", || sink.conclusion_of(sent).is_some());
         sender
     };
     let living = exchange();
-    let before = place.traces();
-    let mut cleaner = Process::start(&place, "clean", Incarnation::from_u64(1));
+    let before = domain.files();
+    let mut cleaner = Process::start(&domain, "clean", Incarnation::from_u64(1));
     assert!(cleaner.child.wait().unwrap().success());
-    assert_eq!(place.traces(), before);
+    assert_eq!(domain.files(), before);
     // Its mailbox can still be found.
     exchange().close();
     living.close();
 }
 
-/// What iceoryx2 leaves of a mailbox when whoever takes the last node out of it is killed at that
-/// moment: nobody says any more that it is used.
+/// iceoryx2 leaves a mailbox like this if the process that removes its last node is killed at that
+/// moment: no node claims to use it any more.
 #[test]
-fn a_mailbox_that_nobody_uses_is_removed() {
-    let place = Place::new();
-    let (living, _) = place.listening();
-    let of_the_living = place.traces();
+fn an_unused_mailbox_is_removed() {
+    let domain = TestDomain::new();
+    let (living, _) = domain.listening();
+    let of_the_living = domain.files();
     let made_since = |end: &str| {
-        let mut made = place.traces();
+        let mut made = domain.files();
         made.retain(|file| file.ends_with(end) && !of_the_living.contains(file));
         made
     };
-    let mut receiver = Process::start(&place, "receive", Incarnation::from_u64(1));
+    let mut receiver = Process::start(&domain, "receive", Incarnation::from_u64(1));
     wait_for("mailbox", || !made_since(".port_tag").is_empty());
     receiver.kill();
     assert_eq!(made_since(".dynamic").len(), 1);
-    // What is removed before: its ports, and that its node has a part in it.
+    // The files that the process removes earlier: its ports, and its node's claim.
     for end in [".data", ".port_tag", ".service_tag"] {
         for file in made_since(end) {
             std::fs::remove_file(file).unwrap();
         }
     }
-    cleanup_dead(&place.config()).unwrap();
-    assert_eq!(place.traces(), of_the_living);
+    cleanup_dead(&domain.config()).unwrap();
+    assert_eq!(domain.files(), of_the_living);
     living.close();
 }
 
 #[test]
-fn whoever_starts_later_removes_it_too() {
-    let place = Place::new();
-    let mut gone = Process::start(&place, "receive", Incarnation::from_u64(1));
+fn a_process_that_starts_later_cleans_up() {
+    let domain = TestDomain::new();
+    let mut gone = Process::start(&domain, "receive", Incarnation::from_u64(1));
     {
-        let (other, _) = place.listening();
+        let (other, _) = domain.listening();
         gone.wait_until_up(&other);
     }
     gone.kill();
-    assert!(!place.traces().is_empty());
-    let (newcomer, _) = place.listening();
+    assert!(!domain.files().is_empty());
+    let (newcomer, _) = domain.listening();
     let dead = gone.incarnation.to_string();
     wait_for("removal", || {
-        !place.traces().iter().any(|file| file.contains(&dead))
+        !domain.files().iter().any(|file| file.contains(&dead))
     });
     newcomer.close();
-    assert_eq!(place.traces(), Vec::<String>::new());
+    assert_eq!(domain.files(), Vec::<String>::new());
 }

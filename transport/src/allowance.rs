@@ -1,20 +1,20 @@
-//! How much somebody may do: so much a second.
+//! A token bucket.
 
 use std::time::{Duration, Instant};
 
-/// What somebody may still do, of what is allowed to do so much a second: letters, bytes. A second's
-/// worth may be done at once.
+/// A token bucket for a peer or a sender: a rate of letters or bytes per second, with bursts of one
+/// second's worth.
 ///
-/// Sans-I/O: `now` goes in, and must not go back.
+/// Sans-I/O: the caller passes `now`, which must not decrease.
 #[derive(Debug, Clone)]
 pub struct Allowance {
-    /// Below zero when more was [spent](Self::spend) than there was.
+    /// Tokens. Negative after more was [spent](Self::spend) than there was.
     left: f64,
     at: Instant,
 }
 
 impl Allowance {
-    /// Of somebody who has done nothing yet.
+    /// A full bucket.
     #[must_use]
     pub fn new(per_second: f64, now: Instant) -> Self {
         Self {
@@ -23,13 +23,13 @@ impl Allowance {
         }
     }
 
-    /// When it was last asked.
+    /// The time of the last use.
     #[must_use]
     pub fn asked(&self) -> Instant {
         self.at
     }
 
-    /// Takes so much, if there is as much.
+    /// Takes `amount` tokens if there are as many. Returns whether it did.
     pub fn take(&mut self, amount: f64, per_second: f64, now: Instant) -> bool {
         self.refill(per_second, now);
         let enough = self.left >= amount;
@@ -39,8 +39,8 @@ impl Allowance {
         enough
     }
 
-    /// Takes so much of what cannot be helped any more, and says for how long no more is to be let in
-    /// after that: a second at most, however much it was.
+    /// Takes `amount` tokens for something that cannot be refused any more. Returns the time until
+    /// the bucket is no longer negative, if it is; at most one second, whatever the amount.
     pub fn spend(&mut self, amount: f64, per_second: f64, now: Instant) -> Option<Duration> {
         self.refill(per_second, now);
         self.left = (self.left - amount).max(-per_second);
@@ -61,7 +61,7 @@ mod tests {
     const SECOND: Duration = Duration::from_secs(1);
 
     #[test]
-    fn a_second_s_worth_at_once_and_then_as_time_goes_by() {
+    fn a_burst_of_one_second_is_allowed_and_then_the_rate() {
         let now = Instant::now();
         let mut allowance = Allowance::new(2.0, now);
         assert!(allowance.take(1.0, 2.0, now) && allowance.take(1.0, 2.0, now));
@@ -71,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_spent_beyond_it_lasts_a_second_at_most() {
+    fn an_overdraft_lasts_at_most_one_second() {
         let now = Instant::now();
         let mut allowance = Allowance::new(10.0, now);
         assert_eq!(allowance.spend(10.0, 10.0, now), None);
@@ -81,7 +81,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_takes_more_than_a_second_s_worth_and_the_rate() {
+    fn the_total_never_exceeds_the_burst_and_the_rate() {
         let mut random = fastrand::Rng::with_seed(9);
         for _ in 0..200 {
             let rate = f64::from(random.u32(1..50));

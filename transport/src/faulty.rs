@@ -1,4 +1,4 @@
-//! A transport that fails on purpose.
+//! A transport decorator that injects faults.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -14,25 +14,25 @@ use crate::{
     ListenError, Location, Parcel, Sink, Ticket, Transport, Verdict, WayError, WayFault,
 };
 
-/// A way of failing.
+/// A kind of fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum Fault {
-    /// Dispatching fails at once: nothing leaves.
+    /// The dispatch fails at once; nothing is sent.
     Unreachable,
-    /// The parcel is dropped on the way; the attempt concludes as unconfirmed.
+    /// The parcel is lost; the attempt concludes as unconfirmed.
     Lost,
     /// The parcel arrives, but its answer is lost; the attempt concludes as unconfirmed.
     AnswerLost,
-    /// Nothing is ever heard of the attempt: the parcel is dropped and no conclusion comes.
+    /// The parcel is lost, and the attempt has no conclusion.
     Silence,
 }
 
-/// Wraps a transport and makes some of its attempts fail, for testing what stands above it.
+/// Wraps a transport and makes some of its attempts fail, to test the layers above it.
 ///
-/// Faults are drawn with a seed, so that a run can be repeated, or forced for everything with
+/// Faults are drawn from a seed, so that a run can be repeated, or forced with
 /// [`force`](Self::force). [`Fault::Silence`] breaks the rule of one conclusion on purpose: the
-/// delivery core must have a time-out of its own.
+/// delivery core must have its own timeout.
 pub struct Faulty {
     inner: Arc<dyn Transport>,
     shared: Arc<Shared>,
@@ -40,10 +40,10 @@ pub struct Faulty {
 
 struct Shared {
     plan: Mutex<Plan>,
-    /// Attempts whose real conclusion is replaced.
+    /// Attempts whose actual conclusion is replaced.
     pending: Mutex<HashMap<AttemptId, Fault>>,
-    /// Conclusions of attempts that never reached the inner transport.
-    invented: Mutex<Vec<(AttemptId, Conclusion)>>,
+    /// Conclusions of attempts that did not reach the inner transport.
+    substituted: Mutex<Vec<(AttemptId, Conclusion)>>,
     sink: Mutex<Option<Arc<dyn Sink>>>,
     injected: AtomicU64,
 }
@@ -55,7 +55,7 @@ struct Plan {
 }
 
 impl Faulty {
-    /// Wraps `inner`. Each dispatch suffers one of the faults with its rate (0 to 1), drawn with
+    /// Wraps `inner`. Each dispatch gets one of the faults with its rate (0 to 1), drawn from
     /// `seed`.
     pub fn new(inner: Arc<dyn Transport>, seed: u64, rates: &[(Fault, f64)]) -> Self {
         let random = fastrand::Rng::with_seed(seed);
@@ -68,19 +68,19 @@ impl Faulty {
                     forced: None,
                 }),
                 pending: Mutex::default(),
-                invented: Mutex::default(),
+                substituted: Mutex::default(),
                 sink: Mutex::default(),
                 injected: AtomicU64::new(0),
             }),
         }
     }
 
-    /// From now on every dispatch suffers this fault, or, with `None`, those drawn by rate.
+    /// Forces this fault for every dispatch from now on; `None` returns to drawn faults.
     pub fn force(&self, fault: Option<Fault>) {
         self.shared.plan.lock().forced = fault;
     }
 
-    /// How many faults were injected so far.
+    /// Number of injected faults so far.
     #[must_use]
     pub fn injected(&self) -> u64 {
         self.shared.injected.load(Ordering::Relaxed)
@@ -135,7 +135,7 @@ impl Transport for Faulty {
         match fault {
             Some(Fault::Unreachable) => Err(WayError::new(WayFault::Unreachable, "injected fault")),
             Some(Fault::Lost) => {
-                self.shared.invented.lock().push((attempt, lost()));
+                self.shared.substituted.lock().push((attempt, lost()));
                 Ok(())
             }
             Some(Fault::Silence) => Ok(()),
@@ -157,7 +157,7 @@ impl Transport for Faulty {
     fn abandon(&self, attempt: AttemptId) -> Abandoned {
         self.shared.pending.lock().remove(&attempt);
         self.shared
-            .invented
+            .substituted
             .lock()
             .retain(|(other, _)| *other != attempt);
         self.inner.abandon(attempt)
@@ -168,11 +168,11 @@ impl Transport for Faulty {
     }
 
     fn drive(&self) -> bool {
-        let invented = std::mem::take(&mut *self.shared.invented.lock());
+        let substituted = std::mem::take(&mut *self.shared.substituted.lock());
         let sink = self.shared.sink.lock().clone();
         let mut did_something = false;
         if let Some(sink) = sink {
-            for (attempt, conclusion) in invented {
+            for (attempt, conclusion) in substituted {
                 did_something = true;
                 sink.concluded(attempt, conclusion);
             }
@@ -204,7 +204,7 @@ impl Transport for Faulty {
     }
 }
 
-/// The sink that the inner transport sees.
+/// The sink of the inner transport.
 struct Filter {
     sink: Arc<dyn Sink>,
     shared: Arc<Shared>,

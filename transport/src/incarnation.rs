@@ -1,15 +1,15 @@
-//! Incarnations: what tells two lives of the same name apart.
+//! Incarnations: identifiers of single registrations of a name.
 
 use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-/// One life of an agent or of a message transport service.
+/// One registration of an agent or of a message transport service.
 ///
-/// Drawn at random for every registration. A name may be registered again, here or on another
-/// host, after a crash or a move; the incarnation says whether it is still the same one, which is
-/// what order and deduplication hang on. Zero is [`Incarnation::UNKNOWN`]: a peer that has none
+/// Drawn at random for every registration. A name may be registered again after a crash or a move,
+/// on this host or another. The incarnation tells the registrations apart, on which order and
+/// deduplication depend. Zero is [`Incarnation::UNKNOWN`], for peers without incarnations
 /// (fipa_services, JADE).
 ///
 /// Written as 16 lower-case hexadecimal digits.
@@ -17,17 +17,17 @@ use serde::{Deserialize, Serialize};
 pub struct Incarnation(u64);
 
 impl Incarnation {
-    /// The incarnation of somebody who does not know of incarnations.
+    /// The incarnation of a peer that has none.
     pub const UNKNOWN: Self = Self(0);
 
-    /// A new incarnation from the operating system's random numbers.
+    /// Draws an incarnation from the operating system's random numbers.
     ///
     /// # Panics
-    /// When the operating system has no random numbers to give, which Linux rules out after boot.
+    /// Panics if the operating system has no random numbers, which Linux rules out after boot.
     #[must_use]
     pub fn random() -> Self {
         loop {
-            let drawn = getrandom::u64().expect("the operating system gives random numbers");
+            let drawn = getrandom::u64().expect("the operating system provides random numbers");
             if drawn != 0 {
                 return Self(drawn);
             }
@@ -46,7 +46,7 @@ impl Incarnation {
         self.0
     }
 
-    /// Whether this is a real incarnation.
+    /// Whether the incarnation is known, that is, not zero.
     #[must_use]
     pub const fn is_known(self) -> bool {
         self.0 != 0
@@ -101,7 +101,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn text_round_trips_and_nonsense_is_refused() {
+    fn text_round_trips_and_invalid_text_is_refused() {
         let incarnation = Incarnation::from_u64(0x00ab_cdef_0123_4567);
         assert_eq!(incarnation.to_string(), "00abcdef01234567");
         assert_eq!("00abcdef01234567".parse(), Ok(incarnation));

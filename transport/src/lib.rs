@@ -1,16 +1,16 @@
-//! The one trait behind which every way of moving a letter stands, and the words it is spoken in.
+//! The [`Transport`] trait, which every transport implements, and the types that it uses.
 //!
-//! * [`Transport`] carries [`Parcel`]s to [`Location`]s and says what became of each.
-//! * [`Sink`] is who listens: the delivery core of `fipa-mts`.
-//! * [`Outcome`] is what a sender is told in the end, one per receiver.
-//! * [`wire`] is the fixed layout of a parcel, shared by the mailbox and the network frame.
+//! * [`Transport`] carries [`Parcel`]s to [`Location`]s and reports the conclusion of each attempt.
+//! * [`Sink`] receives arrivals and conclusions: the delivery core of `fipa-mts`.
+//! * [`Outcome`] is the final result of a letter, one per receiver.
+//! * [`wire`] is the fixed layout of a parcel in mailboxes and network frames.
 //! * [`OwnerProcess`] tells a process from a forked child.
-//! * [`Allowance`] is how much a peer or a sender may still do.
-//! * `conformance` (feature of that name) is the suite that every implementation passes;
-//!   [`Faulty`] wraps a transport and makes it fail on purpose.
+//! * [`Allowance`] limits the rate of a peer or a sender.
+//! * `conformance` (feature of that name) is the suite that every implementation passes.
+//!   [`Faulty`] wraps a transport and injects faults.
 //!
-//! What must not live here: sockets, shared memory, routes, retries. A transport tries once and
-//! reports; trying again, elsewhere or in order is the delivery core's business.
+//! Sockets, shared memory, routes and retries belong to other crates. A transport tries once and
+//! reports; retries, other routes and order belong to the delivery core.
 
 mod allowance;
 #[cfg(feature = "conformance")]

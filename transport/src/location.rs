@@ -1,4 +1,4 @@
-//! Where an agent can be reached, and by which transport.
+//! Locations: the addresses of message transport services, with their transports.
 
 use std::fmt;
 use std::str::FromStr;
@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::Incarnation;
 
-/// A kind of transport, as it is named in the configuration and in addresses.
+/// A kind of transport, as named in the configuration and in addresses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
@@ -29,7 +29,7 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// Every kind, for encoding: the position is the code on the wire, so new ones go last.
+    /// All kinds. The position is the code on the wire, so new ones go last.
     pub const ALL: [Self; 6] = [
         Self::Shm,
         Self::Tcp,
@@ -39,15 +39,14 @@ impl Kind {
         Self::Udt,
     ];
 
-    /// Whether this project has a transport of this kind. Locations of other kinds occur in the
-    /// directory, and letters to them fail as
-    /// [unsupported](crate::FailureReason::Unsupported).
+    /// Whether this project has a transport of this kind. The directory may contain locations of
+    /// other kinds; letters to them fail as [unsupported](crate::FailureReason::Unsupported).
     #[must_use]
     pub const fn is_supported(self) -> bool {
         !matches!(self, Self::Udt)
     }
 
-    /// The name of this kind, which is also the scheme of its addresses.
+    /// Name of this kind, which is also the scheme of its addresses.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -60,8 +59,8 @@ impl Kind {
         }
     }
 
-    /// Whether locations of this kind lead to processes of this host only. They mean nothing on
-    /// other hosts, and are neither told to them nor taken from them.
+    /// Whether locations of this kind lead only to processes of this host. Such locations are
+    /// neither announced to other hosts nor accepted from them.
     #[must_use]
     pub const fn is_host_local(self) -> bool {
         matches!(self, Self::Shm | Self::Unix)
@@ -85,12 +84,12 @@ impl FromStr for Kind {
     }
 }
 
-/// What is understood at a location: the signature type of a service locator (FIPA00001), which
-/// the peers call the signature of a location.
+/// The protocol at a location: the signature type of a service locator (FIPA00001), which legacy
+/// peers call the signature of a location.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[non_exhaustive]
 pub enum Signature {
-    /// This project's own frames, acknowledged.
+    /// Frames of this project, acknowledged.
     #[default]
     Frames,
     /// One letter per connection, bit-efficient in the dialect of fipa_services, not acknowledged.
@@ -101,10 +100,10 @@ pub enum Signature {
 }
 
 impl Signature {
-    /// Every signature.
+    /// All signatures.
     pub const ALL: [Self; 3] = [Self::Frames, Self::FipaServices, Self::JadeProxy];
 
-    /// How it is written behind the address of a [`Location`]; our own is not written.
+    /// Name of this signature in a [`Location`]. The name of frames is omitted there.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -114,8 +113,8 @@ impl Signature {
         }
     }
 
-    /// How the peers write it in the directory. What speaks frames takes the letters of
-    /// fipa_services on the same port, so it bears their signature, too.
+    /// The signature type in the directory of legacy peers. A location for frames also accepts the
+    /// letters of fipa_services on the same port, so it has their signature type.
     #[must_use]
     pub const fn signature_type(self) -> &'static str {
         match self {
@@ -124,8 +123,8 @@ impl Signature {
         }
     }
 
-    /// What an old peer means by a signature type, if it is one that is known here. Never
-    /// [`Signature::Frames`], which the peers cannot tell from their own.
+    /// The signature that a legacy peer means by a signature type, if known. Never
+    /// [`Signature::Frames`], because legacy peers use the same text for their own protocol.
     #[must_use]
     pub fn of_signature_type(text: &str) -> Option<Self> {
         [Self::FipaServices, Self::JadeProxy]
@@ -151,15 +150,15 @@ impl FromStr for Signature {
     }
 }
 
-/// An address at which a message transport service can be reached, what is understood there, and
-/// the incarnation of the service that listened there.
+/// The address of a message transport service, the protocol there, and the incarnation of the
+/// service.
 ///
-/// Written `kind://address`, then `;signature` unless our own frames are understood there (behind
-/// an address of `udt` it may be left out, because only fipa_services is spoken there), then
-/// `#incarnation` when it is known: `tcp://10.0.0.2:7788#00abcdef01234567`,
-/// `tcp://10.0.0.3:6789;fipa-services`, `tcp://10.0.0.4:6789;jade`. What `address` means is up to
-/// the transport. A transport that connects to a location with a known incarnation and finds
-/// another one there reports that nobody was reached: ports are reused.
+/// Written `kind://address`, then `;signature` unless the protocol is frames (it may be omitted for
+/// `udt`, over which only fipa_services is supported), then `#incarnation` if known:
+/// `tcp://10.0.0.2:7788#00abcdef01234567`, `tcp://10.0.0.3:6789;fipa-services`,
+/// `tcp://10.0.0.4:6789;jade`. The transport defines the meaning of `address`. Ports are reused, so
+/// a transport that finds another incarnation than the known one at a location reports that no
+/// receiver was reached.
 ///
 /// Cheap to clone.
 #[derive(Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -171,15 +170,15 @@ pub struct Location {
 }
 
 impl Location {
-    /// Longest address accepted, in bytes.
+    /// Maximum length of an address in bytes.
     pub const MAX_ADDRESS: usize = 512;
 
-    /// A location of a service that understands our frames (over UDT: fipa_services) and whose
-    /// incarnation is not known.
+    /// Creates a location with an unknown incarnation and the signature [`Signature::Frames`] (over
+    /// UDT: [`Signature::FipaServices`]).
     ///
     /// # Errors
-    /// When the address is empty, too long, or has characters that an address cannot have
-    /// (white space, [unprintable](fipa_acl::is_unprintable) characters, `#`, `;`).
+    /// Returns an error if the address is empty, too long, or contains white space,
+    /// [unprintable](fipa_acl::is_unprintable) characters, `#` or `;`.
     pub fn new(kind: Kind, address: &str) -> Result<Self, LocationError> {
         if address.is_empty() || address.len() > Self::MAX_ADDRESS {
             return Err(LocationError::AddressLength(address.len()));
@@ -203,18 +202,18 @@ impl Location {
         })
     }
 
-    /// The same location, of the service with this incarnation.
+    /// Sets the incarnation.
     #[must_use]
     pub fn with_incarnation(mut self, incarnation: Incarnation) -> Self {
         self.incarnation = incarnation;
         self
     }
 
-    /// The same location, where this is understood.
+    /// Sets the signature.
     ///
     /// # Errors
-    /// When it is not spoken over this kind of transport: over TCP every signature is, over UDT
-    /// that of fipa_services only, and over all others frames only.
+    /// Returns an error if this kind of transport does not support it: TCP supports every
+    /// signature, UDT only that of fipa_services, and all others only frames.
     pub fn with_signature(mut self, signature: Signature) -> Result<Self, LocationError> {
         let is_spoken = match self.kind {
             Kind::Tcp => true,
@@ -228,25 +227,25 @@ impl Location {
         Ok(self)
     }
 
-    /// The transport that can reach it.
+    /// The kind of transport that can reach the location.
     #[must_use]
     pub fn kind(&self) -> Kind {
         self.kind
     }
 
-    /// The transport's own part of the address.
+    /// The part of the address that the transport defines.
     #[must_use]
     pub fn address(&self) -> &str {
         &self.address
     }
 
-    /// What is understood there.
+    /// The protocol at the location.
     #[must_use]
     pub fn signature(&self) -> Signature {
         self.signature
     }
 
-    /// The incarnation of the message transport service at this location, which may be unknown.
+    /// Incarnation of the message transport service at this location; may be unknown.
     #[must_use]
     pub fn incarnation(&self) -> Incarnation {
         self.incarnation
@@ -276,26 +275,26 @@ impl fmt::Debug for Location {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum LocationError {
-    /// There is no `://`.
+    /// The text has no `://`.
     #[error("not a location (expected for example tcp://10.0.0.2:7788): {0:?}")]
     NoScheme(String),
     /// No transport has this name.
     #[error("unknown transport {0:?} (known: shm, unix, tcp, udp, quic)")]
     UnknownKind(String),
     /// The address is empty or too long.
-    #[error("address of {0} bytes (1 to {max} allowed)", max = Location::MAX_ADDRESS)]
+    #[error("the address has {0} bytes; 1 to {max} are allowed", max = Location::MAX_ADDRESS)]
     AddressLength(usize),
-    /// The address has characters that no address has.
-    #[error("address with white space, control or format characters, '#' or ';': {0:?}")]
+    /// The address contains characters that are not allowed.
+    #[error("the address contains white space, control or format characters, '#' or ';': {0:?}")]
     AddressCharacters(String),
-    /// What stands behind `;` is no signature.
-    #[error("unknown signature behind ';' (known: fipa-services, jade, fipa): {0:?}")]
+    /// The text after `;` is not a signature.
+    #[error("unknown signature after ';' (known: fipa-services, jade, fipa): {0:?}")]
     UnknownSignature(String),
-    /// This signature is not spoken over this kind of transport.
-    #[error("{0} is not spoken over {1}")]
+    /// This kind of transport does not support this signature.
+    #[error("the transport {1} does not support the signature {0}")]
     NotOverKind(Signature, Kind),
-    /// What stands behind `#` is not an incarnation.
-    #[error("not an incarnation behind '#' (16 hexadecimal digits expected): {0:?}")]
+    /// The text after `#` is not an incarnation.
+    #[error("not an incarnation after '#' (16 hexadecimal digits expected): {0:?}")]
     Incarnation(String),
 }
 
@@ -364,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn our_own_signature_need_not_be_written() {
+    fn the_signature_of_frames_may_be_omitted() {
         let plain: Location = "tcp://10.0.0.2:7788".parse().unwrap();
         assert_eq!(plain.signature(), Signature::Frames);
         assert_eq!("tcp://10.0.0.2:7788;fipa".parse(), Ok(plain.clone()));
@@ -373,7 +372,7 @@ mod tests {
     }
 
     #[test]
-    fn only_fipa_services_is_spoken_over_udt() {
+    fn udt_supports_only_fipa_services() {
         let udt: Location = "udt://10.0.0.3:6790".parse().unwrap();
         assert_eq!(udt.signature(), Signature::FipaServices);
         assert!(!udt.kind().is_supported());
@@ -384,7 +383,7 @@ mod tests {
     }
 
     #[test]
-    fn signature_types_of_the_peers_are_known() {
+    fn signature_types_of_legacy_peers_are_recognized() {
         for (text, signature) in [
             (
                 "fipa::services::transports::MessageTransport",
@@ -399,7 +398,7 @@ mod tests {
     }
 
     #[test]
-    fn nonsense_is_refused() {
+    fn invalid_text_is_refused() {
         for text in [
             "",
             "tcp",

@@ -1,4 +1,4 @@
-//! What became of a letter, one outcome per receiver.
+//! Outcomes of letters, one per receiver.
 
 use std::fmt;
 
@@ -6,14 +6,14 @@ use serde::Serialize;
 
 use crate::{Kind, Location, WayError};
 
-/// One way that was tried and did not work.
+/// A failed attempt to send a letter.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Attempt {
-    /// The transport that was tried.
+    /// The transport of the attempt.
     pub via: Kind,
-    /// Where the letter was tried to be sent.
+    /// The location that the letter was sent to.
     pub location: Location,
-    /// Why it did not work.
+    /// The cause of the failure.
     pub error: WayError,
 }
 
@@ -23,44 +23,44 @@ impl fmt::Display for Attempt {
     }
 }
 
-/// What a sender is told about its letter, once per receiver and within the letter's deadline.
+/// The final result of a letter, one per receiver, within the letter's deadline.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[serde(tag = "outcome", rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum Outcome {
-    /// Accepted into the named agent's queue, in the agent's process. A crash of that process
-    /// afterwards is outside the promise.
+    /// Accepted into the queue of the named agent, in the agent's process. A later crash of that
+    /// process is outside of the promise.
     Delivered {
-        /// The way it went. When the letter went to another host, the transport between the
-        /// hosts.
+        /// The transport that delivered the letter. For a letter to another host, the transport
+        /// between the hosts.
         via: Kind,
-        /// The ways that were tried before.
+        /// The failed attempts before.
         attempts: Vec<Attempt>,
     },
     /// Handed to a peer that cannot confirm (fipa_services, JADE).
     Sent {
-        /// The way it went.
+        /// The transport that carried the letter.
         via: Kind,
-        /// The ways that were tried before.
+        /// The failed attempts before.
         attempts: Vec<Attempt>,
     },
-    /// Not delivered, or ([`FailureReason::Unconfirmed`]) not known to be.
+    /// Not delivered, or ([`FailureReason::Unconfirmed`]) possibly delivered.
     Failed {
-        /// Why.
+        /// The reason.
         reason: FailureReason,
-        /// The ways that were tried.
+        /// The failed attempts.
         attempts: Vec<Attempt>,
     },
 }
 
 impl Outcome {
-    /// Whether the letter is known to be delivered, or was handed to a peer that cannot confirm.
+    /// Whether the letter was delivered, or was handed to a peer that cannot confirm.
     #[must_use]
     pub fn is_success(&self) -> bool {
         !matches!(self, Self::Failed { .. })
     }
 
-    /// The way the letter went, unless it failed.
+    /// The transport that carried the letter, unless it failed.
     #[must_use]
     pub fn via(&self) -> Option<Kind> {
         match self {
@@ -69,7 +69,7 @@ impl Outcome {
         }
     }
 
-    /// The ways that were tried and did not work.
+    /// The failed attempts.
     #[must_use]
     pub fn attempts(&self) -> &[Attempt] {
         match self {
@@ -109,39 +109,37 @@ impl fmt::Display for Outcome {
     }
 }
 
-/// Why a letter was not delivered.
+/// The reason why a letter was not delivered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum FailureReason {
-    /// Nobody has this name, or the agent that had it is gone.
+    /// No agent has this name, or the agent that had it has ended.
     NoSuchAgent,
     /// The agent's queue stayed full until the deadline.
     QueueFull,
-    /// No way led to the agent before the deadline.
+    /// No route led to the agent before the deadline.
     Unreachable,
-    /// The receiver, or a service on the way, does not take this letter.
+    /// The receiver, or a service on the route, refuses this letter.
     Refused,
-    /// Larger than any way to this receiver takes.
+    /// Larger than the limit of every route to this receiver.
     TooLarge,
     /// The deadline passed.
     TimedOut,
-    /// It may have been delivered, but whoever knew is gone.
+    /// The letter may have been delivered, and no confirmation came.
     Unconfirmed,
     /// The letter came back to a service that had already stamped it.
     Loop,
     /// The sender's own service is closed.
     Closed,
-    /// The dialect of the legacy peer that the receiver belongs to has no form for something in the
-    /// letter.
+    /// The dialect of the receiver's legacy peer has no representation for a part of the letter.
     Inexpressible,
-    /// The receiver is reached only by transports that this project does not have. The attempts
-    /// name them.
+    /// The receiver has only locations of unsupported transports, which the attempts list.
     Unsupported,
 }
 
 impl FailureReason {
-    /// Every reason, for encoding: the position is the code on the wire, so new ones go last.
+    /// All reasons. The position is the code on the wire, so new ones go last.
     pub(crate) const CODES: [Self; 11] = [
         Self::NoSuchAgent,
         Self::QueueFull,

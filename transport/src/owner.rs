@@ -1,9 +1,9 @@
-//! Which process owns something, when a process forks without exec.
+//! The process that owns a value, across forks without exec.
 
-/// The process that made a value, and alone may use it.
+/// The process that created a value and that alone may use it.
 ///
-/// A child that was forked without exec has copies of everything that its parent has: handles,
-/// descriptors, locks. Releasing them there would take away what the parent uses.
+/// A child that was forked without exec has copies of all handles, descriptors and locks of its
+/// parent. If it released them, the parent would lose them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct OwnerProcess(u32);
 
@@ -14,16 +14,16 @@ impl OwnerProcess {
         Self(std::process::id())
     }
 
-    /// Whether this is the running process. Costs a system call.
+    /// Whether this is the running process. Makes a system call.
     #[must_use]
     pub fn is_this(self) -> bool {
         self == Self::this()
     }
 
-    /// Refuses the use in another process.
+    /// Checks that the running process is the owner.
     ///
     /// # Errors
-    /// When the running process is a forked child.
+    /// Returns an error in a forked child.
     pub fn check(self) -> Result<(), Forked> {
         match self.is_this() {
             true => Ok(()),
@@ -38,13 +38,13 @@ impl OwnerProcess {
     }
 }
 
-/// A forked child used what its parent owns.
+/// A forked child used a value that its parent owns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error(
     "this process was forked from process {owner}, which joined the domain, and cannot use its \
      membership; open the domain again after the fork"
 )]
 pub struct Forked {
-    /// Identifier of the process that owns it.
+    /// Process identifier of the owner.
     pub owner: u32,
 }

@@ -1,5 +1,4 @@
-//! The parcel: one letter for one receiver, or one of the short notes that delivery cores send
-//! each other about letters.
+//! The parcel: one letter for one receiver, or a short note between delivery cores about letters.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -8,18 +7,18 @@ use fipa_acl::Letter;
 
 use crate::{Incarnation, Outcome};
 
-/// The pair within which order and deduplication hold: one life of a sender, one life of a
-/// receiver.
+/// The pair of registrations, of a sender and of a receiver, within which letters are ordered and
+/// deduplicated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Stream {
-    /// The sending agent. [`Incarnation::UNKNOWN`] for letters of old peers, which have neither
-    /// order nor deduplication.
+    /// The sending agent. [`Incarnation::UNKNOWN`] for letters of legacy peers, which are neither
+    /// ordered nor deduplicated.
     pub sender: Incarnation,
     /// The receiving agent.
     pub receiver: Incarnation,
 }
 
-/// What a transport carries: the header that the promises of delivery need, and a body.
+/// The unit that a transport carries: the header that delivery requires, and a body.
 ///
 /// A parcel has exactly one receiver. A letter to several receivers is several parcels that share
 /// the letter's memory.
@@ -38,12 +37,12 @@ pub struct Parcel {
     /// highest lower sequence that was open (without an outcome) in the sender's process when it
     /// dispatched this copy.
     pub after: u64,
-    /// The hand-over: a number that the service which hands the letter over uses for no other
-    /// hand-over, and that rises from each to the next. A report repeats the number of the latest
-    /// hand-over of its letter by the service that it goes to. 0 in credits.
+    /// Number of the hand-over, chosen by the service that hands the letter over and higher for
+    /// each of its hand-overs. A report repeats the number of the latest hand-over of its letter by
+    /// the service that the report goes to. 0 in credits.
     pub transfer: u64,
-    /// Rest of the letter's deadline. Time in transit is not subtracted, because hosts need not
-    /// agree on the clock.
+    /// Remaining time until the letter's deadline. Time in transit is not subtracted, because hosts
+    /// need not have synchronized clocks.
     pub remaining: Duration,
     /// The letter, or the note about letters.
     pub body: Body,
@@ -59,30 +58,30 @@ impl Parcel {
 pub enum Body {
     /// A letter to be delivered.
     Letter(Letter),
-    /// The end of a custody. It goes back to the service that handed the letter over; stream,
-    /// sequence and transfer name the letter and the hand-over.
+    /// The end of a custody, sent to the service that handed the letter over. Stream, sequence and
+    /// transfer identify the letter and the hand-over.
     Report(Report),
     /// There is room again for letters of this stream, after [`crate::Answer::Busy`].
     Credit,
-    /// The letter named by stream and sequence has a lower predecessor now: the `after` of this
-    /// parcel. It goes to the service that the letter was handed to.
+    /// The predecessor of the letter with this stream and sequence has changed to a lower one: the
+    /// `after` of this parcel. Sent to the service that the letter was handed to.
     Predecessor,
 }
 
-/// How the custody of a letter ended.
+/// The end of the custody of a letter.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Report {
-    /// The letter has an outcome, as its sender is to be told, with the attempts made since
+    /// The letter has an outcome, which its sender must get, with the attempts made during the
     /// custody.
     Settled(Outcome),
     /// The letter is handed back, because its predecessor is not here. The service forgets it, and
     /// its sender dispatches it again.
     Returned {
-        /// Whether an attempt by this service, or by one behind it, may have delivered the letter.
+        /// Whether an attempt by this service, or by a later one, may have delivered the letter.
         uncertain: bool,
     },
-    /// The letter is handed back, because its receiver's registration has left this host. Not
-    /// taken, neither here nor behind this service.
+    /// The letter is handed back, because its receiver's registration has left this host. Neither
+    /// this service nor a later one has delivered it.
     Moved,
 }

@@ -1,4 +1,4 @@
-//! The trait that every way of moving a letter implements, and the one it reports to.
+//! The [`Transport`] trait, and the [`Sink`] that it reports to.
 
 use std::fmt;
 use std::net::IpAddr;
@@ -10,77 +10,77 @@ use serde::Serialize;
 
 use crate::{FailureReason, Kind, Location, Parcel, Signature, Stream};
 
-/// One way of moving letters.
+/// A transport of letters.
 ///
 /// A transport tries once and reports. It keeps these rules, which [`crate::conformance`] checks:
 ///
 /// 1. **One conclusion.** Every [`dispatch`](Self::dispatch) that returned `Ok` has exactly one
 ///    conclusion: by [`Sink::concluded`], or at once by [`abandon`](Self::abandon).
-/// 2. **Honest conclusions.** [`Conclusion::NotSent`] and [`Abandoned::NotSent`] only when no byte
-///    of the parcel has reached the other side, and none ever will. If in doubt,
-///    [`Conclusion::Unconfirmed`] and [`Abandoned::Unconfirmed`]. The parcel of one attempt goes
-///    over at most one connection, and never after the attempt was concluded as not sent.
-/// 3. **An answer is the other sink's answer.** `Accepted` is reported only after the receiving
-///    sink said so; nothing is acknowledged on its behalf. It gets the parcel of an attempt once; of
-///    a copy that reached it nevertheless, what it says is no answer to the attempt.
+/// 2. **Honest conclusions.** [`Conclusion::NotSent`] and [`Abandoned::NotSent`] mean that no byte
+///    of the parcel has reached the other side, and that none will. In doubt, the conclusion is
+///    [`Conclusion::Unconfirmed`] or [`Abandoned::Unconfirmed`]. The parcel of an attempt uses at
+///    most one connection, and is not sent after the attempt was concluded as not sent.
+/// 3. **Answers come from the receiving sink.** `Accepted` is reported only after the receiving
+///    sink has returned it; the transport acknowledges nothing on its behalf. The sink gets the
+///    parcel of an attempt once. If a copy reaches it all the same, its verdict does not answer the
+///    attempt.
 /// 4. **Order.** Parcels dispatched to one location arrive in the order of the calls, or do not
 ///    arrive.
-/// 5. **No call-back from a call.** A sink is never called from within `dispatch`, `abandon` or
-///    `answer`: the caller may hold its own lock. It may be called from within
-///    [`drive`](Self::drive) and `listen`.
-/// 6. **Bounded.** A parcel that there is no room for is returned as an error, not queued without
-///    limit. No length that came from outside makes memory be taken unchecked.
-/// 7. **Lazy.** Nothing is opened to a location before a parcel needs it.
+/// 5. **No callback from a call.** The transport does not call a sink from within `dispatch`,
+///    `abandon` or `answer`, because the caller may hold its own lock. It may call the sink from
+///    within [`drive`](Self::drive) and `listen`.
+/// 6. **Bounded.** A parcel without room is returned as an error, and not queued without limit. No
+///    memory is allocated according to an unchecked length from outside.
+/// 7. **Lazy.** A connection to a location is opened only when a parcel needs it.
 ///
 /// No method blocks. Methods may be called from any thread.
 pub trait Transport: Send + Sync + 'static {
-    /// What kind of transport this is: locations of this kind are dispatched here.
+    /// The kind of this transport. Locations of this kind are dispatched to it.
     fn kind(&self) -> Kind;
 
-    /// Largest letter, in bytes, that can be carried. A larger one fails with
-    /// [`WayFault::TooLarge`].
+    /// Maximum length of a letter in bytes. A longer one fails with [`WayFault::TooLarge`].
     fn max_letter(&self) -> usize;
 
-    /// Whether arrivals must be answered at once. A delivery core that cannot tell the outcome
-    /// yet then answers [`Answer::Custody`] and sends a report later, so that a slow way behind
-    /// it holds no slots of this transport.
+    /// Whether the sink must answer arrivals at once. A delivery core that does not have the
+    /// outcome yet then answers [`Answer::Custody`] and sends a report later, so that a slow next
+    /// hop does not occupy slots of this transport.
     fn answers_at_once(&self) -> bool;
 
-    /// Begins to listen and hands everything that arrives to `sink`. Called once, before anything
-    /// else. Returns the locations at which this endpoint can be reached, best first; a change of
-    /// them is reported by [`Sink::relocated`].
+    /// Starts to listen and passes all arrivals to `sink`. Called once, before all other methods.
+    /// Returns the locations of this endpoint, best first. [`Sink::relocated`] reports changes.
     ///
     /// # Errors
-    /// When the endpoint cannot be opened; nothing is left open then.
+    /// Returns an error if the endpoint cannot be opened. Nothing is left open then.
     fn listen(&self, sink: Arc<dyn Sink>) -> Result<Vec<Location>, ListenError>;
 
-    /// Sends a parcel to a location. See the rules above for what follows.
+    /// Sends a parcel to a location, according to the rules above.
     ///
     /// # Errors
-    /// When it is known at once that the parcel does not go; no conclusion follows then.
+    /// Returns an error if the parcel cannot be sent. No conclusion follows then.
     fn dispatch(&self, attempt: AttemptId, to: &Location, parcel: Parcel) -> Result<(), WayError>;
 
-    /// Ends an attempt and concludes it at once: its resources are freed, and
-    /// [`Sink::concluded`] is not called for it. An unknown attempt is [`Abandoned::Unconfirmed`].
+    /// Ends an attempt and concludes it at once: its resources are released, and
+    /// [`Sink::concluded`] is not called for it. Returns [`Abandoned::Unconfirmed`] for an unknown
+    /// attempt.
     fn abandon(&self, attempt: AttemptId) -> Abandoned;
 
-    /// Answers an arrival for which the sink had said [`Verdict::Later`]. Unknown tickets are
-    /// ignored: the peer may be gone.
+    /// Answers an arrival for which the sink returned [`Verdict::Later`]. Unknown tickets are
+    /// ignored, because the peer may have disconnected.
     fn answer(&self, ticket: Ticket, answer: Answer);
 
-    /// Does what can be done now without blocking, on the calling thread, and says whether there
-    /// was anything. Whoever waits for a letter or an outcome may call this in a short loop
-    /// before going to sleep; nobody has to.
+    /// Performs pending work on the calling thread without blocking. Returns whether there was any.
+    /// A caller that waits for a letter or an outcome may call this in a short loop before it
+    /// sleeps, but need not.
     fn drive(&self) -> bool {
         false
     }
 
-    /// Loans `len` bytes in which the content of a letter to `to` can be written in place, when
-    /// this transport can later carry those very bytes without a copy. `head_room` is the length
-    /// of everything that will stand in front of the content and `tail_room` what will follow it.
+    /// Loans `len` bytes for the content of a letter to `to`. `None` if this transport cannot send
+    /// such memory without a copy. `head_room` is the length of everything before the content and
+    /// `tail_room` of everything after it, in bytes.
     ///
     /// # Errors
-    /// When there is no room or the letter is too large.
+    /// Returns an error if there is no room or the letter is too large.
     fn loan(
         &self,
         to: &Location,
@@ -92,104 +92,104 @@ pub trait Transport: Send + Sync + 'static {
         Ok(None)
     }
 
-    /// Loans `len` bytes for the content of a letter to several locations, when this transport can
-    /// carry them to any number of locations without a copy for each. The content is in memory
-    /// once, as long as anybody reads it; what is dispatched elsewhere is copied as usual.
+    /// Loans `len` bytes for the content of a letter to several locations. `None` if this transport
+    /// would copy it for each location. The content is stored once, as long as any process reads
+    /// it. A letter with it to a location of another transport is copied as usual.
     ///
     /// # Errors
-    /// When there is no room or the content is too large.
+    /// Returns an error if there is no room or the content is too large.
     fn loan_for_many(&self, len: usize) -> Result<Option<Box<dyn LoanedContent>>, WayError> {
         let _ = len;
         Ok(None)
     }
 
-    /// Whether dispatching letters with this content to several locations makes a copy for each
-    /// that is worth avoiding by [`loan_for_many`](Self::loan_for_many).
+    /// Whether dispatching this content to several locations makes a copy for each of them that
+    /// [`loan_for_many`](Self::loan_for_many) would avoid.
     fn copies_for_each(&self, content: &Bytes) -> bool {
         let _ = content;
         false
     }
 
-    /// Stops listening, gives every outstanding attempt its conclusion and frees everything.
-    /// Later dispatches fail. Calling it twice is allowed.
+    /// Stops listening, concludes every open attempt and releases all resources. Later dispatches
+    /// fail. May be called repeatedly.
     fn close(&self);
 }
 
-/// Memory for the content of a letter, to be filled in place.
+/// Loaned memory for the content of a letter.
 pub trait LoanedContent: Send {
-    /// The bytes, to be written. They start out as zeros or as anything else.
+    /// The writable bytes. Their initial values are arbitrary.
     fn content_mut(&mut self) -> &mut [u8];
 
-    /// The bytes as content of a letter. The transport that loaned them recognises them when the
-    /// letter is dispatched to a location they were loaned for, and copies nothing.
+    /// Returns the bytes as content of a letter. The transport that loaned them recognizes them in
+    /// a dispatch to a location they were loaned for, and copies nothing.
     fn freeze(self: Box<Self>) -> Bytes;
 }
 
-/// Where an old peer's letter came from, and what can be sent there.
+/// The origin of a legacy peer's letter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LegacySource {
-    /// The address of the connection.
+    /// Remote address of the connection.
     pub address: IpAddr,
-    /// What the writer of the envelope understands. Never [`Signature::Frames`].
+    /// The protocol that the sender of the envelope supports. Never [`Signature::Frames`].
     pub signature: Signature,
 }
 
-/// Who is told what arrives and what became of attempts: the delivery core.
+/// The receiver of arrivals and conclusions: the delivery core.
 pub trait Sink: Send + Sync {
-    /// A parcel arrived. The verdict is what the sender is told.
+    /// Handles a parcel that arrived. The verdict determines the answer to the sender.
     fn arrived(&self, arrival: Arrival) -> Verdict;
 
-    /// An old peer's letter arrived from this source, without a header; it gets no answer. Its
-    /// envelope has been brought into the standard dialect; whom it is for stands in there.
+    /// Handles a letter of a legacy peer, which has no parcel header and gets no answer. The
+    /// transport has converted its envelope to the standard dialect; the envelope names the
+    /// receiver.
     fn arrived_unframed(&self, letter: Letter, via: Kind, from: LegacySource);
 
-    /// An attempt came to its end.
+    /// Handles the end of an attempt.
     fn concluded(&self, attempt: AttemptId, conclusion: Conclusion);
 
-    /// Memory for the content of a letter of which only the beginning has arrived, when the letter
-    /// can be passed on from there without a copy. The transport then writes what arrives right
-    /// into it, and the letter's content is what it freezes to. Asked for large content only.
+    /// Returns memory for the content of a letter of which only the beginning has arrived, if the
+    /// letter can be forwarded from there without a copy. The transport then writes the content
+    /// directly into it and freezes it. Called only for large content.
     fn memory_for(&self, arriving: &Arriving<'_>) -> Option<Box<dyn LoanedContent>> {
         let _ = arriving;
         None
     }
 
-    /// Other locations at which the service of this location is to be found as well, if any are
-    /// known: a transport that opens a connection may race them. May take longer than other calls;
-    /// asked when a connection is opened only.
+    /// Returns other known locations of the service at this location. A transport that opens a
+    /// connection may race them. Called only when a connection is opened, because it may take
+    /// longer than other calls.
     fn also_at(&self, location: &Location) -> Vec<Location> {
         let _ = location;
         Vec::new()
     }
 
-    /// The endpoint is reached at these locations from now on, best first, instead of those that
-    /// [`listen`](Transport::listen) or an earlier call gave: the addresses of this host have
-    /// changed. There may be none.
+    /// Replaces the locations of the endpoint that [`listen`](Transport::listen) or an earlier call
+    /// gave, best first, after the addresses of this host have changed. May be empty.
     fn relocated(&self, locations: Vec<Location>) {
         let _ = locations;
     }
 
-    /// A service has introduced itself on a connection that was opened: parcels can go both ways
-    /// from now on. Transports without connections say nothing; nor need a sink listen.
+    /// A service has introduced itself on a new connection, so parcels can be sent both ways.
+    /// Transports without connections do not call this.
     fn introduced(&self, peer: &Introduction) {
         let _ = peer;
     }
 
-    /// The connection on which this service had [introduced](Self::introduced) itself is at its
-    /// end. There may be another one with it: there were as many introductions as connections.
+    /// The connection on which this service had [introduced](Self::introduced) itself has ended.
+    /// Other connections with it may remain: there is one introduction for each connection.
     fn parted(&self, peer: &Introduction) {
         let _ = peer;
     }
 }
 
-/// What a service says of itself when a connection with it has been opened.
+/// A service's description of itself on a new connection.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Introduction {
-    /// Its name; several may have the same one.
+    /// Name of the service; not unique.
     pub name: Arc<str>,
-    /// Where it is, with its incarnation.
+    /// Location of the service, with its incarnation.
     pub hop: Hop,
-    /// The location for which this side opened the connection, if this side did.
+    /// The location that this side connected to. `None` if the other side opened the connection.
     pub dialled: Option<Location>,
     /// The agents that the service may speak for on this connection.
     pub mandate: Mandate,
@@ -237,105 +237,105 @@ fn is_meant(agent: &str, name: &str) -> bool {
 /// A parcel that arrived.
 #[derive(Debug)]
 pub struct Arrival {
-    /// What arrived.
+    /// The parcel.
     pub parcel: Parcel,
-    /// Who handed it over.
+    /// The service that handed it over.
     pub from: Hop,
-    /// For [`Transport::answer`], when the verdict is [`Verdict::Later`].
+    /// Identifies the arrival in [`Transport::answer`] after [`Verdict::Later`].
     pub ticket: Ticket,
 }
 
-/// A letter whose content is about to arrive. Nothing of it has been checked but the lengths.
+/// A letter whose content is about to arrive. Only its lengths have been checked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Arriving<'a> {
-    /// The name of the receiving agent.
+    /// Name of the receiving agent.
     pub receiver: &'a str,
-    /// Whose order it belongs to.
+    /// The stream of the letter.
     pub stream: Stream,
-    /// Bytes in front of the content: name, envelope and head of the message.
+    /// Bytes before the content: name, envelope and head of the message.
     pub front: usize,
     /// Bytes of the content.
     pub len: usize,
-    /// Bytes behind the content.
+    /// Bytes after the content.
     pub tail: usize,
 }
 
 /// The message transport service that handed a parcel over.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Hop {
-    /// Where to send reports and credits about the parcel, with the incarnation of the service
-    /// that is there.
+    /// Location for reports and credits about the parcel, with the incarnation of the service
+    /// there.
     pub location: Location,
-    /// What the link proves about that service.
+    /// The proof of that service's identity.
     pub principal: Principal,
 }
 
 impl Hop {
-    /// Whether the service is on another host, as far as is proved.
+    /// Whether the service may be on another host. False only if the link proves that it is not.
     #[must_use]
     pub fn is_remote(&self) -> bool {
         self.principal != Principal::Host
     }
 }
 
-/// What a link proves about the service at its other end. Only this separates two services: what one
-/// says of itself does not.
+/// The identity that a link proves for the service at its other end. Services are told apart only
+/// by this, and not by their own claims.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Principal {
-    /// It is a process of this user on this host: the link is shared memory or a Unix domain socket, or
-    /// loopback where the owner of the host has allowed that.
+    /// A process of this user on this host: the link is shared memory, a Unix domain socket, or
+    /// loopback if the host's owner has allowed that.
     Host,
-    /// It has the key of the certificate with this SHA-256 fingerprint (of its DER form).
+    /// The holder of the key of the certificate with this SHA-256 fingerprint (of its DER form).
     Certificate([u8; 32]),
-    /// Nothing. All services without proof are one.
+    /// No proof. All services without proof count as one.
     Unproved,
 }
 
-/// What a sink says about an arrival.
+/// A sink's reaction to an arrival.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Verdict {
-    /// This is the answer.
+    /// Answers at once.
     Now(Answer),
-    /// The answer follows through [`Transport::answer`]. Not allowed towards a transport that
+    /// Answers later through [`Transport::answer`]. Not allowed for a transport that
     /// [answers at once](Transport::answers_at_once).
     Later,
 }
 
-/// What the other side says about a parcel.
+/// The other side's answer to a parcel.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Answer {
     /// Accepted into the named agent's queue, now or when an earlier copy arrived. Reports and
-    /// credits are accepted too.
+    /// credits are accepted, too.
     Accepted,
-    /// Taken for forwarding; a report follows.
+    /// Accepted for forwarding; a report follows.
     Custody,
-    /// There is no room; a credit follows when there is.
+    /// No room; a credit follows when there is room.
     Busy,
-    /// The letter that this one comes after has not been taken yet.
+    /// The predecessor of the letter has not been accepted yet.
     OutOfOrder {
-        /// The last letter of the stream that was taken.
+        /// Sequence of the last letter of the stream that was accepted.
         last: u64,
     },
-    /// Handed back: the letter's predecessor is not here, so that its sender has to dispatch the
-    /// letter again. Not a failure of the way.
+    /// Handed back, because the letter's predecessor is not here. Its sender dispatches the letter
+    /// again. Not a failure of the route.
     Returned {
-        /// Whether an attempt by this service, or by one behind it, may have delivered the letter.
+        /// Whether an attempt by this service, or by a later one, may have delivered the letter.
         uncertain: bool,
     },
-    /// The receiver's registration that this letter is for was here until a moment ago. Not taken.
+    /// Not accepted: the receiver's registration that this letter is for has just left this host.
     Moved,
-    /// Not accepted, finally.
+    /// Finally not accepted.
     Failed {
-        /// Why.
+        /// The reason.
         reason: FailureReason,
-        /// More about it, for people; at most [`Answer::MAX_DETAIL`] bytes are carried.
+        /// Details for people; at most [`Answer::MAX_DETAIL`] bytes are transmitted.
         detail: String,
     },
 }
 
 impl Answer {
-    /// How much of a failure's detail is carried, in bytes.
+    /// Maximum length of a transmitted failure detail, in bytes.
     pub const MAX_DETAIL: usize = 160;
 
     /// A final refusal.
@@ -347,10 +347,10 @@ impl Answer {
     }
 }
 
-/// How an attempt ended that its caller [abandoned](Transport::abandon).
+/// The end of an attempt that its caller [abandoned](Transport::abandon).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Abandoned {
-    /// No byte of the parcel has reached the other side, and none ever will.
+    /// No byte of the parcel has reached the other side, and none will.
     NotSent,
     /// The other side may have the parcel.
     Unconfirmed,
@@ -367,7 +367,7 @@ impl Abandoned {
     }
 }
 
-/// How an attempt ended.
+/// The end of an attempt.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Conclusion {
@@ -375,25 +375,25 @@ pub enum Conclusion {
     Answered(Answer),
     /// Handed to a peer that cannot answer.
     Handed,
-    /// The other side did not get it and never will.
+    /// The other side has not received the parcel, and will not.
     NotSent(WayError),
-    /// The other side may have got it.
+    /// The other side may have received the parcel.
     Unconfirmed(WayError),
 }
 
-/// Why a way did not work.
+/// The error of an attempt.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error, Serialize)]
 #[error("{}{}{}", fault.description(), if detail.is_empty() { "" } else { ": " }, escape(detail))]
 pub struct WayError {
-    /// What kind of fault it was.
+    /// The kind of fault.
     pub fault: WayFault,
-    /// More about it, for people: what the operating system said, and what to do. It may be the text
-    /// of a peer; `Display` [escapes](fipa_acl::escape) it.
+    /// Details for people: the error of the operating system, and a remedy. May contain text of a
+    /// peer; `Display` [escapes](fipa_acl::escape) it.
     pub detail: String,
 }
 
 impl WayError {
-    /// An error with a detail for people.
+    /// Creates an error with a detail for people.
     pub fn new(fault: WayFault, detail: impl fmt::Display) -> Self {
         Self {
             fault,
@@ -402,39 +402,40 @@ impl WayError {
     }
 }
 
-/// The kinds of faults of a way.
+/// The kinds of faults of a transport.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum WayFault {
-    /// Nobody is there, or nothing leads there.
+    /// No service at the location, or no network path to it.
     Unreachable,
-    /// Somebody is there, but of another incarnation than expected.
+    /// A service of another incarnation than expected is at the location.
     WrongIncarnation,
-    /// The letter is larger than this way takes.
+    /// The letter is longer than this transport's limit.
     TooLarge,
-    /// The window towards that location is full; what is under way makes room.
+    /// The window for the location is full, or memory is temporarily short. A later attempt may
+    /// succeed.
     Congested,
     /// The connection broke, or the other process ended, before an answer came.
     Broken,
     /// No answer came in time.
     TimedOut,
-    /// The other side speaks another version, or nonsense.
+    /// The other side has another protocol version, or sent malformed data.
     Incompatible,
-    /// The other side does not take it.
+    /// The other side refuses the parcel.
     Refused,
     /// This transport has been closed or cannot be used on this machine.
     Closed,
-    /// This end has run out of memory, descriptors or disk for this way.
+    /// This side has no memory, descriptors or disk space left for the attempt.
     Exhausted,
-    /// The dialect of the peer has no form for something in the letter. No byte was sent.
+    /// The peer's dialect has no representation for a part of the letter. No byte was sent.
     Inexpressible,
     /// There is no transport of this kind.
     Unsupported,
 }
 
 impl WayFault {
-    /// Every fault, for encoding: the position is the code on the wire, so new ones go last.
+    /// All faults. The position is the code on the wire, so new ones go last.
     pub(crate) const CODES: [Self; 12] = [
         Self::Unreachable,
         Self::WrongIncarnation,
@@ -453,22 +454,22 @@ impl WayFault {
     fn description(self) -> &'static str {
         match self {
             Self::Unreachable => "unreachable",
-            Self::WrongIncarnation => "another process is there now",
-            Self::TooLarge => "too large for this way",
-            Self::Congested => "too much under way",
-            Self::Broken => "broken off",
+            Self::WrongIncarnation => "another process has this address now",
+            Self::TooLarge => "too large for this transport",
+            Self::Congested => "congested",
+            Self::Broken => "connection broken",
             Self::TimedOut => "no answer in time",
             Self::Incompatible => "incompatible",
             Self::Refused => "refused",
             Self::Closed => "closed",
-            Self::Exhausted => "no room at this end",
+            Self::Exhausted => "out of resources",
             Self::Inexpressible => "the peer's dialect cannot express it",
             Self::Unsupported => "unsupported transport",
         }
     }
 }
 
-/// Why an endpoint could not be opened.
+/// The error of opening an endpoint.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ListenError {
@@ -477,21 +478,21 @@ pub enum ListenError {
     Bind {
         /// The address as configured.
         address: String,
-        /// What the operating system said.
+        /// The error of the operating system.
         source: std::io::Error,
     },
-    /// Something the transport needs is missing; the text says what to do.
+    /// A requirement of the transport is missing; the text names the remedy.
     #[error("{0}")]
     Unavailable(String),
     /// `listen` was called twice, or after `close`.
-    #[error("this endpoint was opened before")]
+    #[error("this endpoint is already listening or closed")]
     OpenedBefore,
 }
 
-/// The caller's number for one dispatch.
+/// Identifies a dispatch. Chosen by the caller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct AttemptId(pub u64);
 
-/// The transport's number for one arrival.
+/// Identifies an arrival. Chosen by the transport.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Ticket(pub u64);

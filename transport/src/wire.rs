@@ -1,12 +1,12 @@
-//! The fixed layout of a parcel, as it lies in a mailbox and in a network frame.
+//! The fixed layout of a parcel in a mailbox and in a network frame.
 //!
-//! A parcel is a [`ParcelHeader`] followed by a body: the receiver's name, then what
-//! [`Body`] it is. All integers are little-endian. A letter's body is its envelope, then the
-//! message in its three pieces ([`Payload`]); a report's body is written by this module; credits
-//! and predecessors have none.
+//! A parcel is a [`ParcelHeader`] followed by a body: the receiver's name, then the content of the
+//! [`Body`]. All integers are little-endian. A letter is its envelope, then the message in its
+//! three pieces ([`Payload`]). [`write_report`] defines the bytes of a report. Credits and
+//! predecessors have only the name.
 //!
-//! Everything here may come from a hostile peer: lengths are checked against what is there before
-//! they are used, and nothing is allocated by them.
+//! All input may come from a hostile peer: lengths are checked against the available bytes before
+//! they are used, and no memory is allocated according to them.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -50,33 +50,33 @@ const REPORT: u8 = 2;
 const CREDIT: u8 = 3;
 const PREDECESSOR: u8 = 4;
 
-/// Longest deadline that travels: one hour. What a peer writes beyond is cut to it.
+/// Longest deadline on the wire: one hour. Longer ones are reduced to it.
 pub const MAX_REMAINING: Duration = Duration::from_secs(60 * 60);
 
 /// Bytes that are not a parcel.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum WireError {
-    /// The kind is none that we know.
+    /// The kind of parcel is unknown.
     #[error("unknown kind of parcel: {0}")]
     UnknownKind(u8),
-    /// The lengths in the header do not add up to the length of the body.
+    /// The lengths in the header contradict the length of the body.
     #[error("the header announces a body of {announced} bytes, and there are {found}")]
     BodyLength {
-        /// What the header says.
+        /// Length according to the header, in bytes.
         announced: u64,
-        /// What is there.
+        /// Actual length, in bytes.
         found: u64,
     },
     /// The name is empty, longer than [`Parcel::MAX_NAME`], or not UTF-8.
     #[error("the receiver's name is empty, too long, or not UTF-8")]
     Name,
-    /// The body of a report makes no sense.
+    /// The body of a report is malformed.
     #[error("malformed report")]
     Report,
 }
 
-/// The body of a parcel, where it is: most of it in the parcel.
+/// The body of a parcel, borrowed from it.
 #[derive(Debug)]
 pub struct Pieces<'a> {
     name: &'a str,
@@ -85,7 +85,7 @@ pub struct Pieces<'a> {
 }
 
 impl Pieces<'_> {
-    /// What is to be written behind the header, in order; none of it is empty.
+    /// The pieces to be written after the header, in order, without empty ones.
     pub fn iter(&self) -> impl Iterator<Item = &[u8]> {
         std::iter::once(self.name.as_bytes()).chain(self.rest().map(|piece| &piece[..]))
     }
@@ -97,11 +97,12 @@ impl Pieces<'_> {
 }
 
 impl ParcelHeader {
-    /// The header of a parcel, and its body: the pieces to be written behind the header, in order
-    /// and none of them empty. The memory of a letter is shared, not copied.
+    /// Returns the header of a parcel, and its body as pieces to be written after the header, in
+    /// order and without empty ones. The memory of a letter is shared, not copied.
     ///
     /// # Errors
-    /// When the name or a piece in front of the content is longer than the header can say.
+    /// Returns an error if the name, or a piece other than the content, is longer than the header
+    /// can express.
     pub fn of(parcel: &Parcel) -> Result<(Self, Vec<Bytes>), WireError> {
         let (header, body) = Self::borrowing(parcel)?;
         let name = Bytes::copy_from_slice(body.name.as_bytes());
@@ -109,10 +110,11 @@ impl ParcelHeader {
         Ok((header, pieces.collect()))
     }
 
-    /// The header of a parcel, and its body where it is.
+    /// Returns the header of a parcel, and its body borrowed from it.
     ///
     /// # Errors
-    /// When the name or a piece in front of the content is longer than the header can say.
+    /// Returns an error if the name, or a piece other than the content, is longer than the header
+    /// can express.
     pub fn borrowing(parcel: &Parcel) -> Result<(Self, Pieces<'_>), WireError> {
         if parcel.receiver.is_empty() || parcel.receiver.len() > Parcel::MAX_NAME {
             return Err(WireError::Name);
@@ -163,19 +165,19 @@ impl ParcelHeader {
         Ok((header, pieces))
     }
 
-    /// Length of the body behind this header, in bytes. Not to be trusted before it has been
-    /// compared with a limit.
+    /// Length of the body after this header, in bytes. Untrusted until it has been compared with a
+    /// limit.
     #[must_use]
     pub fn body_len(&self) -> u64 {
-        // Cannot overflow from honest peers; saturates for others, who then fail the comparison.
+        // Cannot overflow for honest peers; saturates for others, so that the comparison fails.
         (u64::from(self.name_len.get()) + u64::from(self.envelope_len.get()))
             .saturating_add(u64::from(self.head_len.get()))
             .saturating_add(u64::from(self.tail_len.get()))
             .saturating_add(self.content_len.get())
     }
 
-    /// Length of what stands in front of the content: name, envelope and head of the message.
-    /// This is what a receiver copies out of shared memory before it looks at it.
+    /// Length of the pieces before the content, in bytes: name, envelope and head of the message.
+    /// A receiver copies them out of shared memory before it reads them.
     #[must_use]
     pub fn front_len(&self) -> u64 {
         u64::from(self.name_len.get())
@@ -189,8 +191,9 @@ impl ParcelHeader {
         self.content_len.get()
     }
 
-    /// What is arriving, when the parcel with this header is a letter, and this is what stands in
-    /// front of its content. None also when it makes no sense, which is told once all is there.
+    /// Describes the arriving letter, if this is the header of a letter and `front` contains the
+    /// pieces before its content. `None` also if they are malformed, which [`parcel`](Self::parcel)
+    /// reports later.
     #[must_use]
     pub fn arriving<'a>(&self, front: &'a [u8]) -> Option<Arriving<'a>> {
         if self.kind != LETTER || front.len() as u64 != self.front_len() {
@@ -213,11 +216,10 @@ impl ParcelHeader {
         }
     }
 
-    /// The parcel with this header and a body that lies in one piece. Nothing is copied but the
-    /// name.
+    /// Returns the parcel with this header and a body in one piece. Copies only the name.
     ///
     /// # Errors
-    /// When header and body do not fit together.
+    /// Returns an error if the body does not match the header, or is malformed.
     pub fn parcel(&self, body: Bytes) -> Result<Parcel, WireError> {
         let (front, content, tail) = self.split(body)?;
         self.parcel_of_pieces(front, content, tail)
@@ -235,12 +237,11 @@ impl ParcelHeader {
         Ok((front, content, body))
     }
 
-    /// The parcel with this header and a body in three pieces: what stands in front of the
-    /// content ([`front_len`](Self::front_len) bytes), the content, and what follows it. Nothing
-    /// is copied but the name.
+    /// Returns the parcel with this header and a body in three pieces: the bytes before the content
+    /// ([`front_len`](Self::front_len)), the content, and the bytes after it. Copies only the name.
     ///
     /// # Errors
-    /// When header and body do not fit together.
+    /// Returns an error if the body does not match the header, or is malformed.
     pub fn parcel_of_pieces(
         &self,
         mut front: Bytes,
@@ -293,7 +294,7 @@ impl ParcelHeader {
     }
 }
 
-/// At most this many attempts are told in a report; the rest is left out, oldest first.
+/// Maximum number of attempts in a report. Older ones are omitted.
 const MAX_ATTEMPTS: usize = 32;
 
 /// The code of a failure reason in answers and reports: one byte, stable.
@@ -308,13 +309,13 @@ pub fn reason_of_code(code: u8) -> Option<FailureReason> {
     FailureReason::CODES.get(usize::from(code)).copied()
 }
 
-fn position<T: PartialEq>(all: &[T], one: &T) -> u8 {
+fn position<T: PartialEq>(all: &[T], item: &T) -> u8 {
     all.iter()
-        .position(|other| other == one)
-        .map_or(u8::MAX, |place| place as u8)
+        .position(|other| other == item)
+        .map_or(u8::MAX, |index| index as u8)
 }
 
-/// The tags of letters that are handed back; outcomes have lower ones.
+/// The tags of letters that are handed back; outcomes have lower tags.
 const RETURNED: u8 = 3;
 const MOVED: u8 = 4;
 
@@ -336,7 +337,7 @@ pub fn write_report(report: &Report) -> Bytes {
     }
 }
 
-/// Reads the body of a report. Returns none when the bytes are something else.
+/// Reads the body of a report. `None` if the bytes are malformed.
 #[must_use]
 pub fn read_report(bytes: &[u8]) -> Option<Report> {
     match bytes {
@@ -349,7 +350,7 @@ pub fn read_report(bytes: &[u8]) -> Option<Report> {
     }
 }
 
-/// Writes an outcome as it stands in a report; see [`write_report`].
+/// Writes an outcome in the format of [`write_report`].
 #[must_use]
 pub fn write_outcome(outcome: &Outcome) -> Bytes {
     let mut out = BytesMut::new();
@@ -359,13 +360,13 @@ pub fn write_outcome(outcome: &Outcome) -> Bytes {
         Outcome::Failed { reason, .. } => (2, reason_code(*reason)),
     };
     let attempts = outcome.attempts();
-    let told = &attempts[attempts.len().saturating_sub(MAX_ATTEMPTS)..];
-    out.put_slice(&[tag, code, told.len() as u8]);
+    let included = &attempts[attempts.len().saturating_sub(MAX_ATTEMPTS)..];
+    out.put_slice(&[tag, code, included.len() as u8]);
     for Attempt {
         via,
         location,
         error,
-    } in told
+    } in included
     {
         out.put_u8(kind_code(*via));
         out.put_u8(position(&WayFault::CODES, &error.fault));
@@ -380,7 +381,7 @@ pub fn write_outcome(outcome: &Outcome) -> Bytes {
     out.freeze()
 }
 
-/// The outcome in these bytes, unless they are something else. Nothing in them is trusted.
+/// Reads an outcome from untrusted bytes. `None` if they are malformed.
 #[must_use]
 pub fn read_outcome(bytes: &[u8]) -> Option<Outcome> {
     let (&[tag, code, count], mut rest) = bytes.split_first_chunk()?;
@@ -440,7 +441,7 @@ fn text<'a>(rest: &mut &'a [u8]) -> Option<&'a str> {
     std::str::from_utf8(text).ok()
 }
 
-/// The text, cut to at most `max` bytes at a character boundary.
+/// The text, truncated to at most `max` bytes at a character boundary.
 #[must_use]
 pub fn truncated(text: &str, max: usize) -> &str {
     &text[..text.floor_char_boundary(max)]
@@ -495,12 +496,12 @@ mod tests {
     }
 
     #[test]
-    fn the_header_has_no_hidden_padding() {
+    fn the_header_has_no_padding() {
         assert_eq!(HEADER_LEN, 72);
     }
 
     #[test]
-    fn every_kind_survives() {
+    fn every_kind_of_body_round_trips() {
         for body in [
             Body::Letter(split_letter()),
             Body::Report(Report::Settled(failed())),
@@ -529,7 +530,7 @@ mod tests {
     }
 
     #[test]
-    fn lengths_that_do_not_add_up_are_refused() {
+    fn contradicting_lengths_are_refused() {
         let (header, body) = written(&parcel(Body::Letter(split_letter())));
         assert!(matches!(
             header.parcel(body.slice(..body.len() - 1)),
@@ -549,13 +550,13 @@ mod tests {
     #[test]
     fn names_and_kinds_are_checked() {
         let (header, body) = written(&parcel(Body::Credit));
-        let nameless = ParcelHeader {
+        let unnamed = ParcelHeader {
             name_len: U16::ZERO,
             ..header
         };
-        assert_eq!(nameless.parcel(Bytes::new()), Err(WireError::Name));
-        let stranger = ParcelHeader { kind: 9, ..header };
-        assert_eq!(stranger.parcel(body), Err(WireError::UnknownKind(9)));
+        assert_eq!(unnamed.parcel(Bytes::new()), Err(WireError::Name));
+        let unknown = ParcelHeader { kind: 9, ..header };
+        assert_eq!(unknown.parcel(body), Err(WireError::UnknownKind(9)));
     }
 
     #[test]

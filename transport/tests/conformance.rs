@@ -1,6 +1,5 @@
-//! The conformance suite, run against a transport that is as simple as one can be: a table of
-//! endpoints in this process. It shows that the rules can be kept, and that [`Faulty`] without
-//! faults keeps them too.
+//! The conformance suite for a minimal transport: a table of endpoints in this process. Shows that
+//! the rules can be satisfied, and that [`Faulty`] without faults satisfies them, too.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
@@ -17,10 +16,10 @@ const MAX_LETTER: usize = 8 << 20;
 const WINDOW: usize = 64;
 
 #[derive(Default)]
-struct Exchange(Mutex<HashMap<Location, Arc<Endpoint>>>);
+struct EndpointTable(Mutex<HashMap<Location, Arc<Endpoint>>>);
 
 struct Endpoint {
-    exchange: Arc<Exchange>,
+    table: Arc<EndpointTable>,
     location: Location,
     state: Mutex<State>,
 }
@@ -52,10 +51,10 @@ impl Endpoint {
     }
 }
 
-/// The transport: a handle to an endpoint, so that endpoints can name each other.
-struct Local(Arc<Endpoint>);
+/// The transport: a handle to an endpoint, so that endpoints can refer to each other.
+struct TableTransport(Arc<Endpoint>);
 
-impl Transport for Local {
+impl Transport for TableTransport {
     fn kind(&self) -> Kind {
         Kind::Tcp
     }
@@ -72,7 +71,7 @@ impl Transport for Local {
         let endpoint = &self.0;
         endpoint.state.lock().sink = Some(sink);
         endpoint
-            .exchange
+            .table
             .0
             .lock()
             .insert(endpoint.location.clone(), Arc::clone(endpoint));
@@ -87,7 +86,7 @@ impl Transport for Local {
         if matches!(&parcel.body, fipa_transport::Body::Letter(l) if l.len() > MAX_LETTER) {
             return refused(WayFault::TooLarge);
         }
-        let Some(peer) = self.0.exchange.0.lock().get(to).cloned() else {
+        let Some(peer) = self.0.table.0.lock().get(to).cloned() else {
             return refused(WayFault::Unreachable);
         };
         if peer.state.lock().inbox.len() >= WINDOW {
@@ -105,7 +104,7 @@ impl Transport for Local {
         let mut state = self.0.state.lock();
         state.open.remove(&attempt);
         state.conclusions.retain(|(other, _)| *other != attempt);
-        // It is in the other side's inbox, or was.
+        // The parcel is or was in the other side's inbox.
         Abandoned::Unconfirmed
     }
 
@@ -153,7 +152,7 @@ impl Transport for Local {
 
     fn close(&self) {
         let endpoint = &self.0;
-        endpoint.exchange.0.lock().remove(&endpoint.location);
+        endpoint.table.0.lock().remove(&endpoint.location);
         let broken = || WayError::new(WayFault::Broken, "closed");
         let mut state = endpoint.state.lock();
         state.closed = true;
@@ -175,17 +174,17 @@ impl Transport for Local {
 }
 
 #[derive(Default)]
-struct Plain {
-    exchange: Arc<Exchange>,
+struct TableFixture {
+    table: Arc<EndpointTable>,
     next: AtomicU64,
 }
 
-impl Fixture for Plain {
+impl Fixture for TableFixture {
     fn endpoint(&self) -> Arc<dyn Transport> {
         let number = self.next.fetch_add(1, Ordering::Relaxed) + 1;
         let location = Location::new(Kind::Tcp, &format!("table:{number}")).expect("an address");
-        Arc::new(Local(Arc::new(Endpoint {
-            exchange: Arc::clone(&self.exchange),
+        Arc::new(TableTransport(Arc::new(Endpoint {
+            table: Arc::clone(&self.table),
             location: location.with_incarnation(Incarnation::from_u64(number)),
             state: Mutex::default(),
         })))
@@ -199,9 +198,9 @@ impl Fixture for Plain {
 }
 
 #[derive(Default)]
-struct Wrapped(Plain);
+struct FaultyFixture(TableFixture);
 
-impl Fixture for Wrapped {
+impl Fixture for FaultyFixture {
     fn endpoint(&self) -> Arc<dyn Transport> {
         Arc::new(Faulty::new(self.0.endpoint(), 1, &[]))
     }
@@ -211,12 +210,12 @@ impl Fixture for Wrapped {
     }
 }
 
-mod plain {
-    fipa_transport::conformance_tests!(super::Plain::default());
+mod table_transport {
+    fipa_transport::conformance_tests!(super::TableFixture::default());
 }
 
-mod wrapped_without_faults {
-    fipa_transport::conformance_tests!(super::Wrapped::default());
+mod faulty_without_faults {
+    fipa_transport::conformance_tests!(super::FaultyFixture::default());
 }
 
 mod faults {
@@ -224,12 +223,12 @@ mod faults {
     use fipa_transport::{Body, Fault, Stream};
 
     #[derive(Default)]
-    struct Heard {
+    struct RecordingSink {
         arrived: Mutex<u64>,
         concluded: Mutex<Vec<(AttemptId, Conclusion)>>,
     }
 
-    impl Sink for Heard {
+    impl Sink for RecordingSink {
         fn arrived(&self, _: Arrival) -> Verdict {
             *self.arrived.lock() += 1;
             Verdict::Now(Answer::Accepted)
@@ -243,12 +242,12 @@ mod faults {
     }
 
     fn credit() -> Parcel {
-        let nobody = Incarnation::UNKNOWN;
+        let unknown = Incarnation::UNKNOWN;
         Parcel {
             receiver: "x".into(),
             stream: Stream {
-                sender: nobody,
-                receiver: nobody,
+                sender: unknown,
+                receiver: unknown,
             },
             sequence: 1,
             after: 0,
@@ -259,11 +258,14 @@ mod faults {
     }
 
     #[test]
-    fn each_fault_does_what_it_says() {
-        let fixture = Plain::default();
+    fn each_fault_has_its_documented_effect() {
+        let fixture = TableFixture::default();
         let sender = Faulty::new(fixture.endpoint(), 7, &[]);
         let receiver = fixture.endpoint();
-        let (at_sender, at_receiver) = (Arc::new(Heard::default()), Arc::new(Heard::default()));
+        let (at_sender, at_receiver) = (
+            Arc::new(RecordingSink::default()),
+            Arc::new(RecordingSink::default()),
+        );
         sender.listen(at_sender.clone()).unwrap();
         let to = receiver.listen(at_receiver.clone()).unwrap().remove(0);
         let attempt = |number: u64, fault| {
@@ -281,16 +283,16 @@ mod faults {
         assert_eq!(*at_receiver.arrived.lock(), 0);
         attempt(4, Fault::AnswerLost).unwrap();
         assert_eq!(*at_receiver.arrived.lock(), 1);
-        let heard = at_sender.concluded.lock();
+        let concluded = at_sender.concluded.lock();
         assert_eq!(
-            heard
+            concluded
                 .iter()
                 .map(|(attempt, _)| attempt.0)
                 .collect::<Vec<_>>(),
             [2, 4]
         );
         assert!(
-            heard
+            concluded
                 .iter()
                 .all(|(_, end)| matches!(end, Conclusion::Unconfirmed(_)))
         );
@@ -298,14 +300,14 @@ mod faults {
     }
 
     #[test]
-    fn the_seed_decides() {
+    fn the_seed_determines_the_faults() {
         let run = |seed| {
-            let fixture = Plain::default();
+            let fixture = TableFixture::default();
             let sender = Faulty::new(fixture.endpoint(), seed, &[(Fault::Unreachable, 0.3)]);
-            sender.listen(Arc::new(Heard::default())).unwrap();
+            sender.listen(Arc::new(RecordingSink::default())).unwrap();
             let receiver = fixture.endpoint();
             let to = receiver
-                .listen(Arc::new(Heard::default()))
+                .listen(Arc::new(RecordingSink::default()))
                 .unwrap()
                 .remove(0);
             (0..40)

@@ -1,8 +1,8 @@
-//! What the tests share: a domain of their own, endpoints, and a sink that remembers.
+//! Test support: a domain of its own, endpoints, and a sink that records.
 
 // Every test binary uses a part of this.
 #![allow(dead_code)]
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on says so")]
+#![allow(clippy::unwrap_used, reason = "a failed precondition fails the test")]
 
 use std::path::Path;
 use std::sync::Arc;
@@ -19,15 +19,15 @@ use fipa_transport_shm::{ShmConfig, ShmTransport};
 use std::sync::Mutex;
 use tokio::runtime::Runtime;
 
-/// A domain of its own, removed in the end.
-pub(crate) struct Place {
-    // First: what still runs on it has a part in the domain.
+/// A domain with a unique name, removed at the end.
+pub(crate) struct TestDomain {
+    // First: its tasks use the domain.
     pub(crate) runtime: Runtime,
     pub(crate) directory: tempfile::TempDir,
     pub(crate) prefix: String,
 }
 
-impl Place {
+impl TestDomain {
     pub(crate) fn new() -> Self {
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(1)
@@ -54,25 +54,28 @@ impl Place {
         ShmTransport::new(config, self.runtime.handle().clone()).unwrap()
     }
 
-    /// An endpoint that listens, with what it was told.
-    pub(crate) fn listening(&self) -> (Arc<ShmTransport>, Arc<Told>) {
+    /// An endpoint that listens, with its sink.
+    pub(crate) fn listening(&self) -> (Arc<ShmTransport>, Arc<RecordingSink>) {
         self.listening_with(self.config())
     }
 
-    pub(crate) fn listening_with(&self, config: ShmConfig) -> (Arc<ShmTransport>, Arc<Told>) {
+    pub(crate) fn listening_with(
+        &self,
+        config: ShmConfig,
+    ) -> (Arc<ShmTransport>, Arc<RecordingSink>) {
         let endpoint = Arc::new(self.endpoint_with(config));
-        let told = Arc::new(Told::default());
-        endpoint.listen(told.clone()).unwrap();
-        (endpoint, told)
+        let sink = Arc::new(RecordingSink::default());
+        endpoint.listen(sink.clone()).unwrap();
+        (endpoint, sink)
     }
 
-    /// All files of this domain, in order.
-    pub(crate) fn traces(&self) -> Vec<String> {
-        traces(self.directory.path(), &self.prefix)
+    /// All files of this domain, sorted.
+    pub(crate) fn files(&self) -> Vec<String> {
+        files(self.directory.path(), &self.prefix)
     }
 }
 
-pub(crate) fn traces(root: &Path, prefix: &str) -> Vec<String> {
+pub(crate) fn files(root: &Path, prefix: &str) -> Vec<String> {
     let mut found = Vec::new();
     let mut directories = vec![root.to_owned()];
     while let Some(directory) = directories.pop() {
@@ -104,14 +107,14 @@ pub(crate) fn location_of(incarnation: Incarnation) -> Location {
         .with_incarnation(incarnation)
 }
 
-/// A sink that accepts everything and remembers what it was told.
+/// A sink that accepts everything and records its calls.
 #[derive(Default)]
-pub(crate) struct Told {
+pub(crate) struct RecordingSink {
     pub(crate) arrived: Mutex<Vec<(Parcel, Hop)>>,
     pub(crate) concluded: Mutex<Vec<(AttemptId, Conclusion)>>,
 }
 
-impl Sink for Told {
+impl Sink for RecordingSink {
     fn arrived(&self, arrival: Arrival) -> Verdict {
         let mut arrived = self.arrived.lock().unwrap();
         arrived.push((arrival.parcel, arrival.from));
@@ -127,7 +130,7 @@ impl Sink for Told {
     }
 }
 
-impl Told {
+impl RecordingSink {
     pub(crate) fn arrivals(&self) -> usize {
         self.arrived.lock().unwrap().len()
     }
@@ -142,20 +145,23 @@ impl Told {
         found.map(|(_, conclusion)| conclusion.clone())
     }
 
-    /// The content of the letter that arrived at this place.
-    pub(crate) fn content(&self, place: usize) -> Bytes {
-        match &self.arrived.lock().unwrap()[place].0.body {
+    /// The content of the letter that arrived at this index.
+    pub(crate) fn content(&self, index: usize) -> Bytes {
+        match &self.arrived.lock().unwrap()[index].0.body {
             Body::Letter(letter) => letter.payload().content.clone(),
             other => panic!("{other:?}"),
         }
     }
 }
 
-/// Waits for something that must happen.
+/// Polls until the condition holds.
 pub(crate) fn wait_for(what: &str, mut condition: impl FnMut() -> bool) {
     let begin = Instant::now();
     while !condition() {
-        assert!(begin.elapsed() < Duration::from_secs(60), "no {what}");
+        assert!(
+            begin.elapsed() < Duration::from_secs(60),
+            "timed out waiting for {what}"
+        );
         std::thread::sleep(Duration::from_millis(1));
     }
 }
@@ -165,7 +171,7 @@ pub(crate) fn attempt() -> AttemptId {
     AttemptId(NEXT.fetch_add(1, Ordering::Relaxed))
 }
 
-/// A letter whose content is split off.
+/// A parcel with a letter that has separate content.
 pub(crate) fn parcel(content: Bytes) -> Parcel {
     let payload = Payload {
         head: Bytes::from_static(b"message up to its content"),
@@ -186,6 +192,39 @@ pub(crate) fn parcel(content: Bytes) -> Parcel {
     }
 }
 
-/// Length of everything in front of the content of [`parcel`].
+/// Length of the pieces in front of the content of [`parcel`].
 pub(crate) const FRONT: usize =
     "arm_left".len() + "envelope".len() + "message up to its content".len();
+
+/// The part of a file that memory of this process is mapped from.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct MappedRange {
+    pub(crate) device: String,
+    pub(crate) inode: String,
+    /// Offset in the file, in bytes.
+    pub(crate) offset: usize,
+    pub(crate) path: Option<String>,
+}
+
+/// The mapping that contains these bytes, from `/proc/self/maps`.
+pub(crate) fn mapping_of(bytes: &[u8]) -> MappedRange {
+    let address = bytes.as_ptr() as usize;
+    let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
+    let found = maps.lines().find_map(|line| {
+        let mut fields = line.split_whitespace();
+        let (start, end) = fields.next()?.split_once('-')?;
+        let start = usize::from_str_radix(start, 16).ok()?;
+        let end = usize::from_str_radix(end, 16).ok()?;
+        let offset = usize::from_str_radix(fields.nth(1)?, 16).ok()?;
+        let (device, inode) = (fields.next()?, fields.next()?);
+        let path = fields.next().filter(|path| path.starts_with('/'));
+        let contains = (start..end).contains(&address) && address + bytes.len() <= end;
+        contains.then(|| MappedRange {
+            device: device.to_owned(),
+            inode: inode.to_owned(),
+            offset: address - start + offset,
+            path: path.map(str::to_owned),
+        })
+    });
+    found.unwrap()
+}

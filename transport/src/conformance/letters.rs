@@ -1,4 +1,4 @@
-//! What arrives, in which order, and what its sender is told.
+//! Rules on contents, order and answers of parcels.
 
 use std::time::Duration;
 
@@ -6,15 +6,17 @@ use bytes::Bytes;
 use fipa_acl::{Letter, Payload};
 
 use super::Fixture;
-use super::party::{Party, accepted, assert_same, concluded, letter, parcel, pattern, until};
+use super::endpoint::{
+    TestEndpoint, accepted, assert_same, concluded, letter, parcel, pattern, until,
+};
 use crate::{
     Answer, Attempt, AttemptId, Body, Conclusion, FailureReason, Incarnation, Kind, Outcome,
     Parcel, Report, Stream, Verdict, WayError, WayFault,
 };
 
-/// Letters, reports and credits arrive with everything that was said about them.
+/// Letters, reports and credits arrive with all fields unchanged.
 pub fn every_field_and_kind_arrives(fixture: &dyn Fixture) {
-    let (a, b) = (Party::new(fixture), Party::new(fixture));
+    let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
     let attempts = vec![Attempt {
         via: Kind::Tcp,
         location: "tcp://192.0.2.1:7#00000000000000aa"
@@ -52,7 +54,7 @@ pub fn every_field_and_kind_arrives(fixture: &dyn Fixture) {
     }
 }
 
-/// Whatever the receiving sink says is what the sender is told.
+/// The sender gets the answer of the receiving sink unchanged.
 pub fn answers_come_back_as_given(fixture: &dyn Fixture) {
     let answers = [
         Answer::Accepted,
@@ -66,8 +68,8 @@ pub fn answers_come_back_as_given(fixture: &dyn Fixture) {
         Answer::failed(FailureReason::Loop, ""),
     ];
     let given = answers.clone();
-    let a = Party::new(fixture);
-    let b = Party::judging(fixture, move |arrival| {
+    let a = TestEndpoint::new(fixture);
+    let b = TestEndpoint::with_verdict(fixture, move |arrival| {
         Verdict::Now(given[arrival.parcel.sequence as usize].clone())
     });
     for (index, answer) in answers.into_iter().enumerate() {
@@ -77,8 +79,8 @@ pub fn answers_come_back_as_given(fixture: &dyn Fixture) {
             Conclusion::Answered(answer)
         );
     }
-    // A long detail is cut, at a character boundary, and does no harm.
-    let c = Party::judging(fixture, |_| {
+    // A long detail is truncated at a character boundary.
+    let c = TestEndpoint::with_verdict(fixture, |_| {
         Verdict::Now(Answer::failed(FailureReason::Refused, "é".repeat(5000)))
     });
     a.send(100, &c, parcel(1, letter("x")));
@@ -96,9 +98,9 @@ pub fn answers_come_back_as_given(fixture: &dyn Fixture) {
     }
 }
 
-/// Nothing is confirmed before the receiving sink has it.
-pub fn the_letter_is_the_sinks_before_it_is_confirmed(fixture: &dyn Fixture) {
-    let (a, b) = (Party::new(fixture), Party::new(fixture));
+/// A letter is confirmed only after the receiving sink has it.
+pub fn the_sink_has_the_letter_before_it_is_confirmed(fixture: &dyn Fixture) {
+    let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
     for attempt in 0..50 {
         a.send(attempt, &b, parcel(attempt, letter("x")));
         until(&[&a, &b], "a confirmation", || {
@@ -106,7 +108,7 @@ pub fn the_letter_is_the_sinks_before_it_is_confirmed(fixture: &dyn Fixture) {
             if concluded.is_some() {
                 assert!(
                     b.arrivals() > attempt as usize,
-                    "confirmed before it arrived"
+                    "confirmed before the letter arrived"
                 );
             }
             concluded
@@ -114,13 +116,13 @@ pub fn the_letter_is_the_sinks_before_it_is_confirmed(fixture: &dyn Fixture) {
     }
 }
 
-/// Where late answers are allowed, they find their parcel, in any order.
-pub fn a_late_answer_reaches_its_own_parcel(fixture: &dyn Fixture) {
-    let a = Party::new(fixture);
+/// Late answers, where they are allowed, conclude their own parcels in any order.
+pub fn a_late_answer_concludes_its_own_parcel(fixture: &dyn Fixture) {
+    let a = TestEndpoint::new(fixture);
     if a.transport.answers_at_once() {
         return;
     }
-    let b = Party::judging(fixture, |_| Verdict::Later);
+    let b = TestEndpoint::with_verdict(fixture, |_| Verdict::Later);
     for attempt in 0..3 {
         a.send(attempt, &b, parcel(attempt, letter("x")));
     }
@@ -142,10 +144,10 @@ pub fn a_late_answer_reaches_its_own_parcel(fixture: &dyn Fixture) {
 
 /// Parcels to one location arrive in the order in which they were dispatched.
 pub fn order_is_kept(fixture: &dyn Fixture) {
-    let (a, b) = (Party::new(fixture), Party::new(fixture));
+    let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
     let total = 500;
     for sequence in 0..total {
-        // Alternating sizes: a transport may treat small and large ones differently.
+        // Alternating sizes: a transport may treat short and long parcels differently.
         let content = pattern(if sequence % 7 == 0 { 40_000 } else { 20 });
         until(&[&a, &b], "room for the next parcel", || {
             match a.transport.dispatch(
@@ -171,9 +173,9 @@ pub fn order_is_kept(fixture: &dyn Fixture) {
     assert_eq!(order, (0..total).collect::<Vec<_>>());
 }
 
-/// A letter may lie in pieces in the sender's memory; empty pieces are fine.
+/// A letter in several pieces of memory arrives as one; empty pieces are allowed.
 pub fn pieces_arrive_as_one_letter(fixture: &dyn Fixture) {
-    let (a, b) = (Party::new(fixture), Party::new(fixture));
+    let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
     let base = Bytes::from_static(b"base envelope");
     let whole = Letter::new(base.clone(), Bytes::from_static(b"whole message"));
     let letters = [
@@ -200,9 +202,9 @@ pub fn pieces_arrive_as_one_letter(fixture: &dyn Fixture) {
     }
 }
 
-/// Content from nothing to a few megabytes arrives unchanged, also while earlier content is held.
+/// Content from zero bytes to a few MiB arrives unchanged, also while earlier content is held.
 pub fn content_of_many_sizes_arrives(fixture: &dyn Fixture) {
-    let (a, b) = (Party::new(fixture), Party::new(fixture));
+    let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
     let largest = a.transport.max_letter().saturating_sub(200).min(4 << 20);
     let sizes = [
         0,
@@ -230,13 +232,13 @@ pub fn content_of_many_sizes_arrives(fixture: &dyn Fixture) {
     }
 }
 
-/// A letter above the limit is refused as too large, and nothing of it arrives.
-pub fn what_is_too_large_is_not_sent(fixture: &dyn Fixture) {
-    let (a, b) = (Party::new(fixture), Party::new(fixture));
+/// A letter above the limit is refused as too large, and no part of it arrives.
+pub fn a_letter_above_the_limit_is_not_sent(fixture: &dyn Fixture) {
+    let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
     let limit = a.transport.max_letter();
     assert!(
         limit < 1 << 30,
-        "the suite cannot make a letter above {limit} bytes"
+        "the suite cannot create a letter above {limit} bytes"
     );
     let error = a
         .transport
@@ -245,16 +247,16 @@ pub fn what_is_too_large_is_not_sent(fixture: &dyn Fixture) {
             &b.location,
             parcel(1, letter(vec![0; limit + 1])),
         )
-        .expect_err("too large");
+        .expect_err("the letter is too large");
     assert_eq!(error.fault, WayFault::TooLarge, "{error}");
     a.send(2, &b, parcel(2, letter("small")));
     assert_eq!(concluded(&[&a, &b], &a, 2), accepted());
     assert_eq!(b.arrivals(), 1);
 }
 
-/// Where nobody is, nothing was sent, and that is said.
-pub fn nobody_is_nowhere(fixture: &dyn Fixture) {
-    let a = Party::new(fixture);
+/// A parcel to a location without an endpoint is reported as not sent.
+pub fn a_location_without_an_endpoint_is_unreachable(fixture: &dyn Fixture) {
+    let a = TestEndpoint::new(fixture);
     match a
         .transport
         .dispatch(AttemptId(1), &fixture.nowhere(), parcel(1, letter("x")))
@@ -267,9 +269,9 @@ pub fn nobody_is_nowhere(fixture: &dyn Fixture) {
     }
 }
 
-/// A letter for a service that is gone is not given to the one that took its place.
-pub fn another_incarnation_is_somebody_else(fixture: &dyn Fixture) {
-    let (a, b) = (Party::new(fixture), Party::new(fixture));
+/// A letter for one incarnation is not delivered to another one at the same address.
+pub fn a_letter_for_another_incarnation_is_not_delivered(fixture: &dyn Fixture) {
+    let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
     let stale = b
         .location
         .clone()
@@ -291,16 +293,16 @@ pub fn another_incarnation_is_somebody_else(fixture: &dyn Fixture) {
     assert_eq!(b.arrivals(), 0);
 }
 
-/// Reports and credits find their way back to whoever handed a parcel over.
-pub fn a_hop_can_be_answered(fixture: &dyn Fixture) {
-    let (a, b) = (Party::new(fixture), Party::new(fixture));
+/// Reports and credits reach the service that handed the parcel over.
+pub fn parcels_can_be_sent_back_to_the_hop(fixture: &dyn Fixture) {
+    let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
     a.send(1, &b, parcel(1, letter("x")));
     assert_eq!(concluded(&[&a, &b], &a, 1), accepted());
     let hop = b.sink.record.lock().arrivals[0].1.clone();
     assert_eq!(hop.location.incarnation(), a.location.incarnation());
     b.transport
         .dispatch(AttemptId(1), &hop.location, parcel(1, Body::Credit))
-        .expect("the way back is open");
+        .expect("the hop can be reached");
     assert_eq!(concluded(&[&a, &b], &b, 1), accepted());
     assert_eq!(a.arrived(0).body, Body::Credit);
 }

@@ -1,62 +1,62 @@
-//! The rules of [`Transport`], as tests that every implementation runs.
+//! The rules of [`Transport`], as tests for every implementation.
 //!
 //! ```text
-//! struct Mine { /* what endpoints need to reach each other */ }
+//! struct Mine { /* the state that its endpoints share */ }
 //! impl fipa_transport::conformance::Fixture for Mine { /* … */ }
 //! fipa_transport::conformance_tests!(Mine::new());
 //! ```
 //!
-//! The suite knows nothing of runtimes: it waits by calling [`Transport::drive`] and sleeping a
-//! little until a condition holds, and gives up after a time that no working transport needs.
+//! The suite does not depend on a runtime: it calls [`Transport::drive`] and sleeps briefly until a
+//! condition holds, and fails after a timeout that no working transport reaches.
 
-mod ends;
+mod edge_cases;
+mod endpoint;
 mod letters;
-mod party;
 
 use std::sync::Arc;
 
 use crate::{Location, Transport};
 
-pub use ends::*;
+pub use edge_cases::*;
 pub use letters::*;
 
-/// What an implementation brings to the suite.
+/// The transport under test.
 pub trait Fixture {
-    /// A new endpoint on which `listen` was not called yet. Endpoints of one fixture can reach
-    /// each other, and stand for different processes.
+    /// Creates an endpoint without calling `listen`. Endpoints of one fixture can reach each other,
+    /// and represent different processes.
     fn endpoint(&self) -> Arc<dyn Transport>;
 
-    /// A location of this transport at which nobody is.
+    /// A location of this transport without an endpoint.
     fn nowhere(&self) -> Location;
 }
 
-/// Makes one test per rule. The argument is an expression for a new [`Fixture`].
+/// Defines one test per rule. The argument is an expression for a new [`Fixture`].
 #[macro_export]
 macro_rules! conformance_tests {
     ($fixture:expr) => {
         $crate::conformance_tests!(@each $fixture;
             every_field_and_kind_arrives
             answers_come_back_as_given
-            the_letter_is_the_sinks_before_it_is_confirmed
-            a_late_answer_reaches_its_own_parcel
+            the_sink_has_the_letter_before_it_is_confirmed
+            a_late_answer_concludes_its_own_parcel
             order_is_kept
             pieces_arrive_as_one_letter
             content_of_many_sizes_arrives
-            what_is_too_large_is_not_sent
-            nobody_is_nowhere
-            another_incarnation_is_somebody_else
-            a_hop_can_be_answered
+            a_letter_above_the_limit_is_not_sent
+            a_location_without_an_endpoint_is_unreachable
+            a_letter_for_another_incarnation_is_not_delivered
+            parcels_can_be_sent_back_to_the_hop
             an_abandoned_attempt_is_concluded_at_once
             an_attempt_that_is_abandoned_unsent_never_arrives
-            a_closing_receiver_leaves_no_attempt_open
-            a_closing_sender_leaves_no_attempt_open
-            a_closed_transport_takes_nothing
+            attempts_to_a_closing_receiver_are_concluded
+            attempts_of_a_closing_sender_are_concluded
+            a_closed_transport_refuses_parcels
             loaned_content_arrives
-            content_for_many_arrives_everywhere
+            shared_content_arrives_at_all_receivers
             a_flood_is_bounded_and_every_attempt_concluded
-            many_talk_to_one_and_one_to_many
-            a_sink_may_use_its_transport
-            a_caller_may_hold_a_lock_that_its_sink_wants
+            many_endpoints_exchange_letters_with_one
+            a_sink_may_call_its_transport
+            a_caller_may_hold_a_lock_that_its_sink_takes
         );
     };
     (@each $fixture:expr; $($rule:ident)*) => {

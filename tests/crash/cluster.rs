@@ -1,5 +1,5 @@
-//! Where actors play: a domain of its own, the processes in it, what they have said, and what must
-//! be true of that.
+//! A domain of its own with child processes, a log of their output, and the checks after each
+//! round.
 
 use std::collections::{BTreeSet, HashMap};
 use std::io::{BufRead, BufReader, Write};
@@ -11,23 +11,23 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 
-use crate::actor::{PART, Part};
+use crate::process::{ROLE, Role};
 
-/// What ends a test that hangs.
+/// Timeout of a hanging test.
 const WATCHDOG: Duration = Duration::from_secs(90);
 
-/// Waits until something is so; after a long time gives up with what is said then.
-pub(crate) fn wait_for(mut is_so: impl FnMut() -> bool, otherwise: impl FnOnce() -> String) {
+/// Polls until the condition holds. Panics after a timeout, with the given message.
+pub(crate) fn wait_for(mut condition: impl FnMut() -> bool, message: impl FnOnce() -> String) {
     let began = Instant::now();
-    while !is_so() {
-        assert!(began.elapsed() < WATCHDOG, "{}", otherwise());
+    while !condition() {
+        assert!(began.elapsed() < WATCHDOG, "{}", message());
         std::thread::sleep(Duration::from_millis(2));
     }
 }
 
-/// What all actors have said.
+/// The letters in the output of all processes.
 #[derive(Debug, Default)]
-pub(crate) struct Ledger {
+pub(crate) struct LetterLog {
     letters: HashMap<u64, Letter>,
     problems: Vec<String>,
 }
@@ -39,8 +39,8 @@ struct Letter {
     taken_by: Option<u32>,
 }
 
-impl Ledger {
-    fn note(&mut self, tag: u32, line: &str) {
+impl LetterLog {
+    fn record(&mut self, tag: u32, line: &str) {
         let words: Vec<&str> = line.split(' ').collect();
         let id = words.get(1).and_then(|word| word.parse::<u64>().ok());
         match (words.as_slice(), id) {
@@ -64,27 +64,27 @@ impl Ledger {
                     self.problems.push(problem);
                 }
             }
-            (["torn", ..], _) => self.problems.push(format!("{tag}: {line}")),
+            (["corrupt", ..], _) => self.problems.push(format!("{tag}: {line}")),
             _ => {}
         }
     }
 
-    /// The letters of an actor.
+    /// The letters of a process.
     fn of(&self, tag: u32) -> impl Iterator<Item = (u64, &Letter)> {
         let letters = self.letters.iter().map(|(id, letter)| (*id, letter));
         letters.filter(move |(id, _)| id >> 32 == u64::from(tag))
     }
 }
 
-/// A process that plays a part.
-pub(crate) struct Actor {
+/// A child process with a role.
+pub(crate) struct TestProcess {
     pub(crate) tag: u32,
     pub(crate) name: String,
     child: Child,
-    said: Arc<Mutex<Vec<String>>>,
+    output: Arc<Mutex<Vec<String>>>,
 }
 
-impl Actor {
+impl TestProcess {
     pub(crate) fn signal(&self, signal: Signal) {
         let pid = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw);
         kill_process(pid.unwrap(), signal).unwrap();
@@ -94,38 +94,47 @@ impl Actor {
         self.child.id()
     }
 
-    pub(crate) fn has_said(&self, line: &str) -> bool {
-        self.said.lock().unwrap().iter().any(|said| said == line)
+    pub(crate) fn has_printed(&self, line: &str) -> bool {
+        self.output
+            .lock()
+            .unwrap()
+            .iter()
+            .any(|output| output == line)
     }
 
-    /// What it has said after this word.
-    pub(crate) fn said_after(&self, word: &str) -> String {
-        let said = self.said.lock().unwrap();
-        let mut rest = said.iter().filter_map(|said| said.strip_prefix(word));
+    /// The rest of the first output line that starts with this word.
+    pub(crate) fn output_after(&self, word: &str) -> String {
+        let output = self.output.lock().unwrap();
+        let mut rest = output.iter().filter_map(|output| output.strip_prefix(word));
         rest.next().unwrap().trim_start().to_owned()
     }
 
     pub(crate) fn wait_until(&self, line: &str) {
         wait_for(
-            || self.has_said(line),
-            || format!("{} ({}) did not say {line:?}", self.name, self.tag),
+            || self.has_printed(line),
+            || {
+                format!(
+                    "timed out waiting for {line:?} from {} ({})",
+                    self.name, self.tag
+                )
+            },
         );
     }
 
-    pub(crate) fn tell(&mut self, line: &str) {
+    pub(crate) fn command(&mut self, line: &str) {
         writeln!(self.child.stdin.as_mut().unwrap(), "{line}").unwrap();
     }
 
-    /// Ends in order.
+    /// Quits the process in an orderly way.
     fn quit(&mut self) {
-        self.tell("quit");
+        self.command("quit");
         let mut ended = None;
         wait_for(
             || {
                 ended = self.child.try_wait().unwrap();
                 ended.is_some()
             },
-            || format!("{} ({}) did not quit", self.name, self.tag),
+            || format!("timed out waiting for {} ({}) to quit", self.name, self.tag),
         );
         assert!(
             ended.unwrap().success(),
@@ -135,44 +144,44 @@ impl Actor {
     }
 }
 
-impl Drop for Actor {
+impl Drop for TestProcess {
     fn drop(&mut self) {
-        // Ended already, or the test has failed.
+        // Fails if the process has ended already.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-/// How many segments for many a process has at most.
+/// Maximum number of segments of a process.
 const SEGMENTS: usize = 8;
 
-/// What the survivors of a domain use.
+/// The resources that the survivors of a domain use.
 #[derive(Debug, PartialEq, Eq)]
-struct Uses {
+struct ResourceUse {
     files: BTreeSet<PathBuf>,
-    /// How long the files in shared memory are together: what they can come to take at most. What
-    /// they take grows until every part of them has been used once.
+    /// Total length of the files in shared memory, which is the upper bound of what they use. The
+    /// actual use grows until every part of them has been used once.
     length: u64,
     descriptors: Vec<usize>,
 }
 
-/// A domain of its own, with two actors that survive: `anchor` takes, and `pulse` sends.
-pub(crate) struct Stage {
+/// A domain of its own with two processes that survive: `anchor` receives, and `pulse` sends.
+pub(crate) struct Cluster {
     directory: tempfile::TempDir,
     domain: String,
     settings: String,
-    ledger: Arc<Mutex<Ledger>>,
-    anchor: Option<Actor>,
-    pulse: Option<Actor>,
-    start: Option<Uses>,
-    /// The pages of the survivors.
+    log: Arc<Mutex<LetterLog>>,
+    anchor: Option<TestProcess>,
+    pulse: Option<TestProcess>,
+    start: Option<ResourceUse>,
+    /// The status pages of the survivors.
     pages: BTreeSet<PathBuf>,
     memory: u64,
-    told: u32,
+    commands: u32,
     pub(crate) kills: usize,
 }
 
-impl Stage {
+impl Cluster {
     pub(crate) fn new() -> Self {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let number = NEXT.fetch_add(1, Ordering::Relaxed);
@@ -184,81 +193,87 @@ impl Stage {
             "mts.deadline=10s",
             "mts.queue=24",
         ];
-        let mut stage = Self {
+        let mut cluster = Self {
             directory: tempfile::tempdir().unwrap(),
             settings: settings.join(" "),
             domain,
-            ledger: Arc::default(),
+            log: Arc::default(),
             anchor: None,
             pulse: None,
             start: None,
             pages: BTreeSet::new(),
             memory: 0,
-            told: 0,
+            commands: 0,
             kills: 0,
         };
-        stage.anchor = Some(stage.enter_as("anchor", "take", "nothing", ""));
-        stage.pulse = Some(stage.enter_as("pulse", "take", "nothing", ""));
-        for survivor in [&stage.anchor, &stage.pulse] {
+        cluster.anchor = Some(cluster.start_as("anchor", "take", "nothing", ""));
+        cluster.pulse = Some(cluster.start_as("pulse", "take", "nothing", ""));
+        for survivor in [&cluster.anchor, &cluster.pulse] {
             survivor.as_ref().unwrap().wait_until("ready");
         }
-        // Whatever the survivors will need, they have after this.
-        for size in crate::actor::SIZES {
-            stage.talk(100, size);
-            // The other way go credits, at least.
-            let anchor = stage.anchor.as_mut().unwrap();
-            anchor.tell(&format!("send back-{size} pulse 100 {size}"));
+        // Afterwards the survivors have allocated everything that they need.
+        for size in crate::process::SIZES {
+            cluster.exchange_letters(100, size);
+            // Credits are sent in the other direction.
+            let anchor = cluster.anchor.as_mut().unwrap();
+            anchor.command(&format!("send back-{size} pulse 100 {size}"));
             anchor.wait_until(&format!("done back-{size}"));
         }
-        let pages = stage.files().into_iter();
+        let pages = cluster.files().into_iter();
         let is_page = |file: &PathBuf| file.extension().is_some_and(|end| end == "page");
-        stage.pages = pages.filter(is_page).collect();
-        assert_eq!(stage.pages.len(), 2);
-        stage.start = Some(stage.uses());
-        stage.memory = stage.private_memory();
-        stage
+        cluster.pages = pages.filter(is_page).collect();
+        assert_eq!(cluster.pages.len(), 2);
+        cluster.start = Some(cluster.resource_use());
+        cluster.memory = cluster.private_memory();
+        cluster
     }
 
-    /// A new actor of a name that only this one has.
-    pub(crate) fn enter(&self, receives: &str, sends: &str, to: &str) -> Actor {
-        self.enter_as("", receives, sends, to)
+    /// Starts a process with a unique name.
+    pub(crate) fn start_process(&self, receives: &str, sends: &str, to: &str) -> TestProcess {
+        self.start_as("", receives, sends, to)
     }
 
-    /// A new actor as if on another host: one that only gateways reach.
-    pub(crate) fn enter_afar(&self, receives: &str) -> Actor {
+    /// Starts a process in another domain, which only gateways can reach, as on another host.
+    pub(crate) fn start_remote(&self, receives: &str) -> TestProcess {
         let own = format!("domain={}", self.domain);
         let settings = self.settings.replacen(&own, &format!("{own}-far"), 1);
-        self.enter_with("", receives, "nothing", "", settings)
+        self.start_with("", receives, "nothing", "", settings)
     }
 
-    /// A gateway of this domain that knows the one at this address.
-    pub(crate) fn enter_knowing(&self, at: &str) -> Actor {
+    /// Starts a gateway of this domain with a static entry for the gateway at this address.
+    pub(crate) fn start_gateway_to(&self, at: &str) -> TestProcess {
         let known = format!("discovery.static={{far=[\"tcp://{at}\"]}}");
         let settings = format!("{} {known}", self.settings);
-        self.enter_with("", "gateway", "nothing", "", settings)
+        self.start_with("", "gateway", "nothing", "", settings)
     }
 
-    /// A new actor of a given name.
-    pub(crate) fn enter_as(&self, name: &str, receives: &str, sends: &str, to: &str) -> Actor {
-        self.enter_with(name, receives, sends, to, self.settings.clone())
+    /// Starts a process with this name.
+    pub(crate) fn start_as(
+        &self,
+        name: &str,
+        receives: &str,
+        sends: &str,
+        to: &str,
+    ) -> TestProcess {
+        self.start_with(name, receives, sends, to, self.settings.clone())
     }
 
-    fn enter_with(
+    fn start_with(
         &self,
         name: &str,
         receives: &str,
         sends: &str,
         to: &str,
         settings: String,
-    ) -> Actor {
+    ) -> TestProcess {
         static NEXT: AtomicU32 = AtomicU32::new(1);
         let tag = NEXT.fetch_add(1, Ordering::Relaxed);
         let name = if name.is_empty() {
-            format!("actor-{tag}")
+            format!("process-{tag}")
         } else {
             name.to_owned()
         };
-        let part = Part {
+        let role = Role {
             name: name.clone(),
             tag,
             receives: receives.to_owned(),
@@ -267,66 +282,61 @@ impl Stage {
             settings,
         };
         let mut child = Command::new(std::env::current_exe().unwrap())
-            .args([
-                "--ignored",
-                "--exact",
-                "--nocapture",
-                "a_process_of_its_own",
-            ])
-            .env(PART, part.to_words())
+            .args(["--ignored", "--exact", "--nocapture", "process_entry"])
+            .env(ROLE, role.to_words())
             .env("FIPA_RUNTIME_DIR", self.directory.path().join("run"))
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();
-        let said = Arc::new(Mutex::new(Vec::new()));
+        let output = Arc::new(Mutex::new(Vec::new()));
         let lines = BufReader::new(child.stdout.take().unwrap());
-        let (ledger, heard) = (self.ledger.clone(), said.clone());
+        let (log, lines_seen) = (self.log.clone(), output.clone());
         std::thread::spawn(move || {
             let mut lines = lines;
             let mut line = String::new();
-            // The last line of a killed process may be a part of one, which does not count.
+            // The last line of a killed process may be incomplete. It does not count.
             while lines.read_line(&mut line).is_ok_and(|len| len > 0) && line.ends_with('\n') {
                 let words = line.trim_end();
-                ledger.lock().unwrap().note(tag, words);
+                log.lock().unwrap().record(tag, words);
                 let first = words.split(' ').next().unwrap_or_default();
                 if matches!(first, "ready" | "at" | "loaned" | "done" | "bye") {
-                    heard.lock().unwrap().push(words.to_owned());
+                    lines_seen.lock().unwrap().push(words.to_owned());
                 }
                 line.clear();
             }
         });
-        Actor {
+        TestProcess {
             tag,
             name,
             child,
-            said,
+            output,
         }
     }
 
-    /// SIGKILL.
-    pub(crate) fn kill(&mut self, mut actor: Actor) {
-        actor.child.kill().unwrap();
-        actor.child.wait().unwrap();
+    /// Sends SIGKILL and waits for the end.
+    pub(crate) fn kill(&mut self, mut process: TestProcess) {
+        process.child.kill().unwrap();
+        process.child.wait().unwrap();
         self.kills += 1;
     }
 
-    /// Lets an actor end in order. All its letters must have outcomes then.
-    pub(crate) fn dismiss(&self, mut actor: Actor) {
-        let drops = actor.name.starts_with("actor");
+    /// Lets a process quit in an orderly way.
+    pub(crate) fn quit_process(&self, mut process: TestProcess) {
+        let drops = process.name.starts_with("process");
         if drops {
-            actor.tell("drop");
+            process.command("drop");
         }
-        actor.quit();
+        process.quit();
     }
 
-    /// Tells `pulse` to send letters, and does not wait for their outcomes, but says what to wait
-    /// for.
-    pub(crate) fn pulse_sends(&mut self, to: &str, count: usize, size: usize) -> String {
-        self.told += 1;
-        let token = self.told.to_string();
+    /// Makes `pulse` send letters. Returns the token of the command, for
+    /// [`wait_for_pulse`](Self::wait_for_pulse).
+    pub(crate) fn send_from_pulse(&mut self, to: &str, count: usize, size: usize) -> String {
+        self.commands += 1;
+        let token = self.commands.to_string();
         let pulse = self.pulse.as_mut().unwrap();
-        pulse.tell(&format!("send {token} {to} {count} {size}"));
+        pulse.command(&format!("send {token} {to} {count} {size}"));
         token
     }
 
@@ -337,48 +347,51 @@ impl Stage {
             .wait_until(&format!("done {token}"));
     }
 
-    /// `pulse` sends to this one until one letter arrives.
-    pub(crate) fn pulse_reaches(&mut self, to: &str) {
+    /// Makes `pulse` send to this receiver until a letter arrives.
+    pub(crate) fn wait_until_reached(&mut self, to: &str) {
         let began = Instant::now();
-        let arrived = |ledger: &Ledger| {
-            let mut letters = ledger.letters.values();
+        let arrived = |log: &LetterLog| {
+            let mut letters = log.letters.values();
             letters.any(|letter| letter.to == to && letter.taken_by.is_some())
         };
-        while !arrived(&self.ledger.lock().unwrap()) {
-            assert!(began.elapsed() < WATCHDOG, "{to} is not reached");
-            let one = self.pulse_sends(to, 1, 40);
+        while !arrived(&self.log.lock().unwrap()) {
+            assert!(
+                began.elapsed() < WATCHDOG,
+                "timed out waiting for a letter to reach {to}"
+            );
+            let one = self.send_from_pulse(to, 1, 40);
             self.wait_for_pulse(&one);
             std::thread::sleep(Duration::from_millis(10));
         }
     }
 
-    /// How many letters of an actor were sent, and how many of those have outcomes.
-    pub(crate) fn sent(&self, actor: &Actor) -> (usize, usize) {
-        let ledger = self.ledger.lock().unwrap();
-        let letters = ledger.of(actor.tag);
+    /// Number of letters that a process has sent, and number of those with outcomes.
+    pub(crate) fn sent(&self, process: &TestProcess) -> (usize, usize) {
+        let log = self.log.lock().unwrap();
+        let letters = log.of(process.tag);
         letters.fold((0, 0), |(sent, known), (_, letter)| {
             (sent + 1, known + usize::from(letter.outcome.is_some()))
         })
     }
 
-    /// How many letters an actor has taken.
-    pub(crate) fn taken(&self, actor: &Actor) -> usize {
-        let ledger = self.ledger.lock().unwrap();
-        let by = |letter: &&Letter| letter.taken_by == Some(actor.tag);
-        ledger.letters.values().filter(by).count()
+    /// Number of letters that a process has received.
+    pub(crate) fn taken(&self, process: &TestProcess) -> usize {
+        let log = self.log.lock().unwrap();
+        let by = |letter: &&Letter| letter.taken_by == Some(process.tag);
+        log.letters.values().filter(by).count()
     }
 
-    /// The survivors exchange letters, all of which arrive.
-    fn talk(&mut self, count: usize, size: usize) {
+    /// Makes the survivors exchange letters, all of which must be delivered.
+    fn exchange_letters(&mut self, count: usize, size: usize) {
         let pulse = self.pulse.as_ref().unwrap().tag;
         let before: BTreeSet<u64> = {
-            let ledger = self.ledger.lock().unwrap();
-            ledger.of(pulse).map(|(id, _)| id).collect()
+            let log = self.log.lock().unwrap();
+            log.of(pulse).map(|(id, _)| id).collect()
         };
-        let token = self.pulse_sends("anchor", count, size);
+        let token = self.send_from_pulse("anchor", count, size);
         self.wait_for_pulse(&token);
-        let ledger = self.ledger.lock().unwrap();
-        let new = ledger.of(pulse).filter(|(id, _)| !before.contains(id));
+        let log = self.log.lock().unwrap();
+        let new = log.of(pulse).filter(|(id, _)| !before.contains(id));
         let mut seen = 0;
         for (id, letter) in new {
             assert_eq!(
@@ -391,12 +404,13 @@ impl Stage {
         assert_eq!(seen, count);
     }
 
-    /// What must be true after a round, when only the survivors are left.
+    /// Checks the letters and resources after a round, in which all processes but the survivors
+    /// ended.
     pub(crate) fn check(&mut self) {
-        self.talk(4, 1500);
+        self.exchange_letters(4, 1500);
         let (anchor, pulse) = (self.anchor.as_ref().unwrap(), self.pulse.as_ref().unwrap());
-        let open = |ledger: &Ledger| {
-            let open = ledger.of(pulse.tag).filter(|(_, letter)| {
+        let open = |log: &LetterLog| {
+            let open = log.of(pulse.tag).filter(|(_, letter)| {
                 let delivered = letter.outcome.as_deref() == Some("Delivered");
                 let missing = letter.to == "anchor" && letter.taken_by.is_none();
                 letter.outcome.is_none() || delivered && missing
@@ -405,11 +419,11 @@ impl Stage {
                 .collect::<Vec<_>>()
         };
         wait_for(
-            || open(&self.ledger.lock().unwrap()).is_empty(),
-            || format!("open letters: {:?}", open(&self.ledger.lock().unwrap())),
+            || open(&self.log.lock().unwrap()).is_empty(),
+            || format!("open letters: {:?}", open(&self.log.lock().unwrap())),
         );
-        let mut ledger = self.ledger.lock().unwrap();
-        for (id, letter) in &ledger.letters {
+        let mut log = self.log.lock().unwrap();
+        for (id, letter) in &log.letters {
             let may_be_taken = ["Delivered", "Unconfirmed", "TimedOut"];
             let outcome = letter.outcome.as_deref();
             let denied = outcome.is_some_and(|outcome| !may_be_taken.contains(&outcome));
@@ -419,26 +433,28 @@ impl Stage {
                 && letter.taken_by != Some(anchor.tag);
             assert!(!lost, "{id:x} {letter:?}");
         }
-        assert_eq!(ledger.problems, Vec::<String>::new());
-        // What comes late has nothing to be compared with, and is a problem of its own.
-        ledger.letters.retain(|_, letter| letter.outcome.is_none());
-        drop(ledger);
-        // Who starts cleans up; so do the survivors, after those they know.
-        let newcomer = self.enter("take", "nothing", "");
-        newcomer.wait_until("ready");
-        self.dismiss(newcomer);
+        assert_eq!(log.problems, Vec::<String>::new());
+        // A later line on a removed letter creates an entry without an outcome, which the next
+        // check reports as open.
+        log.letters.retain(|_, letter| letter.outcome.is_none());
+        drop(log);
+        // A process cleans up when it starts. The survivors clean up after processes that they
+        // talked to.
+        let new_process = self.start_process("take", "nothing", "");
+        new_process.wait_until("ready");
+        self.quit_process(new_process);
         let start = self.start.as_ref().unwrap();
-        // Segments for many are kept, and those of the other survivor kept open.
+        // Segments are kept for reuse, and those of the other survivor are kept open.
         let most = start.descriptors.iter().map(|count| count + 2 * SEGMENTS);
         let most: Vec<usize> = most.collect();
-        let mut now = self.uses();
+        let mut now = self.resource_use();
         wait_for(
             || {
-                now = self.uses();
+                now = self.resource_use();
                 now.files == start.files && now.length <= start.length && now.descriptors <= most
             },
             || {
-                let now = self.uses();
+                let now = self.resource_use();
                 format!(
                     "left over: {:?}; missing: {:?}; length {} (from {}); descriptors {:?} (from {:?})",
                     now.files.difference(&start.files).collect::<Vec<_>>(),
@@ -452,7 +468,7 @@ impl Stage {
         );
     }
 
-    /// The end: after the survivors, nothing is left.
+    /// Stops the survivors and checks that no file remains.
     pub(crate) fn close(mut self) {
         let grown = self.private_memory().saturating_sub(self.memory);
         assert!(
@@ -468,12 +484,12 @@ impl Stage {
         assert_eq!(self.files(), BTreeSet::new());
     }
 
-    fn survivors(&self) -> impl Iterator<Item = &Actor> {
+    fn survivors(&self) -> impl Iterator<Item = &TestProcess> {
         [&self.anchor, &self.pulse].into_iter().flatten()
     }
 
-    /// Whether this is a segment for many of a survivor, of which each has some.
-    fn is_kept(&self, file: &Path) -> bool {
+    /// Whether this is a segment of a survivor, which may keep some.
+    fn is_survivors_segment(&self, file: &Path) -> bool {
         let name = file.to_string_lossy();
         let life = name.strip_suffix(".content");
         let life = life.and_then(|name| name.rsplit_once('.'));
@@ -481,17 +497,17 @@ impl Stage {
         page.is_some_and(|page| self.pages.contains(&page))
     }
 
-    fn uses(&self) -> Uses {
-        let descriptors = |actor: &Actor| {
-            let descriptors = std::fs::read_dir(format!("/proc/{}/fd", actor.pid()));
+    fn resource_use(&self) -> ResourceUse {
+        let descriptors = |process: &TestProcess| {
+            let descriptors = std::fs::read_dir(format!("/proc/{}/fd", process.pid()));
             descriptors.unwrap().count()
         };
         let (kept, files): (BTreeSet<_>, BTreeSet<_>) = self
             .files()
             .into_iter()
-            .partition(|file| self.is_kept(file));
+            .partition(|file| self.is_survivors_segment(file));
         assert!(kept.len() <= 2 * SEGMENTS, "{kept:?}");
-        Uses {
+        ResourceUse {
             length: files
                 .iter()
                 .filter(|file| file.starts_with("/dev/shm"))
@@ -505,8 +521,9 @@ impl Stage {
 
     /// Memory of the survivors that is not shared, in bytes.
     fn private_memory(&self) -> u64 {
-        let of = |actor: &Actor| {
-            let status = std::fs::read_to_string(format!("/proc/{}/status", actor.pid())).unwrap();
+        let of = |process: &TestProcess| {
+            let status =
+                std::fs::read_to_string(format!("/proc/{}/status", process.pid())).unwrap();
             let line = status
                 .lines()
                 .find_map(|line| line.strip_prefix("RssAnon:"));

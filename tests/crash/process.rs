@@ -1,11 +1,12 @@
-//! A process of the play: one agent that receives and sends as it is told, and writes a line for
-//! everything that happens to it.
+//! A child process: an agent that sends and receives according to its role and to commands, and
+//! prints a line for every event.
 //!
-//! Lines out: `ready`; `at ADDRESS` of a gateway; `sent ID TO` before a letter is sent, `out ID OUTCOME` when its outcome is
-//! known; `took ID` when a letter was received whole, `torn ID` when its content is not what was
-//! sent; `loaned` when memory is on loan; `done TOKEN` after a command; `bye`.
-//! A letter to several has as many IDs, in the order of its receivers; its content has the first.
-//! Lines in: `send TOKEN TO COUNT SIZE`, `drop`, `quit`. Ends when its input ends.
+//! Output: `ready`; `at ADDRESS` of a gateway; `sent ID TO` before a letter is sent; `out ID
+//! OUTCOME` after its outcome; `took ID` for a received letter with intact content; `corrupt ID`
+//! for other content; `loaned` after all loans; `done TOKEN` after a command; `bye` at the end. A
+//! letter to several receivers has one ID for each, in their order; its content has the first.
+//!
+//! Input: `send TOKEN TO COUNT SIZE`, `drop`, `quit`. The process ends when its input ends.
 
 use std::io::{BufRead, Write};
 use std::sync::Arc;
@@ -20,38 +21,38 @@ use fipa::{
 use tokio::sync::mpsc::{Receiver, channel};
 use tokio::task::JoinSet;
 
-/// What an actor does, as it stands in its environment.
-pub(crate) const PART: &str = "FIPA_CRASH_PART";
+/// Environment variable with the role of a child process.
+pub(crate) const ROLE: &str = "FIPA_CRASH_ROLE";
 
-/// How many letters a streaming actor has under way.
-const UNDER_WAY: usize = 6;
+/// Number of letters that a streaming process has under way.
+const WINDOW: usize = 6;
 
-/// How many letters a holding actor keeps.
+/// Number of letters that a holding process keeps.
 const HELD: usize = 40;
 
-/// The sizes of contents: copied, in place, and several pages.
+/// Lengths of contents: copied, in place, of several pages, and in a segment.
 pub(crate) const SIZES: [usize; 4] = [40, 1500, 5000, LARGE];
 
-/// The size of a content that lies in memory once for several receivers.
+/// Length of content that is stored once for several receivers.
 pub(crate) const LARGE: usize = 70_000;
 
-/// An actor's part. All words, so that it can be written into the environment.
+/// The role of a child process. Its fields contain no spaces, except for the last.
 #[derive(Debug, Clone)]
-pub(crate) struct Part {
+pub(crate) struct Role {
     pub(crate) name: String,
-    /// Tells its letters from those of others.
+    /// Distinguishes the letters of this process from those of others.
     pub(crate) tag: u32,
-    /// `take`, `hold`, `deaf`, or `gateway`.
+    /// `take`, `hold`, `ignore`, or `gateway`.
     pub(crate) receives: String,
-    /// `nothing`, `stream`, `many` (each letter to all) or `loan`.
+    /// `nothing`, `stream`, `many` (each letter to all receivers) or `loan`.
     pub(crate) sends: String,
-    /// To whom, separated by commas.
+    /// Receivers, separated by commas.
     pub(crate) to: String,
-    /// For `--set`, separated by spaces.
+    /// Arguments of `--set`, separated by spaces.
     pub(crate) settings: String,
 }
 
-impl Part {
+impl Role {
     pub(crate) fn to_words(&self) -> String {
         let tag = self.tag.to_string();
         let words = [&self.name, &tag, &self.receives, &self.sends, &self.to];
@@ -61,7 +62,7 @@ impl Part {
 
     fn from_words(words: &str) -> Self {
         let mut words = words.splitn(6, ' ').map(str::to_owned);
-        let mut word = || words.next().expect("a part of six words");
+        let mut word = || words.next().expect("a role of six words");
         Self {
             name: word(),
             tag: word().parse().expect("a number"),
@@ -83,7 +84,7 @@ impl Part {
 
 fn say(line: std::fmt::Arguments<'_>) {
     let mut out = std::io::stdout().lock();
-    // When nobody listens any more, the input ends, too.
+    // If the test has ended, the input ends, too.
     let _ = writeln!(out, "{line}").and_then(|()| out.flush());
 }
 
@@ -91,10 +92,10 @@ macro_rules! say {
     ($($line:tt)*) => { say(format_args!($($line)*)) };
 }
 
-/// Plays a part until told to quit, or killed.
-pub(crate) fn play(words: &str) {
-    let part = Part::from_words(words);
-    // Ends a line that the test harness may have begun.
+/// Runs a role until the command `quit`.
+pub(crate) fn run(words: &str) {
+    let role = Role::from_words(words);
+    // Ends a line that the test harness may have started.
     say!("");
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(1)
@@ -108,48 +109,50 @@ pub(crate) fn play(words: &str) {
                 return;
             }
         }
-        // Whoever started this is gone.
+        // The test process has ended.
         std::process::exit(3);
     });
     runtime.block_on(async {
-        if part.receives == "gateway" {
-            gateway(&part, queue).await;
+        if role.receives == "gateway" {
+            gateway(&role, queue).await;
         } else {
-            agent(&part, queue).await;
+            agent(&role, queue).await;
         }
     });
     say!("bye");
 }
 
-async fn gateway(part: &Part, mut queue: Receiver<String>) {
-    // One that was killed is in the way until its end has been noticed.
-    let mut opened = Gateway::open(&part.config()).await;
+async fn gateway(role: &Role, mut queue: Receiver<String>) {
+    // A killed gateway holds the lock until its end has been detected.
+    let mut opened = Gateway::open(&role.config()).await;
     while let Err(fipa::OpenError::GatewayRunning(_)) = opened {
         tokio::time::sleep(Duration::from_millis(20)).await;
-        opened = Gateway::open(&part.config()).await;
+        opened = Gateway::open(&role.config()).await;
     }
     let gateway = opened.unwrap();
-    let mut ways = gateway.locations().into_iter();
-    let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
-    say!("at {}", way.address());
+    let mut locations = gateway.locations().into_iter();
+    let location = locations
+        .find(|location| location.kind() == Kind::Tcp)
+        .unwrap();
+    say!("at {}", location.address());
     say!("ready");
     while queue.recv().await.is_some_and(|line| line != "quit") {}
     gateway.close().await;
 }
 
-async fn agent(part: &Part, mut queue: Receiver<String>) {
-    let domain = Domain::open(&part.config()).await.unwrap();
-    let agent = Arc::new(domain.register(&part.name).unwrap());
+async fn agent(role: &Role, mut queue: Receiver<String>) {
+    let domain = Domain::open(&role.config()).await.unwrap();
+    let agent = Arc::new(domain.register(&role.name).unwrap());
     say!("ready");
     let (release, mut released) = channel::<()>(1);
     let receiving = tokio::spawn({
-        let (agent, mode) = (agent.clone(), part.receives.clone());
-        let own = part.name.clone();
+        let (agent, mode) = (agent.clone(), role.receives.clone());
+        let own = role.name.clone();
         async move {
             let mut held: Vec<Incoming> = Vec::new();
             loop {
                 tokio::select! {
-                    incoming = agent.receive(), if mode != "deaf" => {
+                    incoming = agent.receive(), if mode != "ignore" => {
                         let Ok(incoming) = incoming else { return };
                         take(&incoming, &own);
                         if mode == "hold" && held.len() < HELD {
@@ -164,10 +167,14 @@ async fn agent(part: &Part, mut queue: Receiver<String>) {
     let next = Arc::new(AtomicU32::new(0));
     let sender = Sender {
         agent: agent.clone(),
-        tag: part.tag,
+        tag: role.tag,
         next,
     };
-    let sending = tokio::spawn(sender.clone().sends(part.sends.clone(), part.to.clone()));
+    let sending = tokio::spawn(
+        sender
+            .clone()
+            .run_sender(role.sends.clone(), role.to.clone()),
+    );
     while let Some(line) = queue.recv().await {
         let words: Vec<&str> = line.split(' ').collect();
         match words.as_slice() {
@@ -188,7 +195,7 @@ async fn agent(part: &Part, mut queue: Receiver<String>) {
     domain.close().await;
 }
 
-/// Content that only this letter has: its identity, and bytes that follow from it.
+/// Writes content that is unique to this letter: its ID, then bytes derived from it.
 fn fill(id: u64, content: &mut [u8]) {
     let mut state = id | 1;
     let (head, rest) = content.split_at_mut(8);
@@ -204,22 +211,22 @@ fn fill(id: u64, content: &mut [u8]) {
 
 fn take(incoming: &Incoming, own: &str) {
     let content = incoming.message.content().cloned().unwrap_or_default();
-    // A failure that this agent is told about.
+    // Other performatives report failures.
     if incoming.message.performative() != &Performative::Inform {
         return;
     }
     let Some(head) = content.first_chunk() else {
-        return say!("torn 0");
+        return say!("corrupt 0");
     };
     let id = u64::from_le_bytes(*head);
     let mut receivers = incoming.message.receivers().iter();
-    let place = receivers.position(|receiver| receiver.name() == own);
+    let index = receivers.position(|receiver| receiver.name() == own);
     let mut expected = vec![0; content.len()];
     fill(id, &mut expected);
     if expected == content {
-        say!("took {}", id + place.unwrap() as u64);
+        say!("took {}", id + index.unwrap() as u64);
     } else {
-        say!("torn {id}");
+        say!("corrupt {id}");
     }
 }
 
@@ -231,7 +238,7 @@ struct Sender {
 }
 
 impl Sender {
-    async fn sends(self, mode: String, to: String) {
+    async fn run_sender(self, mode: String, to: String) {
         let to: Vec<&str> = to.split(',').collect();
         let mut random = fastrand::Rng::with_seed(u64::from(self.tag));
         match mode.as_str() {
@@ -247,13 +254,13 @@ impl Sender {
                     let loans = random.bool();
                     let sender = self.clone();
                     sending.spawn(async move { sender.send(&to, size, loans).await });
-                    if sending.len() >= UNDER_WAY {
+                    if sending.len() >= WINDOW {
                         sending.join_next().await;
                     }
                 }
             }
             "many" => loop {
-                self.send_all(&to, UNDER_WAY, LARGE).await;
+                self.send_all(&to, WINDOW, LARGE).await;
             },
             "loan" => {
                 let mut loans = Vec::new();
@@ -272,7 +279,7 @@ impl Sender {
         }
     }
 
-    /// Letters, each to all of these.
+    /// Sends letters, each to all of these receivers.
     async fn send_all(&self, to: &[&str], count: usize, size: usize) {
         let mut sending = JoinSet::new();
         for number in 0..count {
@@ -305,8 +312,8 @@ impl Sender {
         let deliveries = deliveries.unwrap();
         assert_eq!(deliveries.0.len(), to.len(), "{deliveries}");
         for Delivery { receiver, outcome } in &deliveries.0 {
-            let place = to.iter().position(|to| **to == **receiver).unwrap();
-            let id = id + place as u64;
+            let index = to.iter().position(|to| **to == **receiver).unwrap();
+            let id = id + index as u64;
             match outcome {
                 Outcome::Failed { reason, .. } => say!("out {id} {reason:?}"),
                 _ => say!("out {id} Delivered"),

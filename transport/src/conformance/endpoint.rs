@@ -1,4 +1,4 @@
-//! Endpoints under test, and what their sinks have heard.
+//! Endpoints under test, with sinks that record their calls.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -14,10 +14,10 @@ use crate::{
     Parcel, Sink, Stream, Ticket, Transport, Verdict,
 };
 
-/// How long the suite waits before it calls a transport broken.
-const PATIENCE: Duration = Duration::from_secs(60);
+/// Timeout after which the suite considers a transport broken.
+const TIMEOUT: Duration = Duration::from_secs(60);
 
-type Judge = Box<dyn Fn(&Arrival) -> Verdict + Send + Sync>;
+type VerdictOf = Box<dyn Fn(&Arrival) -> Verdict + Send + Sync>;
 
 #[derive(Default)]
 pub(super) struct Record {
@@ -25,14 +25,14 @@ pub(super) struct Record {
     pub(super) concluded: HashMap<AttemptId, Vec<Conclusion>>,
 }
 
-pub(super) struct Recorder {
+pub(super) struct RecordingSink {
     pub(super) record: Mutex<Record>,
-    judge: Judge,
+    verdict_of: VerdictOf,
 }
 
-impl Sink for Recorder {
+impl Sink for RecordingSink {
     fn arrived(&self, arrival: Arrival) -> Verdict {
-        let verdict = (self.judge)(&arrival);
+        let verdict = (self.verdict_of)(&arrival);
         let Arrival {
             parcel,
             from,
@@ -43,7 +43,7 @@ impl Sink for Recorder {
     }
 
     fn arrived_unframed(&self, _: Letter, _: Kind, _: LegacySource) {
-        panic!("nobody sent an unframed letter");
+        panic!("an unframed letter arrived, and none was sent");
     }
 
     fn concluded(&self, attempt: AttemptId, conclusion: Conclusion) {
@@ -56,26 +56,26 @@ impl Sink for Recorder {
     }
 }
 
-/// An endpoint that listens, and what its sink has heard.
-pub(super) struct Party {
+/// An endpoint that listens, with its recording sink.
+pub(super) struct TestEndpoint {
     pub(super) transport: Arc<dyn Transport>,
-    pub(super) sink: Arc<Recorder>,
+    pub(super) sink: Arc<RecordingSink>,
     pub(super) location: Location,
 }
 
-impl Party {
+impl TestEndpoint {
     pub(super) fn new(fixture: &dyn Fixture) -> Self {
-        Self::judging(fixture, |_| Verdict::Now(Answer::Accepted))
+        Self::with_verdict(fixture, |_| Verdict::Now(Answer::Accepted))
     }
 
-    pub(super) fn judging(
+    pub(super) fn with_verdict(
         fixture: &dyn Fixture,
-        judge: impl Fn(&Arrival) -> Verdict + Send + Sync + 'static,
+        verdict_of: impl Fn(&Arrival) -> Verdict + Send + Sync + 'static,
     ) -> Self {
         let transport = fixture.endpoint();
-        let sink = Arc::new(Recorder {
+        let sink = Arc::new(RecordingSink {
             record: Mutex::default(),
-            judge: Box::new(judge),
+            verdict_of: Box::new(verdict_of),
         });
         let locations = transport
             .listen(Arc::clone(&sink) as Arc<dyn Sink>)
@@ -93,7 +93,7 @@ impl Party {
         }
     }
 
-    pub(super) fn send(&self, attempt: u64, to: &Party, parcel: Parcel) {
+    pub(super) fn send(&self, attempt: u64, to: &TestEndpoint, parcel: Parcel) {
         self.transport
             .dispatch(AttemptId(attempt), &to.location, parcel)
             .unwrap_or_else(|error| panic!("dispatch {attempt}: {error}"));
@@ -126,7 +126,7 @@ impl Party {
         self.sink.record.lock().arrivals[index].0.clone()
     }
 
-    /// Nobody was told twice about one attempt.
+    /// Checks that no attempt has two conclusions.
     fn check_single_conclusions(&self) {
         for (attempt, conclusions) in &self.sink.record.lock().concluded {
             assert_eq!(conclusions.len(), 1, "{attempt:?}: {conclusions:?}");
@@ -134,7 +134,7 @@ impl Party {
     }
 }
 
-impl Drop for Party {
+impl Drop for TestEndpoint {
     fn drop(&mut self) {
         self.transport.close();
         if !std::thread::panicking() {
@@ -143,25 +143,33 @@ impl Drop for Party {
     }
 }
 
-pub(super) fn until<T>(parties: &[&Party], what: &str, condition: impl Fn() -> Option<T>) -> T {
+pub(super) fn until<T>(
+    endpoints: &[&TestEndpoint],
+    what: &str,
+    condition: impl Fn() -> Option<T>,
+) -> T {
     let started = Instant::now();
     loop {
-        let driven = parties
+        let driven = endpoints
             .iter()
-            .filter(|party| party.transport.drive())
+            .filter(|endpoint| endpoint.transport.drive())
             .count();
         if let Some(value) = condition() {
             return value;
         }
-        assert!(started.elapsed() < PATIENCE, "gave up waiting for: {what}");
+        assert!(started.elapsed() < TIMEOUT, "timed out waiting for {what}");
         if driven == 0 {
             std::thread::sleep(Duration::from_micros(200));
         }
     }
 }
 
-pub(super) fn concluded(parties: &[&Party], sender: &Party, attempt: u64) -> Conclusion {
-    until(parties, "the conclusion of an attempt", || {
+pub(super) fn concluded(
+    endpoints: &[&TestEndpoint],
+    sender: &TestEndpoint,
+    attempt: u64,
+) -> Conclusion {
+    until(endpoints, "the conclusion of an attempt", || {
         sender.conclusion(attempt)
     })
 }

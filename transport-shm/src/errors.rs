@@ -1,4 +1,4 @@
-//! What went wrong on the way to another process's mailbox, as the sender is told.
+//! Mapping of iceoryx2 errors to transport errors.
 
 use fipa_transport::wire::WireError;
 use fipa_transport::{WayError, WayFault};
@@ -7,7 +7,8 @@ use iceoryx2::port::client::RequestSendError;
 use iceoryx2::service::builder::request_response::RequestResponseOpenError;
 use iceoryx2::service::port_factory::client::ClientCreateError;
 
-const MAILBOX_TAKEN: &str = ": too many processes have it open (max_clients of the other process)";
+const MAILBOX_TAKEN: &str =
+    ": too many processes have it open; raise max_clients of the other process";
 
 pub(crate) fn too_large() -> WayError {
     WayError::new(WayFault::TooLarge, "")
@@ -20,7 +21,7 @@ pub(crate) fn retired() -> WayError {
 pub(crate) fn window_full(window: usize) -> WayError {
     WayError::new(
         WayFault::Congested,
-        format_args!("{window} letters to this process are without an answer"),
+        format_args!("{window} letters to this process are unanswered"),
     )
 }
 
@@ -48,25 +49,25 @@ pub(crate) fn open_error(error: RequestResponseOpenError) -> WayError {
     };
     WayError::new(
         fault,
-        format_args!("the mailbox cannot be opened ({error:?}){hint}"),
+        format_args!("cannot open the mailbox ({error:?}){hint}"),
     )
 }
 
 pub(crate) fn create_error(error: ClientCreateError) -> WayError {
     let hint = match error {
         ClientCreateError::ExceedsMaxSupportedClients => MAILBOX_TAKEN,
-        _ => ": often the limit of open files is too low, or shared memory is full",
+        _ => ": the limit of open files may be too low, or shared memory full",
     };
     WayError::new(
         WayFault::Congested,
-        format_args!("the mailbox cannot be connected to ({error:?}){hint}"),
+        format_args!("cannot connect to the mailbox ({error:?}){hint}"),
     )
 }
 
 pub(crate) fn loan_error(error: LoanError) -> WayError {
     let hint = match error {
-        LoanError::ExceedsMaxLoans => "too many letters are with this process",
-        _ => "no shared memory could be had: enlarge /dev/shm, or raise the limit of open files",
+        LoanError::ExceedsMaxLoans => "too many letters to this process are unanswered",
+        _ => "cannot allocate shared memory: enlarge /dev/shm, or raise the limit of open files",
     };
     WayError::new(WayFault::Congested, format_args!("{hint} ({error:?})"))
 }
@@ -74,9 +75,9 @@ pub(crate) fn loan_error(error: LoanError) -> WayError {
 pub(crate) fn send_error(error: RequestSendError) -> WayError {
     let hint = match error {
         RequestSendError::ExceedsMaxActiveRequests => {
-            "too many letters to this process are without an answer"
+            "too many letters to this process are unanswered"
         }
-        _ => "the mailbox does not take it",
+        _ => "the mailbox does not accept the letter",
     };
     WayError::new(WayFault::Congested, format_args!("{hint} ({error:?})"))
 }

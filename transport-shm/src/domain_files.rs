@@ -1,9 +1,9 @@
-//! The traces of a domain in the file system: making them, and removing those of the dead.
+//! The files of a domain: their creation, and cleanup after dead processes.
 //!
-//! When a process is killed, somebody has to remove its mailbox and its side of every connection.
-//! That must wait until its last letters have been taken by those who are alive: iceoryx2 0.10
-//! never lets go of memory for requests that it finds in the mailbox after their sender has been
-//! cleaned up. So whoever cleans up first rings all bells, and waits until everybody has looked.
+//! After a process was killed, another one removes its mailbox and its side of every connection.
+//! That must wait until the living processes have taken its last letters: iceoryx2 0.10 does not
+//! release memory of requests that a receiver finds after their sender has been cleaned up. So the
+//! cleaning process first rings all doorbells and waits until every living process has polled.
 
 use std::collections::{HashMap, HashSet};
 use std::os::fd::OwnedFd;
@@ -23,31 +23,33 @@ use rustix::io::Errno;
 use crate::fork::Owner;
 use crate::layout::Svc;
 use crate::memory::{SHM, lock};
-use crate::presence::{Names, Neighbour, wait_for_looks};
+use crate::presence::{PeerProcess, ProcessPaths, wait_for_polls};
 use crate::{ShmConfig, ShmError};
 
-/// What [`cleanup_dead`] did.
+/// The result of [`cleanup_dead`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[non_exhaustive]
 pub struct Cleaned {
-    /// Processes that are there.
+    /// Number of processes that run.
     pub alive: usize,
-    /// Dead processes whose traces were removed.
+    /// Number of dead processes whose files were removed.
     pub removed: usize,
-    /// Dead processes whose traces could not be removed, or are being removed by somebody else.
+    /// Number of dead processes whose files could not be removed, or that another process removes
+    /// now.
     pub failed: usize,
 }
 
-/// Removes what killed processes of a domain left behind. For tools: an endpoint does this by
-/// itself when it starts, when it closes, and when it notices that a process it talks to is gone.
+/// Removes the files of killed processes of a domain. For tools: an endpoint does this by itself
+/// when it starts, when it closes, and when a process that it talks to ends.
 ///
-/// Blocks until all living processes have looked into their mailboxes, at most a second. The
-/// configuration's incarnation is not used; it must only be a known one.
+/// Blocks until all living processes have polled their mailboxes, at most a second. The
+/// configuration's incarnation is not used, but must be known.
 ///
 /// # Errors
-/// When the configuration makes no sense, or files cannot be listed.
+/// Returns an error if the configuration is invalid, the lock is held for too long, or files cannot
+/// be listed.
 pub fn cleanup_dead(config: &ShmConfig) -> Result<Cleaned, ShmError> {
-    let domain = Domain::new(config)?;
+    let domain = DomainFiles::new(config)?;
     if !config.root.exists() {
         return Ok(Cleaned::default());
     }
@@ -55,44 +57,44 @@ pub fn cleanup_dead(config: &ShmConfig) -> Result<Cleaned, ShmError> {
     domain.clean(false)
 }
 
-/// A domain's place in the file system.
+/// The directories and files of a domain.
 #[derive(Debug)]
-pub(crate) struct Domain {
-    /// Whether this is an endpoint's, which ends with it.
+pub(crate) struct DomainFiles {
+    /// Whether this belongs to an endpoint, whose files are removed at the end.
     member: bool,
     owner: Owner,
-    /// Somebody of this process is cleaning.
+    /// Held by the thread of this process that cleans up.
     cleaning: Mutex<()>,
-    /// The endpoint closes: whoever is cleaning should come to an end, and nobody wait for long.
+    /// Whether the endpoint closes: a running cleanup stops, and waits are short.
     closing: AtomicBool,
-    /// Somebody has the lock and does not let go.
-    held_up: AtomicBool,
+    /// Whether the last wait for the lock timed out.
+    lock_timed_out: AtomicBool,
     ice: Config,
-    names: Names,
+    paths: ProcessPaths,
     config: ShmConfig,
 }
 
-impl Domain {
+impl DomainFiles {
     pub(crate) fn new(config: &ShmConfig) -> Result<Self, ShmError> {
         Ok(Self {
             member: false,
             owner: Owner::this(),
             cleaning: Mutex::default(),
             closing: AtomicBool::new(false),
-            held_up: AtomicBool::new(false),
+            lock_timed_out: AtomicBool::new(false),
             ice: config.iceoryx()?,
-            names: Names::new(&config.root, &config.prefix),
+            paths: ProcessPaths::new(&config.root, &config.prefix),
             config: config.clone(),
         })
     }
 
-    /// The same, of an endpoint.
-    pub(crate) fn joined(mut self) -> Self {
+    /// Marks this as belonging to an endpoint.
+    pub(crate) fn for_endpoint(mut self) -> Self {
         self.member = true;
         self
     }
 
-    /// The last cleaning up of an endpoint.
+    /// Performs the last cleanup of an endpoint.
     pub(crate) fn leave(&self) -> Result<Cleaned, ShmError> {
         self.closing.store(true, Ordering::SeqCst);
         self.clean(true)
@@ -106,18 +108,18 @@ impl Domain {
         &self.ice
     }
 
-    pub(crate) fn names(&self) -> &Names {
-        &self.names
+    pub(crate) fn paths(&self) -> &ProcessPaths {
+        &self.paths
     }
 
-    /// Makes the directories, checks that they are nobody else's, and excludes others as
-    /// [`lock`](Self::lock) does. Whoever leaves last may be removing them at the same time.
+    /// Creates the directories, checks that they are private, and takes the lock as
+    /// [`lock`](Self::lock) does. Retries if another process removes them at the same time.
     pub(crate) fn enter(&self) -> Result<OwnedFd, ShmError> {
         let mut tries = 0;
         loop {
             tries += 1;
             match self.try_enter() {
-                Err(error) if error.is_missing_file() && tries < ENTERING => {}
+                Err(error) if error.is_missing_file() && tries < MAX_ENTER_ATTEMPTS => {}
                 entered => return entered,
             }
         }
@@ -126,50 +128,52 @@ impl Domain {
     fn try_enter(&self) -> Result<OwnedFd, ShmError> {
         make_private(&self.config.root)?;
         let lock = self.lock()?;
-        make_private(self.names.directory())?;
+        make_private(self.paths.directory())?;
         Ok(lock)
     }
 
-    /// Excludes others from starting and cleaning until the result is dropped. The lock is on the
-    /// directory itself, so that there is no file to be left behind.
+    /// Keeps other processes from starting and cleaning up until the result is dropped. The lock is
+    /// on the directory itself, so no lock file remains.
     pub(crate) fn lock(&self) -> Result<OwnedFd, ShmError> {
         let how = FlockOperation::NonBlockingLockExclusive;
         self.locked(how, || match self.closing.load(Ordering::Relaxed) {
-            true => LEAVING,
-            false => LOCKING,
+            true => CLOSING_LOCK_TIMEOUT,
+            false => LOCK_TIMEOUT,
         })
     }
 
-    /// Excludes others from cleaning, but not from doing the same, until the result is dropped.
-    /// For whoever is about to make files outside of [`Domain::lock`]; all letters of this process
+    /// Keeps other processes from cleaning up, but not from taking this lock, until the result is
+    /// dropped. Taken to create files outside of [`DomainFiles::lock`]. Senders of this process
     /// wait meanwhile.
     pub(crate) fn lock_shared(&self) -> Result<OwnedFd, ShmError> {
-        self.locked(FlockOperation::NonBlockingLockShared, || SHARING)
+        self.locked(FlockOperation::NonBlockingLockShared, || {
+            SHARED_LOCK_TIMEOUT
+        })
     }
 
-    /// Whoever was waited for in vain is not waited for again until the lock was to be had.
+    /// Takes the lock. After a timeout, the next calls do not wait until one has succeeded.
     fn locked(
         &self,
         how: FlockOperation,
-        patience: impl Fn() -> Duration,
+        timeout: impl Fn() -> Duration,
     ) -> Result<OwnedFd, ShmError> {
         let root = &self.config.root;
-        let held_up = self.held_up.load(Ordering::Relaxed);
-        let locked = lock(root, how, || match held_up {
+        let lock_timed_out = self.lock_timed_out.load(Ordering::Relaxed);
+        let locked = lock(root, how, || match lock_timed_out {
             true => Duration::ZERO,
-            false => patience(),
+            false => timeout(),
         });
         let busy = matches!(locked, Err(Errno::WOULDBLOCK));
-        self.held_up.store(busy, Ordering::Relaxed);
+        self.lock_timed_out.store(busy, Ordering::Relaxed);
         locked.map_err(|e| match busy {
             true => ShmError::Busy { path: root.clone() },
             false => file_error("cannot lock", root, e),
         })
     }
 
-    /// Closes to others what iceoryx2 0.10 leaves open to everybody. To be called under the lock,
-    /// after making a node.
-    pub(crate) fn close_to_others(&self) -> Result<(), ShmError> {
+    /// Removes the access of other users to files that iceoryx2 0.10 leaves open to them. The
+    /// caller must hold the lock and have created a node.
+    pub(crate) fn restrict_permissions(&self) -> Result<(), ShmError> {
         for file in files_in(Path::new(SHM)) {
             let name = file.file_name();
             let name = name.to_string_lossy();
@@ -177,7 +181,8 @@ impl Domain {
                 continue;
             }
             let path = file.path();
-            // Opened first: in a directory where everybody may write, a name proves nothing.
+            // Opened before the check: in a directory that any user may write to, a name proves
+            // nothing.
             let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
             let closed = open(&path, flags, Mode::empty()).and_then(|file| {
                 let found = fstat(&file)?;
@@ -186,88 +191,89 @@ impl Domain {
                 }
                 fchmod(&file, Mode::RUSR | Mode::WUSR)
             });
-            closed.map_err(|e| file_error("cannot close to other users", &path, e))?;
+            closed.map_err(|e| file_error("cannot restrict the permissions of", &path, e))?;
         }
         Ok(())
     }
 
-    /// Waits until the living have taken what the dead have sent, and says how many there are.
+    /// Waits until living processes have taken the letters of dead ones. Returns their number.
     pub(crate) fn settle(&self) -> Result<usize, ShmError> {
         let all = self.all()?.into_iter();
-        let living = all.filter_map(|one| Neighbour::open(&self.names, one).ok());
-        let living: Vec<Neighbour> = living.collect();
-        wait_for_looks(living.iter(), || self.closing.load(Ordering::SeqCst));
+        let living = all.filter_map(|one| PeerProcess::open(&self.paths, one).ok());
+        let living: Vec<PeerProcess> = living.collect();
+        wait_for_polls(living.iter(), || self.closing.load(Ordering::SeqCst));
         Ok(living.len())
     }
 
-    /// Rings at every process, and says how many are there.
+    /// Rings at every living process. Returns their number.
     pub(crate) fn ring_all(&self) -> Result<usize, ShmError> {
         let all = self.all()?;
-        let alive = all.into_iter().filter(|one| self.names.is_alive(*one));
-        Ok(alive.map(|one| self.names.ring_once(one)).count())
+        let alive = all.into_iter().filter(|one| self.paths.is_alive(*one));
+        Ok(alive.map(|one| self.paths.ring_once(one)).count())
     }
 
-    /// How many processes are there, and how many have left traces, at least.
+    /// Number of processes that run, and a lower bound of the number of dead ones with files.
     pub(crate) fn count(&self) -> Result<(usize, usize), ShmError> {
         let all = self.all()?;
         let known = all.len();
-        let alive = all.into_iter().filter(|one| self.names.is_alive(*one));
+        let alive = all.into_iter().filter(|one| self.paths.is_alive(*one));
         let alive = alive.count();
         Ok((
             alive,
-            (known - alive).max(self.made().saturating_sub(alive)),
+            (known - alive).max(self.node_count().saturating_sub(alive)),
         ))
     }
 
-    /// How many nodes or services there are, of which a living process has one each.
-    fn made(&self) -> usize {
+    /// Number of nodes or services, whichever is larger. A living process has one of each.
+    fn node_count(&self) -> usize {
         let nodes = files_in(&self.config.root.join("nodes"));
         let nodes = nodes.filter(|node| node.file_type().is_ok_and(|kind| kind.is_dir()));
         nodes.count().max(files_in(&self.services()).count())
     }
 
-    /// How long this process leaves it to others to clean up after the dead: the longer, the more
-    /// of the living come before it.
-    pub(crate) fn turn(&self, own: Incarnation) -> Duration {
+    /// Delay before this process cleans up. It grows with the number of living processes that come
+    /// before this one in order of incarnation.
+    pub(crate) fn cleanup_delay(&self, own: Incarnation) -> Duration {
         let all = self.all().unwrap_or_default();
         let before = all
             .into_iter()
             .take_while(|one| *one < own)
-            .filter(|one| self.names.is_alive(*one));
-        TURN.saturating_mul(u32::try_from(before.count()).unwrap_or(u32::MAX))
-            .min(PATIENCE)
+            .filter(|one| self.paths.is_alive(*one));
+        CLEANUP_STEP
+            .saturating_mul(u32::try_from(before.count()).unwrap_or(u32::MAX))
+            .min(CLEANUP_TIMEOUT)
     }
 
-    /// Whether there are traces of dead processes, as far as can be told without the lock. Errors
-    /// count as such, which `clean` will meet again.
+    /// Whether there seem to be files of dead processes. Checked without the lock; an error counts
+    /// as true, and `clean` reports it.
     pub(crate) fn has_dead(&self) -> bool {
         !self.count().is_ok_and(|(_, dead)| dead == 0)
     }
 
     fn all(&self) -> Result<Vec<Incarnation>, ShmError> {
-        self.names
+        self.paths
             .all()
-            .map_err(|e| file_error("cannot list", self.names.directory(), e))
+            .map_err(|e| file_error("cannot list", self.paths.directory(), e))
     }
 
-    /// Removes the traces of dead processes, and when nobody is left, those of the domain. With
-    /// `if_alone` nothing more is done when somebody is left: they notice the dead by themselves.
+    /// Removes the files of dead processes, and those of the domain if no process is left. With
+    /// `if_alone`, does nothing more if other processes run: they detect dead ones by themselves.
     pub(crate) fn clean(&self, if_alone: bool) -> Result<Cleaned, ShmError> {
         let mut cleaned = Cleaned::default();
-        // Waits for another thread of this process, which comes to an end when the endpoint closes.
-        let Some(_cleaning) = self.cleaning.try_lock_for(PATIENCE) else {
+        // Waits for another thread of this process, which stops when the endpoint closes.
+        let Some(_cleaning) = self.cleaning.try_lock_for(CLEANUP_TIMEOUT) else {
             return Ok(cleaned);
         };
         let lock = match self.lock() {
-            // Somebody else was the last, and has removed all.
+            // Another process was the last one and has removed everything.
             Err(error) if error.is_missing_file() => return Ok(cleaned),
             lock => lock?,
         };
         for one in self.all()? {
-            if self.names.is_alive(one) {
+            if self.paths.is_alive(one) {
                 cleaned.alive += 1;
             } else {
-                self.names.remove(one);
+                self.paths.remove(one);
                 cleaned.removed += 1;
             }
         }
@@ -277,12 +283,12 @@ impl Domain {
             self.remove_all();
             return Ok(cleaned);
         }
-        self.remove_empty(&nodes);
-        self.remove_halves(&nodes);
-        self.remove_untagged();
-        self.remove_orphans();
-        // Who starts must not wait for what follows: iceoryx2 waits in vain, and for long, for
-        // whatever a dead process was making when it was killed.
+        self.remove_empty_files(&nodes);
+        self.remove_partial_nodes(&nodes);
+        self.remove_untagged_services();
+        self.remove_orphaned_connections();
+        // The rest runs without the lock, because a starting process must not wait for it: iceoryx2
+        // waits long for structures that a dead process left unfinished.
         drop(lock);
         if if_alone {
             return Ok(cleaned);
@@ -295,7 +301,7 @@ impl Domain {
             }
             match node {
                 NodeState::Dead(dead) if dead.details().is_some() => {
-                    let removed = dead.blocking_remove_stale_resources(PATIENCE);
+                    let removed = dead.blocking_remove_stale_resources(CLEANUP_TIMEOUT);
                     cleaned.failed += usize::from(removed.is_err());
                 }
                 NodeState::Dead(dead) => nameless.push(*dead.id()),
@@ -303,8 +309,8 @@ impl Domain {
             }
         }
         if !nameless.is_empty() {
-            // Killed while it was being made, or while somebody removed it: iceoryx2 does not know
-            // any more what it was. Looked at again, while nobody can be making one.
+            // Killed during the creation or the removal of the node, so iceoryx2 has no details of
+            // it. Checked again under the lock, under which no process creates a node.
             let _lock = self.lock()?;
             for node in self.nodes()? {
                 if let NodeState::Dead(dead) = node
@@ -317,9 +323,10 @@ impl Domain {
         }
         if dead > 0 {
             let lock = self.lock()?;
-            self.remove_orphans();
+            self.remove_orphaned_connections();
             drop(lock);
-            // Only who looks into its mailbox lets go of its side of connections with the dead.
+            // A process releases its side of connections with dead ones only when it polls its
+            // mailbox.
             self.ring_all()?;
         }
         Ok(cleaned)
@@ -339,10 +346,10 @@ impl Domain {
         Ok(nodes)
     }
 
-    /// Removes the empty files that processes leave which are killed between making a file and
-    /// giving it a length. iceoryx2 0.10 waits for such a file to become longer, without end. To
-    /// be called under the lock, under which nobody else makes connections or services.
-    fn remove_empty(&self, nodes: &[NodeState<Svc>]) {
+    /// Removes empty files of processes that were killed between creating a file and extending it.
+    /// iceoryx2 0.10 waits without limit for such a file to grow. The caller must hold the lock,
+    /// under which no other process creates connections or services.
+    fn remove_empty_files(&self, nodes: &[NodeState<Svc>]) {
         let prefix = self.prefix();
         let mut ports = Vec::new();
         for node in nodes {
@@ -362,17 +369,16 @@ impl Domain {
                 .any(|end| name.ends_with(end))
                 || ports.iter().any(|port| name.contains(port));
             if name.starts_with(&prefix) && nobody_makes_it && is_empty() {
-                // Met again next time if it fails.
+                // A failed removal is retried by the next cleanup.
                 let _ = std::fs::remove_file(file.path());
             }
         }
     }
 
-    /// Removes the nodes whose process was killed while it was making them, or while it removed
-    /// its own: iceoryx2 takes them for nodes that are about to be there, or that make no sense.
-    /// To be called under the lock, under which nobody makes a node; who removes one does not
-    /// mind help.
-    fn remove_halves(&self, nodes: &[NodeState<Svc>]) {
+    /// Removes the nodes whose process was killed while it created or removed them: iceoryx2 takes
+    /// them for nodes that are being created, or for invalid ones. The caller must hold the lock,
+    /// under which no process creates a node. A process that removes its node tolerates the help.
+    fn remove_partial_nodes(&self, nodes: &[NodeState<Svc>]) {
         let whole: HashSet<String> = nodes
             .iter()
             .filter_map(|node| match node {
@@ -385,8 +391,8 @@ impl Domain {
         for file in files_in(&self.config.root.join("nodes")) {
             let name = file.file_name();
             let name = name.to_string_lossy();
-            // A directory is named by the number alone, the files that say who lives by prefix,
-            // number and an ending.
+            // A directory is named by the number alone; the files that show whether the node is
+            // alive are named by prefix, number and suffix.
             let id = name.strip_prefix(&prefix).unwrap_or(&name);
             let id = id.split('.').next().unwrap_or_default();
             if !id.is_empty() && id.bytes().all(|b| b.is_ascii_digit()) && !whole.contains(id) {
@@ -395,15 +401,15 @@ impl Domain {
         }
     }
 
-    /// Removes the services that no node says it uses: what a process leaves that is killed
-    /// between making a service and saying so, or while it removes one. To be called under the
-    /// lock, under which nobody makes a service.
+    /// Removes the services that no node claims to use. A process leaves one if it is killed
+    /// between creating a service and tagging it, or while it removes one. The caller must hold the
+    /// lock, under which no process creates a service.
     ///
-    /// Of iceoryx2 0.10 one is left, too, when whoever takes the last node out of a service is killed
-    /// before it locks that: who comes next finds no node to take out, and takes that for its not
-    /// having been the last.
-    fn remove_untagged(&self) {
-        // Without all that are used nobody can say which are not.
+    /// iceoryx2 0.10 also leaves one if the process that removes the last node from a service is
+    /// killed before it locks the service: a later process finds no node to remove, and so does not
+    /// consider itself the last one.
+    fn remove_untagged_services(&self) {
+        // Without the complete list of used services, unused ones cannot be told apart.
         let Ok(used) = self.tagged(".service_tag") else {
             return;
         };
@@ -414,7 +420,7 @@ impl Domain {
         if untagged.is_empty() {
             return;
         }
-        // Only the service's own file says which shared memory is its, and so goes last.
+        // Only the service's own file names its shared memory, so it is removed last.
         let mut ids = HashSet::new();
         let listed = Svc::list(&self.ice, |service| {
             let details = service.static_details;
@@ -434,20 +440,20 @@ impl Domain {
             id.is_some_and(|id| ids.contains(&id))
         });
         for file in shared.map(|file| file.path()).chain(untagged.into_values()) {
-            // Met again next time if it fails.
+            // A failed removal is retried by the next cleanup.
             let _ = std::fs::remove_file(file);
         }
     }
 
-    /// Removes the connections of ports that nobody has any more. iceoryx2 0.10 leaves one behind
-    /// when a process is killed after making its file and before saying which end it is: then
-    /// neither end is the last to go. To be called under the lock, under which nobody makes a
-    /// port; a port says that it is there before it connects, and as long as it does.
+    /// Removes connections of ports that no process has any more. iceoryx2 0.10 leaves one if a
+    /// process is killed between creating its file and recording its own end: then neither end is
+    /// the last to close. The caller must hold the lock, under which no process creates a port. A
+    /// port is tagged before it connects, and as long as it exists.
     ///
-    /// Whoever lives and still has such a connection open keeps its memory, and does not mind that
-    /// the file is gone.
-    fn remove_orphans(&self) {
-        // Without all the ports nobody can say whose is missing.
+    /// A living process that still has such a connection open keeps its memory and does not need
+    /// the file.
+    fn remove_orphaned_connections(&self) {
+        // Without the complete list of ports, missing ones cannot be told apart.
         let Ok(ports) = self.tagged(".port_tag") else {
             return;
         };
@@ -464,13 +470,13 @@ impl Domain {
             if let (Some(receiver), Some(sender)) = (ends.next(), ends.next())
                 && [sender, receiver].iter().any(|port| !ports.contains(*port))
             {
-                // Met again next time if it fails.
+                // A failed removal is retried by the next cleanup.
                 let _ = std::fs::remove_file(file.path());
             }
         }
     }
 
-    /// What all nodes, dead ones too, say they have or use, by tags with this ending.
+    /// Identifiers in the tags with this suffix, of all nodes including dead ones.
     fn tagged(&self, end: &str) -> std::io::Result<HashSet<String>> {
         let mut tagged = HashSet::new();
         for node in std::fs::read_dir(self.config.root.join("nodes"))? {
@@ -480,7 +486,7 @@ impl Domain {
             }
             let tags = match std::fs::read_dir(node.path()) {
                 Ok(tags) => tags,
-                // It leaves just now.
+                // The node was just removed.
                 Err(e) if e.kind() == std::io::ErrorKind::NotFound => continue,
                 Err(e) => return Err(e),
             };
@@ -491,7 +497,7 @@ impl Domain {
         Ok(tagged)
     }
 
-    /// Of what in this domain a file with this ending is.
+    /// The identifier in the name of a file of this domain with this suffix.
     fn id_of(&self, file: &std::fs::DirEntry, end: &str) -> Option<String> {
         let name = file.file_name();
         let name = name.to_str()?.strip_prefix(&self.prefix())?;
@@ -499,13 +505,13 @@ impl Domain {
         Some(id.to_owned())
     }
 
-    /// The files by which others find a process with this mailbox.
+    /// The files by which other processes find a process with this mailbox.
     pub(crate) fn files_of(&self, process: Incarnation, service_hash: &str) -> Vec<PathBuf> {
         let service = format!("{}{service_hash}.service", self.prefix());
         vec![
-            self.names.live(process),
-            self.names.bell(process),
-            self.names.page(process),
+            self.paths.liveness_fifo(process),
+            self.paths.doorbell(process),
+            self.paths.status_page(process),
             self.services().join(service),
         ]
     }
@@ -514,7 +520,7 @@ impl Domain {
         self.config.root.join("services")
     }
 
-    /// Removes what is in the file system of a node.
+    /// Removes the files of a node.
     fn remove_node(&self, id: &str) {
         let nodes = self.config.root.join("nodes");
         let name = format!("{}{id}.", self.prefix());
@@ -523,9 +529,9 @@ impl Domain {
         let _ = std::fs::remove_dir(nodes.join(id));
     }
 
-    /// Nobody is there, and nobody can come while the lock is held: what has the domain's prefix
-    /// can go. That is what iceoryx2 leaves for the next process, when there may never be one,
-    /// and what it could not make sense of after a process was killed.
+    /// Removes all files with the domain's prefix. The caller holds the lock, and no process of the
+    /// domain runs. Also removes what iceoryx2 leaves for the next process, and structures that it
+    /// cannot interpret after a process was killed.
     fn remove_all(&self) {
         let prefix = self.prefix();
         remove_files(Path::new(SHM), &prefix);
@@ -533,7 +539,7 @@ impl Domain {
             let directory = self.config.root.join(directory);
             for node in files_in(&directory) {
                 remove_files(&node.path(), &prefix);
-                // Fails when it is a file, or has files of another prefix.
+                // Fails for a file, and for a directory with files of another prefix.
                 let _ = std::fs::remove_dir(node.path());
             }
             remove_files(&directory, &prefix);
@@ -546,32 +552,32 @@ impl Domain {
     }
 }
 
-/// How much longer the next one waits before it cleans up.
-const TURN: Duration = Duration::from_millis(20);
+/// Delay of a cleanup for each living process that comes before.
+const CLEANUP_STEP: Duration = Duration::from_millis(20);
 
-/// How long to wait for the lock of the domain. Everybody has it for milliseconds, when it starts or
-/// ends; but hundreds may do that at the same time, on a machine that is busy.
-const LOCKING: Duration = Duration::from_secs(30);
+/// Timeout of the domain's lock. Each process holds it for milliseconds when it starts or ends, but
+/// hundreds may do so at the same time on a busy machine.
+const LOCK_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// The same, for who may go another way.
-const SHARING: Duration = Duration::from_secs(1);
+/// Timeout of the shared lock, whose caller may use another transport.
+const SHARED_LOCK_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// The same, for whoever ends. When many end, those who have the lock meanwhile clean up for it.
-const LEAVING: Duration = Duration::from_secs(2);
+/// Timeout of the lock for a process that ends. When many end, the lock's holders clean up for it.
+const CLOSING_LOCK_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// How often an endpoint tries to enter a domain whose directory others are removing.
-const ENTERING: u32 = 20;
+/// Maximum number of attempts to enter a domain whose directory is being removed.
+const MAX_ENTER_ATTEMPTS: u32 = 20;
 
-/// How long to wait for somebody else who is removing the traces of the same process.
-const PATIENCE: Duration = Duration::from_secs(1);
+/// Timeout for another thread or process that removes files of the same process.
+const CLEANUP_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// What is in a directory, as far as it can be read.
+/// Entries of a directory. Skips those that cannot be read.
 pub(crate) fn files_in(directory: &Path) -> impl Iterator<Item = std::fs::DirEntry> + use<> {
     let files = std::fs::read_dir(directory);
     files.into_iter().flatten().flatten()
 }
 
-/// Removes the files with this prefix. What cannot be removed is met again next time.
+/// Removes the files with this prefix. A failed removal is retried by the next cleanup.
 fn remove_files(directory: &Path, prefix: &str) {
     for file in files_in(directory) {
         if file.file_name().to_string_lossy().starts_with(prefix) {
@@ -580,15 +586,15 @@ fn remove_files(directory: &Path, prefix: &str) {
     }
 }
 
-impl Drop for Domain {
-    /// Whoever goes last removes what is left, also when it held content for longer than its
-    /// endpoint was open.
+impl Drop for DomainFiles {
+    /// The last owner in the process removes the remaining files, also if content was held for
+    /// longer than the endpoint was open.
     fn drop(&mut self) {
         if self.member && self.owner.is_this() && self.config.root.exists() {
             self.closing.store(true, Ordering::SeqCst);
-            // Nobody to report to; what cannot be removed is removed by the next who starts.
+            // The error has no receiver; the next process that starts removes what is left.
             let _ = self.clean(true);
-            // Those who are still there let go of what connected them with this process.
+            // The remaining processes release their connections with this one.
             let _ = self.ring_all();
         }
     }
@@ -600,9 +606,9 @@ fn make_private(directory: &Path) -> Result<(), ShmError> {
         .recursive(true)
         .mode(0o700)
         .create(directory)
-        .map_err(|e| file_error("cannot make the directory", directory, e))?;
+        .map_err(|e| file_error("cannot create the directory", directory, e))?;
     let metadata = std::fs::symlink_metadata(directory)
-        .map_err(|e| file_error("cannot look at the directory", directory, e))?;
+        .map_err(|e| file_error("cannot examine the directory", directory, e))?;
     let me = rustix::process::geteuid().as_raw();
     let problem = if !metadata.is_dir() {
         "is not a directory".to_owned()

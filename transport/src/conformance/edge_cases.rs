@@ -1,4 +1,4 @@
-//! What happens at the edges: endpoints that close, loans, floods, crowds, locks.
+//! Rules on abandoning, closing, loans, load and locks.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -8,47 +8,49 @@ use fipa_acl::{Letter, Payload};
 use parking_lot::Mutex;
 
 use super::Fixture;
-use super::party::{Party, accepted, assert_same, concluded, letter, parcel, pattern, until};
+use super::endpoint::{
+    TestEndpoint, accepted, assert_same, concluded, letter, parcel, pattern, until,
+};
 use crate::{
     Abandoned, Answer, Arrival, AttemptId, Body, Conclusion, Location, Transport, Verdict, WayFault,
 };
 
-/// An abandoned attempt has its conclusion at once and no other, and its neighbors go on.
+/// An abandoned attempt is concluded once and at once, and other attempts go on.
 pub fn an_abandoned_attempt_is_concluded_at_once(fixture: &dyn Fixture) {
-    let a = Party::new(fixture);
-    // The answer must not be there before the attempt is abandoned.
+    let a = TestEndpoint::new(fixture);
+    // The answer must not come before the attempt is abandoned.
     let abandoned = Arc::new(AtomicBool::new(false));
     let may_answer = Arc::clone(&abandoned);
-    let b = Party::judging(fixture, move |_| {
+    let b = TestEndpoint::with_verdict(fixture, move |_| {
         while !may_answer.load(Ordering::Acquire) {
             std::thread::yield_now();
         }
         Verdict::Now(Answer::Accepted)
     });
     let unknown = a.transport.abandon(AttemptId(77));
-    assert_eq!(unknown, Abandoned::Unconfirmed, "of an unknown attempt");
+    assert_eq!(unknown, Abandoned::Unconfirmed, "for an unknown attempt");
     a.send(1, &b, parcel(1, letter("x")));
     let end = a.transport.abandon(AttemptId(1));
     let twice = a.transport.abandon(AttemptId(1));
     assert_eq!(
         twice,
         Abandoned::Unconfirmed,
-        "of an attempt that has ended"
+        "for an attempt that has ended"
     );
     abandoned.store(true, Ordering::Release);
     a.send(2, &b, parcel(2, letter("y")));
     assert_eq!(concluded(&[&a, &b], &a, 2), accepted());
     assert_eq!(a.conclusion(1), None);
     if end == Abandoned::NotSent {
-        assert!(!b.has_arrived(1), "not sent, and it arrived");
+        assert!(!b.has_arrived(1), "concluded as not sent, but it arrived");
     }
 }
 
-/// What was abandoned as not sent never arrives, at whatever moment that was: while the
-/// connection is opened, while other parcels fill the window, and when nothing is in the way.
+/// An attempt that was abandoned as not sent never arrives: neither while the connection is opened,
+/// nor while other parcels fill the window, nor on an idle connection.
 pub fn an_attempt_that_is_abandoned_unsent_never_arrives(fixture: &dyn Fixture) {
-    let a = Party::new(fixture);
-    let b = Party::new(fixture);
+    let a = TestEndpoint::new(fixture);
+    let b = TestEndpoint::new(fixture);
     let mut open = Vec::new();
     let mut unsent = Vec::new();
     for attempt in 1..=64 {
@@ -78,16 +80,16 @@ pub fn an_attempt_that_is_abandoned_unsent_never_arrives(fixture: &dyn Fixture) 
     for attempt in unsent {
         assert!(
             !b.has_arrived(attempt),
-            "{attempt} was not sent, and it arrived"
+            "{attempt} was concluded as not sent, but it arrived"
         );
         assert_eq!(a.conclusion(attempt), None, "{attempt} has two conclusions");
     }
 }
 
-/// When the receiver goes away, every attempt towards it still gets its conclusion.
-pub fn a_closing_receiver_leaves_no_attempt_open(fixture: &dyn Fixture) {
-    let a = Party::new(fixture);
-    let b = Party::new(fixture);
+/// Every attempt to a receiver that closes is concluded.
+pub fn attempts_to_a_closing_receiver_are_concluded(fixture: &dyn Fixture) {
+    let a = TestEndpoint::new(fixture);
+    let b = TestEndpoint::new(fixture);
     a.send(0, &b, parcel(0, letter("x")));
     assert_eq!(concluded(&[&a, &b], &a, 0), accepted());
     let mut open = Vec::new();
@@ -116,9 +118,9 @@ pub fn a_closing_receiver_leaves_no_attempt_open(fixture: &dyn Fixture) {
     }
 }
 
-/// When the sender goes away, every attempt it made still gets its conclusion.
-pub fn a_closing_sender_leaves_no_attempt_open(fixture: &dyn Fixture) {
-    let (a, b) = (Party::new(fixture), Party::new(fixture));
+/// Every attempt of a sender that closes is concluded.
+pub fn attempts_of_a_closing_sender_are_concluded(fixture: &dyn Fixture) {
+    let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
     let mut open = Vec::new();
     for attempt in 0..4 {
         if a.transport
@@ -139,14 +141,14 @@ pub fn a_closing_sender_leaves_no_attempt_open(fixture: &dyn Fixture) {
     a.transport.close();
 }
 
-/// After `close` nothing is taken any more, and no location answers.
-pub fn a_closed_transport_takes_nothing(fixture: &dyn Fixture) {
-    let (a, b) = (Party::new(fixture), Party::new(fixture));
+/// After `close`, dispatches fail, and the location cannot be reached.
+pub fn a_closed_transport_refuses_parcels(fixture: &dyn Fixture) {
+    let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
     b.transport.close();
     let error = b
         .transport
         .dispatch(AttemptId(1), &a.location, parcel(1, letter("x")))
-        .expect_err("closed");
+        .expect_err("the transport is closed");
     assert_eq!(error.fault, WayFault::Closed, "{error}");
     let not_sent = match a
         .transport
@@ -158,13 +160,13 @@ pub fn a_closed_transport_takes_nothing(fixture: &dyn Fixture) {
     assert!(not_sent, "a closed endpoint was reached");
 }
 
-/// Loaned memory arrives as the content it was filled with; it stays readable for the sender,
-/// and a letter filled for one location can still go to another.
+/// Loaned memory arrives with the content that was written to it and stays readable for the sender.
+/// A letter that was loaned for one location can also go to another.
 pub fn loaned_content_arrives(fixture: &dyn Fixture) {
     let (a, b, c) = (
-        Party::new(fixture),
-        Party::new(fixture),
-        Party::new(fixture),
+        TestEndpoint::new(fixture),
+        TestEndpoint::new(fixture),
+        TestEndpoint::new(fixture),
     );
     let (head, tail) = (Bytes::from_static(b"head"), Bytes::from_static(b"\x01"));
     let envelope = Bytes::from_static(b"envelope");
@@ -174,7 +176,7 @@ pub fn loaned_content_arrives(fixture: &dyn Fixture) {
         let loan = a
             .transport
             .loan(&b.location, room, len, tail.len())
-            .expect("room for a loan");
+            .expect("there is room for a loan");
         let Some(mut loan) = loan else { return };
         assert_eq!(loan.content_mut().len(), len);
         loan.content_mut().copy_from_slice(&pattern(len));
@@ -196,14 +198,14 @@ pub fn loaned_content_arrives(fixture: &dyn Fixture) {
     }
 }
 
-/// Memory loaned for many arrives at all of them as the content it was filled with, and stays so
-/// for whoever holds it while further contents follow; what is held and what is given back leaves
-/// room for more.
-pub fn content_for_many_arrives_everywhere(fixture: &dyn Fixture) {
+/// Memory loaned for several receivers arrives at all of them with the content that was written to
+/// it. It stays unchanged while it is held and further contents follow. Held and released contents
+/// leave room for more.
+pub fn shared_content_arrives_at_all_receivers(fixture: &dyn Fixture) {
     let (a, b, c) = (
-        Party::new(fixture),
-        Party::new(fixture),
-        Party::new(fixture),
+        TestEndpoint::new(fixture),
+        TestEndpoint::new(fixture),
+        TestEndpoint::new(fixture),
     );
     let len = 100_000.min(a.transport.max_letter() / 2);
     let filled = |round: u64| Bytes::from(vec![round as u8; len]);
@@ -219,7 +221,7 @@ pub fn content_for_many_arrives_everywhere(fixture: &dyn Fixture) {
                 content
             }
             Ok(None) if round == 0 => return,
-            // What is held takes up the room there is, and letters go on without it.
+            // Held contents use all the room, and letters are sent without a loan.
             Err(error) if round > 0 => {
                 assert_eq!(error.fault, WayFault::Congested, "{error}");
                 filled(round)
@@ -246,7 +248,7 @@ pub fn content_for_many_arrives_everywhere(fixture: &dyn Fixture) {
         }
         let own = kept.iter().enumerate();
         own.for_each(|(round, kept)| assert!(*kept == filled(round as u64), "changed"));
-        // The sender gives back what it kept, and one receiver after the other.
+        // The sender releases its contents, and the receivers in turn release theirs.
         kept.clear();
         let receiver = if round % 2 == 0 { &b } else { &c };
         receiver.sink.record.lock().arrivals.clear();
@@ -257,14 +259,14 @@ pub fn content_for_many_arrives_everywhere(fixture: &dyn Fixture) {
         a.transport
             .loan_for_many(len)
             .is_ok_and(|loan| loan.is_some()),
-        "room comes back"
+        "there is room again"
     );
 }
 
-/// Whatever is dispatched without waiting is either refused at once or concluded; what was
-/// accepted arrived once.
+/// Each of many dispatches without a pause is refused at once or concluded, and each accepted
+/// parcel arrives once.
 pub fn a_flood_is_bounded_and_every_attempt_concluded(fixture: &dyn Fixture) {
-    let (a, b) = (Party::new(fixture), Party::new(fixture));
+    let (a, b) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
     let mut taken = Vec::new();
     for attempt in 0..20_000 {
         match a.transport.dispatch(
@@ -285,11 +287,11 @@ pub fn a_flood_is_bounded_and_every_attempt_concluded(fixture: &dyn Fixture) {
     assert_eq!(concluded(&[&a, &b], &a, 1_000_000), accepted());
 }
 
-/// Several endpoints at once, in both directions.
-pub fn many_talk_to_one_and_one_to_many(fixture: &dyn Fixture) {
-    let hub = Party::new(fixture);
-    let others: Vec<Party> = (0..4).map(|_| Party::new(fixture)).collect();
-    let everyone: Vec<&Party> = others.iter().chain([&hub]).collect();
+/// Several endpoints exchange letters with one at the same time.
+pub fn many_endpoints_exchange_letters_with_one(fixture: &dyn Fixture) {
+    let hub = TestEndpoint::new(fixture);
+    let others: Vec<TestEndpoint> = (0..4).map(|_| TestEndpoint::new(fixture)).collect();
+    let all: Vec<&TestEndpoint> = others.iter().chain([&hub]).collect();
     for round in 0..20 {
         for (index, other) in others.iter().enumerate() {
             let attempt = round * 10 + index as u64;
@@ -298,27 +300,27 @@ pub fn many_talk_to_one_and_one_to_many(fixture: &dyn Fixture) {
         }
         for (index, other) in others.iter().enumerate() {
             let attempt = round * 10 + index as u64;
-            assert_eq!(concluded(&everyone, other, attempt), accepted());
-            assert_eq!(concluded(&everyone, &hub, attempt), accepted());
+            assert_eq!(concluded(&all, other, attempt), accepted());
+            assert_eq!(concluded(&all, &hub, attempt), accepted());
         }
     }
     assert_eq!(hub.arrivals(), 80);
     assert!(others.iter().all(|other| other.arrivals() == 20));
 }
 
-/// A sink sends on what arrives, from within the very call that tells it.
-pub fn a_sink_may_use_its_transport(fixture: &dyn Fixture) {
-    type Onwards = Option<(Arc<dyn Transport>, Location)>;
-    let relay: Arc<Mutex<Onwards>> = Arc::default();
-    let way = Arc::clone(&relay);
-    let (a, c) = (Party::new(fixture), Party::new(fixture));
-    let b = Party::judging(fixture, move |arrival| {
-        if let Some((transport, to)) = &*way.lock() {
+/// A sink may dispatch and abandon from within `arrived`.
+pub fn a_sink_may_call_its_transport(fixture: &dyn Fixture) {
+    type NextHop = Option<(Arc<dyn Transport>, Location)>;
+    let relay: Arc<Mutex<NextHop>> = Arc::default();
+    let next_hop = Arc::clone(&relay);
+    let (a, c) = (TestEndpoint::new(fixture), TestEndpoint::new(fixture));
+    let b = TestEndpoint::with_verdict(fixture, move |arrival| {
+        if let Some((transport, to)) = &*next_hop.lock() {
             let attempt = AttemptId(arrival.parcel.sequence);
             transport.abandon(AttemptId(u64::MAX));
             transport
                 .dispatch(attempt, to, arrival.parcel.clone())
-                .expect("dispatches");
+                .expect("the dispatch succeeds");
         }
         Verdict::Now(Answer::Accepted)
     });
@@ -332,8 +334,8 @@ pub fn a_sink_may_use_its_transport(fixture: &dyn Fixture) {
     *relay.lock() = None;
 }
 
-/// The delivery core calls its transports with its own lock held, and its sink takes that lock.
-pub fn a_caller_may_hold_a_lock_that_its_sink_wants(fixture: &dyn Fixture) {
+/// The delivery core calls its transports while it holds its own lock, which its sink takes.
+pub fn a_caller_may_hold_a_lock_that_its_sink_takes(fixture: &dyn Fixture) {
     let core = Arc::new(Mutex::new(()));
     let locked = |core: &Arc<Mutex<()>>| {
         let core = Arc::clone(core);
@@ -342,16 +344,16 @@ pub fn a_caller_may_hold_a_lock_that_its_sink_wants(fixture: &dyn Fixture) {
             Verdict::Now(Answer::Accepted)
         }
     };
-    let a = Party::judging(fixture, locked(&core));
-    let b = Party::judging(fixture, locked(&core));
+    let a = TestEndpoint::with_verdict(fixture, locked(&core));
+    let b = TestEndpoint::with_verdict(fixture, locked(&core));
     let total = 300;
     std::thread::scope(|scope| {
         let done = Arc::new(AtomicBool::new(false));
-        for party in [&a, &b] {
+        for endpoint in [&a, &b] {
             let done = Arc::clone(&done);
             scope.spawn(move || {
                 while !done.load(Ordering::Relaxed) {
-                    if !party.transport.drive() {
+                    if !endpoint.transport.drive() {
                         std::thread::yield_now();
                     }
                 }
