@@ -13,7 +13,8 @@ use fipa_mts::Source;
 use fipa_sds::Matcher;
 use fipa_transport::Allowance;
 
-use crate::config;
+/// A line of `access.allow` or `access.deny`: the sender and its receivers.
+pub(crate) type Line<'a> = (&'a str, &'a [String]);
 
 /// Senders whose rate is remembered, of all sources. When there are more, the source with the most
 /// senders loses the one that it brought first: a source that invents names makes this process forget
@@ -97,23 +98,21 @@ struct Sender {
 }
 
 impl Access {
-    /// The rules of a configuration; none, when it has none.
-    pub(crate) fn new(config: &config::Access) -> Result<Option<Self>, RuleError> {
-        let rules = |lines: &[config::AccessRule]| -> Result<Vec<Rule>, RuleError> {
-            let all = lines.iter().flat_map(|line| {
-                let receivers = line.receivers.iter();
-                receivers.map(|receiver| Rule::parse(&line.sender, receiver))
-            });
-            all.collect()
-        };
-        let (deny, allow) = (rules(&config.deny)?, rules(&config.allow)?);
-        if deny.is_empty() && allow.is_empty() && config.rate == 0 {
+    /// The rules of these lines, each a sender and its receivers, and the letters per second of one
+    /// sender (0: unlimited). `None` if there is nothing to check.
+    pub(crate) fn new<'a>(
+        deny: impl IntoIterator<Item = Line<'a>>,
+        allow: impl IntoIterator<Item = Line<'a>>,
+        rate: usize,
+    ) -> Result<Option<Self>, RuleError> {
+        let (deny, allow) = (rules(deny)?, rules(allow)?);
+        if deny.is_empty() && allow.is_empty() && rate == 0 {
             return Ok(None);
         }
         Ok(Some(Self {
             deny,
             allow,
-            rate: (config.rate > 0).then_some(config.rate as f64),
+            rate: (rate > 0).then_some(rate as f64),
             senders: Senders::default(),
         }))
     }
@@ -275,12 +274,20 @@ impl Rule {
 }
 
 /// What is wrong with a line of rules, if anything is.
-pub(crate) fn fault(line: &config::AccessRule) -> Option<RuleError> {
-    if line.receivers.is_empty() {
+pub(crate) fn fault((sender, receivers): Line<'_>) -> Option<RuleError> {
+    if receivers.is_empty() {
         return Some(RuleError("has no receivers".to_owned()));
     }
-    let mut rules = line.receivers.iter();
-    rules.find_map(|receiver| Rule::parse(&line.sender, receiver).err())
+    let mut rules = receivers.iter();
+    rules.find_map(|receiver| Rule::parse(sender, receiver).err())
+}
+
+fn rules<'a>(lines: impl IntoIterator<Item = Line<'a>>) -> Result<Vec<Rule>, RuleError> {
+    let rules = lines.into_iter().flat_map(|(sender, receivers)| {
+        let receivers = receivers.iter();
+        receivers.map(move |receiver| Rule::parse(sender, receiver))
+    });
+    rules.collect()
 }
 
 #[cfg(test)]
@@ -288,22 +295,25 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::config::AccessRule;
 
     fn access(deny: &[(&str, &[&str])], allow: &[(&str, &[&str])], rate: usize) -> Access {
-        let lines = |lines: &[(&str, &[&str])]| -> Vec<AccessRule> {
-            let lines = lines.iter().map(|(sender, receivers)| AccessRule {
-                sender: (*sender).to_owned(),
-                receivers: receivers.iter().map(|it| (*it).to_owned()).collect(),
+        let owned = |lines: &[(&str, &[&str])]| -> Vec<(String, Vec<String>)> {
+            let lines = lines.iter().map(|(sender, receivers)| {
+                let receivers = receivers.iter().map(|it| (*it).to_owned()).collect();
+                ((*sender).to_owned(), receivers)
             });
             lines.collect()
         };
-        let config = config::Access {
-            deny: lines(deny),
-            allow: lines(allow),
-            rate,
+        let (deny, allow) = (owned(deny), owned(allow));
+        let lines = |lines: &'_ [(String, Vec<String>)]| -> Vec<Line<'_>> {
+            let lines = lines.iter();
+            lines
+                .map(|(sender, receivers)| (sender.as_str(), receivers.as_slice()))
+                .collect()
         };
-        Access::new(&config).unwrap().unwrap()
+        Access::new(lines(&deny), lines(&allow), rate)
+            .unwrap()
+            .unwrap()
     }
 
     fn claim<'a>(sender: &'a str, receiver: &'a str) -> Claim<'a> {
@@ -412,11 +422,8 @@ mod tests {
             "arm performative=,",
             "arm request",
         ] {
-            let line = AccessRule {
-                sender: "rover".to_owned(),
-                receivers: vec![wrong.to_owned()],
-            };
-            assert!(fault(&line).is_some(), "{wrong:?}");
+            let receivers = [wrong.to_owned()];
+            assert!(fault(("rover", &receivers)).is_some(), "{wrong:?}");
         }
     }
 

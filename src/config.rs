@@ -75,6 +75,8 @@ pub use effective::{Effective, Setting, Value};
 pub use error::{ConfigError, Mistake, Origin};
 pub use sources::Sources;
 
+use crate::access;
+
 /// What the owner of a robot chooses, complete and checked.
 ///
 /// A program that changes a value after loading calls [`Config::check`] before it uses it.
@@ -254,6 +256,22 @@ pub struct AccessRule {
     /// Receivers: a name or pattern each, and behind it perhaps `performative=NAME,…` and
     /// `protocol=NAME,…`, when the rule is about those only.
     pub receivers: Vec<String>,
+}
+
+impl AccessRule {
+    /// The sender and the receivers.
+    pub(crate) fn parts(&self) -> (&str, &[String]) {
+        (&self.sender, &self.receivers)
+    }
+}
+
+impl Access {
+    /// The rules that this section configures; `None` if it has none.
+    pub(crate) fn rules(&self) -> Result<Option<access::Access>, access::RuleError> {
+        let deny = self.deny.iter().map(AccessRule::parts);
+        let allow = self.allow.iter().map(AccessRule::parts);
+        access::Access::new(deny, allow, self.rate)
+    }
 }
 
 /// `[monitor]`: whether agents keep to their protocols. Without the feature `monitor` nothing is

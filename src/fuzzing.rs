@@ -2,6 +2,8 @@
 
 use std::time::Instant;
 
+use fipa_transport::Incarnation;
+
 use crate::access::{self, Claim};
 use crate::config::{AccessRule, Config, ConfigError, Effective, Sources};
 
@@ -38,7 +40,7 @@ impl Access {
         };
         let mut config = Config::for_host("here").access;
         (config.deny, config.allow, config.rate) = (lines(deny), lines(allow), rate);
-        access::Access::new(&config).ok().flatten().map(Self)
+        config.rules().ok().flatten().map(Self)
     }
 
     /// Whether the rules let such a letter pass.
@@ -58,8 +60,9 @@ impl Access {
         self.0.judge(&claim).is_ok()
     }
 
-    /// Whether the sender may send one more letter.
-    pub fn may_send(&mut self, sender: &str, now: Instant) -> bool {
-        self.0.count(sender, now).is_ok()
+    /// Whether the sender may send one more letter from the process with this number.
+    pub fn may_send(&mut self, source: u64, sender: &str, now: Instant) -> bool {
+        let source = fipa_mts::Source::Process(Incarnation::from_u64(source));
+        self.0.count(source, sender, now).is_ok()
     }
 }

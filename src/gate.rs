@@ -212,7 +212,7 @@ mod tests {
             deny: deny.collect(),
             ..config::Access::default()
         };
-        let access = Access::new(&rules).unwrap().unwrap();
+        let access = rules.rules().unwrap().unwrap();
         let door = Door::new(access, Of::Process(Arc::new(open(false))));
         (door, open(true), place)
     }

@@ -13,7 +13,6 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 use crate::Config;
-use crate::access::Access;
 use crate::error::OpenError;
 use crate::gate::{Door, Of};
 use crate::host_directory;
@@ -196,8 +195,10 @@ fn gate(
         false => Of::Process(Arc::clone(host)),
     };
     // What the configuration's check has passed can be understood.
-    let access =
-        Access::new(&config.access).map_err(|error| OpenError::Access(error.to_string()))?;
+    let access = config
+        .access
+        .rules()
+        .map_err(|error| OpenError::Access(error.to_string()))?;
     Ok(access.map(|access| Arc::new(Door::new(access, of)) as Arc<dyn Gate>))
 }
 

@@ -54,7 +54,7 @@ pub fn play(bytes: &[u8]) {
                 end.arrive(&frame(3, input.number(), &body), step, now);
             }
             6 => end.send(&parcel(&mut input)),
-            7 => end.abandon(input.number()),
+            7 => end.abandon(input.number(), now),
             8 => {
                 let answer = answer(&mut input);
                 end.answer(input.below(256), &answer, now);

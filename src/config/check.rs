@@ -205,7 +205,7 @@ impl Findings {
                 continue;
             }
             for line in lines {
-                if let Some(fault) = crate::access::fault(line) {
+                if let Some(fault) = crate::access::fault(line.parts()) {
                     self.add(
                         &["access", name, &line.sender],
                         fault,

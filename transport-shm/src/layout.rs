@@ -255,7 +255,7 @@ impl PieceOffsets {
     }
 }
 
-/// What another process writes into shared memory, for fuzz targets.
+/// Readers of data that another process writes into shared memory, for fuzz targets.
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing {
     use bytes::Bytes;
@@ -273,7 +273,7 @@ pub(crate) mod fuzzing {
     /// says so. Returns whether it is a parcel.
     ///
     /// # Panics
-    /// When the places that are announced do not lie in the payload.
+    /// If the announced offsets are outside of the payload.
     pub fn header(bytes: &[u8; HEADER_LEN], payload: &[u8], elsewhere: &[u8]) -> bool {
         let number = |at: usize| {
             let mut number = [0; 8];
@@ -294,14 +294,14 @@ pub(crate) mod fuzzing {
         let Some(parcel) = header.parcel() else {
             return false;
         };
-        let Some(places) = Places::announced(&header, &parcel, payload.len()) else {
+        let Some(offsets) = PieceOffsets::announced(&header, &parcel, payload.len()) else {
             return false;
         };
         // As the mailbox takes them apart.
-        let around = &payload[places.start..places.end];
+        let around = &payload[offsets.start..offsets.end];
         let read = if header.reference().is_some() {
             let mut front = Bytes::copy_from_slice(around);
-            let tail = front.split_off(places.content - places.start);
+            let tail = front.split_off(offsets.content - offsets.start);
             let len = usize::try_from(parcel.content_len()).unwrap_or(usize::MAX);
             let Some(content) = elsewhere.get(..len) else {
                 return false;
@@ -309,12 +309,12 @@ pub(crate) mod fuzzing {
             parcel.parcel_of_pieces(front, Bytes::copy_from_slice(content), tail)
         } else {
             let pieces = [
-                &payload[places.start..places.content],
-                &payload[places.tail..places.end],
+                &payload[offsets.start..offsets.content],
+                &payload[offsets.tail..offsets.end],
             ];
-            let content = Bytes::copy_from_slice(&payload[places.content..places.tail]);
+            let content = Bytes::copy_from_slice(&payload[offsets.content..offsets.tail]);
             let mut front = Bytes::from(pieces.concat());
-            let tail = front.split_off(places.content - places.start);
+            let tail = front.split_off(offsets.content - offsets.start);
             let apart = parcel.parcel_of_pieces(front, content, tail);
             let whole = parcel.parcel(Bytes::copy_from_slice(around));
             assert_eq!(apart.is_ok(), whole.is_ok(), "{apart:?} or {whole:?}");

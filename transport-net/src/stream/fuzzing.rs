@@ -226,12 +226,12 @@ impl Framed {
     }
 
     /// This side gives up one of its attempts.
-    pub fn abandon(&mut self, pick: u64) {
+    pub fn abandon(&mut self, pick: u64, now: Instant) {
         let attempt = AttemptId(pick % self.dispatched.max(1));
         let is_open = attempt.0 < self.dispatched
             && !self.concluded.contains_key(&attempt)
             && self.abandoned.insert(attempt);
-        let told = self.connection.abandon(attempt);
+        let told = self.connection.abandon(attempt, now);
         assert!(is_open || told == Abandoned::Unconfirmed);
     }
 
