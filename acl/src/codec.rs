@@ -3,7 +3,7 @@
 use bytes::{BufMut, Bytes};
 
 use crate::bitefficient::dialects::{self, Peer};
-use crate::bitefficient::write::{Counter, Out, Sink};
+use crate::bitefficient::write::{Counter, Output, Sink};
 use crate::envelope::encode as encode_envelope;
 use crate::error::{DecodeError, EncodeError};
 use crate::{
@@ -98,7 +98,7 @@ impl Message {
         &self,
         representation: Representation,
         dialect: Dialect,
-        out: &mut dyn Out,
+        out: &mut dyn Output,
     ) -> Result<(), EncodeError> {
         match (representation, dialect) {
             (Representation::BitEfficient, Dialect::Standard) => {

@@ -5,11 +5,11 @@ use crate::Representation;
 /// Bytes that are not what they should be: where, what is wrong, and the clause that says so.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("at byte {}: {} ({})", .0.offset, .0.problem, .0.clause)]
-pub struct DecodeError(Box<Place>);
+pub struct DecodeError(Box<ErrorPosition>);
 
 /// Apart from the error, so that what succeeds does not carry room for it around.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Place {
+struct ErrorPosition {
     offset: usize,
     clause: &'static str,
     problem: Problem,
@@ -18,7 +18,7 @@ struct Place {
 impl DecodeError {
     #[cold]
     pub(crate) fn new(offset: usize, clause: &'static str, problem: Problem) -> Self {
-        Self(Box::new(Place {
+        Self(Box::new(ErrorPosition {
             offset,
             clause,
             problem,

@@ -153,7 +153,7 @@ fn payloads_that_are_not_bit_efficient() {
         Some("241+1 end of base envelope")
     );
     letter.extend_from_slice(b"\x80\xff");
-    let payload = "242+2 payload in an unknown representation: bytes that are no text";
+    let payload = "242+2 payload in an unknown representation: bytes that are not UTF-8";
     assert_eq!(told(&letter).lines().last(), Some(payload));
 }
 
@@ -163,11 +163,11 @@ fn malformed_bytes_up_to_the_error() {
     let end = "3+1 sender\n\
         4+4   agent identifier: name 'a'\n\
         8+1     resolvers\n\
-        at byte 9: unexpected byte 0x05 where an agent identifier should be (FIPA00069 2.1 AID)\n";
+        at byte 9: unexpected byte 0x05 where an agent identifier should be (FIPA00069 2.2 AgentIdentifier)\n";
     assert!(lines.ends_with(end), "{lines}");
     let lines = told(b"\xfa\x10\x08\x0d\x10ab\xff\0\x01");
-    let end = "3+4 begun, and broken off by the error\n\
-        at byte 7: the conversation-id is not UTF-8 (FIPA00069 2.1 BinExpression)\n";
+    let end = "3+4 incomplete, ended by the error\n\
+        at byte 7: the conversation-id is not UTF-8 (FIPA00069 2.2 BinExpression)\n";
     assert!(lines.ends_with(end), "{lines}");
     assert!(told(b"").starts_with("at byte 0: the bytes end within a message"));
     assert!(told(b"(inform)").starts_with("at byte 0: the string representation"));
@@ -194,7 +194,7 @@ fn the_number_of_spans_is_bounded() {
     assert_eq!(explanation.spans.len(), Explanation::MAX_SPANS);
     let last = explanation.spans.last().unwrap();
     assert_eq!(last.offset + last.len, bytes.len());
-    assert_eq!(last.meaning, "and so on, not told apart");
+    assert_eq!(last.meaning, "the remaining bytes, not explained");
 }
 
 fn recorded(name: &str) -> Vec<u8> {

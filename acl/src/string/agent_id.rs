@@ -115,8 +115,8 @@ fn part<'a>(
                 return Ok(Some(Part::UserDefined(name, value)));
             }
             Keyword::Known(Slot::Name) => {
-                let glued = (!lexer.skip_space()).then_some(SLOTS);
-                *name = Some(lexer.text(glued, "name of an agent")?);
+                let terminators = (!lexer.skip_space()).then_some(SLOTS);
+                *name = Some(lexer.text(terminators, "name of an agent")?);
                 continue;
             }
             Keyword::Known(Slot::Addresses) => List::Addresses,

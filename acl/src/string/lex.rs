@@ -151,11 +151,11 @@ impl<'a> Lexer<'a> {
             self.rest = behind;
             return Ok(Keyword::Known(parameter));
         }
-        self.other_keyword(keywords, clause, expected)
+        self.keyword_slow(keywords, clause, expected)
     }
 
     #[inline(never)]
-    fn other_keyword<T: Copy>(
+    fn keyword_slow<T: Copy>(
         &mut self,
         keywords: &Keywords<T>,
         clause: &'static str,
@@ -179,11 +179,11 @@ impl<'a> Lexer<'a> {
     /// one of them ends it too.
     pub(super) fn word<T>(
         &mut self,
-        glued: Option<&Keywords<T>>,
+        terminators: Option<&Keywords<T>>,
         what: &'static str,
     ) -> Result<Text<'a>, DecodeError> {
-        let len = match glued {
-            Some(keywords) => glued_len(self.rest, keywords),
+        let len = match terminators {
+            Some(keywords) => len_to_keyword(self.rest, keywords),
             None => scan::find(self.rest, scan::no_token, |byte| !is_token_byte(byte)),
         };
         let word = self.rest.get(..len.unwrap_or(self.rest.len()));
@@ -205,11 +205,11 @@ impl<'a> Lexer<'a> {
     /// marks, parenthesised expressions with all that is in them.
     pub(super) fn expression<T>(
         &mut self,
-        glued: Option<&Keywords<T>>,
+        terminators: Option<&Keywords<T>>,
         what: &'static str,
     ) -> Result<Text<'a>, DecodeError> {
         if self.peek() != Some(b'(') {
-            return self.text(glued, what);
+            return self.text(terminators, what);
         }
         let start = self.offset();
         let text = Text::plain(self.parenthesised(what)?);
@@ -220,7 +220,7 @@ impl<'a> Lexer<'a> {
     /// A word, a number or a string.
     pub(super) fn text<T>(
         &mut self,
-        glued: Option<&Keywords<T>>,
+        terminators: Option<&Keywords<T>>,
         what: &'static str,
     ) -> Result<Text<'a>, DecodeError> {
         let start = self.offset();
@@ -234,7 +234,7 @@ impl<'a> Lexer<'a> {
                 }
             }
             Some(b'#') => Text::plain(self.counted(what)?),
-            _ => return self.word(glued, what),
+            _ => return self.word(terminators, what),
         };
         check_text(&text, start, what)?;
         Ok(text)
@@ -385,7 +385,7 @@ pub(super) fn holds_keyword<T>(word: &str, keywords: &Keywords<T>) -> bool {
 }
 
 /// Where the word at the beginning of the bytes ends, a keyword behind its first byte ending it too.
-fn glued_len<T>(bytes: &[u8], keywords: &Keywords<T>) -> Option<usize> {
+fn len_to_keyword<T>(bytes: &[u8], keywords: &Keywords<T>) -> Option<usize> {
     let marks = |word| scan::no_token(word) | scan::is(word, b':');
     let ends = |byte: u8| !is_token_byte(byte) || byte == b':';
     let mut from = 0;
@@ -395,14 +395,14 @@ fn glued_len<T>(bytes: &[u8], keywords: &Keywords<T>) -> Option<usize> {
             return Some(at);
         }
         let behind = bytes.get(at + 1..).unwrap_or_default();
-        if at > 0 && is_glued_keyword(behind, keywords) {
+        if at > 0 && is_keyword_with_value(behind, keywords) {
             return Some(at);
         }
         from = at + 1;
     }
 }
 
-fn is_glued_keyword<T>(behind_colon: &[u8], keywords: &Keywords<T>) -> bool {
+fn is_keyword_with_value<T>(behind_colon: &[u8], keywords: &Keywords<T>) -> bool {
     if starts_with(behind_colon, USER_DEFINED) {
         // The next colon ends it, so that many of them do not cost quadratic time.
         let name = behind_colon

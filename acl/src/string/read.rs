@@ -82,7 +82,7 @@ impl<'a> MessageView<'a> {
             return Ok(Step::UserDefined);
         };
         // Without white space in front, the value ends where the next keyword begins.
-        let glued = (!lexer.skip_space()).then_some(PARAMETERS);
+        let terminators = (!lexer.skip_space()).then_some(PARAMETERS);
         let (text, what) = match parameter {
             Parameter::ReplyWith => (&mut self.reply_with, "reply-with"),
             Parameter::InReplyTo => (&mut self.in_reply_to, "in-reply-to"),
@@ -103,7 +103,7 @@ impl<'a> MessageView<'a> {
                 return Ok(Step::Parameter);
             }
             Parameter::Protocol => {
-                self.protocol = Some(protocol(lexer, glued)?);
+                self.protocol = Some(protocol(lexer, terminators)?);
                 return Ok(Step::Parameter);
             }
             Parameter::ReplyBy => {
@@ -112,11 +112,11 @@ impl<'a> MessageView<'a> {
             }
             Parameter::Content => {
                 let offset = lexer.offset();
-                self.content = Some(content(lexer, glued)?);
+                self.content = Some(content(lexer, terminators)?);
                 return Ok(Step::Content(offset));
             }
         };
-        *text = Some(lexer.expression(glued, what)?);
+        *text = Some(lexer.expression(terminators, what)?);
         Ok(Step::Parameter)
     }
 }
@@ -195,10 +195,10 @@ fn performative<'a>(lexer: &mut Lexer<'a>) -> Result<PerformativeView<'a>, Decod
 /// JADE may write it in quotation marks; a word it must be all the same.
 fn protocol<'a>(
     lexer: &mut Lexer<'a>,
-    glued: Option<&Keywords<Parameter>>,
+    terminators: Option<&Keywords<Parameter>>,
 ) -> Result<Text<'a>, DecodeError> {
     let offset = lexer.offset();
-    let text = lexer.text(glued, "protocol")?;
+    let text = lexer.text(terminators, "protocol")?;
     if text.is_token() {
         Ok(text)
     } else {
@@ -219,14 +219,14 @@ fn date_time(lexer: &mut Lexer<'_>) -> Result<Time, DecodeError> {
 /// A string by the standard, a word from JADE, and an expression from before edition F.
 fn content<'a>(
     lexer: &mut Lexer<'a>,
-    glued: Option<&Keywords<Parameter>>,
+    terminators: Option<&Keywords<Parameter>>,
 ) -> Result<Content<'a>, DecodeError> {
     let offset = lexer.offset();
     let (bytes, escaped) = match lexer.peek() {
         Some(b'"') => lexer.quoted("content")?,
         Some(b'#') => (lexer.counted("content")?, false),
         Some(b'(') => (lexer.parenthesised("content")?, false),
-        _ => (lexer.word(glued, "content")?.raw(), false),
+        _ => (lexer.word(terminators, "content")?.raw(), false),
     };
     if bytes.len() as u64 > Message::MAX_CONTENT {
         let problem = Problem::TooLong("content");

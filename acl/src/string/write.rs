@@ -7,7 +7,7 @@ use bytes::Bytes;
 use super::agent_id::SLOTS;
 use super::lex::{Keywords, holds_keyword};
 use super::read::PARAMETERS;
-use crate::bitefficient::write::Out;
+use crate::bitefficient::write::Output;
 use crate::dialect::{BASE64, JADE_ENCODING, announces_base64, check_word, local_time, not_a_word};
 use crate::error::EncodeError;
 use crate::time::Time;
@@ -18,13 +18,13 @@ use crate::{AgentId, Dialect, Message, Performative, Text};
 pub(crate) fn encode(
     message: &Message,
     dialect: Dialect,
-    out: &mut dyn Out,
+    out: &mut dyn Output,
 ) -> Result<(), EncodeError> {
     Writer { out, dialect }.message(message)
 }
 
 struct Writer<'a> {
-    out: &'a mut dyn Out,
+    out: &'a mut dyn Output,
     dialect: Dialect,
 }
 

@@ -281,7 +281,7 @@ impl Fields {
     /// Whether the numbers from century to tens of milliseconds, the lowest byte first and none
     /// above 99, are within the bounds of each, for February, too: as nearly all are.
     #[inline]
-    pub(crate) fn are_usual(numbers: u64) -> bool {
+    pub(crate) fn are_common(numbers: u64) -> bool {
         const LEAST: u64 = u64::from_le_bytes([0, 0, 1, 1, 0, 0, 0, 0]);
         const MOST: u64 = u64::from_le_bytes([99, 99, 12, 28, 23, 59, 59, 99]);
         // None of these carries into the next.

@@ -76,7 +76,7 @@ impl FromStr for Time {
 
     /// Reads the text form of FIPA00070; `Z` in place of the `T` is accepted too (JADE).
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        if let Some(time) = usual(text.as_bytes()) {
+        if let Some(time) = parse_common(text.as_bytes()) {
             return Ok(time);
         }
         let (base, rest) = match text.as_bytes() {
@@ -97,7 +97,7 @@ impl FromStr for Time {
 /// A time of the kind that nearly all are: on the calendar, in UTC or without a zone, and within
 /// what every month and every minute has. All digits are looked at in one.
 #[inline]
-fn usual(text: &[u8]) -> Option<Time> {
+fn parse_common(text: &[u8]) -> Option<Time> {
     let (date, [b'T' | b'Z', rest @ ..]) = text.split_first_chunk::<8>()? else {
         return None;
     };
@@ -113,7 +113,7 @@ fn usual(text: &[u8]) -> Option<Time> {
     let [century, year, month, day] = date;
     let [hour, minute, second, tens] = time;
     let numbers = [century, year, month, day, hour, minute, second, tens];
-    if !Fields::are_usual(u64::from_le_bytes(numbers)) {
+    if !Fields::are_common(u64::from_le_bytes(numbers)) {
         return None;
     }
     let fields = Fields {

@@ -36,7 +36,7 @@ impl<'a> Content<'a> {
                 Cow::Borrowed(text) => Cow::Borrowed(text.as_bytes()),
                 Cow::Owned(text) => Cow::Owned(text.into_bytes()),
             },
-            Self::Xml(inner) => xml::unescaped(inner, xml::Space::Counts),
+            Self::Xml(inner) => xml::unescaped(inner, xml::Whitespace::Counts),
         }
     }
 

@@ -30,7 +30,7 @@ enum Repr<'a> {
     /// A number or an expression in its bit-efficient form.
     Encoded(&'a [u8]),
     /// What is inside of an XML element or attribute; white space around it may count or not.
-    Xml(&'a [u8], xml::Space),
+    Xml(&'a [u8], xml::Whitespace),
 }
 
 impl<'a> Text<'a> {
@@ -111,7 +111,7 @@ impl<'a> Text<'a> {
     }
 
     /// Checked XML.
-    pub(crate) fn xml(bytes: &'a [u8], space: xml::Space) -> Self {
+    pub(crate) fn xml(bytes: &'a [u8], space: xml::Whitespace) -> Self {
         Self(Repr::Xml(bytes, space))
     }
 

@@ -3,10 +3,10 @@
 
 use crate::error::{DecodeError, EncodeError, Problem};
 use crate::view::{AgentIdView, AgentIds, Encoding, List, Part, check_name};
-use crate::xml::out::Out;
 use crate::xml::reader::{Element, Elements, Event};
 use crate::xml::tag::Tag;
-use crate::xml::value::Space;
+use crate::xml::value::Whitespace;
+use crate::xml::writer::XmlWriter;
 use crate::{AgentId, Dialect, Text};
 
 /// The agents in all elements of one kind among the bytes of a document.
@@ -203,7 +203,7 @@ pub(super) fn user_defined<'a>(
     let value = elements.value(element, &[])?;
     Ok(Some((
         name,
-        value.text(Space::Counts, "user-defined value")?,
+        value.text(Whitespace::Preserve, "user-defined value")?,
     )))
 }
 
@@ -218,7 +218,7 @@ pub(super) enum Form {
 
 /// Writes elements with agent identifiers in them, all in one where the dialect's reader takes it.
 pub(super) fn write_all(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     element: &str,
     agents: &[AgentId],
     form: Form,
@@ -242,7 +242,7 @@ pub(super) fn write_all(
 }
 
 pub(super) fn write(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     agent: &AgentId,
     form: Form,
     dialect: Dialect,
@@ -291,7 +291,7 @@ pub(super) fn write(
 }
 
 fn write_value(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     (element, attribute): (&str, &str),
     what: &'static str,
     value: &str,

@@ -2,14 +2,14 @@
 
 use crate::Text;
 use crate::envelope::parts::{
-    AclRepresentationView, Event, Events, Parameter, Part, ReceivedView, Stamp, UserDefined,
+    AclRepresentationView, Event, Events, Parameter, Part, ReceivedView, StampParts, UserDefined,
 };
 use crate::error::{DecodeError, Problem};
 use crate::view::AgentIds;
 use crate::xml::agent_id;
 use crate::xml::reader::{Element, Elements};
 use crate::xml::tag::Tag;
-use crate::xml::value::Space;
+use crate::xml::value::Whitespace;
 
 const CLAUSE: &str = "FIPA00085";
 
@@ -21,12 +21,12 @@ const MAX_NESTING: usize = 64;
 
 /// A walk through an envelope, directly behind which the payload may follow.
 #[derive(Debug, Clone)]
-pub(crate) struct Walk<'a> {
+pub(crate) struct EnvelopeReader<'a> {
     elements: Elements<'a>,
     /// Where the outermost element begins, once it has.
     root: Option<usize>,
     /// The parts that are open, and how many there are.
-    open: [Opened; MAX_NESTING],
+    open: [OpenPart; MAX_NESTING],
     depth: usize,
     /// How many parts have begun.
     parts: usize,
@@ -36,17 +36,17 @@ pub(crate) struct Walk<'a> {
 }
 
 #[derive(Debug, Clone, Copy, Default)]
-struct Opened {
+struct OpenPart {
     part: usize,
     index: u64,
 }
 
-impl<'a> Walk<'a> {
+impl<'a> EnvelopeReader<'a> {
     pub(crate) fn new(bytes: &'a [u8]) -> Self {
         Self {
             elements: Elements::new(bytes, CLAUSE),
             root: None,
-            open: [Opened::default(); MAX_NESTING],
+            open: [OpenPart::default(); MAX_NESTING],
             depth: 0,
             parts: 0,
             index: 1,
@@ -70,7 +70,7 @@ impl<'a> Walk<'a> {
         self.parts += 1;
         let (part, index) = (self.parts, self.index);
         match self.open.get_mut(self.depth) {
-            Some(open) => *open = Opened { part, index },
+            Some(open) => *open = OpenPart { part, index },
             None => return Err(wrong(Problem::TooDeep("params"))),
         }
         self.depth += 1;
@@ -78,7 +78,7 @@ impl<'a> Walk<'a> {
     }
 }
 
-impl<'a> Events<'a> for Walk<'a> {
+impl<'a> Events<'a> for EnvelopeReader<'a> {
     fn next(&mut self) -> Result<Option<Event<'a>>, DecodeError> {
         if self.ended {
             return Ok(None);
@@ -104,7 +104,7 @@ impl<'a> Events<'a> for Walk<'a> {
                 // What follows belongs to the part that this one was in.
                 let around = self.depth.checked_sub(1).and_then(|at| self.open.get(at));
                 match around {
-                    Some(Opened { part, index }) => {
+                    Some(OpenPart { part, index }) => {
                         let (part, index) = (*part, *index);
                         return Ok(Some(Event::Part(Part::Params { part, index })));
                     }
@@ -134,7 +134,7 @@ fn parameter<'a>(
 ) -> Result<Option<Parameter<'a>>, DecodeError> {
     let text = |elements: &mut Elements<'a>, what| {
         let value = elements.value(child, &["value"])?;
-        value.text(Space::Counts, what)
+        value.text(Whitespace::Preserve, what)
     };
     Ok(Some(match child.tag {
         Tag::To => Parameter::To(agents(elements, child)?),
@@ -224,7 +224,7 @@ fn received<'a>(
         from,
         id,
         via,
-        rest: Stamp::Xml(inside.unwrap_or_default()),
+        parts: StampParts::Xml(inside.unwrap_or_default()),
     }))
 }
 

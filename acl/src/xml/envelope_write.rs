@@ -2,9 +2,10 @@
 
 use crate::bitefficient::write;
 use crate::dialect::local_time;
+use crate::envelope::present;
 use crate::error::EncodeError;
 use crate::xml::agent_id::{self, Form};
-use crate::xml::out::Out;
+use crate::xml::writer::XmlWriter;
 use crate::{Dialect, Envelope, EnvelopeParams, Received, Time};
 
 /// Writes the encoded envelope, all extensions included.
@@ -17,9 +18,9 @@ use crate::{Dialect, Envelope, EnvelopeParams, Received, Time};
 pub(crate) fn encode(
     envelope: &Envelope,
     dialect: Dialect,
-    out: &mut dyn write::Out,
+    out: &mut dyn write::Output,
 ) -> Result<(), EncodeError> {
-    let mut out = Out::new(out, dialect);
+    let mut out = XmlWriter::new(out, dialect);
     out.raw(match dialect {
         Dialect::Standard => "<?xml version=\"1.0\"?>",
         Dialect::FipaServices => "<?xml version=\"1.0\" ?>",
@@ -39,7 +40,7 @@ pub(crate) fn encode(
 }
 
 fn write_part(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     index: usize,
     params: &EnvelopeParams,
     dialect: Dialect,
@@ -95,7 +96,7 @@ fn write_part(
 }
 
 fn write_received(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     received: &Received,
     dialect: Dialect,
 ) -> Result<(), EncodeError> {
@@ -122,7 +123,7 @@ fn write_received(
 }
 
 fn write_text(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     element: &'static str,
     text: Option<&str>,
 ) -> Result<(), EncodeError> {
@@ -133,7 +134,7 @@ fn write_text(
 }
 
 fn write_user_defined(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     pairs: &[(String, String)],
     dialect: Dialect,
 ) -> Result<(), EncodeError> {
@@ -141,13 +142,6 @@ fn write_user_defined(
         out.user_defined(name, value, dialect != Dialect::Standard)?;
     }
     Ok(())
-}
-
-/// An empty text is how peers say that there is none.
-fn present<'a>(what: &'static str, text: &'a str) -> Result<&'a str, EncodeError> {
-    (!text.is_empty())
-        .then_some(text)
-        .ok_or(EncodeError::Empty(what))
 }
 
 fn time_text(what: &'static str, time: Time, dialect: Dialect) -> Result<String, EncodeError> {

@@ -7,7 +7,7 @@ use crate::view::{Content, PerformativeView, UserDefined};
 use crate::xml::agent_id;
 use crate::xml::reader::{Element, Elements};
 use crate::xml::tag::Tag;
-use crate::xml::value::Space;
+use crate::xml::value::Whitespace;
 
 const CLAUSE: &str = "FIPA00071";
 
@@ -40,7 +40,7 @@ pub(crate) fn view(bytes: &[u8]) -> Result<MessageView<'_>, DecodeError> {
     if let (None, Some(value)) = (view.conversation_id, conversation)
         && !value.is_empty()
     {
-        view.conversation_id = Some(value.text(Space::Counts, "conversation-id")?);
+        view.conversation_id = Some(value.text(Whitespace::Preserve, "conversation-id")?);
     }
     view.settle_base64(content_offset, CLAUSE)?;
     elements.finish()?;
@@ -104,7 +104,11 @@ impl<'a> MessageView<'a> {
             }
             _ => return agent_id::user_defined(elements, child),
         };
-        *text = Some(elements.value(child, &[])?.text(Space::Counts, what)?);
+        *text = Some(
+            elements
+                .value(child, &[])?
+                .text(Whitespace::Preserve, what)?,
+        );
         Ok(None)
     }
 }

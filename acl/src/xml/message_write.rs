@@ -4,7 +4,7 @@ use crate::bitefficient::write;
 use crate::dialect::{JADE_ENCODING, local_time};
 use crate::error::EncodeError;
 use crate::xml::agent_id::{self, Form};
-use crate::xml::out::Out;
+use crate::xml::writer::XmlWriter;
 use crate::{Dialect, Message, Performative, Time};
 
 /// Writes the encoded message.
@@ -16,9 +16,9 @@ use crate::{Dialect, Message, Performative, Time};
 pub(crate) fn encode(
     message: &Message,
     dialect: Dialect,
-    out: &mut dyn write::Out,
+    out: &mut dyn write::Output,
 ) -> Result<(), EncodeError> {
-    let mut out = Out::new(out, dialect);
+    let mut out = XmlWriter::new(out, dialect);
     let jade = dialect == Dialect::Jade;
     match dialect {
         Dialect::Standard => out.raw("<?xml version=\"1.0\"?>"),
@@ -107,7 +107,7 @@ fn act(message: &Message, jade: bool) -> Result<String, EncodeError> {
 }
 
 fn write_content(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     message: &Message,
     dialect: Dialect,
 ) -> Result<(), EncodeError> {
@@ -132,7 +132,7 @@ fn write_content(
 }
 
 fn write_text(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     element: &'static str,
     text: Option<&str>,
     dialect: Dialect,

@@ -14,15 +14,15 @@ mod envelope_read;
 mod envelope_write;
 mod message_read;
 mod message_write;
-mod out;
 mod plain;
 mod reader;
 mod tag;
 mod value;
+mod writer;
 
 pub(crate) use agent_id::{AgentSet, next_part};
-pub(crate) use envelope_read::{Walk, next_received_user_defined};
+pub(crate) use envelope_read::{EnvelopeReader, next_received_user_defined};
 pub(crate) use envelope_write::encode as encode_envelope;
 pub(crate) use message_read::{next_user_defined, view};
 pub(crate) use message_write::encode;
-pub(crate) use value::{Space, unescaped};
+pub(crate) use value::{Whitespace, unescaped};

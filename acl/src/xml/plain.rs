@@ -1,16 +1,16 @@
 //! Looking for content that needs no escaping, with loops that the compiler turns into vector
 //! instructions.
 
-/// What stands around a text.
+/// What stands context a text.
 #[derive(Clone, Copy)]
-pub(super) struct Around {
+pub(super) struct TextContext {
     /// The byte in front of it.
     pub(super) before: Option<u8>,
     /// Whether nothing follows.
     pub(super) is_last: bool,
 }
 
-impl Around {
+impl TextContext {
     pub(super) const NOTHING: Self = Self {
         before: None,
         is_last: true,
@@ -19,15 +19,15 @@ impl Around {
 
 /// Whether all bytes are ASCII characters of content that need no escaping; if `guards_space`, for a
 /// reader that condenses white space.
-pub(super) fn is_plain(bytes: &[u8], guards_space: bool, around: Around) -> bool {
+pub(super) fn is_plain(bytes: &[u8], guards_space: bool, context: TextContext) -> bool {
     (is_printable(bytes) || !guards_space && is_text(bytes))
         && memchr::memchr3(b'<', b'&', b'>', bytes).is_none()
-        && (!guards_space || keeps_space(bytes, around))
+        && (!guards_space || keeps_space(bytes, context))
 }
 
 /// Whether all bytes are ASCII characters, none of them a control character but perhaps DEL.
 fn is_printable(bytes: &[u8]) -> bool {
-    // Other characters wrap around or are beyond the bound anyway.
+    // Other characters wrap context or are beyond the bound anyway.
     let over = |byte: &u8| byte.wrapping_sub(b' ');
     // Two halves side by side, so that one does not wait for the other.
     let (one, other) = bytes.split_at(bytes.len() / 2);
@@ -48,9 +48,9 @@ fn is_text(bytes: &[u8]) -> bool {
 }
 
 /// Whether a reader that condenses white space leaves bytes without control characters as they are.
-fn keeps_space(bytes: &[u8], around: Around) -> bool {
-    let begins = bytes.first() == Some(&b' ') && around.before.is_none_or(|byte| byte == b' ');
-    let ends = bytes.last() == Some(&b' ') && around.is_last;
+fn keeps_space(bytes: &[u8], context: TextContext) -> bool {
+    let begins = bytes.first() == Some(&b' ') && context.before.is_none_or(|byte| byte == b' ');
+    let ends = bytes.last() == Some(&b' ') && context.is_last;
     let behind = bytes.get(1..).unwrap_or_default();
     let doubled = bytes.iter().zip(behind).fold(false, |found, (one, next)| {
         found | ((*one == b' ') & (*next == b' '))

@@ -388,10 +388,10 @@ fn markup(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
     if let [b'>', behind @ ..] = bytes {
         return Some((&[], behind));
     }
-    other_markup(bytes)
+    markup_slow(bytes)
 }
 
-fn other_markup(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
+fn markup_slow(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
     let mut len = 0;
     loop {
         let rest = bytes.get(len..)?;

@@ -4,18 +4,21 @@ use crate::Dialect;
 use crate::error::EncodeError;
 use crate::scan::{self, TOPS};
 use crate::word::is_token;
-use crate::xml::plain::{Around, is_plain};
+use crate::xml::plain::{TextContext, is_plain};
 
 /// A document in the making.
-pub(super) struct Out<'a> {
-    out: &'a mut dyn crate::bitefficient::write::Out,
+pub(super) struct XmlWriter<'a> {
+    out: &'a mut dyn crate::bitefficient::write::Output,
     /// White space is escaped wherever a reader that condenses it would change it. fipa_services
     /// itself writes content in CDATA sections only, so outside of them nothing is promised.
     guards_space: bool,
 }
 
-impl<'a> Out<'a> {
-    pub(super) fn new(out: &'a mut dyn crate::bitefficient::write::Out, dialect: Dialect) -> Self {
+impl<'a> XmlWriter<'a> {
+    pub(super) fn new(
+        out: &'a mut dyn crate::bitefficient::write::Output,
+        dialect: Dialect,
+    ) -> Self {
         Self {
             out,
             guards_space: dialect == Dialect::FipaServices,
@@ -84,21 +87,21 @@ impl<'a> Out<'a> {
     /// copied before it is checked, because shared memory may change meanwhile.
     pub(super) fn content(&mut self, content: &[u8]) -> Result<(), EncodeError> {
         let guards_space = self.guards_space;
-        let mut around = Around::NOTHING;
+        let mut context = TextContext::NOTHING;
         let mut rest = content;
         while !rest.is_empty() {
             let (step, later) = rest.split_at(rest.len().min(STEP));
-            around.is_last = later.is_empty();
-            let plain = |bytes: &[u8]| is_plain(bytes, guards_space, around);
+            context.is_last = later.is_empty();
+            let plain = |bytes: &[u8]| is_plain(bytes, guards_space, context);
             if self.out.slice_if(step, &plain) {
-                around.before = step.last().copied();
+                context.before = step.last().copied();
                 rest = later;
                 continue;
             }
             while rest.len() > later.len() {
-                let whole = self.piece(rest, around.before)?;
+                let whole = self.piece(rest, context.before)?;
                 let (written, unwritten) = rest.split_at(whole);
-                around.before = written.last().copied();
+                context.before = written.last().copied();
                 rest = unwritten;
             }
         }
@@ -112,8 +115,8 @@ impl<'a> Out<'a> {
         let (copy, _) = copy.split_at_mut(len);
         copy.copy_from_slice(content.split_at(len).0);
         let is_last = len == content.len();
-        let around = Around { before, is_last };
-        if is_plain(copy, self.guards_space, around) {
+        let context = TextContext { before, is_last };
+        if is_plain(copy, self.guards_space, context) {
             self.out.slice(copy);
             return Ok(len);
         }
@@ -131,19 +134,19 @@ impl<'a> Out<'a> {
                 });
             }
         };
-        let around = Around {
+        let context = TextContext {
             is_last: text.len() == content.len(),
-            ..around
+            ..context
         };
-        self.escaped("content", text, self.guards_space, around)?;
+        self.escaped("content", text, self.guards_space, context)?;
         Ok(text.len())
     }
 
     pub(super) fn text(&mut self, what: &'static str, text: &str) -> Result<(), EncodeError> {
-        self.escaped(what, text, true, Around::NOTHING)
+        self.escaped(what, text, true, TextContext::NOTHING)
     }
 
-    /// Text whose reader takes white space around it away: there it is escaped.
+    /// Text whose reader takes white space context it away: there it is escaped.
     pub(super) fn text_trimmed(
         &mut self,
         what: &'static str,
@@ -153,7 +156,7 @@ impl<'a> Out<'a> {
         let before = text.len() - inner.len();
         let core = inner.trim_end_matches(' ');
         self.spaces(before);
-        self.escaped(what, core, true, Around::NOTHING)?;
+        self.escaped(what, core, true, TextContext::NOTHING)?;
         self.spaces(inner.len() - core.len());
         Ok(())
     }
@@ -225,7 +228,7 @@ impl<'a> Out<'a> {
         what: &'static str,
         text: &str,
         layout: bool,
-        around: Around,
+        context: TextContext,
     ) -> Result<(), EncodeError> {
         let looked_for = if self.guards_space {
             MARK | SPACE
@@ -242,9 +245,9 @@ impl<'a> Out<'a> {
             let condensed = || {
                 let before = match at.checked_sub(1) {
                     Some(before) => bytes.get(before).copied(),
-                    None => around.before,
+                    None => context.before,
                 };
-                before.is_none_or(|byte| byte == b' ') || around.is_last && from == bytes.len()
+                before.is_none_or(|byte| byte == b' ') || context.is_last && from == bytes.len()
             };
             let escape = match bytes.get(at..).unwrap_or_default() {
                 [b' ', ..] if condensed() => "&#x20;",
