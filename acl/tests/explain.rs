@@ -163,7 +163,7 @@ fn malformed_bytes_up_to_the_error() {
     let end = "3+1 sender\n\
         4+4   agent identifier: name 'a'\n\
         8+1     resolvers\n\
-        at byte 9: unexpected byte 0x05 where an agent identifier should be (FIPA00069 2.2 AgentIdentifier)\n";
+        at byte 9: found byte 0x05, expected an agent identifier (FIPA00069 2.2 AgentIdentifier)\n";
     assert!(lines.ends_with(end), "{lines}");
     let lines = told(b"\xfa\x10\x08\x0d\x10ab\xff\0\x01");
     let end = "3+4 incomplete, ended by the error\n\

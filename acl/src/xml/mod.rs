@@ -1,13 +1,12 @@
 //! The XML encodings: messages (FIPA00071) and envelopes (FIPA00085).
 //!
-//! [`reader`] walks over elements and knows nothing of FIPA; the other modules know what the
-//! elements mean. Nothing of a document type definition is ever processed, and no entities but the
-//! five of XML itself exist.
+//! [`reader`] parses elements independently of FIPA. The other modules handle the elements of FIPA.
+//! Document type definitions are not processed, and the only entities are the five of XML.
 //!
-//! Reading takes what the standard, fipa_services and JADE write: tags in any case, values as
-//! attribute or text, one element per agent or one for all, unknown elements passed over, and
-//! content in CDATA sections byte for byte, even where that is no XML. What is written is XML 1.0
-//! to the letter.
+//! The reader accepts what the standard, fipa_services and JADE write: tags in any case, values as
+//! attribute or text, and one element per agent or one for all. It skips unknown elements, and
+//! accepts any bytes in CDATA sections, even those that XML forbids. The writer writes strict XML
+//! 1.0.
 
 mod agent_id;
 mod envelope_read;

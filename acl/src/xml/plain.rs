@@ -11,14 +11,15 @@ pub(super) struct TextContext {
 }
 
 impl TextContext {
-    pub(super) const NOTHING: Self = Self {
+    /// The context of a whole text.
+    pub(super) const WHOLE: Self = Self {
         before: None,
         is_last: true,
     };
 }
 
-/// Whether all bytes are ASCII characters of content that need no escaping; if `guards_space`, for a
-/// reader that condenses white space.
+/// Whether all bytes are ASCII characters of content that need no escaping. With `guards_space`, this
+/// is for a reader that condenses white space.
 pub(super) fn is_plain(bytes: &[u8], guards_space: bool, context: TextContext) -> bool {
     (is_printable(bytes) || !guards_space && is_text(bytes))
         && memchr::memchr3(b'<', b'&', b'>', bytes).is_none()
@@ -29,7 +30,7 @@ pub(super) fn is_plain(bytes: &[u8], guards_space: bool, context: TextContext) -
 fn is_printable(bytes: &[u8]) -> bool {
     // Other characters wrap context or are beyond the bound anyway.
     let over = |byte: &u8| byte.wrapping_sub(b' ');
-    // Two halves side by side, so that one does not wait for the other.
+    // Two halves in parallel, so that neither waits for the other.
     let (one, other) = bytes.split_at(bytes.len() / 2);
     let both = one.iter().zip(other);
     let most = both.fold(0, |most: u8, (one, other)| {
@@ -39,7 +40,7 @@ fn is_printable(bytes: &[u8]) -> bool {
     most.max(last) < 0x60
 }
 
-/// The same, with line feeds and tabulators.
+/// Like [`is_printable`], but line feeds and tabs are accepted too.
 fn is_text(bytes: &[u8]) -> bool {
     bytes.iter().fold(0, |others, byte| {
         let printable = byte.wrapping_sub(b' ') < 0x60;
@@ -47,7 +48,7 @@ fn is_text(bytes: &[u8]) -> bool {
     }) == 0
 }
 
-/// Whether a reader that condenses white space leaves bytes without control characters as they are.
+/// Whether a reader that condenses white space reads bytes without control characters unchanged.
 fn keeps_space(bytes: &[u8], context: TextContext) -> bool {
     let begins = bytes.first() == Some(&b' ') && context.before.is_none_or(|byte| byte == b' ');
     let ends = bytes.last() == Some(&b' ') && context.is_last;

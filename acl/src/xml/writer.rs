@@ -1,4 +1,4 @@
-//! Writing XML 1.0: escaped text, nothing that a reader would change.
+//! Writer of XML 1.0. It escapes all text that a reader would otherwise change.
 
 use crate::Dialect;
 use crate::error::EncodeError;
@@ -6,11 +6,11 @@ use crate::scan::{self, TOPS};
 use crate::word::is_token;
 use crate::xml::plain::{TextContext, is_plain};
 
-/// A document in the making.
+/// Writes a document.
 pub(super) struct XmlWriter<'a> {
     out: &'a mut dyn crate::bitefficient::write::Output,
-    /// White space is escaped wherever a reader that condenses it would change it. fipa_services
-    /// itself writes content in CDATA sections only, so outside of them nothing is promised.
+    /// Whether to escape white space that a condensing reader would change. fipa_services writes
+    /// content in CDATA sections, and its reader may condense white space outside of them.
     guards_space: bool,
 }
 
@@ -25,7 +25,7 @@ impl<'a> XmlWriter<'a> {
         }
     }
 
-    /// Something that needs no escaping.
+    /// Writes text that needs no escaping.
     pub(super) fn raw(&mut self, text: &str) {
         self.out.slice(text.as_bytes());
     }
@@ -42,7 +42,7 @@ impl<'a> XmlWriter<'a> {
         self.raw(">");
     }
 
-    /// A value in an attribute of an element that is otherwise empty.
+    /// Writes an empty element with one attribute.
     pub(super) fn empty(
         &mut self,
         element: &str,
@@ -83,11 +83,12 @@ impl<'a> XmlWriter<'a> {
         Ok(())
     }
 
-    /// Text that keeps its line breaks and tabulators as they are where the reader lets it. It is
-    /// copied before it is checked, because shared memory may change meanwhile.
+    /// Writes content. Line breaks and tabs are escaped only if the reader would change them. The
+    /// content is copied before it is checked, because another process may change shared memory at
+    /// any time.
     pub(super) fn content(&mut self, content: &[u8]) -> Result<(), EncodeError> {
         let guards_space = self.guards_space;
-        let mut context = TextContext::NOTHING;
+        let mut context = TextContext::WHOLE;
         let mut rest = content;
         while !rest.is_empty() {
             let (step, later) = rest.split_at(rest.len().min(STEP));
@@ -143,7 +144,7 @@ impl<'a> XmlWriter<'a> {
     }
 
     pub(super) fn text(&mut self, what: &'static str, text: &str) -> Result<(), EncodeError> {
-        self.escaped(what, text, true, TextContext::NOTHING)
+        self.escaped(what, text, true, TextContext::WHOLE)
     }
 
     /// Text whose reader takes white space context it away: there it is escaped.
@@ -156,7 +157,7 @@ impl<'a> XmlWriter<'a> {
         let before = text.len() - inner.len();
         let core = inner.trim_end_matches(' ');
         self.spaces(before);
-        self.escaped(what, core, true, TextContext::NOTHING)?;
+        self.escaped(what, core, true, TextContext::WHOLE)?;
         self.spaces(inner.len() - core.len());
         Ok(())
     }
@@ -167,7 +168,7 @@ impl<'a> XmlWriter<'a> {
         }
     }
 
-    /// A user-defined parameter as the standards have it. Peers write a type too.
+    /// Writes a user-defined parameter in the form of the standards. Peers write a type too.
     pub(super) fn user_defined(
         &mut self,
         name: &str,
@@ -187,13 +188,13 @@ impl<'a> XmlWriter<'a> {
         Ok(())
     }
 
-    /// A user-defined parameter as an element of its own name.
+    /// Writes a user-defined parameter as an element with its name.
     pub(super) fn user_element(&mut self, name: &str, value: &str) -> Result<(), EncodeError> {
         check_element_name(name)?;
         self.element(&format!("X-{name}"), USER_DEFINED, value)
     }
 
-    /// A user-defined parameter as an element of its own name that repeats the name as `href`:
+    /// Writes a user-defined parameter as an element with its name, which `href` repeats:
     /// `<X-role href="X-role" type="string">lifts</X-role>`.
     pub(super) fn user_element_with_name(
         &mut self,
@@ -212,7 +213,7 @@ impl<'a> XmlWriter<'a> {
         Ok(())
     }
 
-    /// Refuses an empty user-defined parameter if its reader loses it.
+    /// Refuses an empty user-defined parameter if the reader would lose it.
     fn check_guarded(&self, value: &str) -> Result<(), EncodeError> {
         if self.guards_space && value.is_empty() {
             return Err(EncodeError::Unrepresentable {
@@ -241,7 +242,7 @@ impl<'a> XmlWriter<'a> {
         while let Some(found) = bytes.get(from..).and_then(|rest| marked(rest, looked_for)) {
             let at = from + found;
             from = at + 1;
-            // In front of the text there might as well be a space.
+            // A space may be in front of the text.
             let condensed = || {
                 let before = match at.checked_sub(1) {
                     Some(before) => bytes.get(before).copied(),
@@ -263,7 +264,7 @@ impl<'a> XmlWriter<'a> {
                 [0..=0x1f, ..] | [0xef, 0xbf, 0xbe | 0xbf, ..] => {
                     return Err(EncodeError::Unrepresentable {
                         what,
-                        why: "XML has no way to write its control characters",
+                        why: "XML cannot represent its control characters",
                     });
                 }
                 _ => continue,
@@ -277,33 +278,33 @@ impl<'a> XmlWriter<'a> {
     }
 }
 
-/// How errors name a user-defined parameter.
+/// The name of a user-defined parameter in errors.
 const USER_DEFINED: &str = "user-defined parameter";
 
-/// Refuses a name of a user-defined parameter that no reader takes for that of an element.
+/// Refuses a name of a user-defined parameter that readers do not accept as an element name.
 fn check_element_name(name: &str) -> Result<(), EncodeError> {
     let allowed = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
     if name.is_empty() || !name.bytes().all(allowed) {
         return Err(EncodeError::Unrepresentable {
             what: USER_DEFINED,
-            why: "its reader needs a name of letters, digits, '-', '_' and '.'",
+            why: "its name must consist of letters, digits, '-', '_' and '.'",
         });
     }
     Ok(())
 }
 
-/// Bytes of content that are copied and checked at a time. A copy stays in the processor's cache until
-/// it has been checked.
+/// Number of bytes of content that are copied and checked at a time. They fit into the processor's
+/// cache.
 const STEP: usize = 16 << 10;
 
-/// Bytes of content that are escaped at a time.
+/// Number of bytes of content that are escaped at a time.
 const PIECE: usize = 4096;
 
-/// Where the first byte is that is looked for.
+/// Returns the position of the first byte of the classes `looked_for`.
 fn marked(bytes: &[u8], looked_for: u8) -> Option<usize> {
     let mut before = 0;
-    // Content may be long, and is looked at eight bytes at a time. '"' and '&', '<' and '>' differ in
-    // one bit each.
+    // Content may be long, so eight bytes are checked at a time. '"' and '&' differ in one bit, and
+    // so do '<' and '>'.
     let eights = |byte: u8| u64::from_le_bytes([byte; 8]);
     for eight in bytes.as_chunks::<8>().0 {
         let word = u64::from_le_bytes(*eight);
@@ -327,11 +328,12 @@ fn marked(bytes: &[u8], looked_for: u8) -> Option<usize> {
     Some(before + found)
 }
 
-/// Bytes that are escaped or refused, or might be.
+/// Class of bytes that may need an escape or be refused.
 const MARK: u8 = 1;
+/// Class of the space.
 const SPACE: u8 = 2;
 
-/// A table, because content may be long.
+/// The class of each byte. A lookup is fast for long content.
 static CLASS: [u8; 256] = {
     let mut class = [0; 256];
     let mut byte = 0;
