@@ -1,12 +1,12 @@
-//! Looking for content that needs no escaping, with loops that the compiler turns into vector
+//! Detection of content that needs no escaping. The compiler turns the loops into vector
 //! instructions.
 
-/// What stands context a text.
+/// The position of a piece in its text.
 #[derive(Clone, Copy)]
 pub(super) struct TextContext {
-    /// The byte in front of it.
+    /// The byte in front of the piece.
     pub(super) before: Option<u8>,
-    /// Whether nothing follows.
+    /// Whether the piece ends the text.
     pub(super) is_last: bool,
 }
 
@@ -26,9 +26,9 @@ pub(super) fn is_plain(bytes: &[u8], guards_space: bool, context: TextContext) -
         && (!guards_space || keeps_space(bytes, context))
 }
 
-/// Whether all bytes are ASCII characters, none of them a control character but perhaps DEL.
+/// Whether all bytes are ASCII characters without control characters. DEL is accepted.
 fn is_printable(bytes: &[u8]) -> bool {
-    // Other characters wrap context or are beyond the bound anyway.
+    // Other bytes wrap around or exceed the bound.
     let over = |byte: &u8| byte.wrapping_sub(b' ');
     // Two halves in parallel, so that neither waits for the other.
     let (one, other) = bytes.split_at(bytes.len() / 2);

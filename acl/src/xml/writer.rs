@@ -147,7 +147,7 @@ impl<'a> XmlWriter<'a> {
         self.escaped(what, text, true, TextContext::WHOLE)
     }
 
-    /// Text whose reader takes white space context it away: there it is escaped.
+    /// Writes text for a reader that removes the white space around it. That white space is escaped.
     pub(super) fn text_trimmed(
         &mut self,
         what: &'static str,
