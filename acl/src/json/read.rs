@@ -358,7 +358,7 @@ mod tests {
             (
                 json!({ "message": { "performative": "inform", "sender": { "name": "" } } }),
                 "message.sender.name",
-                "not empty",
+                "must not be empty",
             ),
             (
                 json!({ "performative": "inform", "sender": { "name": 7 } }),
@@ -385,7 +385,7 @@ mod tests {
             (
                 json!({ "envelope": { "base": { "to": agents } } }),
                 "envelope.base.to[1].resolvers[0].name",
-                "not empty",
+                "must not be empty",
             ),
             (
                 json!({ "envelope": { "base": base, "extensions": [{ "date": "soon" }] } }),
