@@ -174,7 +174,10 @@ fn malformed_bytes_are_explained_up_to_the_error() {
     assert!(lines.ends_with(end), "{lines}");
     assert!(lines_of(b"").starts_with("at byte 0: the bytes end within a message"));
     assert!(lines_of(b"(inform)").starts_with("at byte 0: the string representation"));
-    assert!(lines_of(b"\xfb\x10\x08\x01").starts_with("at byte 0: the message uses dynamic"));
+    assert!(
+        lines_of(b"\xfb\x10\x08\x01")
+            .starts_with("at byte 0: the message uses a dynamic code table")
+    );
 
     // Behind an envelope, offsets are relative to the letter.
     let mut letter = recorded("tcp_letter.bin");
