@@ -63,7 +63,7 @@ performatives! {
     AcceptProposal = 0x01 "accept-proposal",
     /// Agreeing to perform some action, possibly in the future.
     Agree = 0x02 "agree",
-    /// Telling that an action that was asked for is no longer wanted.
+    /// Telling that a requested action is no longer wanted.
     Cancel = 0x03 "cancel",
     /// Calling for proposals to perform an action.
     Cfp = 0x04 "cfp",
@@ -101,7 +101,7 @@ performatives! {
     RequestWhen = 0x14 "request-when",
     /// Asking to perform an action each time a proposition becomes true.
     RequestWhenever = 0x15 "request-whenever",
-    /// Asking to be told of every change of what a descriptor refers to.
+    /// Asking for a report of every change of the object that a descriptor refers to.
     Subscribe = 0x16 "subscribe",
 }
 

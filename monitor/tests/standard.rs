@@ -386,10 +386,10 @@ fn every_performative_is_checked_in_every_state() {
     let library = Arc::new(Library::standard());
     let mut wrong = 0;
     for table in &TABLES {
-        for way in shortest_paths(table) {
+        for path in shortest_paths(table) {
             for side in ['>', '<'] {
                 for act in &Performative::STANDARD {
-                    let mut walk = Walk::along(table, &library, &way);
+                    let mut walk = Walk::along(table, &library, &path);
                     let right = walk.row(side, act.as_str()).is_some()
                         || walk.by_common_rules(side, act.as_str());
                     let (name, state) = (table.name, walk.state);
@@ -497,20 +497,20 @@ fn several_participants_have_independent_states() {
             };
             say(&mut walk, "ann", &["ben", "cid", "dan"], first[0].2);
             let mut ends = [false; 3];
-            for place in 1..first.len().max(second.len()).max(third.len()) {
-                for (who, path) in [first, second, third].into_iter().enumerate() {
-                    let Some((_, side, act, to)) = path.get(place) else {
+            for at in 1..first.len().max(second.len()).max(third.len()) {
+                for (index, path) in [first, second, third].into_iter().enumerate() {
+                    let Some((_, side, act, to)) = path.get(at) else {
                         continue;
                     };
-                    let peer = ["ben", "cid", "dan"][who];
+                    let peer = ["ben", "cid", "dan"][index];
                     let (from, receiver) = if *side == '>' {
                         ("ann", peer)
                     } else {
                         (peer, "ann")
                     };
                     let (ended, complete) = say(&mut walk, from, &[receiver], act);
-                    ends[who] = to.starts_with('F');
-                    assert_eq!((ended, complete), (ends[who], ends == [true; 3]));
+                    ends[index] = to.starts_with('F');
+                    assert_eq!((ended, complete), (ends[index], ends == [true; 3]));
                 }
             }
         }
@@ -524,14 +524,14 @@ fn a_cancel_ends_or_resumes_every_protocol() {
     let [inform, failure, cancel] =
         ["inform", "failure", "cancel"].map(|act| act.parse::<Performative>().unwrap());
     for table in TABLES.iter().filter(|table| table.cancel) {
-        for way in shortest_paths(table) {
+        for path in shortest_paths(table) {
             let state = path.last().map_or("0", |row| row.3);
             if state == "0" || state.starts_with('F') {
                 continue;
             }
             let name = table.name;
             // The cancel succeeds: only crossing messages may follow.
-            let mut walk = Walk::along(table, &library, &way);
+            let mut walk = Walk::along(table, &library, &path);
             assert!(walk.say('>', &cancel).is_accepted(), "{name} {state}");
             assert!(!walk.say('>', &cancel).is_accepted(), "{name} {state}");
             let verdict = walk.say('<', &inform);
@@ -543,7 +543,7 @@ fn a_cancel_ends_or_resumes_every_protocol() {
                 assert!(!walk.say('>', act).is_accepted(), "{name} {state} {act}");
             }
             // The cancel fails: the protocol continues in its state.
-            let mut walk = Walk::along(table, &library, &way);
+            let mut walk = Walk::along(table, &library, &path);
             walk.say('>', &cancel);
             assert!(walk.say('<', &failure).is_accepted(), "{name} {state}");
             let onwards = table.rows.iter().filter(|row| row.0 == state);

@@ -14,7 +14,7 @@ use std::time::{Duration, SystemTime};
 use fastrand::Rng;
 use fipa_acl::{Performative, Time};
 use fipa_monitor::{Header, Library, Limits, Machine, Monitor, State, Verdict};
-use reference::{Reference, Says, Words, matches, options};
+use reference::{Reference, ReferenceVerdict, Words, matches, options};
 
 static ACTS: LazyLock<Vec<&'static str>> = LazyLock::new(|| {
     let names = Performative::STANDARD.iter();
@@ -287,7 +287,7 @@ fn walk(seed: u64, steps: u64) -> [u64; 3] {
     };
     let mut counts = [0; 3];
     let mut ids: Vec<u64> = (0..8).collect();
-    let mut heard: Vec<String> = Vec::new();
+    let mut log: Vec<String> = Vec::new();
     for step in 0..steps {
         // Conversations are replaced by new ones and get no further messages.
         if walk.rng.u8(..) < 12 {
@@ -298,37 +298,37 @@ fn walk(seed: u64, steps: u64) -> [u64; 3] {
         walk.now += walk.rng.u64(0..1_500);
         let id = format!("c{}", walk.pick(&ids));
         let words = walk.words(id);
-        let expected = walk.reference.hear(&words, walk.now);
+        let expected = walk.reference.check(&words, walk.now);
         let header = header(&words);
         let verdict = monitor.check(&header, at(walk.now));
-        let said = match &verdict {
+        let actual = match &verdict {
             Verdict::Accepted(right) => {
                 counts[0] += 1;
                 let flags = [right.opened, right.ended, right.complete, right.late];
-                Says::Right(right.state.to_owned(), flags)
+                ReferenceVerdict::Accepted(right.state.to_owned(), flags)
             }
             Verdict::Violation(violation) => {
                 counts[1] += 1;
-                Says::Wrong(violation.kind.as_str())
+                ReferenceVerdict::Violation(violation.kind.as_str())
             }
             _ => {
                 counts[2] += 1;
-                Says::Nothing
+                ReferenceVerdict::Unchecked
             }
         };
-        heard.push(format!("{words:?} -> {said:?}"));
-        if said != expected {
-            let own: Vec<&String> = heard
+        log.push(format!("{words:?} -> {actual:?}"));
+        if actual != expected {
+            let own: Vec<&String> = log
                 .iter()
                 .filter(|line| line.contains(&format!("id: {:?}", words.id)))
                 .collect();
             panic!(
-                "seed {seed}, step {step}: {said:?}, the reference says {expected:?}\n{:#?}\n{verdict:?}",
+                "seed {seed}, step {step}: {actual:?}, the reference expects {expected:?}\n{:#?}\n{verdict:?}",
                 &own[own.len().saturating_sub(12)..]
             );
         }
-        if heard.len() > 4_000 {
-            heard.drain(..2_000);
+        if log.len() > 4_000 {
+            log.drain(..2_000);
         }
         if step % 1_000 == 0 && walk.rng.bool() {
             monitor.handle_timeout(at(walk.now));

@@ -27,10 +27,10 @@ pub(crate) struct Words {
 
 /// The verdict of the reference: the new state with opened, ended, complete, late; or the violation.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Says {
-    Right(String, [bool; 4]),
-    Wrong(&'static str),
-    Nothing,
+pub(crate) enum ReferenceVerdict {
+    Accepted(String, [bool; 4]),
+    Violation(&'static str),
+    Unchecked,
 }
 
 /// The machine of a conversation, its initiator and the agents that may continue in its place, and the
@@ -83,25 +83,25 @@ impl<'l> Reference<'l> {
         Some((conversation.machine, initiators.collect(), states.collect()))
     }
 
-    pub(crate) fn hear(&mut self, words: &Words, now: u64) -> Says {
+    pub(crate) fn check(&mut self, words: &Words, now: u64) -> ReferenceVerdict {
         if let Some(conversation) = self.talks.get_mut(&words.id) {
             let library = self.library;
             return conversation
-                .hear_any(library, words, now)
-                .unwrap_or_else(Says::Wrong);
+                .check_any(library, words, now)
+                .unwrap_or_else(ReferenceVerdict::Violation);
         }
         let named = words
             .protocol
             .as_ref()
             .and_then(|name| self.library.find(name));
         let Some(machine) = named else {
-            return Says::Nothing;
+            return ReferenceVerdict::Unchecked;
         };
         let mut conversation = Conversation::new(machine, words.from, self.agent);
-        match conversation.hear(words, now) {
-            Ok(says) => {
+        match conversation.check(words, now) {
+            Ok(verdict) => {
                 self.talks.insert(words.id.clone(), conversation);
-                says
+                verdict
             }
             Err(_) => match self.agent {
                 Some(agent)
@@ -111,9 +111,9 @@ impl<'l> Reference<'l> {
                 {
                     let joined = Conversation::joined(machine, agent, words);
                     self.talks.insert(words.id.clone(), joined);
-                    Says::Nothing
+                    ReferenceVerdict::Unchecked
                 }
-                _ => Says::Wrong("not-opened"),
+                _ => ReferenceVerdict::Violation("not-opened"),
             },
         }
     }
@@ -177,7 +177,11 @@ impl<'l> Conversation<'l> {
     }
 
     /// Reconsiders a violation in a conversation that began between other agents.
-    fn elsewhere(&mut self, words: &Words, wrong: &'static str) -> Result<Says, &'static str> {
+    fn elsewhere(
+        &mut self,
+        words: &Words,
+        wrong: &'static str,
+    ) -> Result<ReferenceVerdict, &'static str> {
         let machine = self.machine;
         let asked = self.may_continue_elsewhere() && self.takes_part(words.from);
         let excused = if !self.joined && (!asked || ["repeated", "wrong-receiver"].contains(&wrong))
@@ -205,24 +209,24 @@ impl<'l> Conversation<'l> {
             self.joined && begins(machine, words.act)
         };
         if excused {
-            Ok(Says::Nothing)
+            Ok(ReferenceVerdict::Unchecked)
         } else {
             Err(wrong)
         }
     }
 
     /// Checks a message of this conversation, or of an embedded one.
-    fn hear_any(
+    fn check_any(
         &mut self,
         library: &'l Library,
         words: &Words,
         now: u64,
-    ) -> Result<Says, &'static str> {
+    ) -> Result<ReferenceVerdict, &'static str> {
         let name = match &words.protocol {
             Some(name) if !self.machine.is_called(name) => name,
             _ => {
-                let says = self.hear(words, now);
-                return says.or_else(|wrong| self.elsewhere(words, wrong));
+                let verdict = self.check(words, now);
+                return verdict.or_else(|wrong| self.elsewhere(words, wrong));
             }
         };
         let may_begin = self.may_begin(library, name, words.from)
@@ -233,8 +237,8 @@ impl<'l> Conversation<'l> {
         let (mut first_wrong, mut open) = (None, None);
         for (at, inner) in self.inner.iter_mut().enumerate() {
             if inner.machine.is_called(name) {
-                match inner.hear(words, now) {
-                    Ok(says) => return Ok(says),
+                match inner.check(words, now) {
+                    Ok(verdict) => return Ok(verdict),
                     Err(wrong) if inner.may_continue_elsewhere() => open = Some((at, wrong)),
                     Err(wrong) => first_wrong = first_wrong.or(Some(wrong)),
                 }
@@ -257,25 +261,25 @@ impl<'l> Conversation<'l> {
                     let joined = Conversation::joined(machine, agent, words);
                     self.inner.insert(0, joined);
                 }
-                return Ok(Says::Nothing);
+                return Ok(ReferenceVerdict::Unchecked);
             }
             if self.joined {
-                return Ok(Says::Nothing);
+                return Ok(ReferenceVerdict::Unchecked);
             }
             return Err("wrong-protocol");
         }
         let Some(machine) = library.find(name) else {
-            return Ok(Says::Nothing);
+            return Ok(ReferenceVerdict::Unchecked);
         };
         if self.inner.len() == 64 {
             return Err("too-many");
         }
         let mut inner = Conversation::new(machine, words.from, self.agent);
-        let says = inner
-            .hear(words, now)
+        let verdict = inner
+            .check(words, now)
             .map_err(|_| first_wrong.unwrap_or("not-opened"))?;
         self.inner.insert(0, inner);
-        Ok(says)
+        Ok(verdict)
     }
 
     fn may_begin(&self, library: &Library, name: &str, from: &str) -> bool {
@@ -350,13 +354,13 @@ fn place(talks: &[(&'static str, Talk)], name: &str) -> Option<usize> {
 }
 
 impl Conversation<'_> {
-    fn hear(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
+    fn check(&mut self, words: &Words, now: u64) -> Result<ReferenceVerdict, &'static str> {
         for (_, talk) in &mut self.talks {
             talk.expire(self.machine, now);
         }
         match self.machine.scope() {
-            Scope::Participant => self.hear_each(words, now),
-            _ => self.hear_all(words, now),
+            Scope::Participant => self.check_per_participant(words, now),
+            _ => self.check_per_conversation(words, now),
         }
     }
 
@@ -384,30 +388,38 @@ impl Conversation<'_> {
         }
     }
 
-    fn hear_each(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
+    fn check_per_participant(
+        &mut self,
+        words: &Words,
+        now: u64,
+    ) -> Result<ReferenceVerdict, &'static str> {
         let designated = self.designated.contains(&words.from);
         if words.from == self.initiator {
-            self.hear_initiator(words, now)
+            self.check_initiator(words, now)
         } else if self.multicast.is_some() || place(&self.talks, words.from).is_some() {
-            match self.hear_participant(words, now) {
+            match self.check_participant(words, now) {
                 // The other of the two parts of the sender may fit.
                 Err(wrong) if designated => {
-                    self.hear_initiator(words, now)
+                    self.check_initiator(words, now)
                         .map_err(|other| match wrong {
                             "wrong-receiver" => other,
                             wrong => wrong,
                         })
                 }
-                says => says,
+                verdict => verdict,
             }
         } else if designated {
-            self.hear_initiator(words, now)
+            self.check_initiator(words, now)
         } else {
             self.reported_from_outside(words)
         }
     }
 
-    fn hear_participant(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
+    fn check_participant(
+        &mut self,
+        words: &Words,
+        now: u64,
+    ) -> Result<ReferenceVerdict, &'static str> {
         let machine = self.machine;
         let known = place(&self.talks, words.from);
         let talk = match (known, &self.multicast) {
@@ -425,12 +437,16 @@ impl Conversation<'_> {
             self.talks.len() - 1
         });
         let (opened, late) = self.talks[at].1.go(machine, words, false, step, now);
-        Ok(self.says(Some(at), opened || known.is_none(), late))
+        Ok(self.verdict(Some(at), opened || known.is_none(), late))
     }
 
     /// Checks a message of the initiator, or of an agent that continues in its place and cannot add
     /// participants.
-    fn hear_initiator(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
+    fn check_initiator(
+        &mut self,
+        words: &Words,
+        now: u64,
+    ) -> Result<ReferenceVerdict, &'static str> {
         let machine = self.machine;
         let brings_in = words.from == self.initiator && !self.joined;
         // All receivers or none.
@@ -490,7 +506,7 @@ impl Conversation<'_> {
         if speaks {
             self.designate(words);
         }
-        Ok(self.says_state(first, opened, late))
+        Ok(self.verdict_in(first, opened, late))
     }
 
     fn designate(&mut self, words: &Words) {
@@ -503,7 +519,7 @@ impl Conversation<'_> {
 
     /// Checks a message of an outside agent: a failure report of a message transport service, or a
     /// violation.
-    fn reported_from_outside(&mut self, words: &Words) -> Result<Says, &'static str> {
+    fn reported_from_outside(&mut self, words: &Words) -> Result<ReferenceVerdict, &'static str> {
         let takes_part = |name: &str| {
             name == self.initiator
                 || self.designated.contains(&name)
@@ -544,10 +560,14 @@ impl Conversation<'_> {
                 first = first.or(Some(talk.name()));
             }
         }
-        Ok(self.says_state(first, false, false))
+        Ok(self.verdict_in(first, false, false))
     }
 
-    fn hear_all(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
+    fn check_per_conversation(
+        &mut self,
+        words: &Words,
+        now: u64,
+    ) -> Result<ReferenceVerdict, &'static str> {
         let machine = self.machine;
         let free: Vec<String> = machine
             .roles()
@@ -585,7 +605,7 @@ impl Conversation<'_> {
             Ok(step) => step,
             Err(_) if unknown(words.from) && words.act == "failure" && !strange => {
                 self.talks[0].1.fail();
-                return Ok(self.says(Some(0), false, false));
+                return Ok(self.verdict(Some(0), false, false));
             }
             Err(_) if unknown(words.from) => return Err("stranger"),
             Err("unexpected" | "out-of-order") if strange => return Err("wrong-receiver"),
@@ -613,14 +633,14 @@ impl Conversation<'_> {
         if by_initiator {
             self.designate(words);
         }
-        Ok(self.says(Some(0), opened, late))
+        Ok(self.verdict(Some(0), opened, late))
     }
 
-    fn says(&self, at: Option<usize>, opened: bool, late: bool) -> Says {
-        self.says_state(at.map(|at| self.talks[at].1.name()), opened, late)
+    fn verdict(&self, at: Option<usize>, opened: bool, late: bool) -> ReferenceVerdict {
+        self.verdict_in(at.map(|at| self.talks[at].1.name()), opened, late)
     }
 
-    fn says_state(&self, name: Option<String>, opened: bool, late: bool) -> Says {
+    fn verdict_in(&self, name: Option<String>, opened: bool, late: bool) -> ReferenceVerdict {
         let machine = self.machine;
         let first = || self.talks.first().map(|(_, talk)| talk.name());
         let name = name
@@ -633,6 +653,6 @@ impl Conversation<'_> {
         };
         let complete =
             self.multicast.is_none() && self.talks.iter().all(|(_, talk)| talk.has_ended(machine));
-        Says::Right(name, [opened, ended, complete, late])
+        ReferenceVerdict::Accepted(name, [opened, ended, complete, late])
     }
 }

@@ -24,12 +24,12 @@ pub(super) enum Spot {
 pub(super) struct Talk {
     pub(super) spot: Spot,
     pub(super) previous: Spot,
-    pub(super) said: Vec<Said>,
+    pub(super) said: Vec<SentMessage>,
     pub(super) due: Option<u64>,
 }
 
 #[derive(Debug, Clone)]
-pub(super) struct Said {
+pub(super) struct SentMessage {
     pub(super) by_initiator: bool,
     pub(super) act: &'static str,
     pub(super) reply_with: Option<String>,
@@ -116,18 +116,18 @@ impl Talk {
         last.is_some_and(|said| said.by_initiator)
     }
 
-    pub(super) fn last_of(&self, initiator: bool) -> Option<&Said> {
+    pub(super) fn last_of(&self, initiator: bool) -> Option<&SentMessage> {
         let mut said = self.said.iter().rev();
         said.find(|said| said.by_initiator == initiator && !said.cancels)
     }
 
-    pub(super) fn earlier_of(&self, initiator: bool) -> Option<&Said> {
+    pub(super) fn earlier_of(&self, initiator: bool) -> Option<&SentMessage> {
         let said = self.said.iter().rev();
         let mut own = said.filter(|said| said.by_initiator == initiator && !said.cancels);
         own.nth(1)
     }
 
-    pub(super) fn cancel(&self) -> Option<&Said> {
+    pub(super) fn cancel(&self) -> Option<&SentMessage> {
         self.said.iter().rev().find(|said| said.cancels)
     }
 
@@ -162,7 +162,7 @@ impl Talk {
         Self {
             previous: spot.clone(),
             spot,
-            said: vec![Said {
+            said: vec![SentMessage {
                 by_initiator: false,
                 act: words.act,
                 reply_with: words.reply_with.clone(),
@@ -438,7 +438,7 @@ impl Talk {
         if !matches!(self.spot, Spot::Undelivered(_)) {
             self.previous = self.spot.clone();
         }
-        self.said.push(Said {
+        self.said.push(SentMessage {
             by_initiator,
             act: words.act,
             reply_with: words.reply_with.clone(),
