@@ -114,7 +114,7 @@ impl Change<'_> {
             state => state,
         };
         if cancels {
-            party.canceller = side;
+            party.canceling_side = side;
             party.cancel = self.observed.reply_with;
         } else {
             let index = side_index(side);

@@ -82,7 +82,7 @@ pub(crate) struct Party {
     /// The side that sent the last message.
     pub(crate) last: Side,
     /// The side that canceled.
-    pub(crate) canceller: Side,
+    pub(crate) canceling_side: Side,
     /// Whether the answer to the cancel may still come, because the message that was taken for it may
     /// have been sent before the cancel arrived.
     pub(crate) echo: bool,
@@ -106,7 +106,7 @@ impl Party {
             resume: state,
             before: state,
             last: Side::Other,
-            canceller: Side::Initiator,
+            canceling_side: Side::Initiator,
             echo: false,
             acts: [0; 2],
             asked: [0; 2],
@@ -255,7 +255,9 @@ pub(crate) fn next_state(
 ) -> Result<NextState, Kind> {
     match party.state {
         CANCELLING => while_cancelling(machine, party, message),
-        CANCELLED if party.echo && message.side != party.canceller && is_cancel_answer(message) => {
+        CANCELLED
+            if party.echo && message.side != party.canceling_side && is_cancel_answer(message) =>
+        {
             Ok(NextState::to(CANCELLED))
         }
         AFTER_NOT_UNDERSTOOD | CANCELLED => Err(ended(party, message)),
@@ -284,7 +286,7 @@ fn while_cancelling(
     message: &PartyMessage<'_>,
 ) -> Result<NextState, Kind> {
     let group = machine.scope == Scope::Conversation;
-    if message.side == party.canceller && !group {
+    if message.side == party.canceling_side && !group {
         return match message.act {
             NOT_UNDERSTOOD => Ok(NextState::to(AFTER_NOT_UNDERSTOOD)),
             _ if is_repeated(party, message) => Err(Kind::Repeated),

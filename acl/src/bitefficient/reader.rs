@@ -476,7 +476,7 @@ pub(crate) fn string_form(bytes: &[u8]) -> (Form, &[u8]) {
 
 /// Unescapes the text between quotation marks: `\"` becomes `"`, and any other backslash stays.
 pub(crate) fn unescaped(inner: &[u8]) -> Cow<'_, [u8]> {
-    // Most texts have no quotation mark, which is faster to check.
+    // Most texts have no quotation mark. Checking for one is faster than searching for escapes.
     let mut escapes = match find_byte(inner, b'"') {
         Some(_) => memchr::memmem::find_iter(inner, b"\\\"").peekable(),
         None => return Cow::Borrowed(inner),

@@ -16,8 +16,8 @@ use crate::xml;
 #[derive(Clone, Copy)]
 pub struct Text<'a>(Repr<'a>);
 
-/// The encoded bytes of a text, which the reader has checked to be UTF-8. They are not a `str`: the
-/// reader checks ASCII texts faster than `from_utf8` does, and many texts are never accessed.
+/// The encoded bytes of a text. The reader has checked that they are UTF-8. They are not a `str`
+/// because making one checks them again, and many texts are never accessed.
 #[derive(Clone, Copy)]
 enum Repr<'a> {
     /// The text itself.

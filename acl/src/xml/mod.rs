@@ -5,8 +5,8 @@
 //!
 //! The reader accepts what the standard, fipa_services and JADE write: tags in any case, values as
 //! attribute or text, and one element per agent or one for all. It skips unknown elements, and
-//! accepts any bytes in CDATA sections, even those that XML forbids. The writer writes strict XML
-//! 1.0.
+//! accepts any bytes in CDATA sections, even those that XML forbids. The writer is strict: its output
+//! is XML 1.0.
 
 mod agent_id;
 mod envelope_read;

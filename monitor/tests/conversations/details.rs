@@ -233,7 +233,7 @@ fn in_reply_to_is_not_compared_among_three_participants() {
 }
 
 #[test]
-fn the_side_that_cancelled_must_wait_for_the_answer() {
+fn the_side_that_canceled_must_wait_for_the_answer() {
     let mut stage = Stage::observer();
     let ask = || request("request ann>ben").reply_with("q");
     stage.right(ask());

@@ -260,8 +260,8 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
         Spot::Elsewhere => Err("unexpected"),
         Spot::NotUnderstood => Err(if repeated { "repeated" } else { "ended" }),
         Spot::Cancelled { one_more } => {
-            let canceller = talk.cancel().is_some_and(|cancel| cancel.by_initiator);
-            if *one_more && view.by_initiator != canceller && answers_cancel {
+            let canceling_side = talk.cancel().is_some_and(|cancel| cancel.by_initiator);
+            if *one_more && view.by_initiator != canceling_side && answers_cancel {
                 return Ok(to(Spot::Cancelled { one_more: false }));
             }
             Err(if repeated { "repeated" } else { "ended" })
