@@ -4,7 +4,7 @@
 //! The reader is lenient: it accepts the standard and what fipa_services and JADE write. The writer
 //! is strict: version 1.0, a word if the text is one and a string literal otherwise, the content
 //! last and with its length, no code tables. Messages with code tables are read with a table that
-//! the caller owns. [`code`] names every code.
+//! the caller owns.
 
 pub(crate) mod agent_id;
 pub(crate) mod code;

@@ -283,8 +283,9 @@ impl Writer {
     /// instant of 1970.
     fn no_stamp(&mut self) {
         self.out.slice(b"#0\"\0");
-        self.out
-            .slice(b"\x20\x2a\x81\x12\x12\x11\x11\x11\x11\x11\x01");
+        self.out.byte(code::date_time::ABSOLUTE);
+        self.out.slice(b"\x2a\x81\x12\x12\x11\x11\x11\x11\x11");
+        self.out.byte(code::END);
     }
 
     fn acl_representation(
