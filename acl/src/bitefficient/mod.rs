@@ -1,4 +1,4 @@
-//! The bit-efficient encoding of messages (FIPA00069, edition G) and what its envelopes
+//! The bit-efficient encoding of messages (FIPA00069, edition G), and the parts that envelopes
 //! (FIPA00088) share with it.
 //!
 //! The reader is lenient: it accepts the standard and what fipa_services and JADE write. The writer
