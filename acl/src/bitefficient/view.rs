@@ -16,7 +16,7 @@ pub(super) const UNDEFINED_AGENT: &str = "agent_id:undefined";
 /// Reads a message in one piece.
 ///
 /// # Errors
-/// When the bytes are not one whole message in this encoding.
+/// The bytes are not one whole message in this encoding.
 pub(crate) fn view(bytes: &[u8]) -> Result<MessageView<'_>, DecodeError> {
     Parser::new(Reader::new(bytes), None)?.message()
 }
@@ -24,7 +24,7 @@ pub(crate) fn view(bytes: &[u8]) -> Result<MessageView<'_>, DecodeError> {
 /// Reads a message that is split around its content. The content is not accessed.
 ///
 /// # Errors
-/// When the pieces are not one whole message in this encoding.
+/// The pieces are not one whole message in this encoding.
 pub(crate) fn view_split(payload: &Payload) -> Result<MessageView<'_>, DecodeError> {
     let pieces = Pieces {
         content: &payload.content,
@@ -36,7 +36,7 @@ pub(crate) fn view_split(payload: &Payload) -> Result<MessageView<'_>, DecodeErr
 /// Reads a message in one piece and notes the meaning of every byte.
 ///
 /// # Errors
-/// Like [`view`].
+/// The same as of [`view`].
 pub(crate) fn view_noting(
     bytes: &[u8],
     base: usize,
