@@ -1,4 +1,4 @@
-//! Encoding and decoding beside their limit: a copy of the same bytes in the same run.
+//! Speed of encoding and decoding, compared with a copy of the same bytes in the same run.
 
 use std::hint::black_box;
 use std::time::Duration;
@@ -71,7 +71,7 @@ fn codec(criterion: &mut Criterion) {
         for (name, content_len) in [("1B", 1), ("1KB", 1 << 10), ("1MB", 1 << 20)] {
             let message = message(content_len);
             let mut group = criterion.benchmark_group(representation.to_string());
-            // What encoding XML cannot do without: a copy, and a look at every byte.
+            // The lower bound of encoding XML: a copy and a scan of every byte.
             let content = message.content().cloned().unwrap_or_default();
             group.bench_function(BenchmarkId::new("copy and memchr3", name), |bench| {
                 bench.iter(|| {

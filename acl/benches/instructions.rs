@@ -1,7 +1,7 @@
-//! The hot paths, one at a time, to count their instructions under valgrind: `.ci/instructions`.
+//! Runs one hot path to count its instructions under valgrind: `.ci/instructions`.
 //!
-//! The name of a path is the argument; without one, all names are listed. What is to be counted
-//! happens inside of `measured`, once, after everything was made ready.
+//! The argument is the name of a path. Without one, all names are listed. The counted instructions
+//! are those of `measured`, which runs once after the preparations.
 
 use std::hint::black_box;
 
@@ -89,7 +89,7 @@ fn main() {
     }
 }
 
-/// The instructions of what is given are counted, without those of dropping its result.
+/// Runs a function whose instructions are counted, without those of dropping its result.
 #[inline(never)]
 fn measured<T>(run: impl FnOnce() -> T) -> T {
     black_box(run())

@@ -6,9 +6,10 @@ use std::str::FromStr;
 use crate::escape;
 use crate::word::{is_token, push_string_literal};
 
-/// Who an agent is: a globally unique name, and hints how to reach it.
+/// An agent identifier: a globally unique name, and optional addresses, resolvers and user-defined
+/// parameters.
 ///
-/// Two identifiers are equal (`==`) when all they say is equal; they mean the same agent when
+/// Two identifiers are equal (`==`) if all their parts are equal. They identify the same agent if
 /// their names are equal ([`same_agent`](Self::same_agent)).
 #[derive(Clone, PartialEq, Eq, Hash)]
 pub struct AgentId {
@@ -19,15 +20,15 @@ pub struct AgentId {
 }
 
 impl AgentId {
-    /// Longest name, in bytes.
+    /// Maximum length of a name, in bytes.
     pub const MAX_NAME: usize = 4096;
-    /// Deepest nesting of resolvers: an identifier without resolvers has depth 0.
+    /// Maximum nesting depth of resolvers. An identifier without resolvers has depth 0.
     pub const MAX_DEPTH: usize = 16;
 
-    /// An agent of this name, without addresses.
+    /// Creates an identifier with a name only.
     ///
     /// # Errors
-    /// When the name is empty, longer than [`MAX_NAME`](Self::MAX_NAME) or has a NUL character.
+    /// The name is empty, longer than [`MAX_NAME`](Self::MAX_NAME), or has a NUL character.
     pub fn new(name: impl Into<String>) -> Result<Self, AgentIdError> {
         let name = name.into();
         if name.is_empty() {
@@ -45,10 +46,10 @@ impl AgentId {
         })
     }
 
-    /// The same agent with one more transport address, less preferred than those before.
+    /// Appends a transport address. Earlier addresses are preferred.
     ///
     /// # Errors
-    /// When the address is empty or has a NUL character.
+    /// The address is empty or has a NUL character.
     pub fn with_address(mut self, address: impl Into<String>) -> Result<Self, AgentIdError> {
         let address = address.into();
         if address.is_empty() {
@@ -59,10 +60,10 @@ impl AgentId {
         Ok(self)
     }
 
-    /// The same agent with one more agent that can resolve its name.
+    /// Appends an agent that can resolve the name. Earlier resolvers are preferred.
     ///
     /// # Errors
-    /// When resolvers would be nested deeper than [`MAX_DEPTH`](Self::MAX_DEPTH).
+    /// Resolvers would be nested deeper than [`MAX_DEPTH`](Self::MAX_DEPTH).
     pub fn with_resolver(mut self, resolver: Self) -> Result<Self, AgentIdError> {
         if resolver.depth() >= Self::MAX_DEPTH {
             return Err(AgentIdError::TooDeep);
@@ -71,11 +72,11 @@ impl AgentId {
         Ok(self)
     }
 
-    /// The same agent with one more user-defined parameter. The name is given without `X-`.
+    /// Appends a user-defined parameter. The name has no `X-`.
     ///
     /// # Errors
-    /// When the name is empty or has blanks, parentheses or control characters, or the value has
-    /// a NUL character.
+    /// The name is empty or has blanks, parentheses or control characters, or the value has a NUL
+    /// character.
     pub fn with_user_defined(
         mut self,
         name: impl Into<String>,
@@ -92,7 +93,7 @@ impl AgentId {
         Ok(self)
     }
 
-    /// The name.
+    /// Name of the agent.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.name
@@ -110,19 +111,19 @@ impl AgentId {
         &self.resolvers
     }
 
-    /// User-defined parameters, names without `X-`.
+    /// Names, without their `X-`, and values of user-defined parameters.
     #[must_use]
     pub fn user_defined(&self) -> &[(String, String)] {
         &self.user_defined
     }
 
-    /// Whether both mean the same agent: their names are equal.
+    /// Whether both identifiers have the same name, and so identify the same agent.
     #[must_use]
     pub fn same_agent(&self, other: &Self) -> bool {
         self.name == other.name
     }
 
-    /// Whether there is nothing but the name.
+    /// Whether the identifier has only a name.
     pub(crate) fn is_plain(&self) -> bool {
         self.addresses.is_empty() && self.resolvers.is_empty() && self.user_defined.is_empty()
     }
@@ -175,13 +176,13 @@ fn no_nul(part: &'static str, text: &str) -> Result<(), AgentIdError> {
 impl FromStr for AgentId {
     type Err = AgentIdError;
 
-    /// The agent of this name: see [`AgentId::new`].
+    /// Creates an identifier with a name only: see [`AgentId::new`].
     fn from_str(name: &str) -> Result<Self, Self::Err> {
         Self::new(name)
     }
 }
 
-/// Just the name; in the alternate form (`{:#}`) the whole identifier as FIPA00070 writes it.
+/// Writes the name. The alternate form (`{:#}`) writes the whole identifier in the form of FIPA00070.
 impl fmt::Display for AgentId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if !f.alternate() {
@@ -193,36 +194,36 @@ impl fmt::Display for AgentId {
     }
 }
 
-/// The whole identifier, [escaped](escape).
+/// Writes the whole identifier, [escaped](escape).
 impl fmt::Debug for AgentId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&escape(&format!("{self:#}")))
     }
 }
 
-/// Why something cannot be (part of) an agent identifier.
+/// Error of making an agent identifier.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum AgentIdError {
     /// The name is empty.
-    #[error("an agent needs a name that is not empty")]
+    #[error("the name of an agent must not be empty")]
     EmptyName,
-    /// The name is too long.
-    #[error("agent name of {0} bytes (at most {max} allowed)", max = AgentId::MAX_NAME)]
+    /// The name is longer than [`AgentId::MAX_NAME`]. The value is its length in bytes.
+    #[error("agent name of {0} bytes is too long (maximum {max})", max = AgentId::MAX_NAME)]
     NameTooLong(usize),
-    /// There is a NUL character, which no encoding can carry.
+    /// A part has a NUL character, which no encoding can represent. The value names the part.
     #[error("the {0} of an agent identifier has a NUL character")]
     Nul(&'static str),
     /// A transport address is empty.
     #[error("an address of an agent must not be empty")]
     EmptyAddress,
-    /// Resolvers are nested too deep.
-    #[error("resolvers nested deeper than {max}", max = AgentId::MAX_DEPTH)]
+    /// Resolvers are nested deeper than [`AgentId::MAX_DEPTH`].
+    #[error("the resolvers of an agent are nested deeper than {max}", max = AgentId::MAX_DEPTH)]
     TooDeep,
-    /// The name of a user-defined parameter is no word.
+    /// The name of a user-defined parameter is not one word.
     #[error(
-        "not a name for a user-defined parameter: {0:?} (no blanks, parentheses or control \
-         characters)"
+        "not a name of a user-defined parameter: {0:?}; give one word without blanks, parentheses \
+         or control characters"
     )]
     UserDefinedName(String),
 }
@@ -232,7 +233,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_and_parts_are_checked() {
+    fn invalid_names_and_parts_are_refused() {
         assert_eq!(AgentId::new(""), Err(AgentIdError::EmptyName));
         assert_eq!(AgentId::new("a\0"), Err(AgentIdError::Nul("name")));
         let long = "x".repeat(AgentId::MAX_NAME + 1);
@@ -244,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn nesting_is_bounded() {
+    fn resolvers_nested_too_deep_are_refused() {
         let mut agent = AgentId::new("a0").unwrap();
         for depth in 1..=AgentId::MAX_DEPTH {
             let outer = AgentId::new(format!("a{depth}")).unwrap();
@@ -255,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn the_name_decides_who_it_is() {
+    fn equal_names_identify_the_same_agent() {
         let plain = AgentId::new("bob@home").unwrap();
         let known = plain.clone().with_address("tcp://h:1").unwrap();
         assert_ne!(plain, known);

@@ -1,46 +1,47 @@
-//! Building messages that every encoding can carry.
+//! The builder of messages. It refuses values that an encoding cannot represent.
 
 use bytes::Bytes;
 
 use crate::word::is_token;
 use crate::{AgentId, Message, Performative, Time};
 
-/// A message in the making: see [`Message::builder`] and [`Message::reply`].
+/// A builder of a message: see [`Message::builder`] and [`Message::reply`].
 ///
-/// Setting a parameter again replaces it; receivers, reply-to and user-defined parameters add up.
+/// Setting a parameter again replaces its value. Receivers, reply-to and user-defined parameters
+/// add up.
 #[derive(Debug, Clone)]
 #[must_use]
 pub struct MessageBuilder {
     message: Message,
 }
 
-/// Why a message cannot be built.
+/// Error of building a message.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum BuildError {
-    /// A text has a NUL character, which ends a text in FIPA00069 and cannot stand in XML.
-    #[error("the {parameter} of a message must not have NUL characters")]
+    /// A text has a NUL character, which ends a text in FIPA00069 and is not allowed in XML.
+    #[error("the {parameter} of the message has a NUL character")]
     Nul {
         /// The parameter.
         parameter: &'static str,
     },
     /// The protocol is not one word.
     #[error(
-        "not a protocol name: {0:?} (one word without blanks, parentheses or control characters)"
+        "not a protocol name: {0:?}; give one word without blanks, parentheses or control characters"
     )]
     Protocol(String),
     /// The name of a user-defined parameter is not one word.
     #[error(
-        "not a name for a user-defined parameter: {0:?} (one word without blanks, parentheses or \
-         control characters, and without X-)"
+        "not a name of a user-defined parameter: {0:?}; give one word without blanks, parentheses \
+         or control characters, and without X-"
     )]
     UserDefinedName(String),
-    /// There is more content than a message can carry.
-    #[error("content of {0} bytes (a message carries at most 4294967295)")]
+    /// The content is longer than [`Message::MAX_CONTENT`].
+    #[error("content of {0} bytes is too long for a message (maximum 4294967295)")]
     ContentTooLong(usize),
 }
 
-/// Goes on from a message that exists.
+/// Starts with the parameters of an existing message.
 impl From<Message> for MessageBuilder {
     fn from(message: Message) -> Self {
         Self::of(message)
@@ -56,94 +57,94 @@ impl MessageBuilder {
         Self { message }
     }
 
-    /// Who sends it.
+    /// Sets the sender.
     pub fn sender(mut self, sender: AgentId) -> Self {
         self.message.sender = Some(sender);
         self
     }
 
-    /// One more receiver.
+    /// Adds a receiver.
     pub fn receiver(mut self, receiver: AgentId) -> Self {
         self.message.receivers.push(receiver);
         self
     }
 
-    /// More receivers.
+    /// Adds receivers.
     pub fn receivers(mut self, receivers: impl IntoIterator<Item = AgentId>) -> Self {
         self.message.receivers.extend(receivers);
         self
     }
 
-    /// One more agent to send replies to, instead of the sender.
+    /// Adds an agent that receives replies instead of the sender.
     pub fn reply_to(mut self, agent: AgentId) -> Self {
         self.message.reply_to.push(agent);
         self
     }
 
-    /// What it says.
+    /// Sets the content.
     pub fn content(mut self, content: impl Into<Bytes>) -> Self {
         self.message.content = Some(content.into());
         self
     }
 
-    /// The language of the content.
+    /// Sets the language of the content.
     pub fn language(mut self, language: impl Into<String>) -> Self {
         self.message.language = Some(language.into());
         self
     }
 
-    /// The encoding of the content expression.
+    /// Sets the encoding of the content expression.
     pub fn encoding(mut self, encoding: impl Into<String>) -> Self {
         self.message.encoding = Some(encoding.into());
         self
     }
 
-    /// The ontology of the content.
+    /// Sets the ontology of the content.
     pub fn ontology(mut self, ontology: impl Into<String>) -> Self {
         self.message.ontology = Some(ontology.into());
         self
     }
 
-    /// The interaction protocol: one word.
+    /// Sets the interaction protocol: one word.
     pub fn protocol(mut self, protocol: impl Into<String>) -> Self {
         self.message.protocol = Some(protocol.into());
         self
     }
 
-    /// The conversation.
+    /// Sets the conversation identifier.
     pub fn conversation_id(mut self, conversation_id: impl Into<String>) -> Self {
         self.message.conversation_id = Some(conversation_id.into());
         self
     }
 
-    /// What a reply is to have as `in-reply-to`.
+    /// Sets the `in-reply-to` of replies.
     pub fn reply_with(mut self, reply_with: impl Into<String>) -> Self {
         self.message.reply_with = Some(reply_with.into());
         self
     }
 
-    /// The `reply-with` of the message that this one answers.
+    /// Sets the `reply-with` of the message that this message answers.
     pub fn in_reply_to(mut self, in_reply_to: impl Into<String>) -> Self {
         self.message.in_reply_to = Some(in_reply_to.into());
         self
     }
 
-    /// The latest time for the next message of the conversation.
+    /// Sets the latest time for a reply.
     pub fn reply_by(mut self, reply_by: Time) -> Self {
         self.message.reply_by = Some(reply_by);
         self
     }
 
-    /// One more user-defined parameter; the name is given without `X-`.
+    /// Adds a user-defined parameter. The name has no `X-`.
     pub fn user_defined(mut self, name: impl Into<String>, value: impl Into<String>) -> Self {
         self.message.user_defined.push((name.into(), value.into()));
         self
     }
 
-    /// The message.
+    /// Builds the message.
     ///
     /// # Errors
-    /// When a parameter has a value that a message cannot carry.
+    /// A message cannot have one of the values: see [`BuildError`].
     pub fn build(self) -> Result<Message, BuildError> {
         let message = self.message;
         let texts = [
@@ -192,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_encoding_can_carry_is_refused() {
+    fn values_that_an_encoding_cannot_represent_are_refused() {
         let nul = |parameter| Err(BuildError::Nul { parameter });
         assert_eq!(built(|b| b.language("a\0")), nul("language"));
         assert_eq!(built(|b| b.conversation_id("\0")), nul("conversation-id"));
@@ -207,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn empty_content_differs_from_none() {
+    fn empty_content_differs_from_missing_content() {
         let empty = built(|b| b.content("")).unwrap();
         assert_eq!(empty.content(), Some(&Bytes::new()));
         assert_ne!(empty, built(|b| b).unwrap());

@@ -1,40 +1,42 @@
-//! Messages to bytes and back, whatever the encoding: the way into the modules that know one each.
+//! Encoding and decoding of messages and envelopes. The modules of the encodings do the work.
 
 use bytes::{BufMut, Bytes};
 
 use crate::bitefficient::dialects::{self, Peer};
-use crate::bitefficient::write::{Counter, Out, Sink};
+use crate::bitefficient::write::{Counter, Output, Sink};
 use crate::envelope::encode as encode_envelope;
 use crate::error::{DecodeError, EncodeError};
+use crate::representation::is_bit_efficient;
 use crate::{
     Dialect, Envelope, Message, MessageView, Payload, Representation, bitefficient, string, xml,
 };
 
 impl Message {
-    /// Reads an encoded message, whichever encoding and dialect it is in: its first bytes tell.
+    /// Decodes a message in any encoding (FIPA00069, FIPA00070, FIPA00071) and dialect. The first
+    /// bytes determine the encoding.
     ///
-    /// The content of the result shares the memory it was given in, unless it has to be
-    /// unescaped. Of bit-efficient messages it is not even looked at.
+    /// The content shares the memory of the payload unless it must be unescaped. The content of a
+    /// bit-efficient message is not accessed.
     ///
     /// # Errors
-    /// When the payload is not one whole message.
+    /// The payload is not one whole message.
     pub fn decode(payload: &Payload) -> Result<Self, DecodeError> {
-        let text = !matches!(payload.head.first(), Some(0xfa..=0xfe));
+        let first = payload.head.first();
+        let text = !first.is_some_and(|first| is_bit_efficient(*first));
         if text && payload.is_split() {
-            // Nobody splits these; they are read in one piece.
+            // Only bit-efficient messages are read in pieces.
             let whole = Payload::from(payload.to_bytes());
             return MessageView::parse_payload(&whole)?.to_message(&whole);
         }
         MessageView::parse_payload(payload)?.to_message(payload)
     }
 
-    /// The encoded message as one piece of memory, in the hand that a reader needs.
+    /// Encodes the message into one piece of memory.
     ///
-    /// [`to_payload`](Self::to_payload) is the way to send it bit-efficiently without copying the
-    /// content.
+    /// [`to_payload`](Self::to_payload) encodes bit-efficiently without copying the content.
     ///
     /// # Errors
-    /// When the encoding or the reader has no way to say what the message says.
+    /// The encoding or the dialect cannot represent a value of the message.
     pub fn encode(
         &self,
         representation: Representation,
@@ -44,18 +46,18 @@ impl Message {
             return Ok(self.to_payload().to_bytes());
         }
         let content_len = self.content().map_or(0, Bytes::len);
-        // Room for the other parameters and some escaped characters: moving long content to larger
-        // memory takes longer than encoding it.
-        let room = (content_len / 16).saturating_add(1024);
-        let mut out = Vec::with_capacity(content_len.saturating_add(room));
+        // Capacity for the other parameters and some escaped characters: moving long content to
+        // larger memory takes longer than encoding it.
+        let extra = (content_len / 16).saturating_add(1024);
+        let mut out = Vec::with_capacity(content_len.saturating_add(extra));
         self.write(representation, dialect, &mut out)?;
         Ok(out.into())
     }
 
-    /// How many bytes [`encode_into`](Self::encode_into) writes.
+    /// Number of bytes that [`encode_into`](Self::encode_into) writes.
     ///
     /// # Errors
-    /// Like [`encode`](Self::encode).
+    /// The same as of [`encode`](Self::encode).
     pub fn encoded_len(
         &self,
         representation: Representation,
@@ -69,14 +71,14 @@ impl Message {
         Ok(counter.0)
     }
 
-    /// Writes the encoded message into memory that is there: [`encoded_len`](Self::encoded_len)
-    /// bytes. Of a message that cannot be encoded, a part may have been written.
+    /// Encodes the message into a buffer: [`encoded_len`](Self::encoded_len) bytes. After an error,
+    /// the buffer may hold a part of the message.
     ///
     /// # Errors
-    /// Like [`encode`](Self::encode).
+    /// The same as of [`encode`](Self::encode).
     ///
     /// # Panics
-    /// When the buffer has a limit and less room than that.
+    /// If the buffer has a fixed capacity and less space than that.
     pub fn encode_into(
         &self,
         representation: Representation,
@@ -93,12 +95,12 @@ impl Message {
         written
     }
 
-    /// Writes other representations and dialects than the bit-efficient one of the standard.
+    /// Writes the message. The callers write the standard's bit-efficient encoding themselves.
     fn write(
         &self,
         representation: Representation,
         dialect: Dialect,
-        out: &mut dyn Out,
+        out: &mut dyn Output,
     ) -> Result<(), EncodeError> {
         match (representation, dialect) {
             (Representation::BitEfficient, Dialect::Standard) => {
@@ -118,16 +120,16 @@ impl Message {
 }
 
 impl Envelope {
-    /// The encoded envelope, all extensions included, in the hand that a reader needs.
+    /// Encodes the envelope with all extensions: bit-efficiently (FIPA00088) or in XML (FIPA00085).
     ///
-    /// In XML, JADE reads no extensions: it gets the parameters that count
-    /// ([`effective`](Self::effective)), with the newest stamp only. fipa_services reads no zones:
-    /// it gets times without, and takes them as its local ones. Its bit-efficient envelopes may
-    /// have extensions without a stamp.
+    /// JADE reads no extensions in XML. Its envelope has the [`effective`](Self::effective)
+    /// parameters, with the newest stamp only. fipa_services reads no zones. Its envelope has times
+    /// without a zone, which it takes as local times. Its bit-efficient envelope may have extensions
+    /// without a stamp.
     ///
     /// # Errors
-    /// When a mandatory parameter is missing, or one has a value that the encoding or the reader
-    /// has no way to say.
+    /// A mandatory parameter is missing, or the encoding or the dialect cannot represent a value.
+    /// There are no envelopes in the string encoding.
     pub fn encode(
         &self,
         representation: Representation,

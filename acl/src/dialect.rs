@@ -1,4 +1,4 @@
-//! Whose hand to write in, where peers read less than the standard allows.
+//! The dialects of the encodings: the standard, and the two peers, which read less than it allows.
 
 use std::fmt;
 
@@ -7,25 +7,26 @@ use crate::error::EncodeError;
 use crate::time::{Time, Zone};
 use crate::word::is_word;
 
-/// The user-defined parameter by which JADE says that content is Base64, without `X-`.
+/// Name, without its `X-`, of the user-defined parameter that names the encoding of the content in
+/// JADE.
 pub(crate) const JADE_ENCODING: &str = "JADE-Encoding";
-/// The value that says so, whatever its case.
+/// Value of [`JADE_ENCODING`] for content in Base64, in any case.
 pub(crate) const BASE64: &str = "Base64";
 
-/// Whether the user-defined parameter makes readers take the content for Base64.
+/// Whether the user-defined parameter marks the content as Base64.
 pub(crate) fn announces_base64(name: &Text<'_>, value: &Text<'_>) -> bool {
     name.raw().len() >= JADE_ENCODING.len()
         && name.as_str().eq_ignore_ascii_case(JADE_ENCODING)
         && value.as_str().trim().eq_ignore_ascii_case(BASE64)
 }
 
-/// Which reader an encoding is written for.
+/// The dialect of an encoding, by the implementation that reads it.
 ///
-/// Reading needs none of this: every reader takes the standard and what both peers write.
+/// Decoding needs no dialect: it accepts the standard and what both peers write.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum Dialect {
-    /// The standard to the letter.
+    /// Strictly the standard.
     #[default]
     Standard,
     /// The C++ libraries `fipa_acl` and `fipa_services`.
@@ -44,12 +45,13 @@ impl fmt::Display for Dialect {
     }
 }
 
-/// A time for fipa_services, which reads no zones and takes every time for its local one: both
-/// ends are to live in the same zone, so a time in UTC is written without saying so.
+/// Returns a time without its zone for fipa_services, which reads every time as a local one.
+///
+/// A time in UTC keeps its fields. So both peers must run in UTC for the time to be the same.
 pub(crate) fn local_time(what: &'static str, time: Time) -> Result<Time, EncodeError> {
     let why = match time.zone() {
-        _ if time.is_relative() => "fipa_services knows no relative times",
-        Zone::Letter(_) => "fipa_services knows no zones",
+        _ if time.is_relative() => "fipa_services reads no relative times",
+        Zone::Letter(_) => "fipa_services reads no time zones",
         Zone::Utc | Zone::Unspecified => {
             let zone = Zone::Unspecified;
             return Ok(Time { zone, ..time });
@@ -58,7 +60,7 @@ pub(crate) fn local_time(what: &'static str, time: Time) -> Result<Time, EncodeE
     Err(EncodeError::Unrepresentable { what, why })
 }
 
-/// Checks that fipa_services reads this as a word, in messages of either of its encodings.
+/// Checks that fipa_services reads the text as a word of a message.
 pub(crate) fn check_word(what: &'static str, text: &str) -> Result<(), EncodeError> {
     if !is_word(text) {
         return Err(not_a_word(what));
@@ -73,7 +75,7 @@ pub(crate) fn check_word(what: &'static str, text: &str) -> Result<(), EncodeErr
 pub(crate) fn not_a_word(what: &'static str) -> EncodeError {
     EncodeError::Unrepresentable {
         what,
-        why: "it is not a FIPA00070 word (no blanks or parentheses, and not beginning with a \
-              digit, '#', '-', '@' or '\"')",
+        why: "it is not a FIPA00070 word (a word has no blanks or parentheses and does not begin \
+              with a digit, '#', '-', '@' or '\"')",
     }
 }

@@ -2,14 +2,14 @@
 
 use crate::Representation;
 
-/// Bytes that are not what they should be: where, what is wrong, and the clause that says so.
+/// Error of decoding: the offset, the problem, and the violated clause of the standard.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("at byte {}: {} ({})", .0.offset, .0.problem, .0.clause)]
-pub struct DecodeError(Box<Place>);
+pub struct DecodeError(Box<ErrorPosition>);
 
-/// Apart from the error, so that what succeeds does not carry room for it around.
+/// The data of an error. It is boxed to keep `Result` values small.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Place {
+struct ErrorPosition {
     offset: usize,
     clause: &'static str,
     problem: Problem,
@@ -18,54 +18,54 @@ struct Place {
 impl DecodeError {
     #[cold]
     pub(crate) fn new(offset: usize, clause: &'static str, problem: Problem) -> Self {
-        Self(Box::new(Place {
+        Self(Box::new(ErrorPosition {
             offset,
             clause,
             problem,
         }))
     }
 
-    /// Where the offending bytes begin, counted from the start of what was decoded.
+    /// Offset of the invalid bytes in the decoded input.
     #[must_use]
     pub fn offset(&self) -> usize {
         self.0.offset
     }
 
-    /// The clause of the standard that is violated, for example `FIPA00069 2.1`.
+    /// The violated clause or production of the standard, for example `FIPA00069 2.2 BinWord`.
     #[must_use]
     pub fn clause(&self) -> &'static str {
         self.0.clause
     }
 
-    /// What is wrong.
+    /// The problem.
     #[must_use]
     pub fn problem(&self) -> &Problem {
         &self.0.problem
     }
 }
 
-/// What can be wrong with encoded bytes.
+/// A problem of encoded bytes.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Problem {
     /// The bytes end too early.
     #[error("the bytes end within {0}")]
     Truncated(&'static str),
-    /// A byte that cannot stand there.
-    #[error("unexpected byte {found:#04x} where {expected} should be")]
+    /// A byte that is not allowed at its position.
+    #[error("found byte {found:#04x}, expected {expected}")]
     Unexpected {
         /// The byte.
         found: u8,
-        /// What should be there.
+        /// The expected item.
         expected: &'static str,
     },
     /// Text that is not UTF-8.
     #[error("the {0} is not UTF-8")]
     NotUtf8(&'static str),
-    /// Text with a NUL character inside.
+    /// Text with a NUL character.
     #[error("the {0} has a NUL character")]
     Nul(&'static str),
-    /// Text that must be a word and is not.
+    /// Text that must be a word but is not.
     #[error("the {0} is not a word")]
     NotAWord(&'static str),
     /// Text that must not be empty.
@@ -74,95 +74,96 @@ pub enum Problem {
     /// Text that is too long.
     #[error("the {0} is too long")]
     TooLong(&'static str),
-    /// Nesting deeper than accepted.
-    #[error("{0} nested too deep")]
+    /// Items that are nested too deep, or too many of them.
+    #[error("the {0} are nested too deep")]
     TooDeep(&'static str),
-    /// The message uses dynamic code tables, which both sides have to agree on beforehand, and was
-    /// read without one.
-    #[error("the message uses dynamic code tables, and was read without one")]
+    /// The message uses dynamic code tables but was decoded without one. Both sides must agree on
+    /// code tables beforehand.
+    #[error("the message uses a dynamic code table; decode it with the table of its sender")]
     CodeTable,
-    /// The message refers to an entry that is not in the code table.
-    #[error("there is no entry {0} in the code table")]
+    /// The message refers to a missing entry of the code table.
+    #[error("the code table has no entry {0}")]
     NoSuchCode(usize),
-    /// Digits that are not a number or not one of the range expected.
+    /// Digits that are not a number, or a number out of range.
     #[error("malformed number")]
     Number,
     /// Digits that are not a date and time.
-    #[error("no such date or time of day")]
+    #[error("malformed or invalid date and time")]
     DateTime,
-    /// Opening and closing of an expression do not match.
-    #[error("unbalanced expression")]
+    /// Opening and closing parentheses of an expression do not match.
+    #[error("the parentheses of the expression do not match")]
     Unbalanced,
     /// Bytes behind the end of the message.
-    #[error("{0} bytes behind the end")]
+    #[error("{0} unexpected bytes after the end")]
     Trailing(usize),
-    /// The content that came beside the message is not the one that the message announces.
-    #[error("the pieces of the split message do not fit together: {0}")]
+    /// The pieces of a split message do not form one message.
+    #[error("the pieces of the split message do not match: {0}")]
     Split(&'static str),
     /// A mandatory parameter is missing.
     #[error("the {0} is missing")]
     Missing(&'static str),
-    /// Content that was announced as Base64 and is not.
-    #[error("the content is not Base64")]
+    /// Content that is marked as Base64 but is not.
+    #[error("the content is marked as Base64 but is not valid Base64")]
     Base64,
-    /// XML that is not well-formed, or uses what is not accepted from strangers.
-    #[error("unacceptable XML: {0}")]
+    /// XML that is not well-formed, or uses a feature that this reader refuses.
+    #[error("invalid XML: {0}")]
     Xml(&'static str),
-    /// Another encoding than the one that is understood.
+    /// An encoding that the reader does not support.
     #[error("the {0} representation is not supported here")]
     UnsupportedRepresentation(Representation),
     /// Neither a message nor an envelope in any known encoding.
-    #[error("neither bit-efficient nor string nor XML")]
+    #[error("unknown representation: not bit-efficient, string or XML")]
     UnknownRepresentation,
 }
 
-/// What an encoding cannot carry.
+/// Error of encoding a message or an envelope.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum EncodeError {
-    /// There is more content than a length of 32 bits can say.
-    #[error("content of {0} bytes (a message carries at most 4294967295)")]
+    /// The content is longer than [`Message::MAX_CONTENT`](crate::Message::MAX_CONTENT).
+    #[error("content of {0} bytes is too long for a message (maximum 4294967295)")]
     ContentTooLong(usize),
-    /// An envelope of more bytes than a length of 32 bits can say.
-    #[error("an envelope of {0} bytes is too long")]
+    /// The envelope is longer than its length field allows: 32 bits, or 16 bits for
+    /// fipa_services.
+    #[error("an envelope of {0} bytes is too long for its length field")]
     EnvelopeTooLong(usize),
     /// A mandatory parameter is missing.
     #[error("the {parameter} of {of} is missing")]
     Missing {
         /// The parameter.
         parameter: &'static str,
-        /// What it is missing in.
+        /// The item without the parameter.
         of: &'static str,
     },
-    /// A parameter that has no place in this encoding.
-    #[error("{of} cannot carry the parameter {parameter}")]
+    /// A parameter that the encoding does not define.
+    #[error("{of} cannot have the parameter {parameter}")]
     NoPlace {
         /// The parameter.
         parameter: &'static str,
-        /// What has no place for it.
+        /// The item that cannot have the parameter.
         of: &'static str,
     },
     /// A text has a NUL character.
     #[error("the {0} has a NUL character")]
     Nul(&'static str),
-    /// A text is empty that would be taken for absent.
-    #[error("the {0} is empty; leave it out instead")]
+    /// A text is empty. Readers would take it for absent.
+    #[error("the {0} is empty; omit it instead")]
     Empty(&'static str),
     /// The name of a user-defined parameter is not one word.
     #[error(
-        "not a name for a user-defined parameter: {0:?} (one word without blanks, parentheses or \
-         control characters, and without X-)"
+        "not a name of a user-defined parameter: {0:?}; give one word without blanks, parentheses \
+         or control characters, and without X-"
     )]
     UserDefinedName(String),
-    /// A value that the encoding or the reader it is for has no way to say.
-    #[error("the {what} cannot be written: {why}")]
+    /// A value that the encoding or the dialect cannot represent.
+    #[error("the {what} cannot be encoded: {why}")]
     Unrepresentable {
         /// The parameter.
         what: &'static str,
-        /// What stands in the way.
+        /// The reason.
         why: &'static str,
     },
-    /// There is no such encoding of this kind of thing.
-    #[error("there is no {0} representation to write this in")]
+    /// The standards define no such encoding of an envelope.
+    #[error("envelopes have no {0} representation")]
     UnsupportedRepresentation(Representation),
 }

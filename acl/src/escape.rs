@@ -1,10 +1,10 @@
-//! Text from outside on its way to a terminal or a log.
+//! Escaping of text from outside for a terminal or a log.
 //!
 //! Names, contents and reasons come from peers and files. A control character can move the cursor
 //! of a terminal or draw a line that looks like the program's own, and a bidirectional character
 //! changes the order in which a line is read. [`escape`] makes them visible.
 //!
-//! What must not live here: what a format such as XML or Mermaid has to escape besides.
+//! The escapes of formats such as XML or Mermaid do not belong here.
 
 use std::borrow::Cow;
 use std::fmt::Write as _;
@@ -12,8 +12,8 @@ use std::fmt::Write as _;
 /// Returns the text with each [unprintable](is_unprintable) character written as `\u{…}` in
 /// hexadecimal digits: `\u{1b}`.
 ///
-/// A `\` that stands before `u{` in the text is written `\u{5c}`. So two texts never look the same,
-/// and every other text stays as it is. The result is one line.
+/// A `\` in front of `u{` is written `\u{5c}`. So two different texts have different results. All
+/// other text is unchanged. The result is one line.
 #[must_use]
 pub fn escape(text: &str) -> Cow<'_, str> {
     let Some(first) = first_to_escape(text) else {
@@ -34,9 +34,10 @@ pub fn escape(text: &str) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
-/// Whether a terminal, or a reader, may take a text with this character for something else: control
-/// characters (Cc), format characters, the bidirectional ones among them (Cf), and the separators
-/// of lines and paragraphs (Zl, Zp) of Unicode 17.
+/// Whether the character can change how a terminal or a reader interprets a text.
+///
+/// These are the control characters (Cc), the format characters (Cf), which include the
+/// bidirectional ones, and the separators of lines and paragraphs (Zl, Zp) of Unicode 17.
 #[must_use]
 pub fn is_unprintable(c: char) -> bool {
     match c {
@@ -75,7 +76,7 @@ fn first_to_escape(text: &str) -> Option<usize> {
     found.map(|(at, _)| at)
 }
 
-/// Whether `c`, at the beginning of `rest`, is written as an escape sequence.
+/// Whether `c` is written as an escape sequence. `rest` is the text that begins with `c`.
 fn is_escaped(c: char, rest: &str) -> bool {
     is_unprintable(c) || c == '\\' && rest.starts_with("\\u{")
 }
@@ -86,7 +87,7 @@ mod tests {
 
     use super::*;
 
-    /// The text that an escaped text stands for.
+    /// Reverses [`escape`].
     fn read(escaped: &str) -> String {
         let mut out = String::new();
         let mut rest = escaped;
@@ -110,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_printable_stays_as_it_is() {
+    fn printable_text_is_unchanged() {
         for text in [
             "",
             "arm.left",
@@ -124,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_terminal_obeys_is_made_visible() {
+    fn control_characters_are_escaped() {
         assert_eq!(escape("a\u{1b}[2J\nb"), r"a\u{1b}[2J\u{a}b");
         assert_eq!(escape("\u{9b}31m"), r"\u{9b}31m");
         assert_eq!(escape("x\u{202e}y\u{2028}"), r"x\u{202e}y\u{2028}");
@@ -132,9 +133,9 @@ mod tests {
         assert_eq!(escape("\\\u{1b}"), r"\\u{1b}");
     }
 
-    /// The categories of a second implementation, which follows the releases of Unicode.
+    /// Compares with the categories of the crate `regex`, which follows the releases of Unicode.
     #[test]
-    fn the_characters_are_those_of_unicode() {
+    fn unprintable_characters_are_those_of_unicode() {
         let expected = regex::Regex::new(r"^[\p{Cc}\p{Cf}\p{Zl}\p{Zp}]$").unwrap();
         let mut text = String::new();
         for c in char::MIN..=char::MAX {
@@ -146,7 +147,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_result_stands_for_one_text(text in r"([a\\u{}1\x1b\n\u{9b}\u{202e}]|\PC){0,12}") {
+        fn escaping_is_reversible(text in r"([a\\u{}1\x1b\n\u{9b}\u{202e}]|\PC){0,12}") {
             let escaped = escape(&text);
             prop_assert!(!escaped.chars().any(is_unprintable));
             prop_assert_eq!(read(&escaped), text);

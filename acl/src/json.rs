@@ -13,14 +13,14 @@
 //! letter   = { envelope, effective: params, message | payload_base64 }
 //! ```
 //!
-//! Keys appear only when set. Times are RFC 3339 UTC with milliseconds (a time without a zone is
-//! taken as UTC), relative times as FIPA00070 writes them. `content` is there when the content is
-//! UTF-8, `content_base64` otherwise; on input either may be given. Names of user-defined
-//! parameters come without their `X-`.
+//! Absent parameters have no key. Absolute times are in the form of RFC 3339, in UTC and with
+//! milliseconds; a time without a zone is taken as UTC. Relative times are in the form of FIPA00070.
+//! Output has `content` if the content is UTF-8, and `content_base64` otherwise. Input may have
+//! either. Names of user-defined parameters have no `X-`.
 //!
-//! On input a document is a letter if it has an envelope; otherwise a message, with
-//! (`{ message }`) or without that key around it. `effective` follows from the envelope and is
-//! passed over. A letter with neither message nor payload is an envelope alone.
+//! An input document with the key `envelope` is a letter. Any other document is a message, either
+//! directly or as the value of the key `message`. `effective` is ignored on input. A letter with
+//! neither `message` nor `payload_base64` is an envelope alone.
 
 mod read;
 
@@ -35,12 +35,12 @@ pub use read::{Document, JsonError, JsonProblem, document_from_json, message_fro
 
 use crate::{AgentId, Envelope, EnvelopeParams, Message, Payload, Received, Time};
 
-/// The message as JSON.
+/// Converts a message to JSON: see the [module](self).
 #[must_use]
 pub fn message_to_json(message: &Message) -> Value {
     let (content, content_base64) = match message.content() {
         None => (None, None),
-        // Copied before it is looked at: nobody vouches that shared memory stays as it is.
+        // A copy, because another process may change shared memory at any time.
         Some(bytes) => match String::from_utf8(bytes.to_vec()) {
             Ok(text) => (Some(text), None),
             Err(error) => (None, Some(BASE64.encode(error.as_bytes()))),
@@ -66,7 +66,7 @@ pub fn message_to_json(message: &Message) -> Value {
     })
 }
 
-/// The envelope as JSON.
+/// Converts an envelope to JSON: see the [module](self).
 #[must_use]
 pub fn envelope_to_json(envelope: &Envelope) -> Value {
     let mut json = Map::new();
@@ -76,8 +76,8 @@ pub fn envelope_to_json(envelope: &Envelope) -> Value {
     Value::Object(json)
 }
 
-/// A letter as JSON: its envelope, the parameters that count, and the message, or the payload as
-/// it is if it is none that can be read.
+/// Converts a letter to JSON: its envelope, the effective parameters, and the message. A payload
+/// that cannot be decoded is written as `payload_base64`.
 #[must_use]
 pub fn letter_to_json(envelope: &Envelope, payload: &Payload) -> Value {
     let mut json = Map::new();
@@ -222,7 +222,7 @@ fn received_json(received: &Received) -> ReceivedJson {
 }
 
 fn value(json: &impl Serialize) -> Value {
-    // Structures of strings, numbers and maps with string keys always become JSON.
+    // Structures of strings, numbers and maps with string keys can always be converted.
     serde_json::to_value(json).unwrap_or_default()
 }
 
@@ -230,7 +230,7 @@ fn agents(agents: &[AgentId]) -> Vec<AgentJson> {
     agents.iter().map(AgentJson::of).collect()
 }
 
-/// Of several values under one name the last one remains.
+/// Converts pairs to a map. The last of several values with the same name counts.
 fn pairs(pairs: &[(String, String)]) -> BTreeMap<String, String> {
     pairs.iter().cloned().collect()
 }

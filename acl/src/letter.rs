@@ -1,26 +1,25 @@
-//! The letter: an encoded envelope followed by an encoded message, held as a few [`Bytes`].
+//! The letter: an encoded envelope followed by an encoded message, as a few [`Bytes`].
 //!
-//! Letters are what everything else in this project passes around. This module knows how the
-//! pieces lie behind each other; what is inside the envelope and the message is the business of
-//! the encodings.
+//! This module handles the order of the pieces. The modules of the encodings handle the bytes of
+//! envelope and message.
 
 use bytes::{BufMut, Bytes, BytesMut};
 
-/// An encoded message, in up to three pieces that follow each other on the wire.
+/// An encoded message, in up to three consecutive pieces.
 ///
-/// A message that was written around loaned memory consists of `head` (everything up to and
-/// including the length field of the content), `content` and `tail` (what follows the content;
-/// one byte, `01`, in FIPA00069). A message that came as one piece is all `head`.
+/// A message with content in loaned memory consists of `head` (all bytes up to the content,
+/// including its length field), `content` and `tail` (the bytes behind the content; in FIPA00069 one
+/// byte, `01`). A message in one piece has only a `head`.
 ///
-/// `content` may lie in memory that another process of the same user can still write to; the
-/// other two pieces are always private to this process.
+/// `content` may be in memory that another process of the same user can still write to. The other
+/// two pieces are always private to this process.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Payload {
-    /// The message up to where its content begins, or the whole message.
+    /// The message up to its content, or the whole message.
     pub head: Bytes,
-    /// The bytes of the content parameter, or empty when `head` is the whole message.
+    /// The bytes of the content, or empty if `head` is the whole message.
     pub content: Bytes,
-    /// What follows the content, or empty when `head` is the whole message.
+    /// The bytes behind the content, or empty if `head` is the whole message.
     pub tail: Bytes,
 }
 
@@ -31,19 +30,19 @@ impl Payload {
         self.head.len() + self.content.len() + self.tail.len()
     }
 
-    /// Whether there are no bytes at all (an envelope may travel alone).
+    /// Whether the payload has no bytes. An envelope may be sent alone.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Whether the message is split around its content (see the type's documentation).
+    /// Whether the message is split around its content: see [`Payload`].
     #[must_use]
     pub fn is_split(&self) -> bool {
         !(self.content.is_empty() && self.tail.is_empty())
     }
 
-    /// The message as one piece: without a copy when it is one already.
+    /// Returns the message in one piece. A split message is copied.
     #[must_use]
     pub fn to_bytes(&self) -> Bytes {
         if self.is_split() {
@@ -66,20 +65,20 @@ impl From<Bytes> for Payload {
 
 /// An encoded envelope and the encoded message behind it.
 ///
-/// Cloning shares the memory. A letter never changes, except that a message transport service may
-/// put its stamp in front ([`Letter::stamped`]).
+/// Cloning shares the memory. A letter is immutable, except that a message transport service may
+/// add its stamp ([`Letter::stamped`]).
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Letter {
-    /// Extension envelopes added since the letter was made, newest first (FIPA00088: the newest
-    /// stands in front).
+    /// Extension envelopes added since the letter was made, newest first. FIPA00088 2.2: "by adding a
+    /// new ExtEnvelope element at the beginning of the messageEnvelopes sequence."
     stamps: Vec<Bytes>,
     envelope: Bytes,
     payload: Payload,
 }
 
 impl Letter {
-    /// A letter from an encoded envelope (the base envelope with the extension envelopes in front
-    /// of it, if any) and an encoded message.
+    /// Creates a letter of an encoded envelope (any extension envelopes and the base envelope) and
+    /// an encoded message.
     #[must_use]
     pub fn new(envelope: Bytes, payload: impl Into<Payload>) -> Self {
         Self {
@@ -89,15 +88,14 @@ impl Letter {
         }
     }
 
-    /// The same letter with one more encoded extension envelope in front. Nothing is copied.
+    /// Adds an encoded extension envelope in front of the letter. Nothing is copied.
     #[must_use]
     pub fn stamped(mut self, extension: Bytes) -> Self {
         self.stamps.insert(0, extension);
         self
     }
 
-    /// The encoded envelope with all stamps: without a copy unless a stamp was added since the
-    /// letter was made.
+    /// The encoded envelope with all stamps. It is copied if a stamp was added to the letter.
     #[must_use]
     pub fn envelope(&self) -> Bytes {
         if self.stamps.is_empty() {
@@ -119,7 +117,7 @@ impl Letter {
         &self.payload
     }
 
-    /// The encoded message, by value.
+    /// Returns the encoded message by value.
     #[must_use]
     pub fn into_payload(self) -> Payload {
         self.payload
@@ -131,7 +129,7 @@ impl Letter {
         self.envelope_len() + self.payload.len()
     }
 
-    /// Whether the letter has no bytes at all.
+    /// Whether the letter has no bytes.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
@@ -150,7 +148,7 @@ impl Letter {
             .filter(|piece| !piece.is_empty())
     }
 
-    /// The whole letter as one piece of memory (one copy).
+    /// Copies the whole letter into one piece of memory.
     #[must_use]
     pub fn to_bytes(&self) -> Bytes {
         let pieces: Vec<&Bytes> = self.pieces().collect();
@@ -171,7 +169,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_stamp_goes_in_front_and_nothing_moves() {
+    fn a_stamp_is_added_in_front_without_a_copy() {
         let payload = Bytes::from_static(b"message");
         let letter = Letter::new(Bytes::from_static(b"base"), payload.clone())
             .stamped(Bytes::from_static(b"old"))
@@ -183,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn a_split_message_is_its_pieces_in_order() {
+    fn the_pieces_of_a_split_message_are_in_order() {
         let payload = Payload {
             head: Bytes::from_static(b"head"),
             content: Bytes::from_static(b"content"),

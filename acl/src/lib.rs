@@ -1,16 +1,17 @@
 //! FIPA messages, envelopes and letters, and their encodings.
 //!
-//! What lives here: the value types of the FIPA standards and the code that turns them into bytes
-//! and back. What must not: input and output, clocks, threads, `unsafe`.
+//! The crate has the value types of the FIPA standards, their encoders and their decoders. It has no
+//! input or output, no clocks, no threads and no `unsafe`.
 //!
-//! * [`Message`] is what agents say to each other (FIPA00061), made with [`Message::builder`] and
-//!   encoded with [`Message::to_payload`], or [`Message::encode`] where the reader needs another
-//!   encoding than the bit-efficient one. [`MessageView`] reads one without allocating.
-//! * [`Envelope`] is what message transport services read (FIPA00067): a base and the extensions
-//!   that services put in front on the way. [`EnvelopeView`] is its borrowed counterpart.
-//! * [`Letter`] is both, encoded, and what everything else in this project passes around.
-//! * [`escape`] makes text from outside fit for a terminal or a log.
-//! * [`explain()`] tells people what every byte of a bit-efficient message or letter means.
+//! * [`Message`]: a message between agents (FIPA00061). [`Message::builder`] makes one,
+//!   [`Message::to_payload`] encodes it bit-efficiently, and [`Message::encode`] in any encoding and
+//!   dialect. [`MessageView`] reads an encoded message without allocating.
+//! * [`Envelope`]: the parameters for message transport services (FIPA00067), a base and the
+//!   extensions that services add. [`EnvelopeView`] is its borrowed counterpart.
+//! * [`Letter`]: an encoded envelope and an encoded message, the unit that the other crates of this
+//!   project transport.
+//! * [`escape`]: makes text from outside safe for a terminal or a log.
+//! * [`explain()`]: explains every byte of a bit-efficient message or letter.
 //!
 //! ```
 //! use fipa_acl::{AgentId, Message, Performative};
@@ -31,8 +32,8 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
-//! Bytes from outside are hostile until checked: every length and depth has a bound, and a
-//! [`DecodeError`] says where the bytes break which clause.
+//! Decoding accepts hostile bytes: every length and depth has a bound. A [`DecodeError`] has the
+//! offset, the problem and the violated clause.
 
 pub mod bitefficient;
 

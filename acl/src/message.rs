@@ -1,4 +1,4 @@
-//! The message (FIPA00061): what agents say to each other, whatever it is encoded as.
+//! The message (FIPA00061), independent of its encoding.
 
 use std::fmt;
 
@@ -8,14 +8,17 @@ use crate::builder::MessageBuilder;
 use crate::word::{is_token, push_string_literal};
 use crate::{AgentId, Performative, Time, escape};
 
-/// A FIPA message.
+/// A FIPA message (FIPA00061).
 ///
-/// Every message that exists can be encoded: [`MessageBuilder::build`] refuses what no encoding
-/// could carry, and decoding gives the same guarantee. Parameters that are absent are `None` or
-/// empty; content that is absent differs from content of no bytes.
+/// Every message can be encoded bit-efficiently: [`MessageBuilder::build`] and the decoders refuse
+/// values that cannot. An absent parameter is `None` or empty. Absent content differs from empty
+/// content.
 ///
-/// Cloning shares the memory of the content. The content may lie in shared memory that another
-/// process of the same user can still write to: parse a copy of it where that matters.
+/// Encodings: bit-efficient (FIPA00069), string (FIPA00070), XML (FIPA00071).
+///
+/// Cloning shares the memory of the content. The content may be in shared memory that another
+/// process of the same user can still write to. Code that depends on stable bytes must copy it
+/// first.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Message {
     pub(crate) performative: Performative,
@@ -35,20 +38,20 @@ pub struct Message {
 }
 
 impl Message {
-    /// Most bytes of content that a message can have (FIPA00069: a length of 32 bits).
+    /// Maximum length of the content in bytes. FIPA00069 has lengths of up to 32 bits.
     pub const MAX_CONTENT: u64 = u32::MAX as u64;
 
-    /// Begins a message.
+    /// Returns a builder of a message.
     pub fn builder(performative: Performative) -> MessageBuilder {
         MessageBuilder::new(performative)
     }
 
-    /// Begins a reply to this message.
+    /// Returns a builder of a reply to this message.
     ///
-    /// It goes to the agents in `reply-to`, or to the sender if there are none, and takes over
-    /// language, ontology, protocol and conversation id; `in-reply-to` is what this message has
-    /// as `reply-with`. The sender and, if an answer is expected, a new `reply-with` are for the
-    /// caller to set.
+    /// The receivers are the agents in `reply-to`, or the sender if there are none. Language,
+    /// ontology, protocol and conversation identifier are those of this message. `in-reply-to` is
+    /// its `reply-with`. The caller sets the sender and, if it expects an answer, a new
+    /// `reply-with`.
     pub fn reply(&self, performative: Performative) -> MessageBuilder {
         let receivers = if self.reply_to.is_empty() {
             self.sender.iter().cloned().collect()
@@ -68,9 +71,9 @@ impl Message {
 
     /// Whether this message answers `other`.
     ///
-    /// Both `in-reply-to` here and `reply-with` there decide when they are set; otherwise the
-    /// conversation id does (fipa_services does not look at the former), and then a message by
-    /// the sender of `other` itself is no answer. Nothing of another conversation is.
+    /// If this message has `in-reply-to` and `other` has `reply-with`, they must be equal, and the
+    /// conversation identifiers must not differ. Otherwise the conversation identifiers must be
+    /// equal and the senders must differ. (fipa_services does not evaluate `in-reply-to`.)
     #[must_use]
     pub fn is_reply_to(&self, other: &Self) -> bool {
         let same_conversation = match (&self.conversation_id, &other.conversation_id) {
@@ -87,32 +90,32 @@ impl Message {
         }
     }
 
-    /// What the message does.
+    /// The communicative act.
     #[must_use]
     pub fn performative(&self) -> &Performative {
         &self.performative
     }
 
-    /// Who sent it; absent in anonymous messages.
+    /// The sender. Anonymous messages have none.
     #[must_use]
     pub fn sender(&self) -> Option<&AgentId> {
         self.sender.as_ref()
     }
 
-    /// Whom it is for.
+    /// The receivers.
     #[must_use]
     pub fn receivers(&self) -> &[AgentId] {
         &self.receivers
     }
 
-    /// Whom to send replies to, instead of the sender.
+    /// The agents that receive replies instead of the sender.
     #[must_use]
     pub fn reply_to(&self) -> &[AgentId] {
         &self.reply_to
     }
 
-    /// What it says, in the language and encoding named by [`language`](Self::language) and
-    /// [`encoding`](Self::encoding).
+    /// The content, in the [`language`](Self::language) and [`encoding`](Self::encoding) of the
+    /// message.
     #[must_use]
     pub fn content(&self) -> Option<&Bytes> {
         self.content.as_ref()
@@ -142,39 +145,38 @@ impl Message {
         self.protocol.as_deref()
     }
 
-    /// The conversation that the message is part of.
+    /// The identifier of the conversation that the message is part of.
     #[must_use]
     pub fn conversation_id(&self) -> Option<&str> {
         self.conversation_id.as_deref()
     }
 
-    /// What a reply to this message is to have as `in-reply-to`.
+    /// The `in-reply-to` that a reply to this message must have.
     #[must_use]
     pub fn reply_with(&self) -> Option<&str> {
         self.reply_with.as_deref()
     }
 
-    /// The `reply-with` of the message that this one answers.
+    /// The `reply-with` of the message that this message answers.
     #[must_use]
     pub fn in_reply_to(&self) -> Option<&str> {
         self.in_reply_to.as_deref()
     }
 
-    /// The latest time for the next message of the conversation.
+    /// The latest time for a reply.
     #[must_use]
     pub fn reply_by(&self) -> Option<Time> {
         self.reply_by
     }
 
-    /// User-defined parameters in the order of the message, names without `X-`. Of several with
-    /// the same name the last one counts.
+    /// Names, without their `X-`, and values of user-defined parameters, in the order of the
+    /// message. The last of several with the same name counts.
     #[must_use]
     pub fn user_defined(&self) -> &[(String, String)] {
         &self.user_defined
     }
 
-    /// Takes the content out, as one who shows messages does before keeping them. What remains is
-    /// a message without content; [`MessageBuilder::from`] gives it another.
+    /// Removes the content and returns it. [`MessageBuilder::from`] can set another content.
     pub fn take_content(&mut self) -> Option<Bytes> {
         self.content.take()
     }
@@ -199,11 +201,11 @@ impl Message {
     }
 }
 
-/// Longest text or content that [`Message`]'s `Display` shows, in characters.
+/// Maximum number of characters of a text or content that [`Message`]'s `Display` shows.
 const SHOWN: usize = 80;
 
-/// Like FIPA00070, for people to read: agents by name only, long texts cut, all texts
-/// [escaped](escape). Not for machines.
+/// Writes a form similar to FIPA00070 for people: agents by name only, long texts truncated, all
+/// texts [escaped](escape). No decoder reads it.
 impl fmt::Display for Message {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "({}", escape(self.performative.as_str()))?;
@@ -249,14 +251,10 @@ fn shown(text: &str) -> String {
     if is_token(text) && text.chars().nth(SHOWN).is_none() {
         return escape(text).into_owned();
     }
-    shown_quoted(text)
-}
-
-fn shown_quoted(text: &str) -> String {
     shown_start(text, text.len())
 }
 
-/// The start of a text of `len` bytes.
+/// Formats a text of `len` bytes that begins with `start`.
 fn shown_start(start: &str, len: usize) -> String {
     let cut: String = start.chars().take(SHOWN).collect();
     let mut out = String::new();
@@ -268,11 +266,11 @@ fn shown_start(start: &str, len: usize) -> String {
 }
 
 fn shown_content(content: &Bytes) -> String {
-    // A copy, because nobody vouches that shared memory stays the UTF-8 it was found to be.
+    // A copy, because another process may change shared memory after it was checked for UTF-8.
     let start = content.slice(..content.len().min(4 * SHOWN)).to_vec();
     match std::str::from_utf8(&start) {
         Ok(text) => shown_start(text, content.len()),
-        // The last character was cut in two.
+        // The last character is incomplete.
         Err(error) if error.error_len().is_none() && start.len() < content.len() => {
             let whole = start.get(..error.valid_up_to()).unwrap_or_default();
             shown_start(&String::from_utf8_lossy(whole), content.len())
@@ -305,7 +303,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reply_takes_over_what_the_standard_says() {
+    fn a_reply_copies_the_parameters_of_the_standard() {
         let reply = request().reply(Performative::Agree).build().unwrap();
         assert_eq!(reply.receivers(), [agent("alice")]);
         assert_eq!(reply.sender(), None);
@@ -320,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn reply_to_comes_before_the_sender() {
+    fn replies_go_to_reply_to_instead_of_the_sender() {
         let mut message = request();
         message.reply_to = vec![agent("carol"), agent("dave")];
         let reply = message.reply(Performative::Agree).build().unwrap();
@@ -328,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn what_counts_as_a_reply() {
+    fn replies_are_recognized_by_reply_with_and_conversation() {
         let asked = request();
         let mut answer = asked
             .reply(Performative::Inform)
@@ -341,11 +339,14 @@ mod tests {
         assert!(answer.is_reply_to(&asked), "the conversation decides");
         answer.conversation_id = Some("c 2".into());
         assert!(!answer.is_reply_to(&asked));
-        assert!(!asked.is_reply_to(&asked), "nobody answers himself");
+        assert!(
+            !asked.is_reply_to(&asked),
+            "a message is no reply to itself"
+        );
     }
 
     #[test]
-    fn people_can_read_it() {
+    fn display_shows_truncated_and_escaped_parameters() {
         assert_eq!(
             request().to_string(),
             "(request :sender alice :receiver (set bob) :protocol fipa-request \

@@ -7,12 +7,12 @@ use crate::word::is_word;
 
 macro_rules! performatives {
     ($($(#[$doc:meta])* $variant:ident = $code:literal $name:literal,)*) => {
-        /// What a message does: one of the 22 acts of FIPA00037, or a user-defined one.
+        /// A communicative act: one of the 22 acts of FIPA00037, or a user-defined one.
         #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
         #[allow(clippy::exhaustive_enums, reason = "the standard is final")]
         pub enum Performative {
             $($(#[$doc])* $variant,)*
-            /// An act that only its users know.
+            /// A user-defined act.
             Other(UserPerformative),
         }
 
@@ -20,7 +20,7 @@ macro_rules! performatives {
             /// The 22 acts of the standard, in the order of their codes in FIPA00069.
             pub const STANDARD: [Self; 22] = [$(Self::$variant,)*];
 
-            /// The name as the standard spells it, or the user-defined one.
+            /// Name in the spelling of the standard, or the user-defined name.
             #[must_use]
             pub fn as_str(&self) -> &str {
                 match self {
@@ -29,7 +29,8 @@ macro_rules! performatives {
                 }
             }
 
-            /// The name of the standard act with this code, or nothing.
+            /// Returns the name of the standard act with this code. An unassigned code has an empty
+            /// name.
             pub(crate) fn name_of_code(code: u8) -> &'static str {
                 match code {
                     $($code => $name,)*
@@ -37,16 +38,16 @@ macro_rules! performatives {
                 }
             }
 
-            /// The code of the standard act that has this name, in any case.
+            /// Returns the code of the standard act with this name, in any case.
             pub(crate) fn code_of_name(name: &[u8]) -> Option<u8> {
-                // Those of its length are few.
+                // Few names have the same length.
                 $(if name.len() == $name.len() && name.eq_ignore_ascii_case($name.as_bytes()) {
                     return Some($code);
                 })*
                 None
             }
 
-            /// The code of a standard act (FIPA00069 clause 2.1, `MsgType`).
+            /// Returns the code of a standard act (FIPA00069 2.2 `PredefinedMsgType`).
             pub(crate) fn code(&self) -> Option<u8> {
                 match self {
                     $(Self::$variant => Some($code),)*
@@ -62,7 +63,7 @@ performatives! {
     AcceptProposal = 0x01 "accept-proposal",
     /// Agreeing to perform some action, possibly in the future.
     Agree = 0x02 "agree",
-    /// Telling that an action that was asked for is no longer wanted.
+    /// Telling that a requested action is no longer wanted.
     Cancel = 0x03 "cancel",
     /// Calling for proposals to perform an action.
     Cfp = 0x04 "cfp",
@@ -100,12 +101,12 @@ performatives! {
     RequestWhen = 0x14 "request-when",
     /// Asking to perform an action each time a proposition becomes true.
     RequestWhenever = 0x15 "request-whenever",
-    /// Asking to be told of every change of what a descriptor refers to.
+    /// Asking for a report of every change of the object that a descriptor refers to.
     Subscribe = 0x16 "subscribe",
 }
 
 impl Performative {
-    /// The standard act with this code (FIPA00069).
+    /// Returns the standard act with this code (FIPA00069 2.2 `PredefinedMsgType`).
     pub(crate) fn of_code(code: u8) -> Option<Self> {
         Self::STANDARD
             .get(usize::from(code).checked_sub(1)?)
@@ -113,8 +114,8 @@ impl Performative {
     }
 }
 
-/// The name of a user-defined performative: a FIPA00070 word that is none of the 22 standard
-/// names. Made by parsing a [`Performative`].
+/// Name of a user-defined performative: a FIPA00070 word that is not one of the 22 standard names.
+/// Parsing a [`Performative`] makes one.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct UserPerformative(Box<str>);
 
@@ -126,18 +127,19 @@ impl UserPerformative {
     }
 }
 
-/// Text that cannot name a performative.
+/// Error of parsing a performative: the text is not a word.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "not a performative: {0:?} (a word is needed: no blanks or parentheses, and not beginning with \
-     a digit, '#', '-', '@' or '\"')"
+    "not a performative: {0:?}; give a word, which has no blanks or parentheses and does not begin \
+     with a digit, '#', '-', '@' or '\"'"
 )]
 pub struct PerformativeError(String);
 
 impl FromStr for Performative {
     type Err = PerformativeError;
 
-    /// The standard names are recognised in any case; any other word is a user-defined act.
+    /// Parses a name. The case of the standard names is ignored. Any other word is a user-defined
+    /// act.
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         match Self::code_of_name(text.as_bytes()).and_then(Self::of_code) {
             Some(act) => Ok(act),
@@ -159,17 +161,17 @@ mod tests {
 
     #[test]
     fn codes_are_those_of_the_standard() {
-        for (place, act) in Performative::STANDARD.iter().enumerate() {
-            assert_eq!(act.code().map(usize::from), Some(place + 1), "{act}");
-            assert_eq!(Performative::of_code(place as u8 + 1).as_ref(), Some(act));
-            assert_eq!(Performative::name_of_code(place as u8 + 1), act.as_str());
+        for (index, act) in Performative::STANDARD.iter().enumerate() {
+            assert_eq!(act.code().map(usize::from), Some(index + 1), "{act}");
+            assert_eq!(Performative::of_code(index as u8 + 1).as_ref(), Some(act));
+            assert_eq!(Performative::name_of_code(index as u8 + 1), act.as_str());
         }
         assert_eq!(Performative::of_code(0), None);
         assert_eq!(Performative::of_code(23), None);
     }
 
     #[test]
-    fn names_are_read_in_any_case_and_others_must_be_words() {
+    fn standard_names_are_read_in_any_case_and_other_names_must_be_words() {
         assert_eq!("INFORM".parse(), Ok(Performative::Inform));
         assert_eq!("Query-Ref".parse(), Ok(Performative::QueryRef));
         let user: Performative = "my-act".parse().unwrap();

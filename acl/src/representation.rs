@@ -1,6 +1,8 @@
-//! Names of the encodings, and how to tell them apart.
+//! Names of the encodings and their detection.
 
 use std::fmt;
+
+use crate::bitefficient::code;
 
 /// The three standard encodings of a message or an envelope.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -15,11 +17,11 @@ pub enum Representation {
 }
 
 impl Representation {
-    /// Tells the encoding of a message or an envelope from its first bytes (white space and a
-    /// byte order mark in front of text are passed over). `None` for what begins like neither.
+    /// Detects the encoding of a message or an envelope by its first bytes. White space and a byte
+    /// order mark in front of text are skipped. Returns `None` for an unknown encoding.
     #[must_use]
     pub fn detect(bytes: &[u8]) -> Option<Self> {
-        if let Some(0xfa..=0xfe) = bytes.first() {
+        if bytes.first().is_some_and(|first| is_bit_efficient(*first)) {
             return Some(Self::BitEfficient);
         }
         let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
@@ -29,6 +31,14 @@ impl Representation {
             _ => None,
         }
     }
+}
+
+/// Whether a message or an envelope with this first byte is bit-efficient.
+///
+/// FIPA00069 2.4, note 1: "The identifier byte can be used to separate bit-efficient ACL messages
+/// from (for example) string-based messages and separate different coding schemes."
+pub(crate) fn is_bit_efficient(first: u8) -> bool {
+    (code::message_id::PLAIN..=code::envelope::BASE).contains(&first)
 }
 
 impl fmt::Display for Representation {
@@ -41,13 +51,9 @@ impl fmt::Display for Representation {
     }
 }
 
-/// How the message behind an envelope is encoded, as the envelope says it (FIPA00067
-/// `acl-representation`).
+/// Encoding of the message behind an envelope (FIPA00067 `acl-representation`).
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-#[allow(
-    clippy::exhaustive_enums,
-    reason = "Other is there for what is not known"
-)]
+#[allow(clippy::exhaustive_enums, reason = "`Other` stands for any other name")]
 pub enum AclRepresentation {
     /// `fipa.acl.rep.bitefficient.std`
     BitEfficient,
@@ -60,7 +66,7 @@ pub enum AclRepresentation {
 }
 
 impl AclRepresentation {
-    /// The component name.
+    /// Component name of the representation.
     #[must_use]
     pub fn as_str(&self) -> &str {
         match self {
@@ -72,7 +78,7 @@ impl AclRepresentation {
     }
 }
 
-/// The representation with this component name; the standard ones are recognised in any case.
+/// Returns the representation with this component name. The case of standard names is ignored.
 impl From<&str> for AclRepresentation {
     fn from(name: &str) -> Self {
         [Self::BitEfficient, Self::String, Self::Xml]
@@ -103,7 +109,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_first_bytes_tell() {
+    fn the_first_bytes_determine_the_encoding() {
         use Representation::{BitEfficient, String, Xml};
         for (bytes, expected) in [
             (&b"\xfa\x10"[..], Some(BitEfficient)),

@@ -1,16 +1,18 @@
-//! Looking through short texts, eight bytes at a time.
+//! Scanning of short texts, eight bytes at a time.
 //!
-//! Words and names are a few bytes long: looking at those in one register is quicker than starting
-//! a vectorised search, and one look tells all that is to be known of them.
+//! Words and names are a few bytes long. Scanning them in one register is faster than starting a
+//! vectorized search, and one pass finds all their properties.
 
 pub(crate) const ONES: u64 = 0x0101_0101_0101_0101;
 pub(crate) const TOPS: u64 = ONES << 7;
 
-/// How many times eight bytes count as near.
+/// Maximum length that [`near_text`] scans, in units of eight bytes.
 const NEAR: usize = 6;
 
-/// The text in front of the first NUL, what is behind that, and what kind of text it is, if the NUL
-/// is near and not among the last bytes.
+/// Returns the text in front of the first NUL, the bytes behind the NUL, and the kind of text.
+///
+/// Returns `None` if the NUL is not among the first [`NEAR`] × 8 bytes, or is among the last bytes
+/// that do not fill a word.
 #[inline(always)]
 pub(crate) fn near_text(bytes: &[u8]) -> Option<(&[u8], &[u8], Kind)> {
     let (mut before, mut seen) = (0, Kind::default());
@@ -18,22 +20,22 @@ pub(crate) fn near_text(bytes: &[u8]) -> Option<(&[u8], &[u8], Kind)> {
     for _ in 0..NEAR {
         let (eight, behind) = rest.split_first_chunk()?;
         let word = u64::from_le_bytes(*eight);
-        // Of the first byte that is zero, and perhaps of later ones, the top bit is set.
+        // The top bit of the first zero byte is set, and perhaps those of later bytes.
         let zeros = word.wrapping_sub(ONES) & !word & TOPS;
         if zeros != 0 {
-            seen.see(word, (zeros & zeros.wrapping_neg()).wrapping_sub(1));
+            seen.add(word, (zeros & zeros.wrapping_neg()).wrapping_sub(1));
             let len = before + zeros.trailing_zeros() as usize / 8;
             let (text, behind) = bytes.split_at_checked(len)?;
             return Some((text, behind.split_first()?.1, seen));
         }
-        seen.see(word, u64::MAX);
+        seen.add(word, u64::MAX);
         before += 8;
         rest = behind;
     }
     None
 }
 
-/// What there is among the bytes of a text.
+/// Properties of the bytes of a text.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Kind {
     tops: u64,
@@ -42,7 +44,7 @@ pub(crate) struct Kind {
 
 impl Kind {
     #[inline(always)]
-    fn see(&mut self, word: u64, which: u64) {
+    fn add(&mut self, word: u64, which: u64) {
         self.tops |= word & which;
         self.no_token |= no_token(word) & which;
     }
@@ -53,41 +55,43 @@ impl Kind {
         self.tops & TOPS == 0
     }
 
-    /// Whether there are no blanks, parentheses and control characters.
+    /// Whether the text has no blanks, parentheses or control characters.
     #[inline(always)]
     pub(crate) fn is_token(self) -> bool {
         self.no_token & TOPS == 0
     }
 }
 
-/// The top bit of the first byte is set that no token has (blanks, parentheses and control
-/// characters), and perhaps those of later ones; no other bits count.
+/// Marks bytes that a token cannot have: blanks, parentheses and control characters.
+///
+/// The top bit of the first such byte is set. The top bits of later bytes, and all other bits, are
+/// unspecified. If there is no such byte, no top bit is set.
 #[inline(always)]
 pub(crate) fn no_token(word: u64) -> u64 {
     let parentheses = (word & (ONES * 0xfe)) ^ (ONES * 0x28);
     below(word, 0x21) | zero(parentheses)
 }
 
-/// The same of the bytes below a bound of at most 128.
+/// Marks bytes below a bound of at most 128, like [`no_token`].
 #[inline(always)]
 pub(crate) fn below(word: u64, bound: u64) -> u64 {
     word.wrapping_sub(ONES * bound) & !word
 }
 
-/// The same of the bytes that are zero.
+/// Marks zero bytes, like [`no_token`].
 #[inline(always)]
 pub(crate) fn zero(word: u64) -> u64 {
     below(word, 1)
 }
 
-/// The same of the bytes that are this one.
+/// Marks bytes equal to `byte`, like [`no_token`].
 #[inline(always)]
 pub(crate) fn is(word: u64, byte: u8) -> u64 {
     zero(word ^ (ONES * byte as u64))
 }
 
-/// Where the first byte is that `found` marks, one of the functions above, if there is one; the
-/// last bytes are asked of `exact`.
+/// Returns the position of the first byte that `found` marks. `found` is one of the functions above.
+/// `exact` decides for the last bytes, which do not fill a word.
 #[inline(always)]
 pub(crate) fn find(
     bytes: &[u8],
@@ -108,8 +112,8 @@ pub(crate) fn find(
     Some(before + last)
 }
 
-/// Where the first of these bytes is, quicker for a few than a vectorised search and not slower for
-/// many.
+/// Returns the position of the first byte equal to `byte`. For short texts this is faster than a
+/// vectorized search, and for long ones not slower.
 #[inline]
 pub(crate) fn find_byte(bytes: &[u8], byte: u8) -> Option<usize> {
     let mut before = 0;
@@ -127,7 +131,7 @@ pub(crate) fn find_byte(bytes: &[u8], byte: u8) -> Option<usize> {
     Some(before + memchr::memchr(byte, rest)?)
 }
 
-/// Whether there is a byte that `found` marks, one of the functions above or several.
+/// Whether `found` marks any byte. `found` combines one or more of the functions above.
 #[inline]
 pub(crate) fn any(bytes: &[u8], found: impl Fn(u64) -> u64) -> bool {
     let mut marks = 0;
@@ -135,23 +139,24 @@ pub(crate) fn any(bytes: &[u8], found: impl Fn(u64) -> u64) -> bool {
     marks & TOPS != 0
 }
 
-/// Looks at all bytes, at some twice, and at letters besides.
+/// Passes all bytes to `visit` in words. Some bytes are passed twice. A short text is padded with
+/// letters.
 #[inline(always)]
-pub(crate) fn each(bytes: &[u8], mut look: impl FnMut(u64)) {
+pub(crate) fn each(bytes: &[u8], mut visit: impl FnMut(u64)) {
     match (bytes.as_chunks::<8>(), bytes.last_chunk()) {
-        // The last eight overlap those in front of them.
+        // The last eight bytes overlap the bytes in front of them.
         ((eights, _), Some(last)) => {
             for eight in eights {
-                look(u64::from_le_bytes(*eight));
+                visit(u64::from_le_bytes(*eight));
             }
-            look(u64::from_le_bytes(*last));
+            visit(u64::from_le_bytes(*last));
         }
         ((_, rest), None) => {
             let mut eight = [b'a'; 8];
             for (filled, byte) in eight.iter_mut().zip(rest) {
                 *filled = *byte;
             }
-            look(u64::from_le_bytes(eight));
+            visit(u64::from_le_bytes(eight));
         }
     }
 }
@@ -161,11 +166,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_near_is_found_and_known() {
+    fn near_texts_are_found_with_their_kind() {
         for len in 0..60_usize {
-            for (place, byte) in (0..len).flat_map(|place| [(place, b' '), (place, 0xc3)]) {
+            for (at, byte) in (0..len).flat_map(|at| [(at, b' '), (at, 0xc3)]) {
                 let mut bytes = vec![b'a'; len];
-                bytes[place] = byte;
+                bytes[at] = byte;
                 bytes.extend_from_slice(b"\0(\xff behind..");
                 let Some((text, behind, kind)) = near_text(&bytes) else {
                     assert!(len >= 8 * NEAR, "{len}");
@@ -180,16 +185,16 @@ mod tests {
     }
 
     #[test]
-    fn bytes_are_found_wherever_they_stand() {
+    fn bytes_are_found_at_every_position() {
         for len in 1..40 {
-            for place in 0..len {
+            for at in 0..len {
                 for byte in 0..=u8::MAX {
                     let mut bytes = vec![b'a'; len];
-                    bytes[place] = byte;
+                    bytes[at] = byte;
                     let ends = |byte: u8| byte <= b' ' || byte == b'(' || byte == b')';
-                    let expected = ends(byte).then_some(place);
+                    let expected = ends(byte).then_some(at);
                     assert_eq!(find(&bytes, no_token, ends), expected, "{bytes:?}");
-                    let expected = (byte == b'<').then_some(place);
+                    let expected = (byte == b'<').then_some(at);
                     let found = find(&bytes, |word| is(word, b'<'), |byte| byte == b'<');
                     assert_eq!(found, expected, "{bytes:?}");
                 }

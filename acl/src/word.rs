@@ -1,30 +1,33 @@
-//! What counts as a word, and how text is written as a string literal (FIPA00070).
+//! Words and string literals (FIPA00070).
 //!
-//! Shared by all encodings: the bit-efficient one takes both productions over from the string one.
+//! All encodings share this module: FIPA00069 2.2 defines `Word` and `String` "as in [FIPA00070]".
 
 use crate::scan::{self, TOPS};
 
-/// Whether the text is a FIPA00070 `Word`: not empty, no control characters, blanks or
-/// parentheses, and not beginning with a digit, `#`, `-` or `@`. A quotation mark in front is
-/// excluded too, because a reader would take the text for a string literal.
+/// Whether the text is a FIPA00070 `Word`.
+///
+/// A word is not empty, has no control characters, blanks or parentheses, and does not begin with a
+/// digit, `#`, `-` or `@`. Here it does not begin with a quotation mark either, because a reader
+/// would take it for a string literal.
 pub(crate) fn is_word(text: impl AsRef<[u8]>) -> bool {
     Shape::of(text) == Shape::Word
 }
 
-/// Whether the text is a `Word` but for its first character, which peers do not look at: JADE
-/// writes whatever has no blanks as a word.
+/// Whether the text is a `Word` apart from its first character. Peers do not check that character:
+/// JADE writes every text without blanks as a word.
 pub(crate) fn is_token(text: impl AsRef<[u8]>) -> bool {
     let bytes = text.as_ref();
     !bytes.is_empty() && classes(bytes).0 == 0
 }
 
-/// How a text can be written.
+/// The forms in which a text can be written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Shape {
+    /// As a word.
     Word,
-    /// In quotation marks, as it is.
+    /// In quotation marks, unchanged.
     Quotable,
-    /// Not without care.
+    /// As a string literal that may need escapes or a byte count.
     Other,
 }
 
@@ -32,7 +35,7 @@ impl Shape {
     #[inline(always)]
     pub(crate) fn of(text: impl AsRef<[u8]>) -> Self {
         let bytes = text.as_ref();
-        // Most texts have none of the characters up to the parentheses but blanks, and no
+        // Up to the parentheses, most texts have no characters other than blanks, and no
         // backslashes.
         let (low, odd) = match (bytes.first_chunk(), bytes.last_chunk(), bytes.len()) {
             (Some(first), Some(last), ..=16) => odds::<8>(first, last),
@@ -51,7 +54,7 @@ impl Shape {
         }
     }
 
-    /// Whether the first character is none of a word.
+    /// Whether a word cannot begin like the text.
     #[inline]
     fn is_excluded(bytes: &[u8]) -> bool {
         matches!(
@@ -73,9 +76,10 @@ impl Shape {
     }
 }
 
-/// Whether there are bytes up to the parentheses in a text that begins and ends so, and whether there
-/// are others than blanks among them, or backslashes. Written so that the compiler makes a few
-/// instructions of it that look at all bytes at once.
+/// Checks a text that begins with `first` and ends with `last`, which may overlap.
+///
+/// Returns whether it has bytes up to `)`, and whether it has such bytes other than blanks or
+/// backslashes. The compiler turns the loop into a few vector instructions.
 #[inline(always)]
 fn odds<const N: usize>(first: &[u8; N], last: &[u8; N]) -> (bool, bool) {
     let (mut low, mut odd) = (0, 0);
@@ -89,12 +93,13 @@ fn odds<const N: usize>(first: &[u8; N], last: &[u8; N]) -> (bool, bool) {
     (low != 0, odd != 0)
 }
 
-/// Two numbers, neither of which is zero if there are bytes that no token has (blanks, parentheses
-/// and control characters), or bytes that need care in quotation marks (those and backslashes).
+/// Returns two numbers. The first is not zero if the text has bytes that a token cannot have
+/// (blanks, parentheses and control characters). The second is not zero if it has quotation marks or
+/// backslashes.
 #[inline]
 fn classes(bytes: &[u8]) -> (u64, u64) {
     let (mut no_token, mut care) = (0, 0);
-    // Exact as to whether there is one.
+    // Exact as to whether there is such a byte.
     scan::each(bytes, |word| {
         no_token |= scan::no_token(word) & TOPS;
         care |= (scan::is(word, b'"') | scan::is(word, b'\\')) & TOPS;
@@ -105,13 +110,13 @@ fn classes(bytes: &[u8]) -> (u64, u64) {
 /// A piece of a string literal.
 pub(crate) enum Piece<'a> {
     Text(&'a str),
-    /// The opening of a byte-length encoded string: `#n"`.
+    /// The prefix of a byte-length encoded string: `#n"`.
     LengthPrefix(usize),
 }
 
-/// The pieces of the string literal for a text: `"…"` with `\"` as the only escape, or `#n"…`
-/// where a reader of the former could go wrong (a quotation mark after a backslash, a backslash
-/// at the end).
+/// Writes a text as a string literal, piece by piece: `"…"` with `\"` as the only escape, or `#n"…`
+/// if a reader could misread the former (a quotation mark behind a backslash, or a backslash at the
+/// end).
 pub(crate) fn string_literal<'a>(text: &'a str, mut put: impl FnMut(Piece<'a>)) {
     if !is_quotable(text) {
         put(Piece::LengthPrefix(text.len()));
@@ -121,15 +126,15 @@ pub(crate) fn string_literal<'a>(text: &'a str, mut put: impl FnMut(Piece<'a>)) 
     quoted(text, |piece| put(Piece::Text(piece)));
 }
 
-/// Whether every reader finds the end of the text in quotation marks: no quotation mark behind a
-/// backslash and no backslash at the end.
+/// Whether every reader finds the end of the text in quotation marks: the text has no quotation mark
+/// behind a backslash and no backslash at its end.
 pub(crate) fn is_quotable(text: &str) -> bool {
     let bytes = text.as_bytes();
     bytes.last() != Some(&b'\\')
         && (memchr::memchr(b'"', bytes).is_none() || memchr::memmem::find(bytes, b"\\\"").is_none())
 }
 
-/// The pieces of a text in quotation marks, `"` written as `\"`.
+/// Writes a text in quotation marks, piece by piece. `"` becomes `\"`.
 pub(crate) fn quoted<'a>(text: &'a str, mut put: impl FnMut(&'a str)) {
     put("\"");
     let mut pieces = text.split('"');
@@ -171,17 +176,17 @@ mod tests {
     }
 
     #[test]
-    fn every_byte_counts_wherever_it_stands() {
+    fn every_byte_is_checked_at_every_position() {
         for len in 1..20 {
-            for place in 0..len {
+            for at in 0..len {
                 for byte in 0..=0x7f_u8 {
                     let mut text = vec![b'a'; len];
-                    text[place] = byte;
+                    text[at] = byte;
                     let text = String::from_utf8(text).unwrap();
                     let no_token = byte <= 0x20 || b"()".contains(&byte);
                     assert_eq!(is_token(&text), !no_token, "{text:?}");
-                    let starts_badly = place == 0 && b"0123456789#-@\"".contains(&byte);
-                    let expected = if !no_token && !starts_badly {
+                    let excluded = at == 0 && b"0123456789#-@\"".contains(&byte);
+                    let expected = if !no_token && !excluded {
                         Shape::Word
                     } else if b"\"\\".contains(&byte) {
                         Shape::Other
@@ -197,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn literals_escape_quotes_and_count_bytes_where_escaping_is_ambiguous() {
+    fn literals_have_escapes_or_a_byte_count_if_escapes_are_ambiguous() {
         let literal = |text: &str| {
             let mut out = String::new();
             push_string_literal(&mut out, text);

@@ -1,4 +1,4 @@
-//! Messages with dynamic code tables (FIPA00069 2.4).
+//! Messages with dynamic code tables (FIPA00069 2.3).
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -13,7 +13,7 @@ fn plain(bytes: &[u8]) -> Message {
     Message::decode(&Payload::from(Bytes::copy_from_slice(bytes))).unwrap()
 }
 
-/// Everything that enters a table, in full.
+/// A message with every kind of text that enters a table.
 const FULL: &[u8] = b"\xfb\x10\x00\x10ping\0\
     \x02\x02\x10alice\0\x02\x10tcp://a:1\0\x01\x03\x02\x10bob\0\x01\x01\x04\x10X-k\0\x10v\0\x01\
     \x05\x70seq\0\x12\x53\0\x14\"a b\"\0\x16\x02cd\x74\"e\"\0\x76\x01f\x40\x56\x01g\x40\
@@ -22,7 +22,7 @@ const FULL: &[u8] = b"\xfb\x10\x00\x10ping\0\
     \x04\x16\x03\x00\x01\xff\
     \x01";
 
-/// The same, by the numbers under which it entered: performative 0, alice 1, her address 2, bob 3,
+/// The same message with the indexes of its texts: performative 0, alice 1, her address 2, bob 3,
 /// X-k 4, v 5, seq 6, "a b" 7, cd 8, "e" 9, f 10, g 11, X-prio 12.
 const BY_NUMBER: &[u8] = b"\xfc\x10\x00\x11\x00\
     \x02\x02\x11\x01\x02\x11\x02\x01\x03\x02\x11\x03\x01\x01\x04\x11\x04\x11\x05\x01\
@@ -39,7 +39,7 @@ fn without_tables(bytes: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn what_was_said_once_is_referred_to_by_number() {
+fn texts_of_earlier_messages_are_read_by_index() {
     let mut table = CodeTable::new(8).unwrap();
     let expected = plain(&without_tables(FULL));
     assert_eq!(read(FULL, &mut table), Ok(expected.clone()));
@@ -49,7 +49,7 @@ fn what_was_said_once_is_referred_to_by_number() {
 }
 
 #[test]
-fn content_shares_the_memory_it_came_in() {
+fn content_shares_the_memory_of_the_message() {
     let mut table = CodeTable::new(8).unwrap();
     let bytes = Bytes::from_static(FULL);
     let message = Message::decode_with_table(&bytes.clone().into(), &mut table).unwrap();
@@ -58,7 +58,7 @@ fn content_shares_the_memory_it_came_in() {
 }
 
 #[test]
-fn larger_tables_have_longer_numbers() {
+fn larger_tables_have_longer_indexes() {
     let mut table = CodeTable::new(9).unwrap();
     let full = b"\xfb\x10\x08\x0c\x10request\0\x01";
     let message = read(full, &mut table).unwrap();
@@ -71,7 +71,7 @@ fn larger_tables_have_longer_numbers() {
 }
 
 #[test]
-fn messages_of_the_second_kind_enter_nothing() {
+fn messages_with_an_unchanged_table_add_no_entries() {
     let mut table = CodeTable::new(8).unwrap();
     read(b"\xfc\x10\x08\x0c\x10request\0\x01", &mut table).unwrap();
     assert!(table.is_empty());
@@ -80,7 +80,7 @@ fn messages_of_the_second_kind_enter_nothing() {
 }
 
 #[test]
-fn a_full_table_forgets_what_was_not_used_for_longest() {
+fn a_full_table_evicts_the_least_recently_used_entries() {
     let mut table = CodeTable::new(8).unwrap();
     let say = |word: usize, table: &mut CodeTable| {
         let mut bytes = b"\xfb\x10\x08\x0c\x10".to_vec();
@@ -96,7 +96,7 @@ fn a_full_table_forgets_what_was_not_used_for_longest() {
     }
     assert_eq!(table.len(), 256);
     assert_eq!(by_number(0, &mut table).as_deref(), Ok("w0"));
-    // The 32 that were not used for longest make room: w1 to w32.
+    // The 32 least recently used entries are evicted: w1 to w32.
     say(256, &mut table);
     assert_eq!(table.len(), 225);
     assert_eq!(by_number(0, &mut table).as_deref(), Ok("w0"));
@@ -104,11 +104,11 @@ fn a_full_table_forgets_what_was_not_used_for_longest() {
     assert_eq!(by_number(33, &mut table).as_deref(), Ok("w33"));
     let unknown = by_number(2, &mut table).unwrap_err();
     assert_eq!(unknown.problem(), &Problem::NoSuchCode(2));
-    assert!(table.is_empty(), "out of step");
+    assert!(table.is_empty(), "an error clears the table");
 }
 
 #[test]
-fn without_a_table_they_are_refused() {
+fn messages_with_code_tables_are_refused_without_a_table() {
     for id in [0xfb, 0xfc] {
         let refused = Message::decode(&Payload::from(Bytes::from(vec![id, 0x10, 0x08, 0x01])));
         assert_eq!(refused.unwrap_err().problem(), &Problem::CodeTable);
@@ -116,7 +116,7 @@ fn without_a_table_they_are_refused() {
 }
 
 #[test]
-fn a_few_bytes_cannot_stand_for_many() {
+fn the_length_of_an_expanded_message_is_bounded() {
     let mut table = CodeTable::new(8).unwrap();
     let mut full = b"\xfb\x10\x08\x09\x10".to_vec();
     full.extend(vec![b'a'; CodeTable::MAX_TEXT]);
@@ -138,7 +138,7 @@ fn a_few_bytes_cannot_stand_for_many() {
 }
 
 #[test]
-fn what_is_cut_short_is_an_error() {
+fn truncated_messages_are_refused() {
     let mut filled = CodeTable::new(8).unwrap();
     read(FULL, &mut filled).unwrap();
     for bytes in [FULL, BY_NUMBER] {

@@ -1,4 +1,4 @@
-//! Bit-efficient messages and envelopes in the hands of peers.
+//! Bit-efficient messages and envelopes in the dialects of the peers.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -28,7 +28,7 @@ fn written(message: &Message, dialect: Dialect) -> Result<Bytes, EncodeError> {
     message.encode(BIT_EFFICIENT, dialect)
 }
 
-/// The bytes of what was built, behind what every message without a sender begins with.
+/// Encodes a message without a sender. Returns the bytes behind its fixed beginning.
 fn body(builder: MessageBuilder, dialect: Dialect) -> Vec<u8> {
     let bytes = written(&builder.build().unwrap(), dialect).unwrap();
     let start: &[u8] = match dialect {
@@ -52,7 +52,7 @@ fn enveloped(base: EnvelopeParams, dialect: Dialect) -> Result<Bytes, EncodeErro
 }
 
 #[test]
-fn texts_are_written_so_that_each_peer_finds_all_of_them() {
+fn texts_have_the_form_that_each_peer_reads() {
     let cpp = |text: &str| body(inform().language(text), Dialect::FipaServices);
     assert_eq!(cpp("sl"), b"\x09\x14\"sl\"\0\x01");
     assert_eq!(cpp("a b"), b"\x09\x14\"a b\"\0\x01");
@@ -73,7 +73,7 @@ fn texts_are_written_so_that_each_peer_finds_all_of_them() {
 }
 
 #[test]
-fn content_is_a_string_where_it_can_be_one() {
+fn content_is_a_string_if_the_peer_reads_it_as_one() {
     let cpp = |content: &[u8]| body(inform().content(content.to_vec()), Dialect::FipaServices);
     assert_eq!(cpp(b""), b"\x04\x14#0\"\0\x01");
     assert_eq!(cpp(b"\xff"), b"\x04\x14#1\"\xff\0\x01");
@@ -85,7 +85,7 @@ fn content_is_a_string_where_it_can_be_one() {
 }
 
 #[test]
-fn user_defined_names_have_no_prefix_in_the_memory_of_fipa_services() {
+fn user_defined_names_are_written_without_prefix_for_fipa_services() {
     let named = |name: &str| inform().user_defined(name, "v");
     let cpp = Dialect::FipaServices;
     assert_eq!(body(named("k"), cpp), b"\x00\x10k\0\x14\"v\"\0\x01");
@@ -94,7 +94,7 @@ fn user_defined_names_have_no_prefix_in_the_memory_of_fipa_services() {
 }
 
 #[test]
-fn what_a_peer_would_get_wrong_is_refused() {
+fn values_that_a_peer_misreads_are_refused() {
     let time = |text: &str| text.parse::<Time>().unwrap();
     for (message, dialect, what) in [
         (inform().protocol("é"), Dialect::FipaServices, "protocol"),
@@ -170,7 +170,7 @@ fn an_extension_without_a_stamp_has_an_empty_one_for_fipa_services() {
 }
 
 #[test]
-fn jade_reads_names_of_representations_and_plain_user_defined_values() {
+fn envelopes_for_jade_have_names_of_representations_and_plain_user_defined_values() {
     let stamp = Received::new("mts", base().date.unwrap());
     let extension = EnvelopeParams {
         acl_representation: Some(AclRepresentation::Xml),
@@ -189,7 +189,7 @@ fn jade_reads_names_of_representations_and_plain_user_defined_values() {
 }
 
 #[test]
-fn an_extension_of_more_than_a_peer_can_say_is_refused() {
+fn an_extension_longer_than_the_length_field_is_refused() {
     let envelope = Envelope {
         base: base(),
         extensions: vec![EnvelopeParams {
@@ -201,7 +201,7 @@ fn an_extension_of_more_than_a_peer_can_say_is_refused() {
     assert!(matches!(refused, Err(EncodeError::EnvelopeTooLong(_))));
 }
 
-/// fipa_services takes times as local.
+/// fipa_services takes all times as local.
 fn without_utc(what: &impl std::fmt::Debug) -> String {
     format!("{what:?}").replace("zone: Utc", "zone: Unspecified")
 }
@@ -225,7 +225,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(192))]
 
     #[test]
-    fn a_message_survives_or_is_refused(message in message().boxed()) {
+    fn a_message_is_the_same_after_a_round_trip_or_is_refused(message in message().boxed()) {
         for dialect in PEERS {
             match written(&message, dialect) {
                 Ok(bytes) => {
@@ -238,13 +238,13 @@ proptest! {
     }
 
     #[test]
-    fn an_envelope_survives_or_is_refused(envelope in envelope().boxed()) {
-        let mut sayable = envelope.clone();
-        sayable.base.user_defined.clear();
-        sayable.base.acl_representation = Some(AclRepresentation::Xml);
-        sayable.extensions.iter_mut().for_each(|extension| extension.user_defined.clear());
+    fn an_envelope_is_the_same_after_a_round_trip_or_is_refused(envelope in envelope().boxed()) {
+        let mut representable = envelope.clone();
+        representable.base.user_defined.clear();
+        representable.base.acl_representation = Some(AclRepresentation::Xml);
+        representable.extensions.iter_mut().for_each(|extension| extension.user_defined.clear());
         for dialect in PEERS {
-            for envelope in [&envelope, &sayable] {
+            for envelope in [&envelope, &representable] {
                 match envelope.encode(BIT_EFFICIENT, dialect) {
                     Ok(bytes) => {
                         let (again, len) = Envelope::decode(&bytes).unwrap();
@@ -263,7 +263,7 @@ proptest! {
     }
 
     #[test]
-    fn letters_of_any_combination(envelope in envelope().boxed(), message in message().boxed()) {
+    fn letters_of_any_two_encodings_are_split(envelope in envelope().boxed(), message in message().boxed()) {
         for dialect in [Dialect::Standard, Dialect::FipaServices, Dialect::Jade] {
             for of_envelope in [Representation::BitEfficient, Representation::Xml] {
                 for of_message in [Representation::BitEfficient, Representation::String, Representation::Xml] {
@@ -282,7 +282,7 @@ proptest! {
 }
 
 #[test]
-fn times_go_to_fipa_services_as_local_ones() {
+fn times_are_written_without_zone_for_fipa_services() {
     let message = inform().reply_by("20000508T042651481Z".parse().unwrap());
     let bytes = written(&message.build().unwrap(), Dialect::FipaServices).unwrap();
     let read = Message::decode(&bytes.into()).unwrap().reply_by().unwrap();

@@ -1,4 +1,4 @@
-//! Envelopes of peers that deviate, and envelopes that cannot be written.
+//! Envelopes of peers that deviate from the standard, and envelopes that cannot be encoded.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -33,7 +33,7 @@ fn stamp(by: &str) -> EnvelopeParams {
     }
 }
 
-/// A base envelope with these encoded parameters and a length nobody should trust.
+/// A base envelope with these encoded parameters and a wrong length.
 fn encoded_base(parameters: &[u8]) -> Vec<u8> {
     [b"\xfe\x00\x10\x10", DATE, parameters, b"\x01"].concat()
 }
@@ -43,11 +43,11 @@ fn encoded_extension(stamp: &[u8], parameters: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn jade_puts_a_tag_in_front_of_stamps() {
+fn the_code_in_front_of_a_stamp_of_jade_is_accepted() {
     let bytes = [encoded_extension(b"\x0ajade\0", b""), encoded_base(b"")].concat();
     let (envelope, _) = Envelope::decode(&bytes).unwrap();
     assert_eq!(envelope.extensions, [stamp("jade")]);
-    // A stamp that begins with that byte itself survives.
+    // A stamp that begins with that byte is the same after a round trip.
     let envelope = Envelope {
         base: base(),
         extensions: vec![stamp("\njade")],
@@ -70,7 +70,7 @@ fn an_address_is_not_taken_for_the_end_of_its_list() {
 }
 
 #[test]
-fn jade_writes_user_defined_parameters_its_own_way() {
+fn user_defined_parameters_of_jade_are_read() {
     let parameters = b"\x00X-k v w\0\x03\x02a\0\x04X-p\0q\0\x01\x00X-l\0m\0";
     let (envelope, _) = Envelope::decode(&encoded_base(parameters)).unwrap();
     let pair = |name: &str, value: &str| (name.to_owned(), value.to_owned());
@@ -82,7 +82,7 @@ fn jade_writes_user_defined_parameters_its_own_way() {
 }
 
 #[test]
-fn jade_names_the_representation_without_a_code() {
+fn a_representation_of_jade_without_a_code_is_read() {
     let parameters = b"\x04fipa.acl.rep.string.std\0";
     let (envelope, _) = Envelope::decode(&encoded_base(parameters)).unwrap();
     assert_eq!(
@@ -92,7 +92,7 @@ fn jade_names_the_representation_without_a_code() {
 }
 
 #[test]
-fn the_payload_length_may_have_a_tag() {
+fn the_payload_length_may_have_the_code_of_a_number() {
     for parameters in [
         &b"\x06\x12\x56\x00"[..],
         b"\x06\x13\x56\x00",
@@ -112,7 +112,7 @@ fn the_payload_length_may_have_a_tag() {
 }
 
 #[test]
-fn the_order_of_extensions_is_that_of_their_writer() {
+fn extensions_are_ordered_as_their_writer_orders_them() {
     let intended = |name: &str| [b"\x09\x02", name.as_bytes(), b"\0\x01\x01"].concat();
     let counted = |by: &str, to: &str| {
         let by = format!("#{}\"{by}\0", by.len());
@@ -151,7 +151,7 @@ fn the_order_of_extensions_is_that_of_their_writer() {
 }
 
 #[test]
-fn within_one_part_the_last_value_counts() {
+fn the_last_value_in_one_part_counts() {
     let parameters = b"\x03\x02a\0\x01\x03\x02b\0\x01\x09\x02c\0\x01\x01\x09\x01";
     let bytes = encoded_base(parameters);
     let (envelope, _) = Envelope::decode(&bytes).unwrap();
@@ -163,7 +163,7 @@ fn within_one_part_the_last_value_counts() {
 }
 
 #[test]
-fn long_envelopes_have_long_lengths() {
+fn long_envelopes_have_a_length_of_four_bytes() {
     for receivers in [6_000, 6_600, 20_000] {
         let envelope = Envelope {
             base: EnvelopeParams {
@@ -188,7 +188,7 @@ fn long_envelopes_have_long_lengths() {
 }
 
 #[test]
-fn what_is_no_envelope_is_refused() {
+fn bytes_that_are_no_envelope_are_refused() {
     let problem = |bytes: &[u8]| Envelope::decode(bytes).unwrap_err().problem().clone();
     assert!(matches!(problem(b"<?xml?>"), Problem::Truncated(_)));
     assert!(matches!(
@@ -219,7 +219,7 @@ fn what_is_no_envelope_is_refused() {
 }
 
 #[test]
-fn trailing_bytes_belong_to_the_payload() {
+fn bytes_behind_the_envelope_are_the_payload() {
     let bytes = [&encoded_base(b"")[..], b"rest"].concat();
     let letter = Letter::split(Bytes::from(bytes)).unwrap();
     assert_eq!(letter.payload().to_bytes(), "rest");
@@ -229,7 +229,7 @@ fn trailing_bytes_belong_to_the_payload() {
 }
 
 #[test]
-fn what_cannot_be_written_is_an_error() {
+fn envelopes_with_missing_or_invalid_parameters_are_refused() {
     let written = |params: EnvelopeParams| {
         Envelope {
             base: params,
@@ -292,7 +292,7 @@ fn what_cannot_be_written_is_an_error() {
 }
 
 #[test]
-fn the_envelope_around_a_message_is_the_one_of_its_parameters() {
+fn encode_around_writes_the_same_bytes_as_encode_standard() {
     let representation = AclRepresentation::BitEfficient;
     let plain = agent("rover");
     let reachable = agent("arm_1").with_address("tcp://10.0.0.2:7788").unwrap();

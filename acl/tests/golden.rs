@@ -1,4 +1,4 @@
-//! Recorded messages and letters of real peers decode to what they mean.
+//! Recorded messages and letters of real peers decode to their expected values.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -20,13 +20,13 @@ use serde_json::json;
 use self::recorded::{expected, name, vector, vectors, with_base64};
 
 #[test]
-fn every_message_of_the_cpp_library() {
+fn messages_of_fipa_acl_are_decoded_and_rewritten() {
     let files = vectors('m', "be");
     assert!(files.len() >= 35, "only {} found", files.len());
     for path in files {
         let mut expected = expected(&path)["message"].take();
         if name(&path) == "m28_resolver_depth2" {
-            // The library writes resolvers one deep.
+            // The library writes only one level of resolvers.
             let resolver = &mut expected["sender"]["resolvers"][0];
             resolver.as_object_mut().unwrap().remove("resolvers");
         }
@@ -38,20 +38,20 @@ fn every_message_of_the_cpp_library() {
             Ok(expected)
         );
 
-        // What we write of it means the same.
+        // The standard's dialect represents the same message.
         let again = Message::decode(&message.to_payload()).unwrap();
         assert_eq!(again, message, "{}", path.display());
 
-        // In the library's own hand it is the same bytes.
+        // The library's dialect has the same bytes.
         let written = message.encode(Representation::BitEfficient, Dialect::FipaServices);
         let written = written.unwrap();
         if name(&path) == "m50_strings_special" {
-            // It does not escape the quotation mark in a text, and cannot read it then.
+            // The library does not escape the quotation mark in a text, and then cannot read it.
             let quoted = b"\x0b\x14\"on\"to\"\0";
             let counted = b"\x0b\x14#5\"on\"to\0";
-            let place = memchr::memmem::find(&bytes, quoted).unwrap();
-            let behind = &bytes[place + quoted.len()..];
-            assert_eq!(written, [&bytes[..place], counted, behind].concat());
+            let at = memchr::memmem::find(&bytes, quoted).unwrap();
+            let behind = &bytes[at + quoted.len()..];
+            assert_eq!(written, [&bytes[..at], counted, behind].concat());
         } else {
             assert_eq!(written, bytes, "{}", path.display());
         }
@@ -59,13 +59,13 @@ fn every_message_of_the_cpp_library() {
 }
 
 #[test]
-fn every_letter_of_the_cpp_library() {
+fn letters_of_fipa_services_are_decoded_and_rewritten() {
     let files = vectors('e', "be");
     assert!(files.len() >= 11, "only {} found", files.len());
     for path in files {
         let mut expected = expected(&path);
         if name(&path) == "e12_extra_override" {
-            // The format has no date in extensions.
+            // Extensions have no date in this encoding.
             let extension = &mut expected["envelope"]["extensions"][0];
             extension.as_object_mut().unwrap().remove("date");
         }
@@ -106,7 +106,7 @@ fn every_letter_of_the_cpp_library() {
 }
 
 #[test]
-fn a_letter_as_it_goes_over_tcp() {
+fn a_letter_recorded_from_tcp_is_decoded() {
     let bytes = Bytes::from(fs::read(vector("tcp_letter.bin")).unwrap());
     let (envelope, letter) = Letter::decode(bytes).unwrap();
     same_when_rewritten(&envelope, &letter, Path::new("tcp_letter.bin"));
@@ -142,7 +142,7 @@ fn a_letter_as_it_goes_over_tcp() {
 }
 
 #[test]
-fn a_failure_report() {
+fn a_recorded_failure_report_is_decoded() {
     let bytes = Bytes::from(fs::read(vector("failure_letter.bin")).unwrap());
     let (envelope, letter) = Letter::decode(bytes).unwrap();
     same_when_rewritten(&envelope, &letter, Path::new("failure_letter.bin"));
@@ -165,7 +165,7 @@ fn a_failure_report() {
 }
 
 #[test]
-fn messages_of_jade() {
+fn messages_of_jade_are_decoded_and_rewritten() {
     let bytes = Bytes::from(fs::read(vector("jade_inform.be")).unwrap());
     let expected = json!({
         "performative": "inform",
@@ -187,7 +187,7 @@ fn messages_of_jade() {
     assert_eq!(request.performative(), &Performative::Request);
     assert_eq!(request.content().unwrap(), "hello jade");
     assert!(inform.is_reply_to(&request));
-    // In JADE's own hand it is the same bytes.
+    // JADE's dialect has the same bytes.
     let written = inform.encode(Representation::BitEfficient, Dialect::Jade);
     assert_eq!(
         written.unwrap(),
@@ -196,7 +196,7 @@ fn messages_of_jade() {
 }
 
 #[test]
-fn every_string_message_of_the_cpp_library() {
+fn string_messages_of_fipa_acl_are_decoded_and_rewritten() {
     let files = vectors('m', "str");
     assert!(files.len() >= 35, "only {} found", files.len());
     for path in files {
@@ -207,7 +207,7 @@ fn every_string_message_of_the_cpp_library() {
 
         let written = message.encode(Representation::String, Dialect::FipaServices);
         match name(&path) {
-            // The library writes what it does not read itself: these are refused.
+            // The library writes these but does not read them, so the encoder refuses them.
             "m28_resolver_depth2" | "m51_user_performative" => assert!(written.is_err()),
             _ => assert_eq!(written.unwrap(), bytes, "{}", path.display()),
         }
@@ -218,7 +218,7 @@ fn every_string_message_of_the_cpp_library() {
 }
 
 #[test]
-fn a_string_message_of_the_cpp_library_for_jade() {
+fn a_string_message_of_fipa_services_for_jade_is_decoded() {
     let bytes = Bytes::from(fs::read(vector("for_jade.str")).unwrap());
     let message = string_decoded(&bytes, Path::new("for_jade.str"));
     let expected = json!({
@@ -233,11 +233,11 @@ fn a_string_message_of_the_cpp_library_for_jade() {
 }
 
 #[test]
-fn string_messages_of_jade() {
+fn string_messages_of_jade_are_decoded_and_rewritten() {
     let read = |file: &str| {
         let bytes = Bytes::from(fs::read(vector(file)).unwrap());
         let message = Message::decode(&Payload::from(bytes)).unwrap();
-        // What we write for JADE means the same.
+        // JADE's dialect represents the same message.
         let written = message.encode(Representation::String, Dialect::Jade);
         let again = Message::decode(&written.unwrap().into());
         assert_eq!(again.as_ref(), Ok(&message), "{file}");
@@ -280,7 +280,7 @@ fn string_messages_of_jade() {
 }
 
 #[test]
-fn sizes_of_string_messages() {
+fn string_messages_are_not_longer_than_those_of_fipa_acl() {
     let text = "(request:sender(agent-identifier:nameproxy):receiver(set(agent-identifier:namecrex_0))\
                 :content#1\"x:reply-with#15\"test reply_with:reply-to(set(agent-identifier:nameproxy))\
                 :language#13\"test language:encoding#13\"test encoding:ontology#13\"test ontology\
@@ -293,15 +293,15 @@ fn sizes_of_string_messages() {
 }
 
 #[test]
-fn local_times_of_the_cpp_library_stay_local() {
+fn times_of_fipa_acl_have_no_zone() {
     let bytes = fs::read(vector("m46_reply_by.be")).unwrap();
     let time = MessageView::parse(&bytes).unwrap().reply_by().unwrap();
     assert_eq!(time.zone(), Zone::Unspecified);
     assert_eq!(time.to_string(), "20101223T120037980");
 }
 
-/// Checks that an envelope of the library's in its own hand is the same bytes, and the message behind
-/// it too, if it is one.
+/// Checks that encoding a decoded envelope in the library's dialect gives the same bytes, and the same
+/// for a bit-efficient message behind it.
 fn same_when_rewritten(envelope: &Envelope, letter: &Letter, path: &Path) {
     let written = envelope.encode(Representation::BitEfficient, Dialect::FipaServices);
     assert_eq!(written.unwrap(), letter.envelope(), "{}", path.display());
@@ -312,8 +312,8 @@ fn same_when_rewritten(envelope: &Envelope, letter: &Letter, path: &Path) {
     }
 }
 
-/// Decodes through view and owned value, which must agree on the content, and checks that the
-/// content is not copied.
+/// Decodes a view and an owned message. Checks that they have the same content, and that it is not
+/// copied.
 fn decoded(bytes: &Bytes, path: &Path) -> Message {
     let message = Message::decode(&Payload::from(bytes.clone()))
         .unwrap_or_else(|error| panic!("{}: {error}", path.display()));
@@ -332,7 +332,7 @@ fn decoded(bytes: &Bytes, path: &Path) -> Message {
     message
 }
 
-/// Decodes, and checks that the content is not copied.
+/// Decodes a message. Checks that the content is not copied.
 fn string_decoded(bytes: &Bytes, path: &Path) -> Message {
     let message = Message::decode(&Payload::from(bytes.clone()))
         .unwrap_or_else(|error| panic!("{}: {error}", path.display()));

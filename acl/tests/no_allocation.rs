@@ -1,4 +1,4 @@
-//! Reading a view allocates nothing.
+//! Views do not allocate.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -10,7 +10,7 @@ use fipa_acl::{EnvelopeView, MessageView, Text};
 const MESSAGE: &[u8] = include_bytes!("vectors/m23_all_fields.be");
 const AGENTS: &[u8] = include_bytes!("vectors/m58_reply_to_multi.be");
 const JADE: &[u8] = include_bytes!("vectors/jade_inform.be");
-const GLUED: &[u8] = include_bytes!("vectors/m23_all_fields.str");
+const NO_WHITE_SPACE: &[u8] = include_bytes!("vectors/m23_all_fields.str");
 const JADE_STRING: &[u8] = include_bytes!("vectors/jade_inform.str");
 const STRING: &[u8] = b"(inform :sender (agent-identifier :name a :addresses (sequence u:1 u:2) \
     :resolvers (sequence (agent-identifier :name r)) :X-k v) :receiver (set (agent-identifier \
@@ -28,7 +28,7 @@ const ESCAPED_XML: &[u8] = b"<fipa-message act='inform'><content>a&amp;b</conten
     <language>&#x20;<![CDATA[<]]></language></fipa-message>";
 const XML_LETTER: &[u8] = include_bytes!("vectors/e07_intended.xml");
 const LETTER: &[u8] = include_bytes!("vectors/failure_letter.bin");
-/// With every kind of text: word, string with escapes, number, expression.
+/// A message with every kind of text: word, string with escapes, number, expression.
 const EXPRESSIONS: &[u8] = b"\xfa\x10\x00\x10ping\0\
     \x05\x70seq\0\x12\x53\0\x12\xe2\xf6\0\x14\"a\"\0\x40\
     \x07\x14\"say \\\"hi\\\"\"\0\
@@ -36,29 +36,31 @@ const EXPRESSIONS: &[u8] = b"\xfa\x10\x00\x10ping\0\
     \x01";
 
 #[test]
-fn the_counter_counts() {
+fn an_allocation_is_counted() {
     let info = measure(|| drop(black_box(vec![1_u8])));
     assert_eq!(info.count_total, 1);
 }
 
-/// How often reading the message, and all that is in it, allocates.
+/// Counts the allocations of reading a message and all its parameters.
 fn allocations(bytes: &[u8]) -> u64 {
     measure(|| {
         let view = MessageView::parse(black_box(bytes)).unwrap();
-        let see = |text: Text<'_>| {
+        let access = |text: Text<'_>| {
             black_box(text.as_str().len());
         };
-        see(view.performative_name());
+        access(view.performative_name());
         for agent in view
             .sender()
             .into_iter()
             .chain(view.receivers())
             .chain(view.reply_to())
         {
-            see(agent.name());
-            agent.addresses().for_each(see);
-            agent.resolvers().for_each(|resolver| see(resolver.name()));
-            agent.user_defined().for_each(|(name, _)| see(name));
+            access(agent.name());
+            agent.addresses().for_each(access);
+            agent
+                .resolvers()
+                .for_each(|resolver| access(resolver.name()));
+            agent.user_defined().for_each(|(name, _)| access(name));
         }
         for text in [
             view.language(),
@@ -69,11 +71,11 @@ fn allocations(bytes: &[u8]) -> u64 {
             view.reply_with(),
             view.in_reply_to(),
         ] {
-            text.map(see);
+            text.map(access);
         }
         view.user_defined().for_each(|(name, value)| {
-            see(name);
-            see(value);
+            access(name);
+            access(value);
         });
         black_box(view.content().map(|content| content.len()));
         black_box(view.reply_by());
@@ -82,14 +84,14 @@ fn allocations(bytes: &[u8]) -> u64 {
 }
 
 #[test]
-fn messages_in_every_encoding() {
+fn reading_a_message_does_not_allocate() {
     for (name, bytes) in [
         ("bit-efficient", MESSAGE),
         ("agents", AGENTS),
         ("of JADE", JADE),
         ("string", STRING),
         ("string of JADE", JADE_STRING),
-        ("string without white space", GLUED),
+        ("string without white space", NO_WHITE_SPACE),
         ("XML", XML),
         ("XML of fipa_services", XML_OF_FIPA_SERVICES),
         ("XML of JADE", JADE_XML),
@@ -98,9 +100,8 @@ fn messages_in_every_encoding() {
     }
 }
 
-/// What has to be written out allocates where somebody wants it, but not before.
 #[test]
-fn what_is_escaped_allocates_when_it_is_asked_for() {
+fn escaped_texts_allocate_on_access_but_not_on_parsing() {
     for bytes in [EXPRESSIONS, ESCAPED, ESCAPED_XML] {
         let info = measure(|| {
             black_box(MessageView::parse(black_box(bytes)).unwrap());
@@ -111,7 +112,7 @@ fn what_is_escaped_allocates_when_it_is_asked_for() {
 }
 
 #[test]
-fn envelopes() {
+fn reading_an_envelope_does_not_allocate() {
     for bytes in [LETTER, XML_LETTER] {
         let info = measure(|| {
             let view = EnvelopeView::parse(black_box(bytes)).unwrap();

@@ -1,4 +1,4 @@
-//! What must hold for every message and envelope, and for any bytes at all.
+//! Properties of the bit-efficient encoding for all messages, all envelopes and any bytes.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -14,7 +14,7 @@ use proptest::prelude::*;
 
 use arbitrary::{envelope, message};
 
-/// Bytes with a chance to be taken for something.
+/// Bytes that resemble an encoded message or envelope.
 fn nearly_encoded() -> impl Strategy<Value = Vec<u8>> {
     let codes = prop::sample::select(
         &b"\x00\x01\x02\x03\x04\x05\x06\x09\x0a\x0d\x10\x12\x14\x16\x17\x19\x20\x24\x40\x60\x70\x74\xff\xfa\xfd\xfe\"#1a"[..],
@@ -27,8 +27,8 @@ fn nearly_encoded() -> impl Strategy<Value = Vec<u8>> {
     })
 }
 
-/// Explains the bytes and checks that every byte is told once, up to the error that decoding
-/// gives, if any.
+/// Explains the bytes. Checks that the spans cover every byte once, up to the error of decoding, if
+/// any.
 fn explained(bytes: &[u8]) -> Explanation {
     let explanation = explain(bytes);
     let mut end = 0;
@@ -58,7 +58,7 @@ fn explained(bytes: &[u8]) -> Explanation {
     explanation
 }
 
-/// How many spans mean just this.
+/// Counts the spans with this meaning.
 fn count(explanation: &Explanation, meaning: &str) -> usize {
     let spans = explanation.spans.iter();
     spans.filter(|span| span.meaning == meaning).count()
@@ -113,7 +113,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(192))]
 
     #[test]
-    fn every_length_is_known_before(message in message().boxed()) {
+    fn encoded_len_is_the_length_of_the_encoded_message(message in message().boxed()) {
         for representation in [
             Representation::BitEfficient,
             Representation::String,
@@ -124,18 +124,17 @@ proptest! {
                 let written = message.encode(representation, dialect);
                 prop_assert_eq!(len.clone(), written.as_ref().map(Bytes::len).map_err(Clone::clone));
                 let Ok(written) = written else { continue };
-                // As much room as there has to be, and no more.
-                let mut room = vec![0; written.len()];
-                let mut out = &mut room[..];
+                let mut buffer = vec![0; written.len()];
+                let mut out = &mut buffer[..];
                 message.encode_into(representation, dialect, &mut out).unwrap();
                 prop_assert_eq!(out.len(), 0);
-                prop_assert_eq!(&room[..], &written[..]);
+                prop_assert_eq!(&buffer[..], &written[..]);
             }
         }
     }
 
     #[test]
-    fn a_message_survives(message in message().boxed()) {
+    fn a_message_is_the_same_after_a_round_trip(message in message().boxed()) {
         let payload = message.to_payload();
         prop_assert_eq!(payload.len(), bitefficient::encoded_len(&message));
         prop_assert_eq!(payload.is_split(), message.content().is_some());
@@ -153,7 +152,7 @@ proptest! {
     }
 
     #[test]
-    fn an_envelope_survives(envelope in envelope().boxed()) {
+    fn an_envelope_is_the_same_after_a_round_trip(envelope in envelope().boxed()) {
         let bytes = envelope.encode_standard().unwrap();
         prop_assert_eq!(Envelope::decode(&bytes).unwrap(), (envelope.clone(), bytes.len()));
         let letter = Letter::split(bytes.clone()).unwrap();
@@ -217,9 +216,9 @@ proptest! {
         });
         let agents = agents + all_agents(in_envelope);
         prop_assert_eq!(count(&letter, "end of agent identifier"), agents);
-        // All lengths are right.
+        // All lengths are correct.
         prop_assert!(!letter.spans.iter().any(|span| span.meaning.contains("(ignored)")));
-        // The message is explained as on its own, only further behind.
+        // The message has the same spans as without an envelope, at higher offsets.
         let own = letter.spans.iter().skip_while(|span| span.offset < encoded.len());
         let own: Vec<_> = own.map(|span| (span.offset - encoded.len(), span.len, &span.meaning)).collect();
         let alone: Vec<_> = of_message.spans.iter().map(|span| (span.offset, span.len, &span.meaning)).collect();
@@ -227,7 +226,7 @@ proptest! {
     }
 
     #[test]
-    fn a_message_cut_short_is_an_error(message in message().boxed(), cut in any::<prop::sample::Index>()) {
+    fn a_truncated_message_is_refused(message in message().boxed(), cut in any::<prop::sample::Index>()) {
         let bytes = message.to_payload().to_bytes();
         let cut = cut.index(bytes.len());
         prop_assert!(Message::decode(&Payload::from(bytes.slice(..cut))).is_err());
@@ -237,7 +236,7 @@ proptest! {
     }
 
     #[test]
-    fn an_envelope_cut_short_is_an_error(envelope in envelope().boxed(), cut in any::<prop::sample::Index>()) {
+    fn a_truncated_envelope_is_refused(envelope in envelope().boxed(), cut in any::<prop::sample::Index>()) {
         let bytes = envelope.encode_standard().unwrap();
         let cut = cut.index(bytes.len());
         prop_assert!(Envelope::decode(&bytes[..cut]).is_err());
@@ -248,13 +247,13 @@ proptest! {
     fn damaged_bytes_are_read_or_refused(
         message in message().boxed(),
         envelope in envelope().boxed(),
-        place in any::<prop::sample::Index>(),
+        at in any::<prop::sample::Index>(),
         byte in any::<u8>(),
     ) {
         for bytes in [message.to_payload().to_bytes(), envelope.encode_standard().unwrap()] {
             let mut damaged = bytes.to_vec();
-            let place = place.index(damaged.len());
-            damaged[place] = byte;
+            let at = at.index(damaged.len());
+            damaged[at] = byte;
             never_panics(&damaged);
         }
     }

@@ -1,4 +1,4 @@
-//! How long messages and envelopes get: the figures of docs/benchmarks.md.
+//! Lengths of encoded messages and envelopes: the figures of docs/benchmarks.md.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -9,8 +9,8 @@ use fipa_acl::{
 
 const DIALECTS: [Dialect; 3] = [Dialect::Standard, Dialect::FipaServices, Dialect::Jade];
 
-/// The message that the old systems were measured with: 99 bytes of header information and one of
-/// content.
+/// The message of the published measurements of fipa_acl: 99 bytes of header information and one byte
+/// of content.
 fn message() -> Message {
     Message::builder(Performative::Request)
         .sender(agent("proxy"))
@@ -45,12 +45,12 @@ fn envelope(payload_len: usize) -> Envelope {
     Envelope { base, extensions }
 }
 
-/// The lengths in bytes for the standard, fipa_services and JADE.
+/// Returns the lengths of the message in bytes for the standard, fipa_services and JADE.
 fn message_sizes(representation: Representation) -> [usize; 3] {
     DIALECTS.map(|dialect| message().encode(representation, dialect).unwrap().len())
 }
 
-/// The same of a letter with a bit-efficient message.
+/// Returns the lengths of a letter with a bit-efficient message.
 fn letter_sizes(representation: Representation) -> [usize; 3] {
     DIALECTS.map(|dialect| {
         let message = message().encode(Representation::BitEfficient, dialect);
@@ -61,7 +61,7 @@ fn letter_sizes(representation: Representation) -> [usize; 3] {
 }
 
 #[test]
-fn messages() {
+fn messages_have_the_documented_lengths() {
     for (representation, expected, most) in [
         (Representation::BitEfficient, [148, 151, 138], 162),
         (Representation::String, [321, 303, 320], 330),
@@ -73,7 +73,7 @@ fn messages() {
 }
 
 #[test]
-fn letters() {
+fn letters_have_the_documented_lengths() {
     for (representation, expected, most) in [
         (Representation::BitEfficient, [198, 217, 188], 242),
         (Representation::Xml, [583, 586, 643], 647),

@@ -33,7 +33,7 @@ fn the_content_is_shared_in_both_directions() {
 }
 
 #[test]
-fn content_of_no_bytes_is_there() {
+fn empty_content_is_present() {
     let message = Message::builder(Performative::Inform)
         .content("")
         .build()
@@ -58,7 +58,7 @@ fn parameters_behind_the_content_are_read() {
 }
 
 #[test]
-fn pieces_that_do_not_fit_are_refused() {
+fn pieces_that_do_not_match_are_refused() {
     let whole = message().to_payload();
     let longer = Payload {
         content: Bytes::from_static(b"fours"),
@@ -97,7 +97,7 @@ fn pieces_that_do_not_fit_are_refused() {
         ..whole.clone()
     };
     assert!(matches!(problem(&headless), Problem::Truncated(_)));
-    // The head must end with the length, not with something that looks like one.
+    // The head must end with the length.
     let mut beyond = whole.head.to_vec();
     beyond.extend_from_slice(b"\x02\x02");
     let beyond = Payload {
@@ -108,7 +108,7 @@ fn pieces_that_do_not_fit_are_refused() {
 }
 
 #[test]
-fn other_encodings_and_code_tables_are_named() {
+fn errors_name_other_encodings_and_code_tables() {
     let of = |bytes: &'static [u8]| problem(&Payload::from(Bytes::from_static(bytes)));
     assert_eq!(of(b"\xfb\x10\x08\x01"), Problem::CodeTable);
     assert_eq!(of(b"\xfa\x10\x08\x05\x11\x00\x01"), Problem::CodeTable);
@@ -124,9 +124,9 @@ fn other_encodings_and_code_tables_are_named() {
     assert_eq!(of(b"\xfa\x10\x08\x01\n"), Problem::Trailing(1));
 }
 
-/// FIPA00069: a length has 32 bits. Nobody touches the content, so the memory is never taken.
+/// FIPA00069 has lengths of 32 bits. The content is never accessed, so its memory is only reserved.
 #[test]
-fn the_longest_content_there_can_be() {
+fn content_of_the_maximum_length_is_encoded_and_decoded() {
     let longest = u32::MAX as usize;
     let (head, tail) = message().around_content(longest).unwrap();
     assert!(head.ends_with(b"\x04\x19\xff\xff\xff\xff"));
@@ -134,7 +134,7 @@ fn the_longest_content_there_can_be() {
     let too_long = message().around_content(longest + 1);
     assert_eq!(too_long, Err(EncodeError::ContentTooLong(longest + 1)));
 
-    // The kernel gives addresses for more than there is room for, but not for very much more.
+    // The kernel reserves more memory than is available, but not much more.
     let memory = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
     let free = memory.lines().find_map(|line| {
         let kilobytes = line.strip_prefix("MemAvailable:")?.strip_suffix("kB")?;

@@ -1,5 +1,4 @@
-//! String messages: recorded ones of both peers, every form that is accepted, and what must hold
-//! for all of them.
+//! String messages: the three dialects, every accepted form, and properties of all messages.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -33,7 +32,7 @@ fn agent(name: &str) -> AgentId {
 }
 
 #[test]
-fn each_reader_gets_its_own_hand() {
+fn each_dialect_has_its_form() {
     let sender = agent("alice")
         .with_address("tcp://h:1")
         .unwrap()
@@ -89,7 +88,7 @@ fn each_reader_gets_its_own_hand() {
 }
 
 #[test]
-fn bytes_go_to_jade_in_base64() {
+fn binary_content_is_base64_for_jade() {
     let message = Message::builder(Performative::Inform)
         .content(&b"\0\x01\xff"[..])
         .build()
@@ -118,7 +117,7 @@ fn bytes_go_to_jade_in_base64() {
 }
 
 #[test]
-fn what_a_reader_would_get_wrong_is_refused() {
+fn values_that_a_reader_misreads_are_refused() {
     let refused = |set: &dyn Fn(fipa_acl::MessageBuilder) -> fipa_acl::MessageBuilder| {
         let message = set(Message::builder(Performative::Inform)).build().unwrap();
         DIALECTS.map(|dialect| written(&message, dialect).is_err())
@@ -200,12 +199,12 @@ fn every_form_is_read() {
     ];
     assert_eq!(message.user_defined(), pairs);
 
-    // JADE takes words for content.
+    // JADE accepts a word as content.
     assert_eq!(
         decode("(inform :content word)").unwrap().content().unwrap(),
         "word"
     );
-    // Only parentheses that fipa_services put there are taken away.
+    // Only the parentheses of fipa_services are removed.
     let quoted = decode("(inform :X-p \"(#1\\\"a)\")").unwrap();
     assert_eq!(quoted.user_defined()[0].1, "(#1\"a)");
 }
@@ -228,9 +227,9 @@ fn without_white_space_keywords_end_words() {
     assert_eq!(message.user_defined()[0].1, ")");
 }
 
-/// Whoever looks for the end of every word in all that is left would not come to an end here.
+/// A reader with quadratic time would not finish.
 #[test]
-fn a_million_bytes_without_white_space() {
+fn a_million_bytes_without_white_space_are_read_in_linear_time() {
     let words = format!("(inform{})", ":protocolx".repeat(100_000));
     assert_eq!(decode(words).unwrap().protocol(), Some("x"));
     let strings = format!("(inform{})", ":language#1\"x".repeat(100_000));
@@ -238,7 +237,7 @@ fn a_million_bytes_without_white_space() {
 }
 
 #[test]
-fn errors_say_where_and_what() {
+fn errors_have_the_offset_and_the_problem() {
     for (text, offset, problem) in [
         ("(", 1, Problem::Truncated("performative")),
         ("(inform", 7, Problem::Truncated("a parameter of a message")),
@@ -297,7 +296,7 @@ fn errors_say_where_and_what() {
 }
 
 #[test]
-fn nesting_is_bounded() {
+fn resolvers_and_expressions_nested_too_deep_are_refused() {
     let nested = |depth| {
         let open = "(agent-identifier :name a :resolvers (sequence ".repeat(depth);
         format!(
@@ -313,9 +312,9 @@ fn nesting_is_bounded() {
     assert!(decode(format!("(inform :content {}", "(".repeat(100_000))).is_err());
 }
 
-/// Agents and protocols that the string encoding can say in every dialect.
-fn sayable() -> impl Strategy<Value = Message> {
-    // fipa_services reads no others than ASCII ones.
+/// Messages with agents and protocols that every dialect of the string encoding can represent.
+fn representable() -> impl Strategy<Value = Message> {
+    // fipa_services reads only ASCII words.
     let word = "[a-z+~][a-z0-9.@\"-]{0,8}".boxed();
     let agent = (
         word.clone(),
@@ -345,7 +344,7 @@ fn sayable() -> impl Strategy<Value = Message> {
     })
 }
 
-/// fipa_services takes times as local.
+/// fipa_services takes all times as local.
 fn without_utc(message: &Message) -> String {
     format!("{message:?}").replace("zone: Utc", "zone: Unspecified")
 }
@@ -364,7 +363,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(192))]
 
     #[test]
-    fn what_can_be_written_survives(message in message().boxed()) {
+    fn a_message_is_the_same_after_a_round_trip_or_is_refused(message in message().boxed()) {
         for dialect in DIALECTS {
             match written(&message, dialect) {
                 Ok(bytes) => survives(&message, &bytes, dialect),
@@ -377,7 +376,7 @@ proptest! {
     }
 
     #[test]
-    fn what_can_be_said_can_be_written(message in sayable().boxed()) {
+    fn representable_messages_are_encoded(message in representable().boxed()) {
         let bytes = written(&message, Dialect::Standard).unwrap();
         survives(&message, &bytes, Dialect::Standard);
         if matches!(message.performative(), Performative::Other(_)) {
@@ -401,7 +400,7 @@ proptest! {
     }
 
     #[test]
-    fn a_message_cut_short_is_an_error(message in sayable().boxed(), cut in any::<prop::sample::Index>()) {
+    fn a_truncated_message_is_refused(message in representable().boxed(), cut in any::<prop::sample::Index>()) {
         for dialect in DIALECTS {
             if let Ok(bytes) = written(&message, dialect) {
                 prop_assert!(decode(&bytes[..cut.index(bytes.len())]).is_err());
@@ -411,14 +410,14 @@ proptest! {
 
     #[test]
     fn damaged_bytes_are_read_or_refused(
-        message in sayable().boxed(),
-        place in any::<prop::sample::Index>(),
+        message in representable().boxed(),
+        at in any::<prop::sample::Index>(),
         byte in prop_oneof![any::<u8>(), prop::sample::select(&b"():\"#\\ 0\0"[..])],
     ) {
         for dialect in DIALECTS {
             if let Ok(bytes) = written(&message, dialect) {
                 let mut damaged = bytes.to_vec();
-                damaged[place.index(bytes.len())] = byte;
+                damaged[at.index(bytes.len())] = byte;
                 read_or_refused(&damaged);
             }
         }
@@ -443,7 +442,8 @@ proptest! {
     }
 }
 
-/// What is read means the same bit-efficiently, and in every dialect that can say it.
+/// Checks that a decoded message is the same after a round trip in the bit-efficient encoding and in
+/// every dialect that can represent it.
 fn read_or_refused(bytes: &[u8]) {
     let Ok(message) = decode(bytes) else { return };
     assert_eq!(

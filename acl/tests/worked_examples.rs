@@ -1,4 +1,4 @@
-//! The worked examples of the bit-efficient formats, byte for byte.
+//! Worked examples of the bit-efficient encodings, byte for byte.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -21,17 +21,17 @@ fn encoded(message: &Message) -> Bytes {
 }
 
 #[test]
-fn the_smallest_message() {
+fn the_smallest_message_is_decoded_and_encoded() {
     let bytes = b"\xfa\x10\x08\x01";
     let message = Message::builder(Performative::Inform).build().unwrap();
     assert_eq!(decoded(bytes), message);
     assert_eq!(encoded(&message), &bytes[..]);
 }
 
-/// The example has the content in the middle and as a quoted string; we write it last and with its
-/// length, which every peer reads and which carries any bytes.
+/// The example has the content as a quoted string in the middle. The encoder writes it last and with
+/// its length, which every peer reads and which allows any bytes.
 #[test]
-fn a_request_with_text() {
+fn a_request_with_text_is_decoded_and_encoded() {
     let bytes = b"\xfa\x10\x13\
         \x02\x02\x10a@p\0\x01\
         \x03\x02\x10b@q\0\x01\x01\
@@ -60,9 +60,9 @@ fn a_request_with_text() {
     assert_eq!(decoded(ours), message);
 }
 
-/// Our own differs in the order of parameters only.
+/// The encoder uses another order of the parameters.
 #[test]
-fn addresses_resolvers_bytes_and_a_date() {
+fn addresses_resolvers_bytes_and_a_date_are_decoded_and_encoded() {
     let head = b"\xfa\x10\x08\
         \x02\x02\x10alice@p1\0\
         \x02\x10http://h1:7778/acc\0\x01\
@@ -93,9 +93,9 @@ fn addresses_resolvers_bytes_and_a_date() {
     assert_eq!(encoded(&message), ours);
 }
 
-/// Numbers and expressions are read as the text they stand for, and written as text.
+/// Numbers and expressions are decoded to the text that they stand for, and encoded as text.
 #[test]
-fn a_user_defined_act_with_an_expression() {
+fn a_user_defined_act_with_an_expression_is_decoded_and_encoded() {
     let bytes = b"\xfa\x10\x00\x10ping\0\
         \x05\x70seq\0\x12\x53\0\x12\xe2\xf6\0\x14\"a\"\0\x40\
         \x06\x21\x11\x11\x11\x11\x11\x11\x41\x11\x10\
@@ -119,7 +119,7 @@ fn a_user_defined_act_with_an_expression() {
 }
 
 #[test]
-fn test_messages_of_the_cpp_library() {
+fn test_messages_of_fipa_acl_are_decoded() {
     assert_eq!(
         decoded(b"\xfa\x01\x01\x01").performative(),
         &Performative::AcceptProposal
@@ -139,7 +139,7 @@ fn test_messages_of_the_cpp_library() {
 }
 
 #[test]
-fn an_envelope_with_a_stamp_inside() {
+fn an_envelope_with_a_stamp_is_decoded_and_encoded() {
     let bytes = b"\xfe\x00\x8a\x12\
         \x20\x31\x11\x16\x19\x15\x37\x62\x59\x20\
         \x02\x02receiver@foo.com\0\x02http://foo.com/acc\0\x01\x01\x01\
@@ -169,7 +169,7 @@ fn an_envelope_with_a_stamp_inside() {
 }
 
 #[test]
-fn a_base_and_the_stamp_put_in_front_of_it() {
+fn a_stamp_in_front_of_a_base_is_decoded_and_encoded() {
     let base = b"\xfe\x00\x38\x10\x24\x31\x35\x12\x42\x34\x6a\x6a\x11\x80\x5a\
         \x02\x02b@q\0\x02http://q/acc\0\x01\x01\x01\
         \x03\x02a@p\0\x01\

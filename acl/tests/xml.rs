@@ -1,5 +1,5 @@
-//! XML of real peers decodes to what it says; hostile XML is refused; what we write can be read,
-//! by us exactly and by the peers as far as their own recordings show how they write.
+//! XML of real peers decodes to its expected values, hostile XML is refused, and encoded XML has the
+//! form that the recordings of the peers have.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -20,15 +20,15 @@ use serde_json::json;
 use self::recorded::{expected, name, vector, vectors, with_base64};
 
 #[test]
-fn every_message_of_the_cpp_library() {
+fn messages_of_fipa_acl_are_decoded() {
     let files = vectors('m', "xml");
     assert!(files.len() >= 35, "only {} found", files.len());
     for path in files {
         let mut expected = expected(&path)["message"].take();
         match name(&path) {
-            // The library cuts content at the first NUL, which is the first byte here.
+            // The library truncates content at the first NUL, which is the first byte here.
             "m42_content_255_bin" => expected["content_base64"] = json!(""),
-            // It writes no element for content of no bytes.
+            // The library writes no element for empty content.
             "m35_content_empty" => {
                 expected.as_object_mut().unwrap().remove("content_base64");
             }
@@ -53,7 +53,7 @@ fn every_message_of_the_cpp_library() {
 }
 
 #[test]
-fn we_write_to_the_cpp_library_as_it_writes_itself() {
+fn messages_and_envelopes_for_fipa_services_have_its_form() {
     for path in vectors('m', "xml") {
         if name(&path) == "m34_content_bytes_1_255" {
             continue;
@@ -61,7 +61,7 @@ fn we_write_to_the_cpp_library_as_it_writes_itself() {
         let recorded = fs::read_to_string(&path).unwrap();
         let message = decoded(recorded.as_bytes()).unwrap();
         let written = message.encode(Representation::Xml, Dialect::FipaServices);
-        // Escaped instead of in CDATA sections, in which not everything can stand.
+        // The encoder escapes content. CDATA sections cannot hold every text.
         let mut escaped = recorded.clone();
         if let (Some(start), Some(end)) = (recorded.find("<![CDATA["), recorded.find("]]>")) {
             let content = recorded[start + 9..end].replace('&', "&amp;");
@@ -86,13 +86,13 @@ fn we_write_to_the_cpp_library_as_it_writes_itself() {
 }
 
 #[test]
-fn every_letter_of_the_cpp_library() {
+fn letters_of_fipa_services_are_decoded() {
     let files = vectors('e', "xml");
     assert!(files.len() >= 12, "only {} found", files.len());
     for path in files {
         let mut expected = expected(&path);
         if name(&path) == "e10_transport_behaviour" {
-            // The library writes none.
+            // The library does not write this parameter.
             let base = expected["envelope"]["base"].as_object_mut().unwrap();
             base.remove("transport_behaviour");
         }
@@ -108,7 +108,7 @@ fn every_letter_of_the_cpp_library() {
 }
 
 #[test]
-fn a_letter_for_a_jade_location() {
+fn a_letter_of_fipa_services_for_jade_is_decoded() {
     let bytes = Bytes::from(fs::read(vector("tcp_letter_jade.xml")).unwrap());
     let (envelope, letter) = Letter::decode(bytes).unwrap();
     assert_eq!(envelope.extensions.len(), 3);
@@ -127,7 +127,7 @@ fn a_letter_for_a_jade_location() {
 }
 
 #[test]
-fn letters_of_jade() {
+fn letters_of_jade_are_decoded_and_rewritten() {
     let us = "rusty@rustap http://127.0.0.1:9901/acc";
     let jade = "echo@jadetest http://127.0.0.1:7778/acc";
     let known = [
@@ -204,7 +204,7 @@ fn letters_of_jade() {
 }
 
 #[test]
-fn messages_of_jade() {
+fn messages_of_jade_are_decoded_and_rewritten() {
     let request = json!({
         "performative": "request",
         "sender": { "name": "rusty@rustap", "addresses": ["http://127.0.0.1:9901/acc"] },
@@ -229,7 +229,7 @@ fn messages_of_jade() {
         let recorded = fs::read_to_string(vector(file)).unwrap();
         let message = decoded(recorded.as_bytes()).unwrap();
         assert_eq!(message_to_json(&message), expected);
-        // JADE lays its elements out in lines; apart from that we write what it writes.
+        // JADE writes its elements in lines. Apart from that, the encoder has the same form.
         let dense: String = recorded.lines().map(str::trim_start).collect();
         let written = message.encode(Representation::Xml, Dialect::Jade).unwrap();
         let written = String::from_utf8(written.to_vec()).unwrap();
@@ -238,7 +238,7 @@ fn messages_of_jade() {
 }
 
 #[test]
-fn every_form_of_a_message_that_is_around() {
+fn every_form_of_a_message_is_read() {
     let message = read(
         "<?xml version='1.0'?>\n<!DOCTYPE fipa-message SYSTEM \"fipa.dtd\"><!-- hello -->\n\
          <FIPA-Message ACT='Inform' conversation-id='attribute'>\n\
@@ -280,7 +280,7 @@ fn every_form_of_a_message_that_is_around() {
 }
 
 #[test]
-fn jade_sends_bytes_as_base64() {
+fn base64_content_of_jade_is_decoded() {
     let message = read(
         "<fipa-message act=\"INFORM\"><content>AAH/\n</content>\
          <X-JADE-Encoding>Base64</X-JADE-Encoding></fipa-message>",
@@ -295,7 +295,7 @@ fn jade_sends_bytes_as_base64() {
 
 /// fipa_services writes content into one CDATA section, `]]>` included.
 #[test]
-fn the_end_of_a_cdata_section_in_content_makes_no_third_text() {
+fn content_with_an_unescaped_end_of_a_cdata_section_is_refused() {
     let content = |inside: &str| {
         let xml = format!("<fipa-message act='inform'><content>{inside}</content></fipa-message>");
         Message::decode(&Payload::from(Bytes::from(xml)))
@@ -312,7 +312,7 @@ fn the_end_of_a_cdata_section_in_content_makes_no_third_text() {
 }
 
 #[test]
-fn long_content_is_written_whole_wherever_its_pieces_end() {
+fn long_content_is_the_same_after_a_round_trip_wherever_its_pieces_end() {
     for dialect in [Dialect::Standard, Dialect::FipaServices] {
         for (len, odd) in (4080..4112).flat_map(|len| {
             [
@@ -339,7 +339,7 @@ fn long_content_is_written_whole_wherever_its_pieces_end() {
             assert_eq!(read.content().unwrap(), &text);
             if dialect == Dialect::FipaServices {
                 let condensed = bytes.windows(2).any(|two| two == b"  ");
-                assert!(!condensed, "its reader would take one space for two");
+                assert!(!condensed, "its reader would condense two spaces");
             }
         }
         for wrong in [&b"\xff"[..], b"\xf0\x9f", b"\x01", "\u{fffe}".as_bytes()] {
@@ -361,9 +361,8 @@ fn long_content_is_written_whole_wherever_its_pieces_end() {
     }
 }
 
-/// The C++ library reads no `<X-role>` inside of agent identifiers.
 #[test]
-fn fipa_services_gets_what_it_reads_or_a_refusal_with_the_reason() {
+fn user_defined_parameters_for_fipa_services_have_its_form_or_are_refused() {
     let agent = |value: &str| {
         let agent = AgentId::new("arm").unwrap();
         agent.with_user_defined("role", value).unwrap()
@@ -379,8 +378,8 @@ fn fipa_services_gets_what_it_reads_or_a_refusal_with_the_reason() {
         bytes.map(|bytes| String::from_utf8(bytes.to_vec()).unwrap())
     };
     let xml = encoded("lifts", Representation::Xml).unwrap();
-    // Its parser of identifiers looks at elements that begin with `X-` only, and takes the name
-    // from `href`.
+    // In identifiers, fipa_services reads only elements with names that begin with `X-`, and takes
+    // the parameter's name from `href`.
     let element = "<X-role href=\"X-role\" type=\"string\">lifts</X-role>";
     assert!(xml.contains(element), "{xml}");
     let read = Message::decode(&Payload::from(Bytes::from(xml))).unwrap();
@@ -430,7 +429,7 @@ fn plain_content_is_not_copied() {
 }
 
 #[test]
-fn every_form_of_an_envelope_that_is_around() {
+fn every_form_of_an_envelope_is_read() {
     let xml = "\u{feff} <ENVELOPE><Params><to><agent-identifier><name>a</name></agent-identifier>\
          </to><to><agent-identifier><name>b</name></agent-identifier></to>\
          <encrypted>old</encrypted><comments></comments><payload-length>-1</payload-length>\
@@ -576,7 +575,7 @@ fn hostile_envelopes_are_refused() {
 }
 
 #[test]
-fn what_xml_or_its_reader_cannot_carry_is_an_error() {
+fn values_that_xml_or_a_dialect_cannot_represent_are_refused() {
     let inform = || Message::builder(Performative::Inform);
     let refused = |message: Message, dialect| {
         matches!(
@@ -643,7 +642,7 @@ fn what_xml_or_its_reader_cannot_carry_is_an_error() {
 }
 
 #[test]
-fn the_message_of_the_published_figures_is_small() {
+fn the_message_of_the_published_measurements_is_not_longer() {
     let json = expected(&vector("m23_all_fields.xml"))["message"].take();
     let mut json = json;
     json.as_object_mut().unwrap().remove("in_reply_to");

@@ -1,4 +1,4 @@
-//! What must hold for every message and envelope in XML, and for any bytes at all.
+//! Properties of the XML encodings for all messages, all envelopes and damaged documents.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -19,7 +19,7 @@ use arbitrary::{Kinds, agent_of, message_of};
 
 const XML: Representation = Representation::Xml;
 
-/// Text that XML can carry, if need be escaped.
+/// Text that XML can represent, with escapes if necessary.
 fn text() -> BoxedStrategy<String> {
     let carried = |c: &char| !matches!(c, '\0'..='\x08' | '\x0b' | '\x0c' | '\x0e'..='\x1f' | '\u{fffe}' | '\u{ffff}');
     prop_oneof![
@@ -126,19 +126,19 @@ fn decoded(bytes: &Bytes) -> Message {
 
 proptest! {
     #[test]
-    fn every_message_of_text_survives(message in message()) {
+    fn a_message_of_text_is_the_same_after_a_round_trip(message in message()) {
         let encoded = message.encode(XML, Dialect::Standard).unwrap();
         prop_assert_eq!(decoded(&encoded), message);
     }
 
     #[test]
-    fn a_message_written_for_a_peer_says_what_was_meant(message in message()) {
+    fn a_message_in_the_dialect_of_a_peer_is_the_same_apart_from_zones(message in message()) {
         if let Ok(encoded) = message.encode(XML, Dialect::Jade) {
             prop_assert_eq!(decoded(&encoded), message.clone());
         }
         if let Ok(encoded) = message.encode(XML, Dialect::FipaServices) {
             let read = decoded(&encoded);
-            // The zone of a time is the only thing that is lost on purpose.
+            // Only the zone of a time is dropped.
             let local = |message: &Message| message.reply_by().map(|time| {
                 let mut text = time.to_string();
                 text.truncate(18);
@@ -150,15 +150,15 @@ proptest! {
                 encoded
             );
             if message.reply_by().is_none() {
-                // An empty conversation id is how fipa_services says that there is none; the
-                // element in our hand tells the difference.
+                // fipa_services writes an empty conversation identifier for an absent one. The
+                // encoder writes an element only if it is present.
                 prop_assert_eq!(read, message);
             }
         }
     }
 
     #[test]
-    fn every_envelope_survives_with_its_payload(
+    fn an_envelope_with_a_payload_is_the_same_after_a_round_trip(
         envelope in envelope(),
         payload in vec(any::<u8>(), 0..20),
     ) {
@@ -171,7 +171,7 @@ proptest! {
     }
 
     #[test]
-    fn an_envelope_written_for_a_peer_says_what_counts(envelope in envelope()) {
+    fn an_envelope_in_the_dialect_of_a_peer_has_the_effective_parameters(envelope in envelope()) {
         if let Ok(encoded) = envelope.encode(XML, Dialect::Jade) {
             let (read, _) = Envelope::decode(&encoded).unwrap();
             prop_assert_eq!(read.base, envelope.effective());

@@ -258,7 +258,7 @@ fn malformed_bytes_are_explained_up_to_the_error() {
     let ran = host.run_with_input(&["decode", "--hex", "--explain", "--json"], input);
     let (json, _) = ran.failed_json();
     assert_eq!(json["error"]["offset"], 9);
-    assert_eq!(json["error"]["clause"], "FIPA00069 2.1 AID");
+    assert_eq!(json["error"]["clause"], "FIPA00069 2.2 AgentIdentifier");
 
     let ran = host.run_with_input(&["decode", "--explain"], b"(inform)");
     let told = ran.failed(1);

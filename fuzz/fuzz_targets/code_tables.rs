@@ -1,5 +1,5 @@
-//! Any messages with code tables, one after the other, are read or refused; what is read survives
-//! being written.
+//! Any sequence of messages with code tables is decoded or refused. A decoded message is the same after
+//! a round trip.
 
 #![no_main]
 
@@ -8,12 +8,12 @@ use fipa_fuzz::{message_survives, payload};
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {
-    let mut table = CodeTable::new(8).expect("a size there is");
-    // Each but the last has its length in front.
+    let mut table = CodeTable::new(8).expect("a valid size");
+    // Each message but the last has its length in front.
     let mut rest = bytes;
     while let Some((len, behind)) = rest.split_first() {
         let (one, others) = behind.split_at(behind.len().min(usize::from(*len)));
-        // Nearly all should be of those that are to be tried.
+        // A valid message identifier. Two of three messages use code tables.
         let one: Vec<u8> = match one.split_first() {
             Some((id, one)) => [&[0xfa + id % 3], one].concat(),
             None => Vec::new(),

@@ -1,5 +1,5 @@
-//! Any bytes begin with a bit-efficient envelope or give an error; what was read survives being
-//! written, and the view and the explanation agree with it.
+//! Any bytes begin with a bit-efficient envelope or are refused. A decoded envelope is the same after a
+//! round trip, and the view and the explanation agree with it.
 
 #![no_main]
 

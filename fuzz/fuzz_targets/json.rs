@@ -1,4 +1,4 @@
-//! Any JSON describes a message or a letter or gives an error; what it describes can be written.
+//! Any JSON is a message or a letter or is refused. A decoded message or letter can be encoded.
 
 #![no_main]
 

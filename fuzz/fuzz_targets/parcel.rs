@@ -1,4 +1,4 @@
-//! Any bytes are a parcel or give an error; a parcel that was read survives being written.
+//! Any bytes are a parcel or are refused. A decoded parcel is the same after a round trip.
 
 #![no_main]
 

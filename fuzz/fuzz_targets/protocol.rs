@@ -1,4 +1,5 @@
-//! Any text is a protocol or an error with lines that exist; a protocol can be run with anything.
+//! Any text is a protocol, or is refused with existing line numbers. A protocol can be run with any
+//! messages.
 
 #![no_main]
 

@@ -1,5 +1,5 @@
-//! Any bytes from a process are a record or an error; whatever is told, the watcher tells no letter
-//! twice and keeps to its bounds. What this project writes of a letter is a record.
+//! Any bytes from a process are a record or are refused. For any records, the watcher reports no letter
+//! twice and keeps its bounds. The records that this project writes are accepted.
 
 #![no_main]
 
@@ -14,21 +14,21 @@ use fipa_mts::watch::{Event, Joiner, Record, Source};
 use fipa_transport::{Incarnation, Stream};
 use libfuzzer_sys::fuzz_target;
 
-/// Where the header has the lengths of its five parts, and where it ends.
+/// Offsets of the lengths of the five parts in the header, and of the end of the header.
 const LENGTHS: usize = 72;
 const HEADER: usize = 96;
 
 fuzz_target!(|bytes: &[u8]| {
     let _ = Wish::parse(bytes);
     let whole = Bytes::copy_from_slice(bytes);
-    // Also of what is no letter: whoever sends it is watched, too.
+    // Payloads that are no letter are recorded too.
     let envelope_len = Envelope::decode(&whole).map_or(bytes.len() / 2, |(_, len)| len);
     let (envelope, payload) = (whole.slice(..envelope_len), whole.slice(envelope_len..));
-    what_is_written_is_read(&Letter::new(envelope, payload));
+    written_records_are_accepted(&Letter::new(envelope, payload));
     let mut joiner = Joiner::new();
-    joiner.handle_begin(Source(0), "somebody");
+    joiner.handle_begin(Source(0), "arm_2");
     let mut now = Instant::now();
-    let mut told = HashSet::new();
+    let mut reported = HashSet::new();
     let mut rest = bytes;
     let mut number = 0_u64;
     while let Some(([kind, wait, low, high], after)) = rest.split_first_chunk::<4>() {
@@ -37,7 +37,7 @@ fuzz_target!(|bytes: &[u8]| {
         rest = after;
         number += 1;
         let source = Source(number % 3);
-        // What says that it is no record needs no help; the rest is made to look like one.
+        // Some inputs are tried as they are. The others get a valid header.
         let record = match kind {
             0 => record.to_vec(),
             kind => repaired(*kind, record),
@@ -58,23 +58,23 @@ fuzz_target!(|bytes: &[u8]| {
         }
         now += Duration::from_millis(u64::from(*wait));
         while let Some(event) = joiner.poll_event(now) {
-            note(&event, &mut told);
+            note(&event, &mut reported);
         }
     }
     while let Some(event) = joiner.finish() {
-        note(&event, &mut told);
+        note(&event, &mut reported);
     }
 });
 
-fn note(event: &Event, told: &mut HashSet<(Incarnation, u64)>) {
+fn note(event: &Event, reported: &mut HashSet<(Incarnation, u64)>) {
     if let Event::Letter(passage) = event {
         let letter = (passage.stream.sender, passage.sequence);
-        assert!(told.insert(letter), "told twice");
+        assert!(reported.insert(letter), "a letter was reported twice");
     }
 }
 
-/// With magic number, version and a kind, and with lengths that add up, so that what lies behind
-/// is looked at.
+/// Sets the magic number, the version, a kind and matching lengths, so that the parser reads the parts
+/// behind the header.
 fn repaired(kind: u8, record: &[u8]) -> Vec<u8> {
     let mut record = record.to_vec();
     record.resize(record.len().max(HEADER), 0);
@@ -93,7 +93,7 @@ fn repaired(kind: u8, record: &[u8]) -> Vec<u8> {
     record
 }
 
-fn what_is_written_is_read(letter: &Letter) {
+fn written_records_are_accepted(letter: &Letter) {
     let notice = Notice {
         stream: Stream {
             sender: Incarnation::from_u64(7),

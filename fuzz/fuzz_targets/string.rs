@@ -1,4 +1,4 @@
-//! Any text is a string message or an error; a message that was read survives being written.
+//! Any text is a string message or is refused. A decoded message is the same after a round trip.
 
 #![no_main]
 
@@ -7,7 +7,7 @@ use fipa_fuzz::{message_survives, message_view_agrees, payload};
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {
-    // What begins otherwise is the other targets' business.
+    // The other targets cover other first bytes.
     if Representation::detect(bytes) != Some(Representation::String) {
         return;
     }

@@ -1,5 +1,5 @@
-//! Any bytes begin with an XML envelope or give an error; an envelope that was read survives being
-//! written.
+//! Any bytes begin with an XML envelope or are refused. A decoded envelope is the same after a round
+//! trip.
 
 #![no_main]
 

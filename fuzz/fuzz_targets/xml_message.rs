@@ -1,4 +1,4 @@
-//! Any bytes are an XML message or an error; a message that was read survives being written.
+//! Any bytes are an XML message or are refused. A decoded message is the same after a round trip.
 
 #![no_main]
 

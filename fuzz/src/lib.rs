@@ -1,4 +1,4 @@
-//! What several fuzz targets check.
+//! Checks that several fuzz targets share.
 
 pub mod access;
 pub mod config;
@@ -25,7 +25,8 @@ use serde_json::json;
 
 const DIALECTS: [Dialect; 3] = [Dialect::Standard, Dialect::FipaServices, Dialect::Jade];
 
-/// A message that was read survives every encoding in every dialect that can say it, and JSON.
+/// Checks that a decoded message is the same after a round trip in every encoding and dialect that can
+/// represent it, and in JSON.
 pub fn message_survives(message: &Message) {
     let payload = message.to_payload();
     assert_eq!(payload.len(), fipa_acl::bitefficient::encoded_len(message));
@@ -57,12 +58,13 @@ pub fn message_survives(message: &Message) {
     }
     let json = json!({ "message": message_to_json(message) });
     let again = document_from_json(&json).expect("a message survives JSON");
-    // Where all times are in UTC.
+    // Only if all times are in UTC.
     assert!(matches!(again, Document::Message(_)));
     let _ = message.to_string();
 }
 
-/// An envelope that was read survives both encodings in every dialect that can say it.
+/// Checks that a decoded envelope is the same after a round trip in both encodings and in every dialect
+/// that can represent it.
 pub fn envelope_survives(envelope: &Envelope) {
     let _ = envelope_to_json(envelope);
     for representation in [Representation::BitEfficient, Representation::Xml] {
@@ -85,7 +87,7 @@ pub fn envelope_survives(envelope: &Envelope) {
     }
 }
 
-/// fipa_services gets times without their zone.
+/// The dialect of fipa_services has times without a zone.
 fn same<T: Debug + PartialEq>(one: &T, other: &T, dialect: Dialect) {
     if dialect == Dialect::FipaServices {
         let local = |what: &T| format!("{what:?}").replace("zone: Utc", "zone: Unspecified");
@@ -95,7 +97,7 @@ fn same<T: Debug + PartialEq>(one: &T, other: &T, dialect: Dialect) {
     }
 }
 
-/// The view of a message says what the message says, or is refused for the same reason.
+/// Checks that the view of a message has the same values as the message, or the same error.
 pub fn message_view_agrees(bytes: &[u8], decoded: &Result<Message, DecodeError>) {
     let view = MessageView::parse(bytes);
     assert_eq!(decoded.as_ref().err(), view.as_ref().err());
@@ -117,7 +119,7 @@ pub fn message_view_agrees(bytes: &[u8], decoded: &Result<Message, DecodeError>)
     assert_eq!(view.user_defined().count(), message.user_defined().len());
 }
 
-/// The view of an envelope says what the envelope says.
+/// Checks that the view of an envelope has the same values as the envelope.
 pub fn envelope_view_agrees(bytes: &[u8], envelope: &Envelope, len: usize) {
     let view = EnvelopeView::parse(bytes).expect("the view is not stricter");
     assert_eq!(view.len(), len);
@@ -136,7 +138,7 @@ pub fn envelope_view_agrees(bytes: &[u8], envelope: &Envelope, len: usize) {
     let _ = view.stamps().count();
 }
 
-/// The bytes as a message that lies in one piece.
+/// Returns the bytes as a message in one piece.
 pub fn payload(bytes: &[u8]) -> Payload {
     Payload::from(Bytes::copy_from_slice(bytes))
 }

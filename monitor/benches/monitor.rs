@@ -1,7 +1,7 @@
-//! What a verdict costs, and how much memory a conversation takes.
+//! Time of a verdict, and memory of a conversation.
 //!
-//! `raw` is the least that any monitor of 10,000 conversations has to do: hash the conversation's id
-//! and find it in a table.
+//! `raw` is the lower bound for any monitor of 10,000 conversations: hash the identifier of the
+//! conversation and find it in a table.
 
 #![expect(clippy::unwrap_used, reason = "a bench that cannot go on has failed")]
 #![expect(clippy::print_stdout, reason = "figures")]
@@ -35,7 +35,7 @@ fn message(act: Performative, from: &str, to: &str, protocol: &str, id: String) 
         .unwrap()
 }
 
-/// A monitor of subscriptions that go on.
+/// A monitor with open subscriptions.
 fn with_open(count: usize) -> (Monitor, Vec<Message>) {
     let mut limits = Limits::default();
     limits.conversations = 2_000_000;
@@ -64,7 +64,8 @@ fn with_open(count: usize) -> (Monitor, Vec<Message>) {
     (monitor, informs)
 }
 
-/// Time for so many messages, which have just been received, of conversations far apart.
+/// Measures the time for `count` messages that have just been received, of conversations far apart in
+/// memory.
 fn on_letters(all: &[Message], count: u64, mut check: impl FnMut(&Message) -> bool) -> Duration {
     const AT_ONCE: u64 = 64;
     let mut spent = Duration::ZERO;

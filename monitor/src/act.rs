@@ -1,17 +1,17 @@
-//! Performatives as the machines use them: a number for the 22 of the standard, and sets of them.
+//! Performatives in the form that the machines use: numbers for the 22 standard ones, and sets.
 
 use fipa_acl::Performative;
 use regex::Regex;
 
-/// The bit of every standard performative.
+/// The bits of all standard performatives.
 const STANDARD: u32 = (1 << 22) - 1;
 
-/// What a message does, ready to be compared.
+/// A performative in a form that is fast to compare.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Act<'a> {
-    /// One of the 22 of FIPA00037, by its place in [`Performative::STANDARD`].
+    /// One of the 22 of FIPA00037: its index in [`Performative::STANDARD`].
     Standard(u8),
-    /// A user-defined one.
+    /// A user-defined one: its name.
     Other(&'a str),
 }
 
@@ -74,18 +74,19 @@ fn standard_name(number: u8) -> &'static str {
     NAMES.get(usize::from(number)).map_or("", String::as_str)
 }
 
-/// A set of performatives, written as a regular expression that matches the whole of their names.
+/// A set of performatives, written as a regular expression that matches whole names.
 #[derive(Debug, Clone)]
 pub(crate) struct Acts {
     text: String,
+    /// A bit for each standard performative.
     standard: u32,
-    /// Of user-defined ones.
+    /// The pattern for user-defined performatives.
     other: Option<Regex>,
 }
 
 impl Acts {
     /// # Errors
-    /// When the text is no regular expression.
+    /// The text is not a regular expression.
     pub(crate) fn new(text: &str) -> Result<Self, regex::Error> {
         let pattern = whole(text, true)?;
         let mut standard = 0;
@@ -114,8 +115,8 @@ impl Acts {
         }
     }
 
-    /// A performative that both sets have, as far as that can be told: of user-defined ones, one
-    /// that either text spells out.
+    /// Returns a performative that both sets contain. A user-defined one is found only if one of the
+    /// texts is its name, or both texts are equal.
     pub(crate) fn common(&self, other: &Self) -> Option<String> {
         let both = self.standard & other.standard & STANDARD;
         if both != 0 {
@@ -131,7 +132,7 @@ impl Acts {
             .or_else(|| shared(other, self))
     }
 
-    /// The names, as far as they are finite: `agree, refuse`; else as written.
+    /// Formats the set for people: the standard names, for example `agree, refuse`, or the text.
     pub(crate) fn shown(&self) -> String {
         if is_word(&self.text) || self.standard == 0 || self.standard == STANDARD {
             return match self.text.as_str() {
@@ -149,10 +150,10 @@ impl Acts {
     }
 }
 
-/// Largest compiled pattern, in bytes.
+/// Maximum size of a compiled pattern, in bytes.
 const MAX_COMPILED: usize = 64 << 10;
 
-/// A pattern that matches whole texts only.
+/// Compiles a pattern that matches whole texts only.
 pub(crate) fn whole(text: &str, any_case: bool) -> Result<Regex, regex::Error> {
     regex::RegexBuilder::new(&format!("^(?:{text})$"))
         .case_insensitive(any_case)
@@ -161,7 +162,7 @@ pub(crate) fn whole(text: &str, any_case: bool) -> Result<Regex, regex::Error> {
         .build()
 }
 
-/// Whether the text stands for itself as a pattern.
+/// Whether the pattern matches only its own text.
 pub(crate) fn is_word(text: &str) -> bool {
     let literal = |c: char| c.is_alphanumeric() || matches!(c, '-' | '_' | ':' | ' ' | '@' | '/');
     text.chars().all(literal)
@@ -172,7 +173,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_are_places_in_the_standard() {
+    fn numbers_are_indexes_of_the_standard_performatives() {
         for (number, act) in (0..).zip(&Performative::STANDARD) {
             assert_eq!(Act::of(act), Act::Standard(number));
             assert_eq!(Act::named(act.as_str()), Act::Standard(number));
@@ -191,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn sets_match_whole_names() {
+    fn sets_contain_whole_names_only() {
         let inform = Acts::new("inform").unwrap();
         assert!(inform.contains(INFORM));
         assert!(!inform.contains(Act::named("inform-if")));

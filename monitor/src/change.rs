@@ -1,17 +1,17 @@
-//! What a message that was accepted changes, and what time does.
+//! Changes of a conversation by an accepted message or by a timeout.
 
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use crate::Header;
 use crate::conversation::{
-    Bound, CANCELLING, Conversation, FAILED, NONE, Party, Side, act_number, side_index,
+    CANCELLING, Conversation, FAILED, NONE, Party, RoleBinding, Side, act_number, side_index,
 };
 use crate::deadlines::{Deadline, Deadlines};
-use crate::judge::{Heard, Move, Who, unbound};
+use crate::judge::{Move, MoveTarget, ObservedMessage, unbound};
 use crate::machine::{After, Machine};
 use crate::names::Names;
 
-/// Takes the time-outs that are due.
+/// Applies the timeouts that are due.
 pub(crate) fn expire(machine: &Machine, conversation: &mut Conversation, now: u64) {
     for party in &mut conversation.parties {
         if party.deadline != 0 && party.deadline < now {
@@ -20,7 +20,7 @@ pub(crate) fn expire(machine: &Machine, conversation: &mut Conversation, now: u6
     }
 }
 
-/// Takes the time-out of the party's state, which is due.
+/// Applies the timeout of the party's state, which is due.
 pub(crate) fn expire_party(machine: &Machine, party: &mut Party) {
     let timeout = machine.state(party.state).and_then(|state| state.timeout);
     if let Some(timeout) = timeout {
@@ -29,13 +29,13 @@ pub(crate) fn expire_party(machine: &Machine, party: &mut Party) {
     }
 }
 
-/// What a message changes.
+/// Applies an accepted message to its conversation.
 pub(crate) struct Change<'a> {
     pub(crate) machine: &'a Machine,
     pub(crate) names: &'a mut Names,
     pub(crate) deadlines: &'a mut Deadlines,
-    pub(crate) heard: &'a Heard<'a>,
-    pub(crate) place: Deadline,
+    pub(crate) observed: &'a ObservedMessage<'a>,
+    pub(crate) deadline: Deadline,
     pub(crate) now: u64,
     /// The message's `reply-by`, or 0.
     pub(crate) due: u64,
@@ -48,22 +48,22 @@ pub(crate) struct Change<'a> {
 impl Change<'_> {
     pub(crate) fn make(&mut self, conversation: &mut Conversation, made: Move) {
         let fresh = |peer| Party::new(peer, self.machine.initial);
-        let index = match made.who {
-            Who::Party(index) => index,
-            Who::Receiver(number) => {
-                let receiver = self.heard.receivers.get(number);
+        let index = match made.target {
+            MoveTarget::Party(index) => index,
+            MoveTarget::Receiver(number) => {
+                let receiver = self.observed.receivers.get(number);
                 let peer = self.names.acquire(receiver.map_or("", |name| name));
                 conversation.parties.push(fresh(peer));
                 conversation.parties.len() - 1
             }
-            Who::Sender => {
-                let peer = self.names.acquire(self.heard.sender);
-                let told = conversation.unnamed.as_deref().cloned();
-                let party = told.unwrap_or_else(|| fresh(peer));
+            MoveTarget::Sender => {
+                let peer = self.names.acquire(self.observed.sender);
+                let unnamed = conversation.unnamed.as_deref().cloned();
+                let party = unnamed.unwrap_or_else(|| fresh(peer));
                 conversation.parties.push(Party { peer, ..party });
                 conversation.parties.len() - 1
             }
-            Who::Unnamed => {
+            MoveTarget::Unnamed => {
                 self.opened |= conversation.unnamed.is_none();
                 let mut party = match conversation.unnamed.take() {
                     Some(party) => party,
@@ -74,7 +74,7 @@ impl Change<'_> {
                 return;
             }
         };
-        self.opened |= matches!(made.who, Who::Receiver(_) | Who::Sender);
+        self.opened |= matches!(made.target, MoveTarget::Receiver(_) | MoveTarget::Sender);
         if let Some(party) = conversation.parties.get_mut(index) {
             self.opened |= party.acts == [0; 2];
             self.move_party(party, made);
@@ -82,26 +82,30 @@ impl Change<'_> {
                 self.deadlines.push(Deadline {
                     due: party.deadline,
                     party: u32::try_from(index).unwrap_or(NONE),
-                    ..self.place
+                    ..self.deadline
                 });
             }
         }
     }
 
     fn move_party(&mut self, party: &mut Party, made: Move) {
-        let Move { side, lead, .. } = made;
-        let answers = party.last != side && !made.told;
+        let Move {
+            side, next_state, ..
+        } = made;
+        let answers = party.last != side && !made.reported;
         self.late |= party.deadline != 0 && party.deadline < self.now && answers;
-        let cancels = lead.state == CANCELLING && party.state != CANCELLING;
-        if lead.void {
-            (party.state, party.resume, party.echo) = (lead.state, lead.resume, lead.echo);
+        let cancels = next_state.state == CANCELLING && party.state != CANCELLING;
+        if next_state.void {
+            (party.state, party.resume, party.echo) =
+                (next_state.state, next_state.resume, next_state.echo);
             self.state = self.state.or(Some(party.state));
             (self.late, self.void) = (true, true);
             return;
         }
-        if made.told || lead.state == FAILED {
-            // What failed may be said again, from the state before it.
-            (party.state, party.resume, party.echo) = (lead.state, lead.resume, lead.echo);
+        if made.reported || next_state.state == FAILED {
+            // The message that failed may be sent again, from the state before it.
+            (party.state, party.resume, party.echo) =
+                (next_state.state, next_state.resume, next_state.echo);
             self.state = self.state.or(Some(party.state));
             return;
         }
@@ -110,16 +114,17 @@ impl Change<'_> {
             state => state,
         };
         if cancels {
-            party.canceller = side;
-            party.cancel = self.heard.reply_with;
+            party.canceling_side = side;
+            party.cancel = self.observed.reply_with;
         } else {
             let index = side_index(side);
-            party.acts[index] = act_number(self.heard.act);
+            party.acts[index] = act_number(self.observed.act);
             party.asked_before[index] = party.asked[index];
-            party.asked[index] = self.heard.reply_with;
+            party.asked[index] = self.observed.reply_with;
         }
-        (party.state, party.resume, party.echo) = (lead.state, lead.resume, lead.echo);
-        if !lead.crossed {
+        (party.state, party.resume, party.echo) =
+            (next_state.state, next_state.resume, next_state.echo);
+        if !next_state.crossed {
             party.last = side;
         }
         let timeout = self
@@ -133,26 +138,26 @@ impl Change<'_> {
         self.state = self.state.or(Some(party.state));
     }
 
-    /// Gives roles that nobody has to those who speak and are spoken to in them.
+    /// Binds free roles of a step to the sender and the receivers.
     pub(crate) fn bind(&mut self, conversation: &mut Conversation, (from, to): (u32, u32)) {
         let free = unbound(self.machine, conversation);
         let mut give = |role: u32, agent: &str| {
             if role & free != 0 && role.count_ones() == 1 {
                 let agent = self.names.acquire(agent);
                 let role = u8::try_from(role.trailing_zeros()).unwrap_or(0);
-                conversation.bound.push(Bound { role, agent });
+                conversation.bound.push(RoleBinding { role, agent });
             }
         };
-        give(from, self.heard.sender);
-        for receiver in self.heard.receivers {
+        give(from, self.observed.sender);
+        for receiver in self.observed.receivers {
             give(to, receiver);
         }
     }
 
-    /// Whether the message can say who gets the replies: the initiator's can, and that of who goes
-    /// on instead.
+    /// Whether the `reply-to` of the message counts: the sender is the initiator, or an agent that
+    /// continues in its place.
     pub(crate) fn names_designated(&self, conversation: &Conversation, moves: &[Move]) -> bool {
-        let sender = self.heard.sender;
+        let sender = self.observed.sender;
         self.names.is(conversation.initiator, sender)
             || conversation.is_designated(self.names, sender)
                 && moves.iter().any(|made| made.side == Side::Initiator)
@@ -172,7 +177,7 @@ impl Change<'_> {
     }
 }
 
-/// Most agents that get replies instead of the initiator.
+/// Maximum number of agents that receive replies instead of the initiator.
 const MAX_DESIGNATED: usize = 64;
 
 /// Milliseconds since 1970, at least 1.

@@ -1,7 +1,7 @@
-//! One conversation, and what a message would do to it.
+//! The state of one conversation, and the state transitions of its parties.
 //!
-//! Where each participant has a state of its own ([`Scope::Participant`]), it is kept in a
-//! [`Party`] each; otherwise there is one party, nobody's, and a list of who has which role.
+//! With [`Scope::Participant`], each participant has a [`Party`] with a state of its own. With
+//! [`Scope::Conversation`], there is one party without a participant, and a list of role bindings.
 
 use smallvec::SmallVec;
 
@@ -10,21 +10,21 @@ use crate::machine::{Cancel, Machine, Roles, Scope, Transition, step};
 use crate::names::{Name, Names};
 use crate::verdict::ViolationKind as Kind;
 
-/// Nobody, or nothing.
+/// The absence of a name or an index.
 pub(crate) const NONE: u32 = u32::MAX;
 
-/// States that every protocol has: after `not-understood` …
+/// State of every protocol after `not-understood`.
 pub(crate) const AFTER_NOT_UNDERSTOOD: u16 = u16::MAX;
-/// … after `cancel`, before its answer …
+/// State of every protocol after `cancel`, before the answer to it.
 pub(crate) const CANCELLING: u16 = u16::MAX - 1;
-/// … when that was `inform` …
+/// State of every protocol after the answer `inform` to a `cancel`.
 pub(crate) const CANCELLED: u16 = u16::MAX - 2;
-/// … and when the message transport service told of a failure.
+/// State of every protocol after the message transport service reported a failure.
 pub(crate) const FAILED: u16 = u16::MAX - 3;
-/// The state of which only others know: see [`crate::elsewhere`].
+/// State that the monitor does not know: see [`crate::delegated`].
 pub(crate) const ELSEWHERE: u16 = u16::MAX - 4;
 
-/// The name of a state.
+/// Returns the name of a state.
 pub(crate) fn state_name(machine: &Machine, state: u16) -> &str {
     match state {
         AFTER_NOT_UNDERSTOOD => "not-understood",
@@ -44,7 +44,7 @@ pub(crate) fn is_final(machine: &Machine, state: u16) -> bool {
     }
 }
 
-/// Whether nothing more is to come.
+/// Whether no further message can follow.
 pub(crate) fn is_over(machine: &Machine, state: u16) -> bool {
     match state {
         AFTER_NOT_UNDERSTOOD | CANCELLED | FAILED => true,
@@ -53,7 +53,7 @@ pub(crate) fn is_over(machine: &Machine, state: u16) -> bool {
     }
 }
 
-/// Who speaks.
+/// The side that sends a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Side {
     Initiator,
@@ -69,31 +69,32 @@ impl Side {
     }
 }
 
-/// Where a conversation is, with one participant or altogether.
+/// The state of a conversation with one participant or with all of them.
 #[derive(Debug, Clone)]
 pub(crate) struct Party {
-    /// The participant.
+    /// The participant, or [`NONE`].
     pub(crate) peer: Name,
     pub(crate) state: u16,
-    /// While cancelling or after a failure: the state from which that came.
+    /// During a cancel or after a failure: the state before it.
     pub(crate) resume: u16,
     /// The state before the last message.
     pub(crate) before: u16,
-    /// Who spoke last.
+    /// The side that sent the last message.
     pub(crate) last: Side,
-    /// Who cancelled; and whether the answer to the cancel may still come, because what was
-    /// taken for it may have been something that was said before.
-    pub(crate) canceller: Side,
+    /// The side that canceled.
+    pub(crate) canceling_side: Side,
+    /// Whether the answer to the cancel may still come, because the message that was taken for it may
+    /// have been sent before the cancel arrived.
     pub(crate) echo: bool,
-    /// The number of what each side said last, plus 1.
+    /// [`act_number`] of the last message of each side; 0 for none.
     pub(crate) acts: [u8; 2],
-    /// The fingerprint of the last `reply-with` of each side; 0 for none.
+    /// Fingerprint of the last `reply-with` of each side; 0 for none.
     pub(crate) asked: [u64; 2],
-    /// Of the one before that.
+    /// Fingerprint of the `reply-with` before that.
     pub(crate) asked_before: [u64; 2],
-    /// That of the cancel.
+    /// Fingerprint of the `reply-with` of the cancel.
     pub(crate) cancel: u64,
-    /// When the next message is due, in milliseconds since 1970; 0 for no time.
+    /// Deadline of the next message in milliseconds since 1970; 0 for none.
     pub(crate) deadline: u64,
 }
 
@@ -105,7 +106,7 @@ impl Party {
             resume: state,
             before: state,
             last: Side::Other,
-            canceller: Side::Initiator,
+            canceling_side: Side::Initiator,
             echo: false,
             acts: [0; 2],
             asked: [0; 2],
@@ -115,15 +116,15 @@ impl Party {
         }
     }
 
-    /// Whether the initiator has said anything yet.
+    /// Whether no message was sent yet.
     fn is_fresh(&self) -> bool {
         self.acts == [0; 2]
     }
 }
 
-/// A role that somebody has.
+/// A role and the agent that has it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Bound {
+pub(crate) struct RoleBinding {
     pub(crate) role: u8,
     pub(crate) agent: Name,
 }
@@ -135,19 +136,18 @@ pub(crate) struct Conversation {
     pub(crate) machine: u16,
     pub(crate) initiator: Name,
     pub(crate) parties: SmallVec<[Party; 1]>,
-    pub(crate) bound: SmallVec<[Bound; 2]>,
-    /// Whether it began between others, and the agent that watches itself came into it because a
-    /// `reply-to` names it. It stands for the initiator then.
+    pub(crate) bound: SmallVec<[RoleBinding; 2]>,
+    /// Whether the conversation began between other agents, and the monitored agent joined it because
+    /// a `reply-to` names it. It then has the place of the initiator.
     pub(crate) joined: bool,
-    /// Who gets replies instead of the initiator, and may go on instead.
+    /// Agents that receive replies instead of the initiator, and may continue in its place.
     pub(crate) reply_to: Vec<Name>,
-    /// What the members of a multicast have been told, who are not known by name before they
-    /// answer.
+    /// State of the members of a multicast. Their names are unknown until they answer.
     pub(crate) unnamed: Option<Box<Party>>,
 }
 
 impl Conversation {
-    /// Whether the agent has said anything here, or been told.
+    /// Whether the agent has sent or received a message of this conversation.
     pub(crate) fn takes_part(&self, names: &Names, agent: &str) -> bool {
         let peers = self.parties.iter().map(|party| party.peer);
         let bound = self.bound.iter().map(|bound| bound.agent);
@@ -160,15 +160,15 @@ impl Conversation {
         self.reply_to.iter().any(|name| names.is(*name, agent))
     }
 
-    /// Where there is one state for all: whether the agent began, or goes on instead and has no
-    /// part of its own.
+    /// With one state for all participants: whether the agent is the initiator, or continues in its
+    /// place without a role of its own.
     pub(crate) fn speaks_for_initiator(&self, names: &Names, agent: &str) -> bool {
         let has_part = || self.bound.iter().any(|bound| names.is(bound.agent, agent));
         names.is(self.initiator, agent) || self.is_designated(names, agent) && !has_part()
     }
 }
 
-/// Who has which role in a conversation, as far as one party is concerned.
+/// The roles of agents in a conversation, with respect to one party.
 pub(crate) struct Holders<'a> {
     pub(crate) conversation: &'a Conversation,
     pub(crate) machine: &'a Machine,
@@ -192,39 +192,41 @@ impl Holders<'_> {
     }
 }
 
-/// A message as far as one party of its conversation is concerned.
+/// A message with respect to one party of its conversation.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Said<'a> {
+pub(crate) struct PartyMessage<'a> {
     pub(crate) act: Act<'a>,
     pub(crate) side: Side,
-    /// The roles that the sender may have, and all receivers have in common.
+    /// Roles that the sender may have.
     pub(crate) from: u32,
+    /// Roles that every receiver may have.
     pub(crate) to: u32,
     pub(crate) reply_with: u64,
     pub(crate) in_reply_to: u64,
-    /// Whether in-reply-to can be compared: the conversation is between two.
+    /// Whether `in-reply-to` can be compared: the conversation has two participants.
     pub(crate) answers: bool,
-    /// Whether the sender is the agent that watches itself: it knows all it was told.
+    /// Whether the sender is the monitored agent, which has received all earlier messages.
     pub(crate) own: bool,
-    /// Whether sender and receivers take part already.
+    /// Whether sender and receivers already take part.
     pub(crate) known: bool,
 }
 
-/// Where a message leads.
+/// The state after a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Lead {
+pub(crate) struct NextState {
     pub(crate) state: u16,
     pub(crate) resume: u16,
     pub(crate) echo: bool,
-    /// Whether the message was sent before its sender could know of the last one.
+    /// Whether the message was sent before its sender had received the last one.
     pub(crate) crossed: bool,
-    /// Whether it answers what has been said anew since: it was too late, and changes nothing.
+    /// Whether the message answers one that another message has replaced. It is too late and changes
+    /// nothing.
     pub(crate) void: bool,
-    /// The roles of the sender and the receivers in the step that was taken; 0 for none.
+    /// Roles of the sender and the receivers in the transition; 0 for none.
     pub(crate) roles: (u32, u32),
 }
 
-impl Lead {
+impl NextState {
     pub(crate) fn to(state: u16) -> Self {
         Self {
             state,
@@ -245,146 +247,169 @@ impl Lead {
     }
 }
 
-/// Where the message leads, or in which way it is wrong.
-pub(crate) fn lead(machine: &Machine, party: &Party, said: &Said<'_>) -> Result<Lead, Kind> {
+/// Returns the state after a message, or the kind of violation.
+pub(crate) fn next_state(
+    machine: &Machine,
+    party: &Party,
+    message: &PartyMessage<'_>,
+) -> Result<NextState, Kind> {
     match party.state {
-        CANCELLING => while_cancelling(machine, party, said),
-        CANCELLED if party.echo && said.side != party.canceller && is_cancel_answer(said) => {
-            Ok(Lead::to(CANCELLED))
+        CANCELLING => while_cancelling(machine, party, message),
+        CANCELLED
+            if party.echo && message.side != party.canceling_side && is_cancel_answer(message) =>
+        {
+            Ok(NextState::to(CANCELLED))
         }
-        AFTER_NOT_UNDERSTOOD | CANCELLED => Err(ended(party, said)),
-        // What was reported as failed may have arrived all the same, or is tried again.
-        FAILED => in_state(machine, party, party.resume, said)
-            .or_else(|kind| in_state(machine, party, party.before, said).map_err(|_| kind)),
-        own => in_state(machine, party, own, said),
+        AFTER_NOT_UNDERSTOOD | CANCELLED => Err(ended(party, message)),
+        // A message that was reported as failed may have arrived, or is sent again.
+        FAILED => in_state(machine, party, party.resume, message)
+            .or_else(|kind| in_state(machine, party, party.before, message).map_err(|_| kind)),
+        own => in_state(machine, party, own, message),
     }
 }
 
-fn is_cancel_answer(said: &Said<'_>) -> bool {
-    [INFORM, FAILURE, NOT_UNDERSTOOD].contains(&said.act)
+fn is_cancel_answer(message: &PartyMessage<'_>) -> bool {
+    [INFORM, FAILURE, NOT_UNDERSTOOD].contains(&message.act)
 }
 
-fn ended(party: &Party, said: &Said<'_>) -> Kind {
-    if is_repeated(party, said) {
+fn ended(party: &Party, message: &PartyMessage<'_>) -> Kind {
+    if is_repeated(party, message) {
         Kind::Repeated
     } else {
         Kind::Ended
     }
 }
 
-fn while_cancelling(machine: &Machine, party: &Party, said: &Said<'_>) -> Result<Lead, Kind> {
+fn while_cancelling(
+    machine: &Machine,
+    party: &Party,
+    message: &PartyMessage<'_>,
+) -> Result<NextState, Kind> {
     let group = machine.scope == Scope::Conversation;
-    if said.side == party.canceller && !group {
-        return match said.act {
-            NOT_UNDERSTOOD => Ok(Lead::to(AFTER_NOT_UNDERSTOOD)),
-            _ if is_repeated(party, said) => Err(Kind::Repeated),
+    if message.side == party.canceling_side && !group {
+        return match message.act {
+            NOT_UNDERSTOOD => Ok(NextState::to(AFTER_NOT_UNDERSTOOD)),
+            _ if is_repeated(party, message) => Err(Kind::Repeated),
             _ => Err(Kind::Unexpected),
         };
     }
-    // `in-reply-to` tells the answer from what was on its way when the cancel came.
-    let told_apart = said.in_reply_to != 0 && party.cancel != 0;
-    let answers = !told_apart || said.in_reply_to == party.cancel;
-    let crossing = in_state(machine, party, party.resume, said);
-    if answers && is_cancel_answer(said) {
-        return Ok(match said.act {
-            INFORM => Lead {
+    // `in-reply-to` distinguishes the answer from a message that crossed the cancel.
+    let told_apart = message.in_reply_to != 0 && party.cancel != 0;
+    let answers = !told_apart || message.in_reply_to == party.cancel;
+    let crossing = in_state(machine, party, party.resume, message);
+    if answers && is_cancel_answer(message) {
+        return Ok(match message.act {
+            INFORM => NextState {
                 echo: !told_apart && crossing.is_ok(),
-                ..Lead::to(CANCELLED)
+                ..NextState::to(CANCELLED)
             },
-            // It was not cancelled, and goes on.
-            FAILURE => Lead::to(party.resume),
-            _ => Lead::to(AFTER_NOT_UNDERSTOOD),
+            // The cancel failed, and the conversation continues.
+            FAILURE => NextState::to(party.resume),
+            _ => NextState::to(AFTER_NOT_UNDERSTOOD),
         });
     }
-    // Where it leads to is where the conversation goes on if it is not cancelled.
-    crossing.map(|lead| match lead.state {
-        AFTER_NOT_UNDERSTOOD => lead,
-        _ => Lead {
+    // If the cancel fails, the conversation continues in the state after the crossing message.
+    crossing.map(|next_state| match next_state.state {
+        AFTER_NOT_UNDERSTOOD => next_state,
+        _ => NextState {
             state: CANCELLING,
             crossed: true,
-            ..lead
+            ..next_state
         },
     })
 }
 
-/// What the message means in one of the protocol's own states.
-fn in_state(machine: &Machine, party: &Party, state: u16, said: &Said<'_>) -> Result<Lead, Kind> {
+/// Returns the state after a message in one of the protocol's own states.
+fn in_state(
+    machine: &Machine,
+    party: &Party,
+    state: u16,
+    message: &PartyMessage<'_>,
+) -> Result<NextState, Kind> {
     let Some(here) = machine.state(state) else {
         return Err(Kind::Unexpected);
     };
-    let taken = step(&here.steps, said.act, said.from, said.to);
+    let taken = step(&here.steps, message.act, message.from, message.to);
     let proxied = || {
         let mut embedded = here.embedded.iter();
         embedded.any(|sub| {
             let to = sub.proxied_to.as_ref();
-            sub.from.includes(said.from) && to.is_some_and(|to| to.includes(said.to))
+            sub.from.includes(message.from) && to.is_some_and(|to| to.includes(message.to))
         })
     };
     if let Some(step) = taken {
-        return Ok(match in_reply(party, said)? {
-            Reply::ToLast => Lead::taking(step),
-            Reply::ToEarlier => Lead {
+        return Ok(match in_reply(party, message)? {
+            Reply::ToLast => NextState::taking(step),
+            Reply::ToEarlier => NextState {
                 void: true,
-                ..Lead::to(state)
+                ..NextState::to(state)
             },
         });
     }
     if proxied() {
-        return Ok(Lead::to(state));
+        return Ok(NextState::to(state));
     }
-    if let Some(lead) = by_default(machine, party, state, said) {
-        return Ok(lead);
+    if let Some(next_state) = by_default(machine, party, state, message) {
+        return Ok(next_state);
     }
-    Err(wrong(machine, party, state, said))
+    Err(wrong(machine, party, state, message))
 }
 
-/// What every protocol allows, in the way of Figure 6 of the paper about fipa_acl.
-fn by_default(machine: &Machine, party: &Party, state: u16, said: &Said<'_>) -> Option<Lead> {
-    if party.is_fresh() || !said.known {
+/// Returns the state after a message that every protocol allows, as in figure 6 of the paper about
+/// fipa_acl.
+fn by_default(
+    machine: &Machine,
+    party: &Party,
+    state: u16,
+    message: &PartyMessage<'_>,
+) -> Option<NextState> {
+    if party.is_fresh() || !message.known {
         return None;
     }
     let here = machine.state(state)?;
     let has_ended = here.is_final;
-    // Who has been told the last thing may not have understood it; who said it has no reason.
-    let answers_last = party.last != said.side;
-    match said.act {
-        NOT_UNDERSTOOD => (!has_ended || answers_last).then(|| Lead::to(AFTER_NOT_UNDERSTOOD)),
+    // The receiver of the last message may not have understood it. Its sender cannot send
+    // `not-understood`.
+    let answers_last = party.last != message.side;
+    match message.act {
+        NOT_UNDERSTOOD => (!has_ended || answers_last).then(|| NextState::to(AFTER_NOT_UNDERSTOOD)),
         CANCEL => {
             let may = match machine.cancel {
-                Cancel::Initiator => said.side == Side::Initiator,
+                Cancel::Initiator => message.side == Side::Initiator,
                 Cancel::Anyone => true,
                 Cancel::Nobody => false,
             };
-            // Sent before the end was known, if not by somebody who knew it.
-            let too_late = here.is_over() && (said.own || !answers_last);
-            (may && !too_late).then_some(Lead {
+            // After the end, a cancel is allowed only if its sender may not have received the last
+            // message.
+            let too_late = here.is_over() && (message.own || !answers_last);
+            (may && !too_late).then_some(NextState {
                 resume: state,
-                ..Lead::to(CANCELLING)
+                ..NextState::to(CANCELLING)
             })
         }
-        FAILURE if machine.failure_by_parties => (!has_ended).then_some(Lead {
+        FAILURE if machine.failure_by_parties => (!has_ended).then_some(NextState {
             resume: state,
-            ..Lead::to(FAILED)
+            ..NextState::to(FAILED)
         }),
         _ => None,
     }
 }
 
-/// What a message answers.
+/// The message that a message answers.
 enum Reply {
-    /// The last one of the other side, as far as it tells.
+    /// The last message of the other side, or unspecified.
     ToLast,
-    /// The one before, which its sender took for the last: the two have crossed, as a bid and the
-    /// next call of an auction may.
+    /// The message before the last one. The answer and the last message have crossed, as a bid and
+    /// the next call of an auction may.
     ToEarlier,
 }
 
-fn in_reply(party: &Party, said: &Said<'_>) -> Result<Reply, Kind> {
-    let other = side_index(said.side.opposite());
+fn in_reply(party: &Party, message: &PartyMessage<'_>) -> Result<Reply, Kind> {
+    let other = side_index(message.side.opposite());
     let (asked, before) = (party.asked[other], party.asked_before[other]);
-    if !said.answers || [0, asked].contains(&said.in_reply_to) || asked == 0 {
+    if !message.answers || [0, asked].contains(&message.in_reply_to) || asked == 0 {
         Ok(Reply::ToLast)
-    } else if said.in_reply_to == before && !said.own {
+    } else if message.in_reply_to == before && !message.own {
         Ok(Reply::ToEarlier)
     } else {
         Err(Kind::WrongReply)
@@ -398,13 +423,13 @@ pub(crate) fn side_index(side: Side) -> usize {
     }
 }
 
-fn is_repeated(party: &Party, said: &Said<'_>) -> bool {
-    let index = side_index(said.side);
-    let same_act = act_number(said.act) != 0 && party.acts[index] == act_number(said.act);
-    same_act && said.reply_with != 0 && party.asked[index] == said.reply_with
+fn is_repeated(party: &Party, message: &PartyMessage<'_>) -> bool {
+    let index = side_index(message.side);
+    let same_act = act_number(message.act) != 0 && party.acts[index] == act_number(message.act);
+    same_act && message.reply_with != 0 && party.asked[index] == message.reply_with
 }
 
-/// The number of a standard performative, plus 1; 255 for others.
+/// Returns the number of a standard performative, plus 1, and 255 for other performatives.
 pub(crate) fn act_number(act: Act<'_>) -> u8 {
     match act {
         Act::Standard(number) => number + 1,
@@ -412,8 +437,8 @@ pub(crate) fn act_number(act: Act<'_>) -> u8 {
     }
 }
 
-fn wrong(machine: &Machine, party: &Party, state: u16, said: &Said<'_>) -> Kind {
-    if is_repeated(party, said) {
+fn wrong(machine: &Machine, party: &Party, state: u16, message: &PartyMessage<'_>) -> Kind {
+    if is_repeated(party, message) {
         return Kind::Repeated;
     }
     let Some(here) = machine.state(state) else {
@@ -422,10 +447,10 @@ fn wrong(machine: &Machine, party: &Party, state: u16, said: &Said<'_>) -> Kind 
     if here.is_over() {
         return Kind::Ended;
     }
-    if step(&here.steps, said.act, said.to, said.from).is_some() {
+    if step(&here.steps, message.act, message.to, message.from).is_some() {
         return Kind::WrongSender;
     }
-    // Whether a later state allows it.
+    // Checks whether a later state allows the message.
     let mut reached = vec![false; machine.states.len()];
     let mut next = vec![state];
     while let Some(id) = next.pop() {
@@ -434,7 +459,7 @@ fn wrong(machine: &Machine, party: &Party, state: u16, said: &Said<'_>) -> Kind 
             continue;
         };
         *seen = true;
-        if step(&later.steps, said.act, said.from, said.to).is_some() {
+        if step(&later.steps, message.act, message.from, message.to).is_some() {
             return Kind::OutOfOrder;
         }
         next.extend(later.transitions.iter().map(|step| step.target));

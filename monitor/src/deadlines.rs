@@ -1,24 +1,27 @@
-//! When messages are due.
+//! Deadlines of expected messages.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
-/// When a message is due, and in which conversation with whom.
+/// The deadline of a message: its time, its conversation and its party.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct Deadline {
     /// Milliseconds since 1970.
     pub(crate) due: u64,
+    /// Slot of the conversation.
     pub(crate) at: u32,
+    /// Generation of the slot.
     pub(crate) generation: u32,
+    /// Index of the party.
     pub(crate) party: u32,
 }
 
-/// Deadlines, the earliest first. Those that no longer count stay until they are due, or until
-/// there are too many of them.
+/// Deadlines, the earliest first. A stale deadline is removed when it is due, or when there are too
+/// many.
 #[derive(Debug, Default)]
 pub(crate) struct Deadlines {
     heap: BinaryHeap<Reverse<Deadline>>,
-    /// How many there were when those that did not count were last removed.
+    /// Number of deadlines after stale ones were last removed.
     counted: usize,
 }
 
@@ -36,7 +39,7 @@ impl Deadlines {
         self.heap.len()
     }
 
-    /// The earliest, if it is before this time.
+    /// Removes and returns the earliest deadline if it is before `now`.
     pub(crate) fn pop_before(&mut self, now: u64) -> Option<Deadline> {
         if self.next()? >= now {
             return None;
@@ -44,7 +47,8 @@ impl Deadlines {
         self.heap.pop().map(|Reverse(deadline)| deadline)
     }
 
-    /// Removes those that do not count when they could be more than those that do.
+    /// Removes stale deadlines if there may be more of them than of valid ones. `counts` tells
+    /// whether a deadline is valid.
     pub(crate) fn keep_few(&mut self, counts: impl Fn(&Deadline) -> bool) {
         const SOME: usize = 1_024;
         if self.heap.len() > 2 * self.counted + SOME {
@@ -59,7 +63,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn deadlines_come_in_order_and_do_not_pile_up() {
+    fn deadlines_are_ordered_and_stale_ones_are_removed() {
         let mut deadlines = Deadlines::default();
         let deadline = |due| Deadline {
             due,
@@ -83,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn as_many_again_and_some_may_not_count() {
+    fn stale_deadlines_are_removed_beyond_a_bound() {
         let mut deadlines = Deadlines::default();
         let mut left = |more, counts| {
             for due in 0..more {

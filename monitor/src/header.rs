@@ -1,4 +1,4 @@
-//! What a monitor reads of a message: all but the content.
+//! The parameters of a message that a monitor reads: all but the content.
 
 use std::borrow::Cow;
 use std::time::SystemTime;
@@ -8,11 +8,11 @@ use smallvec::SmallVec;
 
 use crate::act::Act;
 
-/// The parameters of a message that decide whether it fits its conversation.
+/// The parameters of a message that determine whether it fits its conversation.
 ///
-/// Made from a [`Message`], from a [`MessageView`], or part by part from whatever else was read.
-/// Whoever watches letters rather than messages says with [`receivers`](Self::receivers) to whom this copy goes.
-/// Nothing is allocated for up to two receivers.
+/// A header is made from a [`Message`], from a [`MessageView`], or parameter by parameter. For a
+/// letter, [`receivers`](Self::receivers) sets the receivers of its envelope. A header with up to two
+/// receivers does not allocate.
 #[derive(Debug, Clone)]
 pub struct Header<'a> {
     performative: Cow<'a, Performative>,
@@ -27,7 +27,7 @@ pub struct Header<'a> {
 }
 
 impl<'a> Header<'a> {
-    /// A header that says only what the message does.
+    /// Creates a header with a performative only.
     #[must_use]
     pub fn new(performative: Performative) -> Self {
         Self::of_act(Cow::Owned(performative))
@@ -47,14 +47,14 @@ impl<'a> Header<'a> {
         }
     }
 
-    /// The same with a sender.
+    /// Sets the sender.
     #[must_use]
     pub fn sender(mut self, sender: impl Into<Cow<'a, str>>) -> Self {
         self.sender = Some(sender.into());
         self
     }
 
-    /// The same with these receivers, and no others: of a letter, those in its envelope.
+    /// Replaces the receivers. For a letter, these are the receivers in its envelope.
     #[must_use]
     pub fn receivers<N: Into<Cow<'a, str>>>(
         mut self,
@@ -64,42 +64,42 @@ impl<'a> Header<'a> {
         self
     }
 
-    /// The same with agents to whom replies go instead of the sender.
+    /// Replaces the agents that receive replies instead of the sender.
     #[must_use]
     pub fn reply_to<N: Into<Cow<'a, str>>>(mut self, agents: impl IntoIterator<Item = N>) -> Self {
         self.reply_to = agents.into_iter().map(Into::into).collect();
         self
     }
 
-    /// The same with a protocol.
+    /// Sets the protocol.
     #[must_use]
     pub fn protocol(mut self, name: impl Into<Cow<'a, str>>) -> Self {
         self.protocol = Some(name.into());
         self
     }
 
-    /// The same with a conversation id.
+    /// Sets the conversation identifier.
     #[must_use]
     pub fn conversation_id(mut self, id: impl Into<Cow<'a, str>>) -> Self {
         self.conversation_id = Some(id.into());
         self
     }
 
-    /// The same with a `reply-with`.
+    /// Sets `reply-with`.
     #[must_use]
     pub fn reply_with(mut self, text: impl Into<Cow<'a, str>>) -> Self {
         self.reply_with = Some(text.into());
         self
     }
 
-    /// The same with an `in-reply-to`.
+    /// Sets `in-reply-to`.
     #[must_use]
     pub fn in_reply_to(mut self, text: impl Into<Cow<'a, str>>) -> Self {
         self.in_reply_to = Some(text.into());
         self
     }
 
-    /// The same with a `reply-by`.
+    /// Sets `reply-by`.
     #[must_use]
     pub fn reply_by(mut self, time: fipa_acl::Time) -> Self {
         self.reply_by = Some(time);
@@ -190,7 +190,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_message_and_its_view_say_the_same() {
+    fn a_message_and_its_view_have_the_same_header() {
         let id = |name| AgentId::new(name).unwrap();
         let now = SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000);
         let message = Message::builder(Performative::Cfp)

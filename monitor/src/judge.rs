@@ -1,54 +1,54 @@
-//! What a message would do to its conversation, with every participant it concerns; nothing is
-//! changed here.
+//! Checks a message against its conversation and computes the moves of all concerned parties. This
+//! module does not change the conversation.
 
 use std::borrow::Cow;
 
 use crate::act::{Act, FAILURE};
 use crate::conversation::{
-    AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, Conversation, FAILED, Lead, NONE, Party, Said,
-    Side, lead, side_index,
+    AFTER_NOT_UNDERSTOOD, CANCELLED, CANCELLING, Conversation, FAILED, NONE, NextState, Party,
+    PartyMessage, Side, next_state, side_index,
 };
 use crate::machine::{Machine, Scope};
 use crate::names::{Name, Names};
 use crate::verdict::ViolationKind as Kind;
 
-/// A message, and what it has to do with one conversation.
-pub(crate) struct Heard<'a> {
+/// A message with the values that every check of it needs.
+pub(crate) struct ObservedMessage<'a> {
     pub(crate) act: Act<'a>,
     pub(crate) sender: &'a str,
     pub(crate) receivers: &'a [Cow<'a, str>],
     pub(crate) reply_with: u64,
     pub(crate) in_reply_to: u64,
-    /// Whether the sender is the agent that watches itself.
+    /// Whether the sender is the monitored agent.
     pub(crate) own: bool,
-    /// Which of the receivers is, when it is told by somebody else.
-    pub(crate) told: Option<usize>,
+    /// Index of the monitored agent in the receivers, if another agent is the sender.
+    pub(crate) own_receiver: Option<usize>,
 }
 
-/// One change.
+/// The state transition of one party.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Move {
-    pub(crate) who: Who,
+    pub(crate) target: MoveTarget,
     pub(crate) side: Side,
-    pub(crate) lead: Lead,
-    /// Whether this was told from outside, so that nobody who takes part has said anything.
-    pub(crate) told: bool,
+    pub(crate) next_state: NextState,
+    /// Whether an agent outside the conversation reported a failure, so no party has sent a message.
+    pub(crate) reported: bool,
 }
 
-/// Whose state changes.
+/// The party that a move changes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Who {
-    /// The party of this number.
+pub(crate) enum MoveTarget {
+    /// The party with this index.
     Party(usize),
-    /// The receiver of this number, who is new.
+    /// A new party: the receiver with this index.
     Receiver(usize),
-    /// The members of a multicast who have not answered yet.
+    /// The members of a multicast that have not answered yet.
     Unnamed,
-    /// The sender, who was one of those.
+    /// A new party: the sender, a member of a multicast.
     Sender,
 }
 
-/// Why a message is wrong, and with whom.
+/// The kind of a violation, and the party with the violated state.
 #[derive(Debug, Clone)]
 pub(crate) struct Fault {
     pub(crate) kind: Kind,
@@ -66,12 +66,12 @@ impl Fault {
     }
 }
 
-/// Writes all changes, or tells the first fault.
+/// Writes all moves to `moves`, or returns the first fault.
 pub(crate) fn judge(
     machine: &Machine,
     conversation: &Conversation,
     names: &Names,
-    heard: &Heard<'_>,
+    observed: &ObservedMessage<'_>,
     moves: &mut Vec<Move>,
 ) -> Result<(), Fault> {
     moves.clear();
@@ -79,15 +79,15 @@ pub(crate) fn judge(
         machine,
         conversation,
         names,
-        heard,
+        observed,
     };
     match machine.scope {
-        Scope::Participant => judge.with_each(moves),
-        Scope::Conversation => judge.with_all(moves),
+        Scope::Participant => judge.per_participant(moves),
+        Scope::Conversation => judge.per_conversation(moves),
     }
 }
 
-/// Whether a receiver is a pattern of names: what of a multicast is not known beforehand.
+/// Whether a receiver is a pattern of names: the members of the multicast are unknown.
 fn is_pattern(receiver: &str) -> bool {
     receiver.contains(['*', '+', '?', '[', '(', '{', '|', '^', '$', '\\'])
 }
@@ -96,30 +96,31 @@ struct Judge<'a> {
     machine: &'a Machine,
     conversation: &'a Conversation,
     names: &'a Names,
-    heard: &'a Heard<'a>,
+    observed: &'a ObservedMessage<'a>,
 }
 
 impl Judge<'_> {
-    fn with_each(&self, moves: &mut Vec<Move>) -> Result<(), Fault> {
-        let sender = self.heard.sender;
+    fn per_participant(&self, moves: &mut Vec<Move>) -> Result<(), Fault> {
+        let sender = self.observed.sender;
         if self.names.is(self.conversation.initiator, sender) {
             return self.by_initiator(moves);
         }
         let known = self.party(sender);
-        let known = known.map(|(at, party)| (Who::Party(at), party));
+        let known = known.map(|(at, party)| (MoveTarget::Party(at), party));
         let unnamed = self.conversation.unnamed.as_deref();
-        let Some((who, party)) = known.or(unnamed.map(|party| (Who::Sender, party))) else {
+        let Some((target, party)) = known.or(unnamed.map(|party| (MoveTarget::Sender, party)))
+        else {
             if self.conversation.is_designated(self.names, sender) {
                 return self.by_initiator(moves);
             }
-            if self.heard.act == FAILURE && self.all_take_part() {
+            if self.observed.act == FAILURE && self.all_take_part() {
                 self.reported_failure(moves);
                 return Ok(());
             }
             return Err(Fault::plain(Kind::Stranger));
         };
-        self.by_participant(who, party, moves).or_else(|fault| {
-            // Who takes part himself may have been named in a `reply-to` as well.
+        self.by_participant(target, party, moves).or_else(|fault| {
+            // A participant may also have been named in a `reply-to`.
             if !self.conversation.is_designated(self.names, sender) {
                 return Err(fault);
             }
@@ -130,76 +131,88 @@ impl Judge<'_> {
         })
     }
 
-    /// What the initiator says, or who goes on instead: with those who take part already.
+    /// Checks a message of the initiator, or of an agent that continues in its place. The latter can
+    /// address only agents that already take part.
     fn by_initiator(&self, moves: &mut Vec<Move>) -> Result<(), Fault> {
         let fresh = Party::new(NONE, self.machine.initial);
         let conversation = self.conversation;
         let began =
-            !conversation.joined && self.names.is(conversation.initiator, self.heard.sender);
-        // Who watches himself does not know what others who are told the same have answered before.
-        let told = self.heard.told.and_then(|at| self.heard.receivers.get(at));
-        for (number, receiver) in self.heard.receivers.iter().enumerate() {
-            if told.is_some_and(|agent| receiver != agent && !is_pattern(receiver)) {
+            !conversation.joined && self.names.is(conversation.initiator, self.observed.sender);
+        // The monitored agent does not know the answers of the other receivers of the same message.
+        let own = self
+            .observed
+            .own_receiver
+            .and_then(|at| self.observed.receivers.get(at));
+        for (number, receiver) in self.observed.receivers.iter().enumerate() {
+            if own.is_some_and(|agent| receiver != agent && !is_pattern(receiver)) {
                 continue;
             }
-            let (who, party) = match self.party(receiver) {
-                Some((at, party)) => (Who::Party(at), party),
+            let (target, party) = match self.party(receiver) {
+                Some((at, party)) => (MoveTarget::Party(at), party),
                 None if is_pattern(receiver) && (began || conversation.unnamed.is_some()) => {
                     let unnamed = conversation.unnamed.as_deref();
-                    (Who::Unnamed, unnamed.unwrap_or(&fresh))
+                    (MoveTarget::Unnamed, unnamed.unwrap_or(&fresh))
                 }
-                None if began => (Who::Receiver(number), &fresh),
+                None if began => (MoveTarget::Receiver(number), &fresh),
                 None => return Err(self.fault(Kind::WrongReceiver, &fresh, receiver)),
             };
-            let said = self.said(Side::Initiator);
-            let mut led = lead(self.machine, party, &said).map(|lead| (Side::Initiator, lead));
-            // Who talks to himself has both roles.
-            if led.is_err() && **receiver == *self.heard.sender {
-                let answer = lead(self.machine, party, &self.said(Side::Other));
-                led = answer.map(|lead| (Side::Other, lead)).or(led);
+            let message = self.message(Side::Initiator);
+            let mut led = next_state(self.machine, party, &message)
+                .map(|next_state| (Side::Initiator, next_state));
+            // An agent that sends to itself has both roles.
+            if led.is_err() && **receiver == *self.observed.sender {
+                let answer = next_state(self.machine, party, &self.message(Side::Other));
+                led = answer.map(|next_state| (Side::Other, next_state)).or(led);
             }
-            let (side, lead) = led.map_err(|kind| self.fault(kind, party, receiver))?;
-            // Somebody named twice is told once.
-            let again = match who {
-                Who::Receiver(_) => self.heard.receivers[..number].contains(receiver),
-                who => moves.iter().any(|made| made.who == who),
+            let (side, next_state) = led.map_err(|kind| self.fault(kind, party, receiver))?;
+            // An agent that is named twice receives the message once.
+            let again = match target {
+                MoveTarget::Receiver(_) => self.observed.receivers[..number].contains(receiver),
+                target => moves.iter().any(|made| made.target == target),
             };
             if !again {
-                let told = false;
+                let reported = false;
                 moves.push(Move {
-                    who,
+                    target,
                     side,
-                    lead,
-                    told,
+                    next_state,
+                    reported,
                 });
             }
         }
         Ok(())
     }
 
-    fn by_participant(&self, who: Who, party: &Party, moves: &mut Vec<Move>) -> Result<(), Fault> {
-        let mut receivers = self.heard.receivers.iter();
-        let elsewhere = receivers.any(|receiver| !self.gets_replies(receiver));
-        let name = self.heard.sender;
-        if elsewhere {
+    fn by_participant(
+        &self,
+        target: MoveTarget,
+        party: &Party,
+        moves: &mut Vec<Move>,
+    ) -> Result<(), Fault> {
+        let mut receivers = self.observed.receivers.iter();
+        let misdirected = receivers.any(|receiver| !self.gets_replies(receiver));
+        let name = self.observed.sender;
+        if misdirected {
             return Err(self.fault(Kind::WrongReceiver, party, name));
         }
-        let lead = lead(self.machine, party, &self.said(Side::Other))
+        let next_state = next_state(self.machine, party, &self.message(Side::Other))
             .map_err(|kind| self.fault(kind, party, name))?;
         moves.push(Move {
-            who,
+            target,
             side: Side::Other,
-            lead,
-            told: false,
+            next_state,
+            reported: false,
         });
         Ok(())
     }
 
-    /// Somebody outside, a message transport service, tells a party that something it said was
-    /// not delivered. To whom is in the content: where it can be only one, the protocol has ended
-    /// with that one.
+    /// Handles a failure report of an agent outside the conversation, a message transport service: a
+    /// message of the receiver was not delivered.
+    ///
+    /// The content, which is not read, names the agent that did not get the message. If only one
+    /// party is possible, the protocol has ended with it.
     fn reported_failure(&self, moves: &mut Vec<Move>) {
-        for receiver in self.heard.receivers {
+        for receiver in self.observed.receivers {
             let initiator = self.names.is(self.conversation.initiator, receiver);
             let designated = self.conversation.is_designated(self.names, receiver);
             let concerns = |(_, party): &(usize, &Party)| {
@@ -211,8 +224,9 @@ impl Judge<'_> {
                     return false;
                 };
                 let asked = party.asked[side_index(side)];
-                let answers =
-                    self.heard.in_reply_to == 0 || asked == 0 || self.heard.in_reply_to == asked;
+                let answers = self.observed.in_reply_to == 0
+                    || asked == 0
+                    || self.observed.in_reply_to == asked;
                 party.last == side && answers
             };
             let mut concerned = self
@@ -228,22 +242,22 @@ impl Judge<'_> {
     }
 
     fn all_take_part(&self) -> bool {
-        let mut receivers = self.heard.receivers.iter();
+        let mut receivers = self.observed.receivers.iter();
         receivers.all(|receiver| self.gets_replies(receiver) || self.party(receiver).is_some())
     }
 
-    /// Whether what participants say may be for this agent.
+    /// Whether participants may send messages to this agent.
     fn gets_replies(&self, agent: &str) -> bool {
         self.names.is(self.conversation.initiator, agent)
             || self.conversation.is_designated(self.names, agent)
     }
 
-    fn with_all(&self, moves: &mut Vec<Move>) -> Result<(), Fault> {
+    fn per_conversation(&self, moves: &mut Vec<Move>) -> Result<(), Fault> {
         let conversation = self.conversation;
         let Some(party) = conversation.parties.first() else {
             return Err(Fault::plain(Kind::NotOpened));
         };
-        let sender = self.heard.sender;
+        let sender = self.observed.sender;
         let side = if conversation.speaks_for_initiator(self.names, sender) {
             Side::Initiator
         } else {
@@ -252,23 +266,23 @@ impl Judge<'_> {
         let unbound = unbound(self.machine, conversation);
         let has = self.roles_of(sender);
         let (mut to, mut all_bound, mut stranger) = (u32::MAX, has != 0, false);
-        for receiver in self.heard.receivers {
+        for receiver in self.observed.receivers {
             let roles = self.roles_of(receiver);
             to &= roles | unbound;
             all_bound &= roles != 0;
             stranger |= roles | unbound == 0;
         }
-        let said = Said {
+        let message = PartyMessage {
             from: has | unbound,
             to,
             known: all_bound,
             answers: conversation.bound.len() == 2,
-            ..self.said(side)
+            ..self.message(side)
         };
         let outside = has == 0 && unbound == 0;
-        let lead = match lead(self.machine, party, &said) {
-            Ok(lead) => lead,
-            Err(_) if outside && self.heard.act == FAILURE && !stranger => {
+        let next_state = match next_state(self.machine, party, &message) {
+            Ok(next_state) => next_state,
+            Err(_) if outside && self.observed.act == FAILURE && !stranger => {
                 moves.push(failed(0, party));
                 return Ok(());
             }
@@ -288,10 +302,10 @@ impl Judge<'_> {
             }
         };
         moves.push(Move {
-            who: Who::Party(0),
+            target: MoveTarget::Party(0),
             side,
-            lead,
-            told: false,
+            next_state,
+            reported: false,
         });
         Ok(())
     }
@@ -306,21 +320,21 @@ impl Judge<'_> {
         roles
     }
 
-    fn said(&self, side: Side) -> Said<'_> {
+    fn message(&self, side: Side) -> PartyMessage<'_> {
         let initiator = 1 << self.machine.initiator;
         let (from, to) = match side {
             Side::Initiator => (initiator, !initiator),
             Side::Other => (!initiator, initiator),
         };
-        Said {
-            act: self.heard.act,
+        PartyMessage {
+            act: self.observed.act,
             side,
             from,
             to,
-            reply_with: self.heard.reply_with,
-            in_reply_to: self.heard.in_reply_to,
+            reply_with: self.observed.reply_with,
+            in_reply_to: self.observed.in_reply_to,
             answers: true,
-            own: self.heard.own,
+            own: self.observed.own,
             known: true,
         }
     }
@@ -346,7 +360,7 @@ impl Judge<'_> {
     }
 }
 
-/// The roles that nobody has yet.
+/// Returns the roles that no agent has.
 pub(crate) fn unbound(machine: &Machine, conversation: &Conversation) -> u32 {
     let all = 1_u64.checked_shl(machine.roles.len().try_into().unwrap_or(32));
     let all = u32::try_from(all.unwrap_or(0).wrapping_sub(1)).unwrap_or(u32::MAX);
@@ -354,27 +368,27 @@ pub(crate) fn unbound(machine: &Machine, conversation: &Conversation) -> u32 {
     all & !bound.fold(0, |mask, bound| mask | (1 << bound.role))
 }
 
-/// What the last message of a party, not having been delivered, leads to.
+/// Returns the move of a party with an undelivered last message.
 fn failed(at: usize, party: &Party) -> Move {
-    let failed = |resume| Lead {
+    let failed = |resume| NextState {
         resume,
-        ..Lead::to(FAILED)
+        ..NextState::to(FAILED)
     };
-    let lead = match party.state {
-        // What had ended has not begun again.
-        ended @ (AFTER_NOT_UNDERSTOOD | CANCELLED) => Lead {
+    let next_state = match party.state {
+        // An ended conversation does not continue.
+        ended @ (AFTER_NOT_UNDERSTOOD | CANCELLED) => NextState {
             echo: party.echo,
-            ..Lead::to(ended)
+            ..NextState::to(ended)
         },
-        // The cancel was not heard.
-        CANCELLING => Lead::to(party.resume),
+        // The cancel was not delivered.
+        CANCELLING => NextState::to(party.resume),
         FAILED => failed(party.resume),
         state => failed(state),
     };
     Move {
-        who: Who::Party(at),
+        target: MoveTarget::Party(at),
         side: party.last,
-        lead,
-        told: true,
+        next_state,
+        reported: true,
     }
 }

@@ -1,21 +1,21 @@
-//! Interaction protocols as state machines, and conversations that are checked while they run.
+//! Interaction protocols as state machines, and a monitor that checks conversations at run time.
 //!
-//! * [`Machine`] is a protocol, read from SCXML ([`scxml`] has the form); [`Library`] is those that
-//!   are known by name, [`Library::standard`] all of FIPA's.
-//! * [`Monitor`] takes the messages of any number of conversations, as an observer or as an agent
-//!   that takes part, and gives a [`Verdict`] for each. It reads a [`Header`]: no content is needed.
+//! * [`Machine`]: a protocol, read from an SCXML file (see [`scxml`] for the format).
+//! * [`Library`]: protocols by name. [`Library::standard`] has those of FIPA.
+//! * [`Monitor`]: checks the messages of any number of conversations, as an observer or for one
+//!   participating agent, and returns a [`Verdict`] for each. It reads a [`Header`], without the
+//!   content.
 //!
-//! What must not live here: input and output, clocks, threads. Messages and the time go in,
-//! verdicts come out; whoever sends letters or watches them is elsewhere.
+//! The crate has no input or output, no clocks and no threads: the caller passes messages and the
+//! current time, and gets verdicts.
 //!
-//! Files and messages are hostile until checked: every size has a bound, and what is remembered is
-//! limited by [`Limits`].
+//! Files and messages may be hostile: every size has a bound, and [`Limits`] bounds the memory.
 
 mod act;
 mod change;
 mod conversation;
 mod deadlines;
-mod elsewhere;
+mod delegated;
 mod header;
 mod judge;
 mod library;

@@ -1,9 +1,9 @@
-//! The protocols that are known by name.
+//! Libraries of protocols by name.
 
 use crate::Machine;
 use crate::scxml::ScxmlError;
 
-/// Most protocols in a library.
+/// Maximum number of protocols in a library.
 const MAX_MACHINES: usize = 256;
 
 macro_rules! standard {
@@ -15,7 +15,7 @@ macro_rules! standard {
     };
 }
 
-/// The files of the standard's protocols; each says its name itself.
+/// The files of the standard protocols. Each file contains the name of its protocol.
 const STANDARD: [(&str, &str); 13] = [
     standard!("request"),
     standard!("query"),
@@ -32,35 +32,35 @@ const STANDARD: [(&str, &str); 13] = [
     standard!("rock-query"),
 ];
 
-/// The protocols that are known by name.
+/// A set of protocols with distinct names.
 #[derive(Debug, Clone, Default)]
 pub struct Library {
     machines: Vec<Machine>,
 }
 
 impl Library {
-    /// A library without protocols.
+    /// Creates a library without protocols.
     #[must_use]
     pub fn empty() -> Self {
         Self::default()
     }
 
-    /// The protocols of the FIPA standards.
+    /// Creates a library of the protocols of the FIPA standards.
     #[must_use]
     pub fn standard() -> Self {
         let read = |(file, text): &(&str, &str)| Machine::read(file, text);
-        // A file of this crate with a mistake fails the tests below.
+        // The tests below fail if a file of this crate has a mistake.
         let machines = STANDARD.iter().filter_map(|file| read(file).ok());
         Self {
             machines: machines.collect(),
         }
     }
 
-    /// Adds a protocol. Its name and aliases come before those of the protocols that are there
-    /// already: one of the same name is replaced.
+    /// Adds a protocol. It replaces a protocol with the same name. Its aliases take precedence over
+    /// those of earlier protocols.
     ///
     /// # Errors
-    /// When the library is full.
+    /// The library is full.
     pub fn add(&mut self, machine: Machine) -> Result<(), LibraryFull> {
         let same = |known: &Machine| known.name().eq_ignore_ascii_case(machine.name());
         self.machines.retain(|known| !same(known));
@@ -71,22 +71,23 @@ impl Library {
         Ok(())
     }
 
-    /// Reads a protocol and adds it; see [`Machine::read`] and [`add`](Self::add).
+    /// Reads a protocol and adds it: see [`Machine::read`] and [`add`](Self::add).
     ///
     /// # Errors
-    /// When the file has mistakes, or the library is full.
+    /// The file has mistakes, or the library is full.
     pub fn read(&mut self, file: &str, text: &str) -> Result<(), LibraryError> {
         self.add(Machine::read(file, text)?)?;
         Ok(())
     }
 
-    /// The protocol with this name or alias; names come first. Case does not matter.
+    /// Finds the protocol with this name or alias. Names take precedence over aliases. Case is
+    /// ignored.
     #[must_use]
     pub fn find(&self, name: &str) -> Option<&Machine> {
         self.machine(self.index_of(name)?)
     }
 
-    /// All protocols, those added last first.
+    /// Iterates over all protocols, the one added last first.
     pub fn iter(&self) -> impl Iterator<Item = &Machine> {
         self.machines.iter()
     }
@@ -107,16 +108,16 @@ impl Library {
     }
 }
 
-/// A library takes no more protocols.
+/// Error of adding a protocol to a full library.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("a library holds at most {MAX_MACHINES} protocols")]
 pub struct LibraryFull;
 
-/// Why a protocol was not added.
+/// Error of reading and adding a protocol.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum LibraryError {
-    /// Its file has mistakes.
+    /// The file has mistakes.
     #[error(transparent)]
     Scxml(#[from] ScxmlError),
     /// The library is full.
@@ -129,7 +130,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_files_have_no_mistakes() {
+    fn the_standard_files_have_no_mistakes() {
         for (file, text) in STANDARD {
             if let Err(error) = Machine::read(file, text) {
                 panic!("{error}");
@@ -139,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn protocols_have_their_standard_names_and_those_of_peers() {
+    fn standard_protocols_are_found_by_name_and_by_the_names_of_peers() {
         let library = Library::standard();
         for (name, aliases) in [
             ("fipa-request", &["request"][..]),
@@ -169,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_added_comes_first() {
+    fn added_protocols_take_precedence() {
         let mut library = Library::standard();
         let own = r#"<scxml initial="1">
             <state id="1"><transition performative="inform" from="a" to="b" target="2"/></state>

@@ -1,27 +1,28 @@
-//! How much a monitor keeps.
+//! Bounds of the memory of a monitor.
 
 use std::time::Duration;
 
-/// How much a monitor keeps, and for how long.
+/// Bounds of the number of conversations that a monitor keeps, and of the time that it keeps them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Limits {
-    /// Conversations, those within others included. When there are more, one that is over is
-    /// forgotten, else the one in which nothing has happened for longest.
+    /// Maximum number of conversations, including embedded ones. Beyond it, the monitor evicts the
+    /// least recently active conversation that is over or, if there is none, the least recently
+    /// active one.
     pub conversations: usize,
-    /// Participants of one conversation.
+    /// Maximum number of participants of a conversation.
     pub participants: usize,
-    /// Conversations within one.
+    /// Maximum number of conversations embedded in one.
     pub embedded: usize,
-    /// How long a conversation is kept that is over.
+    /// Time for which a conversation is kept after its end.
     pub ended: Duration,
-    /// How long one is kept in which nothing happens.
+    /// Time for which a conversation is kept without a message.
     pub idle: Duration,
 }
 
 impl Default for Limits {
-    /// 100,000 conversations of at most 1,024 participants and 64 embedded ones, kept for a minute
-    /// after their end and for an hour of silence.
+    /// Returns limits of 100,000 conversations, 1,024 participants and 64 embedded conversations
+    /// each, one minute after the end, and one hour without a message.
     fn default() -> Self {
         Self {
             conversations: 100_000,
@@ -33,5 +34,5 @@ impl Default for Limits {
     }
 }
 
-/// Longest conversation id or agent's name that is kept, in bytes.
+/// Maximum length of a conversation identifier or an agent name, in bytes.
 pub(crate) const MAX_TEXT: usize = 4_096;

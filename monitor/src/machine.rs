@@ -1,4 +1,4 @@
-//! A protocol as a state machine, checked: what [`crate::scxml`] reads and conversations follow.
+//! Protocols as checked state machines. [`crate::scxml`] reads them.
 
 use std::time::Duration;
 
@@ -6,13 +6,13 @@ use regex::Regex;
 
 use crate::act::{Act, Acts, CANCEL, NOT_UNDERSTOOD};
 
-/// Most roles of a protocol.
+/// Maximum number of roles of a protocol.
 pub(crate) const MAX_ROLES: usize = 32;
 
 /// An interaction protocol as a state machine.
 ///
-/// Made by [`Machine::read`]; every state it names exists and can be reached, and no message can
-/// mean two things in one state.
+/// [`Machine::read`] makes one. Every state exists and is reachable, and in each state a message
+/// leads to one state only.
 #[derive(Debug, Clone)]
 pub struct Machine {
     pub(crate) name: String,
@@ -20,35 +20,36 @@ pub struct Machine {
     pub(crate) title: Option<String>,
     pub(crate) scope: Scope,
     pub(crate) cancel: Cancel,
-    /// Whether any party may end the conversation with `failure`, as fipa_acl has it; otherwise
-    /// only somebody outside (a message transport service) may, and parties where the states say so.
+    /// Whether any party may end the conversation with `failure`, as in fipa_acl. Otherwise, a party
+    /// may send `failure` only in a transition of the machine, and an agent outside the conversation
+    /// (a message transport service) at any time.
     pub(crate) failure_by_parties: bool,
     pub(crate) roles: Vec<String>,
-    /// Index of the role that begins.
+    /// Index of the initiating role.
     pub(crate) initiator: u8,
     pub(crate) initial: u16,
     pub(crate) states: Vec<State>,
 }
 
-/// What has a state of its own.
+/// The scope of the state of a protocol.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Scope {
-    /// The whole conversation is in one state, as in fipa_acl.
+    /// The conversation has one state, as in fipa_acl.
     Conversation,
-    /// Each participant is in a state of its own with the initiator.
+    /// Each participant has a state of its own with the initiator.
     Participant,
 }
 
-/// Who may cancel a conversation with the cancel meta-protocol.
+/// The agents that may cancel a conversation with the cancel meta-protocol.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Cancel {
-    /// Who began it, as the standard has it.
+    /// The initiator, as in the standard.
     Initiator,
-    /// Anybody who takes part, as fipa_acl has it.
+    /// Any participant, as in fipa_acl.
     Anyone,
-    /// Nobody: the protocol defines no cancelling.
+    /// No agent: the protocol cannot be canceled.
     Nobody,
 }
 
@@ -60,13 +61,13 @@ pub struct State {
     pub(crate) transitions: Vec<Transition>,
     pub(crate) subprotocols: Vec<Subprotocol>,
     pub(crate) timeout: Option<Timeout>,
-    /// The transitions, and those of states that are reached by leaving out optional steps.
+    /// The transitions of this state and of the states behind its optional transitions.
     pub(crate) steps: Vec<Transition>,
-    /// Likewise.
+    /// The subprotocols of this state and of the states behind its optional transitions.
     pub(crate) embedded: Vec<Subprotocol>,
 }
 
-/// A message that leads from one state to another.
+/// A transition from one state to another by a message.
 #[derive(Debug, Clone)]
 pub struct Transition {
     pub(crate) acts: Acts,
@@ -76,7 +77,7 @@ pub struct Transition {
     pub(crate) optional: bool,
 }
 
-/// A protocol that may run within a state of another.
+/// A protocol that may run within a state of another protocol.
 #[derive(Debug, Clone)]
 pub struct Subprotocol {
     pub(crate) text: String,
@@ -85,20 +86,20 @@ pub struct Subprotocol {
     pub(crate) proxied_to: Option<Roles>,
 }
 
-/// What happens when no message comes in time.
+/// A transition that is taken when no message arrives in time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Timeout {
     pub(crate) after: After,
     pub(crate) target: u16,
 }
 
-/// When time is up.
+/// The time of a timeout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum After {
-    /// At the `reply-by` of the message that led to the state, if it has one.
+    /// The `reply-by` of the message that led to the state. Without one, there is no timeout.
     ReplyBy,
-    /// So long after the state was entered.
+    /// A span after the message that led to the state.
     Span(Duration),
 }
 
@@ -108,58 +109,58 @@ pub(crate) struct Roles {
     pub(crate) text: String,
     /// A bit for each role of the machine.
     pub(crate) mask: u32,
-    /// Whether it stands for anybody, with a role or without (`.*`).
+    /// Whether it stands for any agent, with a role or without (`.*`).
     pub(crate) anyone: bool,
 }
 
 impl Machine {
-    /// The standard name: what messages have as `protocol`.
+    /// The name: the `protocol` of its messages.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Other names under which peers know it.
+    /// Other names that messages may have as `protocol`.
     #[must_use]
     pub fn aliases(&self) -> &[String] {
         &self.aliases
     }
 
-    /// What it is, in a line, if the file says so.
+    /// A description in one line, if the file has one.
     #[must_use]
     pub fn title(&self) -> Option<&str> {
         self.title.as_deref()
     }
 
-    /// What has a state of its own.
+    /// The scope of its state.
     #[must_use]
     pub fn scope(&self) -> Scope {
         self.scope
     }
 
-    /// Who may cancel.
+    /// The agents that may cancel it.
     #[must_use]
     pub fn cancel(&self) -> Cancel {
         self.cancel
     }
 
-    /// The roles, in the order in which the file names them.
+    /// The roles, in the order of the file.
     #[must_use]
     pub fn roles(&self) -> &[String] {
         &self.roles
     }
 
-    /// The role that begins.
+    /// The initiating role.
     #[must_use]
     pub fn initiator(&self) -> &str {
         let role = self.roles.get(usize::from(self.initiator));
         role.map_or("", String::as_str)
     }
 
-    /// The state in which it begins.
+    /// The initial state.
     #[must_use]
     pub fn initial(&self) -> &State {
-        // `states` is never empty and `initial` one of them: see `scxml::build`.
+        // `scxml::build` ensures that `initial` is the index of a state.
         self.state(self.initial).unwrap_or(&self.states[0])
     }
 
@@ -169,7 +170,7 @@ impl Machine {
         &self.states
     }
 
-    /// Whether messages may name the protocol so. Case does not matter.
+    /// Whether `name` is the name or an alias of the protocol. Case is ignored.
     #[must_use]
     pub fn is_called(&self, name: &str) -> bool {
         self.name.eq_ignore_ascii_case(name)
@@ -185,20 +186,20 @@ impl Machine {
         self.state(transition.target).map_or("", State::id)
     }
 
-    /// The state to which a time-out of this machine leads.
+    /// The state to which a timeout of this machine leads.
     #[must_use]
     pub fn timeout_target(&self, timeout: Timeout) -> &str {
         self.state(timeout.target).map_or("", State::id)
     }
 
-    /// Whether the initiator may say this to somebody else, in whatever state.
-    pub(crate) fn is_said_by_initiator(&self, act: Act<'_>) -> bool {
+    /// Whether the initiator may send this to another agent in any state.
+    pub(crate) fn is_sent_by_initiator(&self, act: Act<'_>) -> bool {
         let initiator = 1_u32 << self.initiator;
-        let says = |state: &State| step(&state.transitions, act, initiator, !initiator).is_some();
-        [CANCEL, NOT_UNDERSTOOD].contains(&act) || self.states.iter().any(says)
+        let sends = |state: &State| step(&state.transitions, act, initiator, !initiator).is_some();
+        [CANCEL, NOT_UNDERSTOOD].contains(&act) || self.states.iter().any(sends)
     }
 
-    /// Whether somebody else may say this to the initiator, in whatever state.
+    /// Whether another agent may send this to the initiator in any state.
     pub(crate) fn is_answer(&self, act: Act<'_>) -> bool {
         let initiator = 1_u32 << self.initiator;
         let answers =
@@ -213,62 +214,62 @@ impl Machine {
 }
 
 impl State {
-    /// Its name in the file.
+    /// Identifier of the state in the file.
     #[must_use]
     pub fn id(&self) -> &str {
         &self.id
     }
 
-    /// Whether the protocol may end here. There can be ways out all the same.
+    /// Whether the protocol may end in this state. The state may still have transitions.
     #[must_use]
     pub fn is_final(&self) -> bool {
         self.is_final
     }
 
-    /// The transitions that the file gives the state.
+    /// The transitions of the state in the file.
     #[must_use]
     pub fn transitions(&self) -> &[Transition] {
         &self.transitions
     }
 
-    /// The protocols that may run within it.
+    /// The protocols that may run within the state.
     #[must_use]
     pub fn subprotocols(&self) -> &[Subprotocol] {
         &self.subprotocols
     }
 
-    /// What happens when no message comes in time.
+    /// The transition that is taken when no message arrives in time.
     #[must_use]
     pub fn timeout(&self) -> Option<Timeout> {
         self.timeout
     }
 
-    /// Whether nothing can follow but an answer to the last message.
+    /// Whether only an answer to the last message can follow.
     pub(crate) fn is_over(&self) -> bool {
         self.is_final && self.steps.is_empty() && self.embedded.is_empty()
     }
 }
 
 impl Transition {
-    /// The performative as the file has it: a name, or a regular expression for several.
+    /// The performative in the file: a name, or a regular expression for several.
     #[must_use]
     pub fn performative(&self) -> &str {
         self.acts.text()
     }
 
-    /// The role that sends.
+    /// The sending role, or a regular expression for several.
     #[must_use]
     pub fn from(&self) -> &str {
         &self.from.text
     }
 
-    /// The role that receives.
+    /// The receiving role, or a regular expression for several.
     #[must_use]
     pub fn to(&self) -> &str {
         &self.to.text
     }
 
-    /// Whether the step may be left out, and its next one taken at once.
+    /// Whether the transition may be skipped: the transitions of its target are then allowed too.
     #[must_use]
     pub fn is_optional(&self) -> bool {
         self.optional
@@ -282,13 +283,13 @@ impl Subprotocol {
         &self.text
     }
 
-    /// The role that begins it.
+    /// The role that may begin the protocol.
     #[must_use]
     pub fn from(&self) -> &str {
         &self.from.text
     }
 
-    /// The role to which answers are passed on, with any performative.
+    /// The role to which answers with any performative may be forwarded.
     #[must_use]
     pub fn proxied_to(&self) -> Option<&str> {
         self.proxied_to.as_ref().map(|roles| roles.text.as_str())
@@ -301,7 +302,7 @@ impl Subprotocol {
 }
 
 impl Timeout {
-    /// When time is up.
+    /// The time of the timeout.
     #[must_use]
     pub fn after(self) -> After {
         self.after
@@ -319,7 +320,7 @@ impl Roles {
     }
 }
 
-/// The first step that takes this message.
+/// Returns the first transition for this message.
 #[inline]
 pub(crate) fn step<'m>(
     steps: &'m [Transition],

@@ -1,4 +1,4 @@
-//! The monitor: messages in, verdicts out.
+//! The monitor of conversations.
 
 use std::hash::{BuildHasher, RandomState};
 use std::sync::Arc;
@@ -7,7 +7,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use crate::change::{Change, expire, expire_party, millis, span_millis};
 use crate::conversation::{Holders, NONE, Party, is_final, is_over, state_name};
 use crate::deadlines::{Deadline, Deadlines};
-use crate::judge::{Fault, Heard, Move, Who, judge};
+use crate::judge::{Fault, Move, MoveTarget, ObservedMessage, judge};
 use crate::limits::MAX_TEXT;
 use crate::machine::{Machine, Scope, step};
 use crate::names::Names;
@@ -18,60 +18,60 @@ use crate::{Header, Library, Limits};
 
 /// Checks messages against the protocols of their conversations.
 ///
-/// Messages go in with [`check`](Self::check), in the order in which they were sent or seen, and
-/// a verdict comes out; a message that violates its protocol changes nothing. Time comes in with
-/// every call: there is no clock here. [`handle_timeout`](Self::handle_timeout) tells of
-/// conversations in which a message is overdue, and forgets those that are over or abandoned.
+/// [`check`](Self::check) takes the messages in the order in which they were sent or received, and
+/// returns a verdict. A message that violates its protocol changes nothing. The monitor has no clock:
+/// the caller passes the current time. [`handle_timeout`](Self::handle_timeout) reports overdue
+/// messages, and removes conversations that are over or abandoned.
 #[derive(Debug)]
 pub struct Monitor {
     pub(crate) library: Arc<Library>,
     pub(crate) limits: Limits,
-    /// The agent that watches its own conversations; none for an observer.
+    /// The monitored agent; none for an observer.
     pub(crate) agent: Option<String>,
     pub(crate) names: Names,
     pub(crate) table: Table,
     deadlines: Deadlines,
     hasher: RandomState,
-    /// Room that is used again.
+    /// Buffer that is reused.
     moves: Vec<Move>,
     forgotten: u64,
 }
 
-/// What a monitor noticed without a message.
+/// An event that has no message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Event {
-    /// No message came by the `reply-by` of the last one, or within the time of the state.
+    /// No message came by the `reply-by` of the last one, or within the timeout of the state.
     Overdue {
-        /// The standard name of the protocol.
+        /// Name of the protocol.
         protocol: String,
-        /// The conversation.
+        /// Conversation identifier.
         conversation_id: String,
-        /// The participant, where each has a state of its own.
+        /// Participant, if each has a state of its own.
         participant: Option<String>,
-        /// The state in which no message came.
+        /// State in which no message came.
         state: String,
-        /// The state that follows, if the protocol says one.
+        /// State after the timeout, if the protocol defines one.
         next: Option<String>,
     },
-    /// Nothing had happened for so long that the conversation was forgotten, though it was not
-    /// over.
+    /// The monitor has removed a conversation that was not over, because it had no message for
+    /// [`Limits::idle`].
     Abandoned {
-        /// The standard name of the protocol.
+        /// Name of the protocol.
         protocol: String,
-        /// The conversation.
+        /// Conversation identifier.
         conversation_id: String,
     },
 }
 
-/// Why a message was not accepted.
+/// The reason that a message was not accepted.
 pub(crate) enum Denied {
     Fault(Fault, u32),
     NotOpened(u16),
     Unchecked(Unchecked),
 }
 
-/// What is left to say about a message that was accepted.
+/// The result of an accepted message.
 struct Passed {
     machine: u16,
     state: u16,
@@ -83,15 +83,17 @@ struct Passed {
 }
 
 impl Monitor {
-    /// A monitor of everybody's conversations.
+    /// Creates a monitor of the conversations of all agents.
     #[must_use]
     pub fn observer(library: Arc<Library>) -> Self {
         Self::with(library, None)
     }
 
-    /// A monitor of one agent's conversations, which is shown all that the agent sends and
-    /// receives, in that order. It knows what the agent knew when it sent something, so that it is
-    /// stricter than an observer about messages that could have crossed.
+    /// Creates a monitor of the conversations of one agent.
+    ///
+    /// The caller passes all messages that the agent sends and receives, in their order. So a message
+    /// of the agent cannot have crossed a message that was passed before it, and the monitor is
+    /// stricter than an observer.
     #[must_use]
     pub fn agent(library: Arc<Library>, name: &str) -> Self {
         Self::with(library, Some(name.to_owned()))
@@ -112,38 +114,39 @@ impl Monitor {
         }
     }
 
-    /// The same with other limits.
+    /// Sets the limits.
     #[must_use]
     pub fn with_limits(mut self, limits: Limits) -> Self {
         self.limits = limits;
         self
     }
 
-    /// The protocols it knows.
+    /// Protocols of the monitor.
     #[must_use]
     pub fn library(&self) -> &Library {
         &self.library
     }
 
-    /// How many conversations it knows, those within others included.
+    /// Number of conversations, including embedded ones.
     #[must_use]
     pub fn len(&self) -> usize {
         self.table.len()
     }
 
-    /// Whether it knows no conversation.
+    /// Whether the monitor has no conversation.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// How many conversations that were not over it has forgotten to keep within its limits.
+    /// Number of conversations that were evicted before their end because of
+    /// [`Limits::conversations`].
     #[must_use]
     pub fn forgotten(&self) -> u64 {
         self.forgotten
     }
 
-    /// Checks a message, and moves its conversation on if it fits.
+    /// Checks a message. If it fits its conversation, updates the conversation.
     pub fn check(&mut self, header: &Header<'_>, now: SystemTime) -> Verdict<'_> {
         match self.take(header, now) {
             Ok(passed) => self.accepted(&passed),
@@ -196,14 +199,14 @@ impl Monitor {
         }
         let agent = self.agent.as_deref();
         let fingerprint = |text: Option<&str>| text.map_or(0, |text| self.hasher.hash_one(text));
-        let heard = Heard {
+        let observed = ObservedMessage {
             act: header.act(),
             sender,
             receivers,
             reply_with: fingerprint(header.reply_with_text()),
             in_reply_to: fingerprint(header.in_reply_to_text()),
             own: agent == Some(sender),
-            told: agent.filter(|agent| *agent != sender).and_then(|agent| {
+            own_receiver: agent.filter(|agent| *agent != sender).and_then(|agent| {
                 let mut receivers = receivers.iter();
                 receivers.position(|receiver| *receiver == agent)
             }),
@@ -215,43 +218,44 @@ impl Monitor {
             let Some(machine) = self.library.index_of(protocol) else {
                 return unchecked(Unchecked::UnknownProtocol);
             };
-            return self.open(id, NONE, machine, header, &heard, now);
+            return self.open(id, NONE, machine, header, &observed, now);
         };
         let machine = self.machine_of(&self.library, main);
         let follows = |name| machine.is_some_and(|machine: &Machine| machine.is_called(name));
         if header.protocol_name().is_none_or(follows) {
-            let passed = self.go_on(main, header, &heard, now);
-            return passed.map_err(|denied| self.elsewhere(main, &heard, denied, now));
+            let passed = self.advance(main, header, &observed, now);
+            return passed.map_err(|denied| self.recheck_delegated(main, &observed, denied, now));
         }
         let library = Arc::clone(&self.library);
-        self.embedded(&library, main, header, &heard, now)
+        self.embedded(&library, main, header, &observed, now)
     }
 
-    /// A message of another protocol than its conversation's: it belongs to one within.
+    /// Checks a message with another protocol than its conversation has. It belongs to an embedded
+    /// conversation.
     fn embedded(
         &mut self,
         library: &Library,
         main: u32,
         header: &Header<'_>,
-        heard: &Heard<'_>,
+        observed: &ObservedMessage<'_>,
         now: SystemTime,
     ) -> Result<Passed, Denied> {
         let name = header.protocol_name().unwrap_or_default();
         let (mut denied, mut open) = (None, None);
         let mut children = 0;
-        let mut may_begin = self.may_begin(library, main, name, heard.sender);
+        let mut may_begin = self.may_begin(library, main, name, observed.sender);
         let mut child = self.table.slot(main).map_or(NONE, |slot| slot.child);
         while child != NONE {
             children += 1;
-            may_begin |= self.may_begin(library, child, name, heard.sender);
+            may_begin |= self.may_begin(library, child, name, observed.sender);
             let called = self.machine_of(library, child);
             if called.is_some_and(|machine| machine.is_called(name)) {
-                match self.go_on(child, header, heard, now) {
+                match self.advance(child, header, observed, now) {
                     Ok(passed) => {
                         self.touch(main, millis(now));
                         return Ok(passed);
                     }
-                    Err(fault) if self.goes_on_elsewhere(child) => open = Some((child, fault)),
+                    Err(fault) if self.may_continue_elsewhere(child) => open = Some((child, fault)),
                     Err(fault) => denied = denied.or(Some(fault)),
                 }
             }
@@ -260,12 +264,12 @@ impl Monitor {
         if !may_begin {
             return Err(match (denied, open) {
                 (Some(denied), _) => denied,
-                (None, Some((child, fault))) => self.elsewhere(child, heard, fault, now),
-                (None, None) if self.began_elsewhere(library, main, name, heard.sender) => {
-                    let inner = library.index_of(name).filter(|_| !heard.own);
+                (None, Some((child, fault))) => self.recheck_delegated(child, observed, fault, now),
+                (None, None) if self.began_elsewhere(library, main, name, observed.sender) => {
+                    let inner = library.index_of(name).filter(|_| !observed.own);
                     if let Some(inner) = inner.filter(|_| children < self.limits.embedded) {
                         let id = header.conversation().unwrap_or_default();
-                        self.join(id, main, inner, heard, now);
+                        self.join(id, main, inner, observed, now);
                     }
                     Denied::Unchecked(Unchecked::BegunElsewhere)
                 }
@@ -282,7 +286,7 @@ impl Monitor {
             return Err(Denied::Fault(Fault::plain(Kind::TooMany), main));
         }
         let id = header.conversation().unwrap_or_default();
-        match self.open(id, main, machine, header, heard, now) {
+        match self.open(id, main, machine, header, observed, now) {
             Ok(passed) => {
                 self.touch(main, millis(now));
                 Ok(passed)
@@ -291,14 +295,13 @@ impl Monitor {
         }
     }
 
-    /// Whether the agent may begin a conversation of this protocol within another.
+    /// Whether the agent may begin a conversation of this protocol within another conversation.
     fn may_begin(&self, library: &Library, at: u32, protocol: &str, sender: &str) -> bool {
         self.is_begun(library, at, protocol, |roles| roles.of(sender))
     }
 
-    /// Whether somebody else than the agent that watches itself can have begun a conversation of
-    /// this protocol within one of its own, in which a stranger speaks to it now: as the recruited
-    /// do to who has them recruited.
+    /// Whether another agent than the monitored one may have begun a conversation of this protocol
+    /// within its conversation, so that an unknown agent sends messages to it. Recruited agents do so.
     fn began_elsewhere(&self, library: &Library, at: u32, protocol: &str, sender: &str) -> bool {
         let Some(agent) = &self.agent else {
             return false;
@@ -310,7 +313,7 @@ impl Monitor {
         !takes_part(sender) && self.is_begun(library, at, protocol, |roles| !roles.of(agent))
     }
 
-    /// Whether those with certain roles may begin it now.
+    /// Whether agents with the roles `by` may begin the protocol now.
     fn is_begun(
         &self,
         library: &Library,
@@ -347,28 +350,28 @@ impl Monitor {
         parent: u32,
         machine: u16,
         header: &Header<'_>,
-        heard: &Heard<'_>,
+        observed: &ObservedMessage<'_>,
         now: SystemTime,
     ) -> Result<Passed, Denied> {
         let library = Arc::clone(&self.library);
         let Some(protocol) = library.machine(machine) else {
             return Err(Denied::Unchecked(Unchecked::UnknownProtocol));
         };
-        // Looked at first, so that nonsense drives nothing out.
-        let begins = step(&protocol.initial().steps, heard.act, u32::MAX, u32::MAX);
+        // Checked before eviction, so that an invalid message evicts no conversation.
+        let begins = step(&protocol.initial().steps, observed.act, u32::MAX, u32::MAX);
         if begins.is_none() {
-            // Who asked may have named the agent in `reply-to`, without telling it.
-            let named = parent == NONE && self.agent.is_some() && !heard.own;
-            return Err(if named && protocol.is_answer(heard.act) {
-                self.join(id, parent, machine, heard, now);
+            // The initiator may have named the monitored agent in a `reply-to`.
+            let named = parent == NONE && self.agent.is_some() && !observed.own;
+            return Err(if named && protocol.is_answer(observed.act) {
+                self.join(id, parent, machine, observed, now);
                 Denied::Unchecked(Unchecked::BegunElsewhere)
             } else {
                 Denied::NotOpened(machine)
             });
         }
-        self.make_room(parent);
+        self.evict(parent);
         let at = self.table.insert(id, parent, machine, millis(now));
-        let initiator = self.names.acquire(heard.sender);
+        let initiator = self.names.acquire(observed.sender);
         if let Some(slot) = self.table.slot_mut(at) {
             slot.conversation.initiator = initiator;
             if protocol.scope == Scope::Conversation {
@@ -376,7 +379,7 @@ impl Monitor {
                 slot.conversation.parties.push(party);
             }
         }
-        let passed = self.go_on(at, header, heard, now);
+        let passed = self.advance(at, header, observed, now);
         passed.map_err(|denied| {
             self.remove(at);
             match denied {
@@ -386,8 +389,8 @@ impl Monitor {
         })
     }
 
-    /// Forgets conversations until there is room for one more.
-    pub(crate) fn make_room(&mut self, keep: u32) {
+    /// Removes conversations until there is space for one more. The conversation `keep` is kept.
+    pub(crate) fn evict(&mut self, keep: u32) {
         while self.table.len() >= self.limits.conversations.max(1) {
             let other = |at: &u32| *at != keep;
             let ended = self.table.oldest(List::Ended).filter(other);
@@ -401,12 +404,12 @@ impl Monitor {
         }
     }
 
-    /// Judges the message in a conversation that is there, and moves it on.
-    fn go_on(
+    /// Checks a message in an existing conversation and updates the conversation.
+    fn advance(
         &mut self,
         at: u32,
         header: &Header<'_>,
-        heard: &Heard<'_>,
+        observed: &ObservedMessage<'_>,
         now: SystemTime,
     ) -> Result<Passed, Denied> {
         let now_ms = millis(now);
@@ -420,12 +423,19 @@ impl Monitor {
         };
         expire(machine, &mut slot.conversation, now_ms);
         let conversation = &slot.conversation;
-        judge(machine, conversation, &self.names, heard, &mut self.moves)
-            .map_err(|fault| Denied::Fault(fault, at))?;
-        let new = |made: &&Move| matches!(made.who, Who::Receiver(_) | Who::Sender);
+        judge(
+            machine,
+            conversation,
+            &self.names,
+            observed,
+            &mut self.moves,
+        )
+        .map_err(|fault| Denied::Fault(fault, at))?;
+        let new =
+            |made: &&Move| matches!(made.target, MoveTarget::Receiver(_) | MoveTarget::Sender);
         let grown = conversation.parties.len() + self.moves.iter().filter(new).count();
         if grown > self.limits.participants
-            || conversation.bound.len() + heard.receivers.len() > self.limits.participants + 1
+            || conversation.bound.len() + observed.receivers.len() > self.limits.participants + 1
         {
             return Err(fault(Kind::TooMany));
         }
@@ -434,8 +444,8 @@ impl Monitor {
             machine,
             names: &mut self.names,
             deadlines: &mut self.deadlines,
-            heard,
-            place: Deadline {
+            observed,
+            deadline: Deadline {
                 due: 0,
                 at,
                 generation: slot.generation,
@@ -450,7 +460,7 @@ impl Monitor {
         };
         for made in &self.moves {
             if machine.scope == Scope::Conversation {
-                change.bind(&mut slot.conversation, made.lead.roles);
+                change.bind(&mut slot.conversation, made.next_state.roles);
             }
             change.make(&mut slot.conversation, *made);
         }
@@ -480,7 +490,7 @@ impl Monitor {
         Ok(passed)
     }
 
-    /// Notes that something happened in a main conversation.
+    /// Updates the time and the list of a main conversation.
     pub(crate) fn touch(&mut self, at: u32, now: u64) {
         let library = &self.library;
         let over = |slot: &crate::table::Slot| {
@@ -505,7 +515,7 @@ impl Monitor {
         self.table.touch(at, list, now);
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) is to be called next.
+    /// Time at which the caller must call [`handle_timeout`](Self::handle_timeout) next.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<SystemTime> {
         let kept = |list, span: Duration| {
@@ -523,7 +533,8 @@ impl Monitor {
         UNIX_EPOCH.checked_add(Duration::from_millis(next))
     }
 
-    /// Time has passed: tells what is overdue, and forgets what is over or abandoned.
+    /// Handles timeouts: reports overdue messages, and removes conversations that are over or
+    /// abandoned.
     pub fn handle_timeout(&mut self, now: SystemTime) -> Vec<Event> {
         let now = millis(now);
         let mut events = Vec::new();
@@ -544,8 +555,8 @@ impl Monitor {
                 let resting =
                     |party: &Party| machine.is_some_and(|machine| is_final(machine, party.state));
                 let conversation = &slot.conversation;
-                // How far others have gone on elsewhere is not known.
-                let known = list == List::Open && !self.goes_on_elsewhere(at);
+                // The monitor does not know the state of a conversation that continues elsewhere.
+                let known = list == List::Open && !self.may_continue_elsewhere(at);
                 if known && !conversation.parties.iter().all(resting) {
                     events.push(Event::Abandoned {
                         protocol: machine.map_or("", Machine::name).to_owned(),
@@ -559,15 +570,15 @@ impl Monitor {
     }
 
     fn overdue(&mut self, deadline: Deadline) -> Option<Event> {
-        // Its answer may have gone to somebody else.
-        let heard = !self.goes_on_elsewhere(deadline.at);
+        // The answer may have been sent to another agent.
+        let complete = !self.may_continue_elsewhere(deadline.at);
         let slot = self.table.slot_mut(deadline.at)?;
         if slot.generation != deadline.generation {
             return None;
         }
         let machine = self.library.machine(slot.conversation.machine)?;
         let party = slot.conversation.parties.get_mut(deadline.party as usize)?;
-        // A later message has another deadline, or none.
+        // A later message has set another deadline or none.
         if party.deadline != deadline.due || is_over(machine, party.state) {
             return None;
         }
@@ -589,10 +600,10 @@ impl Monitor {
             slot.parent
         };
         self.touch(main, touched);
-        heard.then_some(event)
+        complete.then_some(event)
     }
 
-    /// Removes a main conversation, with all that are within it.
+    /// Removes a main conversation with its embedded conversations.
     fn forget(&mut self, at: u32) {
         while let Some(slot) = self.table.slot(at) {
             let child = slot.child;
@@ -624,7 +635,7 @@ impl Monitor {
         library.machine(self.table.slot(at)?.conversation.machine)
     }
 
-    /// Deadlines that no longer count are left where they are until there are too many.
+    /// Removes stale deadlines if there are too many.
     fn keep_deadlines_few(&mut self) {
         let table = &self.table;
         let counts = |deadline: &Deadline| {
@@ -645,7 +656,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn deadlines_that_were_met_do_not_pile_up() {
+    fn stale_deadlines_are_removed() {
         let mut monitor = Monitor::observer(Arc::new(Library::standard()));
         let now = UNIX_EPOCH + Duration::from_secs(1_700_000_000);
         let due = Time::from_system_time(now + Duration::from_secs(3_600));
@@ -669,7 +680,7 @@ mod tests {
     }
 
     #[test]
-    fn names_are_forgotten_with_the_last_conversation() {
+    fn names_are_released_with_the_last_conversation() {
         let mut monitor = Monitor::observer(Arc::new(Library::standard()));
         let now = UNIX_EPOCH + Duration::from_secs(1_700_000_000);
         for id in ["1", "2"] {

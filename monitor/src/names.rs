@@ -1,13 +1,13 @@
-//! Names of agents, each kept once however many conversations it is part of.
+//! A table of agent names with reference counts. Conversations share its entries.
 
 use std::hash::{BuildHasher, RandomState};
 
 use hashbrown::HashTable;
 
-/// A name in [`Names`].
+/// Index of a name in [`Names`].
 pub(crate) type Name = u32;
 
-/// Agents by name, counted by use. Room that was given back is used again without allocating.
+/// Agent names with reference counts. A released entry is reused without allocating.
 #[derive(Debug)]
 pub(crate) struct Names {
     entries: Vec<Entry>,
@@ -32,7 +32,7 @@ impl Names {
         }
     }
 
-    /// The name, with one use more; every call is to be followed by [`release`](Self::release).
+    /// Adds a reference to a name. The caller must call [`release`](Self::release) for it once.
     pub(crate) fn acquire(&mut self, name: &str) -> Name {
         let hash = self.hasher.hash_one(name);
         if let Some(known) = self.find(hash, name) {
@@ -41,30 +41,30 @@ impl Names {
             }
             return known;
         }
-        let place = match self.free.pop() {
-            Some(place) => {
-                if let Some(entry) = self.entry(place) {
+        let index = match self.free.pop() {
+            Some(index) => {
+                if let Some(entry) = self.entry(index) {
                     entry.name.clear();
                     entry.name.push_str(name);
                     entry.uses = 1;
                 }
-                place
+                index
             }
             None => {
                 self.entries.push(Entry {
                     name: name.to_owned(),
                     uses: 1,
                 });
-                // Uses are bounded by conversations and their participants, far below.
+                // The number of conversations and participants bounds the number of entries.
                 Name::try_from(self.entries.len() - 1).unwrap_or(Name::MAX)
             }
         };
         let (entries, hasher) = (&self.entries, &self.hasher);
-        self.by_name.insert_unique(hash, place, |name| {
+        self.by_name.insert_unique(hash, index, |name| {
             let entry = entries.get(*name as usize);
             hasher.hash_one(entry.map_or("", |entry| entry.name.as_str()))
         });
-        place
+        index
     }
 
     pub(crate) fn release(&mut self, name: Name) {
@@ -79,7 +79,7 @@ impl Names {
         if let Ok(found) = self.by_name.find_entry(hash, |other| *other == name) {
             found.remove();
         }
-        // A name of unusual length is not kept for later.
+        // The buffer of a long name is not reused.
         if entry.name.capacity() > 256 {
             entry.name = String::new();
         }
@@ -97,7 +97,7 @@ impl Names {
         entry.map_or("", |entry| entry.name.as_str())
     }
 
-    /// The name, if somebody uses it.
+    /// Returns the index of the name if it is in use.
     pub(crate) fn known(&self, text: &str) -> Option<Name> {
         self.find(self.hasher.hash_one(text), text)
     }
@@ -123,7 +123,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_name_lives_as_long_as_it_is_used() {
+    fn a_name_is_kept_while_it_has_references() {
         let mut names = Names::new(RandomState::new());
         let alice = names.acquire("alice");
         assert_eq!(names.acquire("alice"), alice);
@@ -133,13 +133,13 @@ mod tests {
         assert_eq!(names.known("alice"), Some(alice));
         names.release(alice);
         assert_eq!(names.known("alice"), None);
-        assert_eq!(names.acquire("carol"), alice, "its room is used again");
+        assert_eq!(names.acquire("carol"), alice, "its entry is reused");
         assert!(names.is(alice, "carol") && names.is(bob, "bob"));
         assert_eq!(names.len(), 2);
     }
 
     #[test]
-    fn long_names_do_not_stay() {
+    fn buffers_of_long_names_are_not_kept() {
         for (len, kept) in [(200, true), (256, true), (257, false), (1_000, false)] {
             let mut names = Names::new(RandomState::new());
             let name = names.acquire(&"x".repeat(len));

@@ -1,4 +1,4 @@
-//! Violations in words: what came, where the conversation is, what would have been right.
+//! Descriptions of violations: the message, the state of the conversation, the expected messages.
 
 use crate::conversation::{CANCELLING, Conversation, FAILED, Party, state_name};
 use crate::judge::Fault;
@@ -9,7 +9,7 @@ use crate::table::Table;
 use crate::verdict::{Expected, Violation, ViolationKind as Kind};
 use crate::{Header, Library};
 
-/// Most receivers that are named.
+/// Maximum number of receivers in a violation.
 const MAX_NAMED: usize = 16;
 
 pub(crate) fn violation(
@@ -44,7 +44,7 @@ pub(crate) fn violation(
             }
             return violation;
         }
-        // Never asked for.
+        // The caller handles this case.
         Denied::Unchecked(_) => return violation,
     };
     let Fault {
@@ -63,11 +63,11 @@ pub(crate) fn violation(
     machine.name().clone_into(&mut violation.protocol);
     if let Some(state) = state {
         violation.state = Some(state_name(machine, state).to_owned());
-        let person = participant.as_deref();
+        let name = participant.as_deref();
         let resume = || {
             let mut parties = conversation.parties.iter();
-            let meant = |party: &&Party| person.is_none_or(|name| names.is(party.peer, name));
-            let party = parties.find(meant);
+            let concerned = |party: &&Party| name.is_none_or(|name| names.is(party.peer, name));
+            let party = parties.find(concerned);
             party.and_then(|party| machine.state(party.resume))
         };
         let own = match state {
@@ -75,12 +75,12 @@ pub(crate) fn violation(
             own => machine.state(own),
         };
         if let Some(own) = own {
-            violation.expected = expected(machine, own, Some(conversation), names, person);
+            violation.expected = expected(machine, own, Some(conversation), names, name);
         } else if state == CANCELLING {
             violation.expected = vec![Expected {
                 performative: "inform, failure".to_owned(),
                 from: "the other side".to_owned(),
-                to: "who cancelled".to_owned(),
+                to: "the side that canceled".to_owned(),
             }];
         }
     }
@@ -88,7 +88,8 @@ pub(crate) fn violation(
     violation
 }
 
-/// What a state expects, with agents in place of roles where they are known.
+/// Returns the messages that a state allows. Roles are replaced by the names of their agents if
+/// these are known.
 fn expected(
     machine: &Machine,
     state: &State,
@@ -97,7 +98,8 @@ fn expected(
     participant: Option<&str>,
 ) -> Vec<Expected> {
     let named = |roles: &Roles| {
-        who(machine, roles, conversation, names, participant).unwrap_or_else(|| roles.text.clone())
+        agent_of(machine, roles, conversation, names, participant)
+            .unwrap_or_else(|| roles.text.clone())
     };
     let mut all: Vec<Expected> = Vec::new();
     for step in &state.steps {
@@ -124,7 +126,8 @@ fn expected(
     all
 }
 
-fn who(
+/// Returns the name of the agent with a role, if it is known.
+fn agent_of(
     machine: &Machine,
     roles: &Roles,
     conversation: Option<&Conversation>,

@@ -1,4 +1,4 @@
-//! The conversations that are known: found by id, listed by when something last happened.
+//! The table of conversations: indexed by identifier, and listed in the order of their last message.
 
 use std::hash::{BuildHasher, RandomState};
 
@@ -7,20 +7,20 @@ use smallvec::SmallVec;
 
 use crate::conversation::{Conversation, NONE};
 
-/// Which list a conversation is in.
+/// A list of conversations.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum List {
-    /// Of those that go on.
+    /// Conversations that are not over.
     Open = 0,
-    /// Of those that are over.
+    /// Conversations that are over.
     Ended = 1,
 }
 
-/// How exact the order of lists is, in milliseconds: moving a conversation touches two others, which
-/// would cost more than anything else, if it were done for every message.
+/// Precision of the order of the lists, in milliseconds. Moving a conversation changes two others. For
+/// every message, this would be the largest cost of a check.
 const PRECISION: u64 = 1_000;
 
-/// Conversations in slots that are used again, without allocating.
+/// Conversations in slots. A free slot is reused without allocating.
 #[derive(Debug)]
 pub(crate) struct Table {
     slots: Vec<Slot>,
@@ -34,17 +34,18 @@ pub(crate) struct Table {
 #[derive(Debug)]
 pub(crate) struct Slot {
     pub(crate) conversation: Conversation,
-    /// Counts how often the slot was given to another conversation.
+    /// Number of conversations that have used the slot.
     pub(crate) generation: u32,
-    /// When something last happened, in milliseconds since 1970.
+    /// Time of the last message, in milliseconds since 1970.
     pub(crate) touched: u64,
-    /// The first conversation within this one, and the next one beside it.
+    /// First conversation embedded in this one.
     pub(crate) child: u32,
+    /// Next conversation with the same parent.
     pub(crate) sibling: u32,
     pub(crate) parent: u32,
     used: bool,
     list: List,
-    /// When it came to its place in the list.
+    /// Value of `touched` when the conversation got its position in the list.
     listed: u64,
     older: u32,
     newer: u32,
@@ -72,7 +73,7 @@ impl Table {
         }
     }
 
-    /// Conversations, those within others included.
+    /// Number of conversations, including embedded ones.
     pub(crate) fn len(&self) -> usize {
         self.len
     }
@@ -98,9 +99,9 @@ impl Table {
         Some(self.ends[list as usize].oldest).filter(|at| *at != NONE)
     }
 
-    /// A new conversation, beginning `now`, within a parent or by itself.
+    /// Inserts a new conversation, with a parent or [`NONE`].
     pub(crate) fn insert(&mut self, id: &str, parent: u32, machine: u16, now: u64) -> u32 {
-        let at = self.room(id);
+        let at = self.free_slot(id);
         if let Some(slot) = self.slots.get_mut(at as usize) {
             slot.used = true;
             slot.generation = slot.generation.wrapping_add(1);
@@ -128,7 +129,7 @@ impl Table {
         at
     }
 
-    fn room(&mut self, id: &str) -> u32 {
+    fn free_slot(&mut self, id: &str) -> u32 {
         if let Some(at) = self.free.pop() {
             if let Some(slot) = self.slots.get_mut(at as usize) {
                 slot.conversation.id.clear();
@@ -161,7 +162,7 @@ impl Table {
         u32::try_from(self.slots.len() - 1).unwrap_or(NONE)
     }
 
-    /// Something happened in a main conversation.
+    /// Updates the time and the list of a main conversation.
     pub(crate) fn touch(&mut self, at: u32, list: List, now: u64) {
         let Some(slot) = self.slot_mut(at) else {
             return;
@@ -174,7 +175,7 @@ impl Table {
         self.append(at, list);
     }
 
-    /// Empties a slot that has no children any more. What it held is the caller's to give back.
+    /// Frees a slot without children. The caller must release its names first.
     pub(crate) fn remove(&mut self, at: u32) {
         let Some(slot) = self.slot(at) else {
             return;
@@ -192,7 +193,7 @@ impl Table {
         if let Some(slot) = self.slots.get_mut(at as usize) {
             slot.used = false;
             let conversation = &mut slot.conversation;
-            // What is unusually large is not kept for later.
+            // Large buffers are not kept for reuse.
             if conversation.id.capacity() > 256 {
                 conversation.id = String::new();
             }
@@ -274,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn conversations_are_listed_by_age_and_slots_used_again() {
+    fn conversations_are_listed_by_age_and_slots_are_reused() {
         let mut table = Table::new(RandomState::new());
         let [a, b, c] = ["a", "b", "c"].map(|id| table.insert(id, NONE, 0, 1));
         assert_eq!(order(&table, List::Open), ["a", "b", "c"]);
@@ -300,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn long_ids_do_not_stay() {
+    fn buffers_of_long_ids_are_not_kept() {
         for (len, kept) in [(200, true), (256, true), (257, false), (1_000, false)] {
             let mut table = Table::new(RandomState::new());
             let at = table.insert(&"x".repeat(len), NONE, 0, 1);
@@ -311,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn children_hang_on_their_parent() {
+    fn embedded_conversations_are_linked_to_their_parent() {
         let mut table = Table::new(RandomState::new());
         let main = table.insert("main", NONE, 0, 1);
         let children = [0; 3].map(|_| table.insert("main", main, 1, 1));

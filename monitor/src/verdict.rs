@@ -1,23 +1,23 @@
-//! What a monitor says about a message.
+//! Verdicts of a monitor.
 
 use std::fmt;
 
 use fipa_acl::escape;
 
-/// What a monitor says about a message.
+/// The verdict of a monitor on a message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Verdict<'m> {
-    /// It fits its conversation, which has moved on.
+    /// The message fits its conversation and has changed its state.
     Accepted(Accepted<'m>),
-    /// It does not; the conversation is as it was.
+    /// The message violates its protocol. The conversation is unchanged.
     Violation(Box<Violation>),
-    /// Nothing can be said.
+    /// The message cannot be checked.
     Unchecked(Unchecked),
 }
 
 impl Verdict<'_> {
-    /// The violation, if it is one.
+    /// Returns the violation, if the verdict is one.
     #[must_use]
     pub fn violation(&self) -> Option<&Violation> {
         match self {
@@ -33,134 +33,135 @@ impl Verdict<'_> {
     }
 }
 
-/// A message that fits, and where its conversation is now.
+/// An accepted message and the new state of its conversation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Accepted<'m> {
-    /// The standard name of the protocol.
+    /// Name of the protocol.
     pub protocol: &'m str,
-    /// The new state: of the participant whom the message concerns, the first of several.
+    /// New state with the participant of the message, or with the first of several.
     pub state: &'m str,
-    /// Whether that is a state of the protocol's own, and none that all have: `not-understood`,
-    /// `cancelling`, `cancelled`, `undelivered`.
+    /// Whether the state is one of the protocol's own. Other states are common to all protocols:
+    /// `not-understood`, `cancelling`, `cancelled`, `undelivered`, `elsewhere`.
     pub own: bool,
-    /// Whether the message began the conversation, or brought another participant in.
+    /// Whether the message began the conversation or added a participant.
     pub opened: bool,
     /// Whether the protocol may end in the new state.
     pub ended: bool,
-    /// Whether nothing can follow in the new state but an answer to this message.
+    /// Whether only an answer to this message can follow in the new state.
     pub over: bool,
-    /// Whether it may end in the states of all participants.
+    /// Whether the protocol may end in the states of all participants.
     pub complete: bool,
-    /// Whether it came after the `reply-by` of the message it answers, or is void.
+    /// Whether the message came after the `reply-by` of the message that it answers, or is void.
     pub late: bool,
-    /// Whether it answers a message in whose place another had come before: it was too late, and
-    /// changes nothing.
+    /// Whether the message answers one that another message has replaced. It is too late and changes
+    /// nothing.
     pub void: bool,
-    /// Whether the conversation, or the protocol within it, began between others: the agent that
-    /// watches itself came into it because a `reply-to` names it.
+    /// Whether the conversation, or the protocol within it, began between other agents, and the
+    /// monitored agent joined it because a `reply-to` names it.
     pub elsewhere: bool,
 }
 
-/// A message that does not fit.
+/// A message that violates its protocol.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Violation {
-    /// In which way.
+    /// Kind of the violation.
     pub kind: ViolationKind,
-    /// The protocol of the conversation.
+    /// Protocol of the conversation.
     pub protocol: String,
-    /// The conversation.
+    /// Conversation identifier.
     pub conversation_id: String,
-    /// What the message does.
+    /// Performative of the message.
     pub performative: String,
-    /// Who sent it.
+    /// Sender of the message.
     pub sender: String,
-    /// To whom; of many the first 16.
+    /// Receivers of the message, at most the first 16.
     pub receivers: Vec<String>,
-    /// The participant whose state is meant, where each has one.
+    /// Participant that `state` belongs to, if each has a state of its own.
     pub participant: Option<String>,
-    /// The state that does not allow the message.
+    /// State that does not allow the message.
     pub state: Option<String>,
-    /// What would have been right.
+    /// Messages that the state allows.
     pub expected: Vec<Expected>,
 }
 
-/// How a message can be wrong.
+/// The kind of a violation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum ViolationKind {
-    /// The state does not allow it.
+    /// The state does not allow the message.
     Unexpected,
-    /// It would be right if the other side had said it.
+    /// The state allows the message only from the other side.
     WrongSender,
-    /// It is for somebody to whom it cannot be said.
+    /// The message cannot be sent to one of its receivers.
     WrongReceiver,
-    /// It was there already: the same performative with the same `reply-with`.
+    /// The sender has already sent the same performative with the same `reply-with`.
     Repeated,
-    /// A later state would allow it: a step is missing in between.
+    /// A later state allows the message: a step is missing.
     OutOfOrder,
     /// The conversation has ended.
     Ended,
-    /// The sender takes no part in the conversation.
+    /// The sender does not take part in the conversation.
     Stranger,
-    /// No conversation begins so, and none with this id is known: it did not begin, began before
-    /// it was watched, or is over for long.
+    /// The message cannot begin a conversation, and the monitor has none with its identifier: it did
+    /// not begin, it began before the monitor did, or it ended long ago.
     NotOpened,
-    /// `in-reply-to` is not what the message that it answers has as `reply-with`.
+    /// `in-reply-to` differs from the `reply-with` of the message that it answers.
     WrongReply,
     /// The conversation follows another protocol.
     WrongProtocol,
-    /// The conversation has as many participants or parts as can be watched.
+    /// The conversation has too many participants or embedded conversations: see
+    /// [`Limits`](crate::Limits).
     TooMany,
 }
 
-/// A message that would have been right.
+/// A message that a state allows.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Expected {
     /// The performatives, for example `agree, refuse`.
     pub performative: String,
-    /// The role from which, or the agent that has it.
+    /// Sending role, or the agent that has it.
     pub from: String,
-    /// The role to which, or the agent that has it.
+    /// Receiving role, or the agent that has it.
     pub to: String,
 }
 
-/// Why nothing can be said about a message.
+/// The reason that a message cannot be checked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, thiserror::Error)]
 #[non_exhaustive]
 pub enum Unchecked {
-    /// It belongs to no conversation.
+    /// The message has no conversation identifier.
     #[error("the message has no conversation-id")]
     NoConversation,
-    /// It is the first of its conversation and names no protocol.
-    #[error("the message names no protocol")]
+    /// The message begins a conversation and has no protocol.
+    #[error("the message has no protocol")]
     NoProtocol,
-    /// No machine for its protocol is known.
-    #[error("the protocol is not known")]
+    /// The library has no machine for the protocol.
+    #[error("the library does not have the protocol")]
     UnknownProtocol,
-    /// It is anonymous.
+    /// The message has no sender.
     #[error("the message has no sender")]
     NoSender,
-    /// It names nobody to whom it is sent.
+    /// The message has no receiver.
     #[error("the message has no receiver")]
     NoReceiver,
-    /// It belongs to a conversation, or a protocol within one, that began between others: the agent
-    /// that watches itself was not told. So are the first answers of the recruited to whom a
-    /// `reply-to` names, and later ones that something must have come before which was not said
-    /// to it.
-    #[error("the conversation, or the protocol within it, began between others")]
+    /// The message belongs to a conversation, or a protocol within one, that began between other
+    /// agents, and the monitored agent has not received the earlier messages. Examples are the first
+    /// answers to an agent that a `reply-to` names.
+    #[error("the conversation, or the protocol within it, began between other agents")]
     BegunElsewhere,
-    /// A conversation id or name is too long to be kept, or there are too many receivers.
+    /// The conversation identifier or a name is too long, or the message has too many receivers.
     #[error(
-        "the message is beyond what is watched: an id or a name too long, or too many receivers"
+        "the message exceeds the limits of the monitor: its conversation-id or a name is too \
+         long, or it has too many receivers"
     )]
     TooLarge,
 }
 
 impl ViolationKind {
-    /// A word for it, as it stands in JSON: `unexpected`, `wrong-sender` …
+    /// Name of the kind in JSON: `unexpected`, `wrong-sender` and so on.
     #[must_use]
     pub fn as_str(self) -> &'static str {
         match self {
@@ -199,17 +200,21 @@ impl fmt::Display for Violation {
             escape(protocol)
         )?;
         f.write_str(match self.kind {
-            ViolationKind::Unexpected => "not allowed",
-            ViolationKind::WrongSender => "the other side says that",
-            ViolationKind::WrongReceiver => "not to this receiver",
-            ViolationKind::Repeated => "said already",
-            ViolationKind::OutOfOrder => "too early, a step is missing",
+            ViolationKind::Unexpected => "the state does not allow this message",
+            ViolationKind::WrongSender => "only the other side may send this message",
+            ViolationKind::WrongReceiver => "the message cannot be sent to this receiver",
+            ViolationKind::Repeated => "the sender has already sent this message",
+            ViolationKind::OutOfOrder => "the message is too early, a step is missing",
             ViolationKind::Ended => "the conversation has ended",
-            ViolationKind::Stranger => "the sender takes no part",
-            ViolationKind::NotOpened => "no such conversation, and none begins so",
-            ViolationKind::WrongReply => "in-reply-to does not match",
+            ViolationKind::Stranger => "the sender does not take part",
+            ViolationKind::NotOpened => {
+                "the conversation is unknown, and the message cannot begin one"
+            }
+            ViolationKind::WrongReply => "in-reply-to does not match reply-with",
             ViolationKind::WrongProtocol => "the conversation follows another protocol",
-            ViolationKind::TooMany => "more participants than can be watched",
+            ViolationKind::TooMany => {
+                "the conversation has more participants or parts than the monitor allows"
+            }
         })?;
         match (&self.state, &self.participant) {
             (Some(state), Some(participant)) => {

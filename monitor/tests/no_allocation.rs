@@ -1,4 +1,5 @@
-//! A conversation between two that goes well costs no memory, once the monitor has had as many.
+//! Accepted messages between two agents do not allocate once the monitor has had as many
+//! conversations before.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -10,14 +11,14 @@ use fipa_acl::{AgentId, Message, MessageView, Payload, Performative};
 use fipa_monitor::{Header, Library, Monitor};
 
 #[test]
-fn the_counter_counts() {
+fn an_allocation_is_counted() {
     assert_eq!(
         measure(|| drop(std::hint::black_box(vec![1_u8]))).count_total,
         1
     );
 }
 
-/// A whole request, encoded.
+/// The encoded messages of a whole request conversation.
 fn request(number: usize) -> [Payload; 3] {
     let ask = Message::builder(Performative::Request)
         .sender(AgentId::new("rover").unwrap())
@@ -37,7 +38,7 @@ fn request(number: usize) -> [Payload; 3] {
 }
 
 #[test]
-fn the_accepted_path_allocates_nothing() {
+fn accepted_messages_do_not_allocate() {
     let mut now = SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000);
     let mut monitor = Monitor::observer(Arc::new(Library::standard()));
     let conversations: Vec<[Payload; 3]> = (0..300).map(request).collect();

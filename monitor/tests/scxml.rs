@@ -1,4 +1,4 @@
-//! Files as users write them, and the mistakes in them.
+//! SCXML files of users and their mistakes.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -8,7 +8,7 @@ use fipa_monitor::scxml::{MAX_FILE, Problem, ScxmlError};
 use fipa_monitor::{After, Cancel, Machine, Scope};
 use proptest::prelude::*;
 
-/// A file in the form of fipa_acl, with its blanks, comments and spellings of yes.
+/// A file in the format of fipa_acl, with blanks, comments and several spellings of yes.
 const PLAIN: &str = "<scxml version=\"1.0\" initial=\"1\">
 
     <!-- lifting things -->
@@ -44,7 +44,7 @@ fn only(text: &str) -> (usize, Problem) {
     all.remove(0)
 }
 
-/// A file whose state "1" has this line 3, and which has a final state "2" in line 5.
+/// A file with this line 3 in its state "1", and with a final state "2" in line 5.
 fn with(line: &str) -> String {
     format!(
         "<scxml initial=\"1\" xmlns:f=\"urn:fipa-rs:protocol\">\n<state id=\"1\">\n{line}\n\
@@ -55,7 +55,7 @@ fn with(line: &str) -> String {
 const GOOD: &str = r#"<transition performative="inform" from="a" to="b" target="2"/>"#;
 
 #[test]
-fn the_form_of_fipa_acl_is_read() {
+fn files_in_the_format_of_fipa_acl_are_read() {
     let machine = Machine::read("/robot/protocols/lift", PLAIN).unwrap();
     assert_eq!((machine.name(), machine.title()), ("lift", None));
     assert_eq!(machine.roles(), ["initiator", "B"]);
@@ -83,7 +83,7 @@ fn the_form_of_fipa_acl_is_read() {
 }
 
 #[test]
-fn our_additions_are_read() {
+fn attributes_of_the_namespace_are_read() {
     let text = r#"<?xml version="1.0"?>
 <scxml initial="s" xmlns="http://www.w3.org/2005/07/scxml" xmlns:x="urn:fipa-rs:protocol"
   x:name="own-lift" x:aliases=" lift  heben " x:title="Lifting &amp; more" x:scope="participant" x:cancel="nobody">
@@ -116,7 +116,7 @@ fn our_additions_are_read() {
 }
 
 #[test]
-fn mistakes_have_their_lines() {
+fn mistakes_have_line_numbers() {
     for (line, expected) in [
         (
             r#"<transition performative="inform" from="a" to="b" target="3"/>"#,
@@ -136,19 +136,19 @@ fn mistakes_have_their_lines() {
         ),
         (
             r#"<transition performative="(" from="a" to="b" target="2"/>"#,
-            "performative=\"(\" is no regular expression: error: unclosed group",
+            "performative=\"(\" is not a regular expression: error: unclosed group",
         ),
         (
             r#"<transition performative="inform" from="a" to="b" target="2" f:optional="maybe"/>"#,
-            "optional=\"maybe\" is not understood",
+            "invalid value optional=\"maybe\"; expected yes",
         ),
         (
             r#"<transition f:after="tomorrow" target="2"/>"#,
-            "after=\"tomorrow\" is not understood; expected reply-by",
+            "invalid value after=\"tomorrow\"; expected reply-by",
         ),
         (
             r#"<transition f:after="25h" target="2"/>"#,
-            "after=\"25h\" is not understood",
+            "invalid value after=\"25h\"; expected reply-by",
         ),
         (
             r#"<subprotocol name=".*" from="c"/>"#,
@@ -156,7 +156,7 @@ fn mistakes_have_their_lines() {
         ),
         (
             r#"<transition performative="agree" from="c" to="a" target="2"/>"#,
-            "the first message has several senders: c, a; one role",
+            "the first message has several senders: c, a; only one role",
         ),
         (
             r#"<transition performative="inform|agree" from="a" to="b" target="1"/>"#,
@@ -178,20 +178,20 @@ fn mistakes_have_their_lines() {
 }
 
 #[test]
-fn file_line_and_what_is_wrong_are_told() {
+fn errors_show_file_line_and_problem() {
     let again = GOOD
         .replace("inform", "inform|agree")
         .replace("\"2\"", "\"1\"");
     let ambiguous = format!("{GOOD}\n{again}");
     let far = format!("{GOOD}</state>\n<state id=\"far\" final=\"yes\">");
-    for (text, told) in [
+    for (text, expected) in [
         (
             with(&format!("{GOOD}\n{}", GOOD.replace("\"2\"", "\"done\""))),
             "a/own.scxml:4: there is no state \"done\"",
         ),
         (
             with(&far),
-            "a/own.scxml:4: no transition leads to state \"far\"; remove it, or lead to it",
+            "a/own.scxml:4: no transition leads to state \"far\"; remove it, or add a transition to it",
         ),
         (
             with(&ambiguous),
@@ -203,16 +203,16 @@ fn file_line_and_what_is_wrong_are_told() {
                 "{GOOD}\n<subprotocol name=\".*\" from=\"broker\"/>"
             )),
             "a/own.scxml:4: role \"broker\" is never bound: no message is sent to it, and it does \
-             not begin; send it one, or correct its name",
+             not begin; send it a message, or correct its name",
         ),
     ] {
         let error = Machine::read("a/own.scxml", &text).unwrap_err();
-        assert_eq!(error.to_string(), told);
+        assert_eq!(error.to_string(), expected);
     }
 }
 
 #[test]
-fn what_is_missing_or_left_over() {
+fn missing_and_superfluous_items_are_mistakes() {
     assert_eq!(only("<scxml initial=\"1\"/>"), (1, Problem::NoState));
     assert_eq!(
         only("<statechart/>"),
@@ -265,7 +265,7 @@ fn what_is_missing_or_left_over() {
 }
 
 #[test]
-fn elements_of_others_are_passed_over_and_ours_have_their_place() {
+fn unknown_elements_are_skipped_and_misplaced_elements_are_mistakes() {
     let others = "<datamodel/><onentry><log/><state id=\"no\"/></onentry>";
     let first = "<state id=\"1\">";
     for text in [
@@ -286,13 +286,13 @@ fn elements_of_others_are_passed_over_and_ours_have_their_place() {
 }
 
 #[test]
-fn an_element_of_several_lines_is_in_its_first() {
+fn an_element_of_several_lines_has_the_number_of_its_first() {
     let unknown = |id: &str| Problem::UnknownState {
         id: id.into(),
         nearest: None,
     };
     let bad = GOOD.replace("\"2\"", "\"9\"").replace(' ', "\n");
-    // With and without anything in between, and behind a mark of the byte order.
+    // With and without lines in between, and behind a byte order mark.
     let lines = GOOD.matches(' ').count();
     for (between, second) in [("", 3 + lines), ("\n\n", 5 + lines)] {
         let text = with(&format!("{bad}{between}{bad}\n{GOOD}"));
@@ -304,7 +304,7 @@ fn an_element_of_several_lines_is_in_its_first() {
 }
 
 #[test]
-fn a_near_miss_is_pointed_out() {
+fn an_unknown_state_is_reported_with_a_similar_one() {
     let text = with(GOOD)
         .replace("id=\"2\"", "id=\"agreed\"")
         .replace("target=\"2\"", "target=\"agred\"");
@@ -314,13 +314,13 @@ fn a_near_miss_is_pointed_out() {
         nearest,
     };
     assert_eq!(mistakes(&text)[0], (3, unknown));
-    let told = Machine::read("f", &text).unwrap_err().to_string();
+    let error = Machine::read("f", &text).unwrap_err().to_string();
     let first = "f:3: there is no state \"agred\"; did you mean \"agreed\"?\n";
-    assert!(told.starts_with(first), "{told}");
+    assert!(error.starts_with(first), "{error}");
 }
 
 #[test]
-fn names_are_near_that_differ_in_a_character_or_in_case() {
+fn names_that_differ_in_one_character_or_in_case_are_similar() {
     for (known, written, near) in [
         ("agreed", "AGREED", true),
         ("agreed", "agreeds", true),
@@ -353,7 +353,7 @@ fn names_are_near_that_differ_in_a_character_or_in_case() {
 fn yes_and_no_are_written_in_several_ways() {
     let is_final = |word: &str| {
         let text = with(GOOD).replace("final=\"yes\"", &format!("final=\"{word}\""));
-        // What is not final has to lead on.
+        // A state that is not final needs a transition.
         let text = text.replace("/>\n</scxml>", &format!(">{GOOD}</state>\n</scxml>"));
         let machine = Machine::read("f", &text).unwrap();
         machine.states()[1].is_final()
@@ -367,7 +367,7 @@ fn yes_and_no_are_written_in_several_ways() {
 }
 
 #[test]
-fn optional_steps_must_not_make_two_meanings() {
+fn ambiguity_behind_an_optional_transition_is_a_mistake() {
     let text = with(&format!(
         "{}<transition performative=\"failure\" from=\"a\" to=\"b\" target=\"3\"/></state>\n<state id=\"3\">{GOOD}",
         r#"<transition performative="agree" from="a" to="b" target="3" f:optional="yes"/>"#
@@ -382,12 +382,12 @@ fn optional_steps_must_not_make_two_meanings() {
         (both.state.as_str(), both.performative.as_str()),
         ("1", "inform")
     );
-    // The one from behind the optional step has no line of its own here.
+    // The transition behind the optional one has the line of the state.
     assert_eq!((line, both.other_line), (2, 3));
 }
 
 #[test]
-fn of_transitions_that_are_alike_the_right_line_is_told() {
+fn an_ambiguity_has_the_lines_of_both_transitions() {
     let step = |act: &str, target: &str| {
         format!(r#"<transition performative="{act}" from="a" to="b" target="{target}"/>"#)
     };
@@ -397,27 +397,27 @@ fn of_transitions_that_are_alike_the_right_line_is_told() {
         panic!("{text}");
     };
     assert_eq!((line, both.other_line), (5, 3));
-    // A byte order mark is no part of the text.
+    // A byte order mark is not part of the text.
     let (line, _) = only(&format!("\u{feff}{text}"));
     assert_eq!(line, 5);
 }
 
 #[test]
-fn hostile_files_end_in_errors() {
+fn hostile_files_are_refused() {
     let is = |text: &str, words: &str| {
         let error = Machine::read("f", text).unwrap_err().to_string();
         assert!(error.contains(words), "{words}: {error}");
     };
-    is(&" ".repeat(MAX_FILE + 1), "at most 1048576");
-    is("", "no element is there");
-    is("<!-- nothing else -->", "no element is there");
+    is(&" ".repeat(MAX_FILE + 1), "(maximum 1048576)");
+    is("", "the file has no element");
+    is("<!-- nothing else -->", "the file has no element");
     is(
         "<scxml initial='1'><state id='1'>",
-        "the file ends within an element",
+        "the file ends inside an element",
     );
     is(
         "<!DOCTYPE scxml [<!ENTITY a \"aaaa\">]><scxml initial='&a;'/>",
-        "a document type is not accepted",
+        "document types are not supported",
     );
     is("<scxml initial='&bomb;'/>", "not well-formed XML");
     is("<scxml initial='1'></state></scxml>", "not well-formed XML");
@@ -448,9 +448,9 @@ fn hostile_files_end_in_errors() {
     is(&with(&roles), "more than 32 roles");
 }
 
-/// What is one more than these is refused.
+/// Files at the limits are read, and files beyond them are refused.
 #[test]
-fn files_may_have_as_much_as_the_limits_say() {
+fn files_at_the_limits_are_read() {
     let allowed = |text: &str| drop(Machine::read("f", text).unwrap());
     let refused = |text: &str, words: &str| {
         let error = Machine::read("f", text).unwrap_err().to_string();
@@ -459,7 +459,7 @@ fn files_may_have_as_much_as_the_limits_say() {
     let step = |act: usize, to: &str, target: usize| {
         format!("<transition performative='p{act}' from='a' to='{to}' target='s{target}'/>")
     };
-    // Each state leads to the next one.
+    // Each state has a transition to the next one.
     let chain = |states: usize, steps: usize, more: &str| {
         let inner = |at: usize| {
             let next = (at + 1).min(states - 1);
@@ -493,7 +493,7 @@ fn files_may_have_as_much_as_the_limits_say() {
     let name = |len: usize| format!("name='{}'", "x".repeat(len));
     allowed(&and(&name(256)));
     refused(&and(&name(257)), "more than 256 bytes in an attribute");
-    // Beside `initial`.
+    // In addition to `initial`.
     let many = |count: usize| -> String { (0..count).map(|at| format!(" a{at}='1'")).collect() };
     allowed(&and(&many(63)));
     refused(&and(&many(64)), "more than 64 attributes");
@@ -505,7 +505,7 @@ fn files_may_have_as_much_as_the_limits_say() {
     refused(&deep(33), "more than 32 levels");
     let padded = |len: usize| format!("{good}{}", " ".repeat(len - good.len()));
     allowed(&padded(MAX_FILE));
-    refused(&padded(MAX_FILE + 1), "at most 1048576");
+    refused(&padded(MAX_FILE + 1), "(maximum 1048576)");
 }
 
 #[test]
@@ -537,7 +537,7 @@ fn spans_have_units() {
 }
 
 #[test]
-fn what_means_one_thing_may_be_said_twice() {
+fn overlapping_transitions_to_one_state_are_allowed() {
     let file = |one: [&str; 3], other: [&str; 3]| {
         let step = |[from, to, target]: [&str; 3]| {
             format!("<transition performative='inform' from='{from}' to='{to}' target='{target}'/>")
@@ -553,7 +553,7 @@ fn what_means_one_thing_may_be_said_twice() {
         );
         Machine::read("f", &text)
     };
-    // Leading to the same state, from others, and to others.
+    // The same target, other senders, and other receivers.
     assert!(file(["b", "a", "2"], ["b", "a", "2"]).is_ok());
     assert!(file(["b", "a", "2"], ["c", "a", "3"]).is_ok());
     assert!(file(["b", "a", "2"], ["b", "c", "3"]).is_ok());
@@ -561,9 +561,9 @@ fn what_means_one_thing_may_be_said_twice() {
     assert!(matches!(error.mistakes[0].problem, Problem::Ambiguous(_)));
 }
 
-/// The largest file that the limits allow is read, or refused, before anybody gets impatient.
+/// A reader with quadratic time would take very long for the largest allowed file.
 #[test]
-fn large_files_take_little_time() {
+fn large_files_are_read_in_little_time() {
     use std::fmt::Write as _;
     let mut text = "<scxml initial=\"s0\">".to_owned();
     for state in 0..500 {
@@ -580,7 +580,7 @@ fn large_files_take_little_time() {
     }
     text.push_str("</scxml>");
     let error: ScxmlError = Machine::read("f", &text).unwrap_err();
-    // No role has a name of its own but b, who never begins.
+    // Only role b has a plain name, and it never begins.
     assert!(error.to_string().contains("never bound"), "{error}");
 }
 

@@ -1,10 +1,10 @@
-//! The protocols against the tables of the standard.
+//! Checks the protocols against tables of the standard.
 //!
-//! The tables below are written by hand from FIPA00026 to FIPA00036, not made from the files they
-//! check. `>` is what the initiator says, `<` what the participant says, `!` the passing of the
-//! call's `reply-by`. States whose names begin with F are final. Of two rows that fit, the first
-//! counts; `*` is any performative. What goes for all protocols, not-understood and cancel, is in
-//! [`Walk::by_common_rules`].
+//! The tables below are written by hand from FIPA00026 to FIPA00036, not generated from the files that
+//! they check. `>` is a message of the initiator, `<` a message of the participant, and `!` the
+//! expiration of the call's `reply-by`. States with a name that begins with F are final. Of two rows
+//! that fit, the first counts. `*` is any performative. [`Walk::by_common_rules`] has the rules of all
+//! protocols: not-understood and cancel.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -23,7 +23,7 @@ struct Table {
     cancel: bool,
 }
 
-/// FIPA00026: agree may be left out.
+/// FIPA00026: agree may be skipped.
 const REQUEST: Table = Table {
     name: "fipa-request",
     rows: &[
@@ -54,7 +54,7 @@ const QUERY: Table = Table {
     cancel: true,
 };
 
-/// What the agents of fipa_acl answer besides.
+/// Additional answers of the agents of fipa_acl.
 const ROCK_QUERY: Table = Table {
     name: "query",
     rows: &[
@@ -74,7 +74,7 @@ const ROCK_QUERY: Table = Table {
     cancel: true,
 };
 
-/// FIPA00028: agree may not be left out.
+/// FIPA00028: agree must not be skipped.
 const REQUEST_WHEN: Table = Table {
     name: "fipa-request-when",
     rows: &[
@@ -98,7 +98,7 @@ const PROPOSE: Table = Table {
     cancel: true,
 };
 
-/// FIPA00035: informs repeat.
+/// FIPA00035: inform may be repeated.
 const SUBSCRIBE: Table = Table {
     name: "fipa-subscribe",
     rows: &[
@@ -152,8 +152,8 @@ const ITERATED_CONTRACT_NET: Table = Table {
     cancel: true,
 };
 
-/// FIPA00031, as one bidder sees it. A second call after his bid was accepted says that somebody
-/// else leads.
+/// FIPA00031 for one bidder. A second call after its bid was accepted means that another bidder
+/// leads.
 const ENGLISH: Table = Table {
     name: "fipa-auction-english",
     rows: &[
@@ -164,7 +164,7 @@ const ENGLISH: Table = Table {
         ("2", '>', "inform", "F"),
         ("bid", '>', "accept-proposal", "leads"),
         ("bid", '>', "reject-proposal", "lost"),
-        // What was bid crossed the next call, or the end.
+        // The bid crossed the next call or the end.
         ("bid", '>', "cfp", "2"),
         ("bid", '>', "inform", "F"),
         ("lost", '>', "cfp", "2"),
@@ -179,7 +179,7 @@ const ENGLISH: Table = Table {
     cancel: false,
 };
 
-/// FIPA00032, as one bidder sees it.
+/// FIPA00032 for one bidder.
 const DUTCH: Table = Table {
     name: "fipa-auction-dutch",
     rows: &[
@@ -190,7 +190,7 @@ const DUTCH: Table = Table {
         ("2", '>', "inform", "F"),
         ("3", '>', "accept-proposal", "Fbought"),
         ("3", '>', "reject-proposal", "Flate"),
-        // What was bid crossed the next call, or the end.
+        // The bid crossed the next call or the end.
         ("3", '>', "cfp", "2"),
         ("3", '>', "inform", "F"),
         ("Fbought", '>', "cfp", "2"),
@@ -201,7 +201,7 @@ const DUTCH: Table = Table {
     cancel: false,
 };
 
-/// FIPA00033: in 3, whatever the targets answered is passed on.
+/// FIPA00033: in 3, all answers of the targets are forwarded.
 const BROKERING: Table = Table {
     name: "fipa-brokering",
     rows: &[
@@ -216,7 +216,7 @@ const BROKERING: Table = Table {
     cancel: true,
 };
 
-/// FIPA00034: the answers of the recruited are no part of it.
+/// FIPA00034: the answers of the recruited agents are not part of it.
 const RECRUITING: Table = Table {
     name: "fipa-recruiting",
     rows: &[
@@ -225,7 +225,7 @@ const RECRUITING: Table = Table {
         ("1", '<', "agree", "2"),
         ("2", '<', "failure", "F"),
         ("2", '<', "inform", "Fproxied"),
-        // Nothing more is said between the two, but within the embedded protocol.
+        // Further messages between the two belong to the embedded protocol.
         ("Fproxied", '#', "", "Fproxied"),
     ],
     cancel: true,
@@ -258,7 +258,7 @@ const TABLES: [Table; 13] = [
     CANCEL,
 ];
 
-/// A conversation of its own, and where the table says it is.
+/// A conversation and its state in the table.
 struct Walk<'t> {
     table: &'t Table,
     monitor: Monitor,
@@ -286,7 +286,7 @@ impl<'t> Walk<'t> {
         walk
     }
 
-    /// Goes along a row, which must be right.
+    /// Takes the transition of a row, which must be accepted.
     fn step(&mut self, (_, side, act, to): Row) {
         let before = self.state;
         if side == '!' {
@@ -339,7 +339,7 @@ impl<'t> Walk<'t> {
         rows.find(|row| row.2 == act || row.2 == "*").copied()
     }
 
-    /// What goes for every protocol.
+    /// The rules of every protocol.
     fn by_common_rules(&self, side: char, act: &str) -> bool {
         let ended = self.state.starts_with('F');
         let over = ended && !self.table.rows.iter().any(|row| row.0 == self.state);
@@ -347,24 +347,24 @@ impl<'t> Walk<'t> {
             return false;
         }
         match act {
-            // Anybody may say so at any time; of the last message, only who got it.
+            // Allowed at any time; after the last message, only for its receiver.
             "not-understood" => !ended || side != self.last,
-            // The initiator, before the end or before he could know of it.
+            // Allowed for the initiator before it has received the end.
             "cancel" => self.table.cancel && side == '>' && (!over || self.last == '<'),
             _ => false,
         }
     }
 }
 
-/// The shortest way to each state, for each side that may have spoken last.
-fn ways(table: &Table) -> Vec<Vec<Row>> {
+/// The shortest path to each state, for each side that may have sent the last message.
+fn shortest_paths(table: &Table) -> Vec<Vec<Row>> {
     let mut seen = HashSet::from([("0", '-')]);
-    let mut ways: Vec<Vec<Row>> = vec![Vec::new()];
+    let mut paths: Vec<Vec<Row>> = vec![Vec::new()];
     let mut next = 0;
-    while let Some(way) = ways.get(next).cloned() {
+    while let Some(path) = paths.get(next).cloned() {
         next += 1;
-        let state = way.last().map_or("0", |row| row.3);
-        let last = way.iter().rev().find(|row| row.1 != '!');
+        let state = path.last().map_or("0", |row| row.3);
+        let last = path.iter().rev().find(|row| row.1 != '!');
         for row in table.rows.iter().filter(|row| row.0 == state) {
             let last = match row.1 {
                 '#' => continue,
@@ -372,31 +372,31 @@ fn ways(table: &Table) -> Vec<Vec<Row>> {
                 side => side,
             };
             if seen.insert((row.3, last)) {
-                let mut longer = way.clone();
+                let mut longer = path.clone();
                 longer.push(*row);
-                ways.push(longer);
+                paths.push(longer);
             }
         }
     }
-    ways
+    paths
 }
 
 #[test]
-fn every_performative_in_every_state() {
+fn every_performative_is_checked_in_every_state() {
     let library = Arc::new(Library::standard());
     let mut wrong = 0;
     for table in &TABLES {
-        for way in ways(table) {
+        for path in shortest_paths(table) {
             for side in ['>', '<'] {
                 for act in &Performative::STANDARD {
-                    let mut walk = Walk::along(table, &library, &way);
+                    let mut walk = Walk::along(table, &library, &path);
                     let right = walk.row(side, act.as_str()).is_some()
                         || walk.by_common_rules(side, act.as_str());
                     let (name, state) = (table.name, walk.state);
                     let opened_by_other = state == "0" && side == '<';
                     let verdict = walk.say(side, act);
                     if opened_by_other && walk_begins(table, act) {
-                        // Who speaks first is the initiator, whatever he is called here.
+                        // The sender of the first message is the initiator, whatever its name is.
                         assert!(verdict.is_accepted());
                         continue;
                     }
@@ -417,7 +417,7 @@ fn walk_begins(table: &Table, act: &Performative) -> bool {
 }
 
 #[test]
-fn every_path_to_an_end() {
+fn every_path_to_an_end_is_accepted() {
     let library = Arc::new(Library::standard());
     for table in &TABLES {
         let mut used = HashSet::new();
@@ -435,7 +435,7 @@ fn every_path_to_an_end() {
                 .filter(|row| row.0 == state && row.1 != '#');
             for row in onwards {
                 used.insert((row.0, row.1, row.2));
-                // Every loop up to twice.
+                // Every loop at most twice.
                 let times = path.iter().filter(|other| *other == row).count();
                 if times < 2 && path.len() < 10 {
                     let mut longer = path.clone();
@@ -450,7 +450,7 @@ fn every_path_to_an_end() {
     }
 }
 
-/// Paths to an end, without those on which time passes, for that is everybody's.
+/// Paths to an end without timeouts, which would affect all participants.
 fn timeless_paths(table: &Table) -> Vec<Vec<Row>> {
     let mut found = Vec::new();
     let mut paths = vec![Vec::<Row>::new()];
@@ -470,13 +470,13 @@ fn timeless_paths(table: &Table) -> Vec<Vec<Row>> {
 }
 
 #[test]
-fn each_of_several_participants_goes_its_own_way() {
+fn several_participants_have_independent_states() {
     let library = Arc::new(Library::standard());
     for table in &TABLES {
         let paths = timeless_paths(table);
         let mut walked = 0;
         for (number, first) in paths.iter().enumerate() {
-            // What begins is said to all three at once; each goes on along another path.
+            // The first message goes to all three. Each then takes another path.
             let [second, third] = [1, 3].map(|other| &paths[(number + other) % paths.len()]);
             if first[0] != second[0] || first[0] != third[0] {
                 continue;
@@ -497,20 +497,20 @@ fn each_of_several_participants_goes_its_own_way() {
             };
             say(&mut walk, "ann", &["ben", "cid", "dan"], first[0].2);
             let mut ends = [false; 3];
-            for place in 1..first.len().max(second.len()).max(third.len()) {
-                for (who, path) in [first, second, third].into_iter().enumerate() {
-                    let Some((_, side, act, to)) = path.get(place) else {
+            for at in 1..first.len().max(second.len()).max(third.len()) {
+                for (index, path) in [first, second, third].into_iter().enumerate() {
+                    let Some((_, side, act, to)) = path.get(at) else {
                         continue;
                     };
-                    let peer = ["ben", "cid", "dan"][who];
+                    let peer = ["ben", "cid", "dan"][index];
                     let (from, receiver) = if *side == '>' {
                         ("ann", peer)
                     } else {
                         (peer, "ann")
                     };
                     let (ended, complete) = say(&mut walk, from, &[receiver], act);
-                    ends[who] = to.starts_with('F');
-                    assert_eq!((ended, complete), (ends[who], ends == [true; 3]));
+                    ends[index] = to.starts_with('F');
+                    assert_eq!((ended, complete), (ends[index], ends == [true; 3]));
                 }
             }
         }
@@ -519,19 +519,19 @@ fn each_of_several_participants_goes_its_own_way() {
 }
 
 #[test]
-fn cancelling_and_what_follows() {
+fn a_cancel_ends_or_resumes_every_protocol() {
     let library = Arc::new(Library::standard());
     let [inform, failure, cancel] =
         ["inform", "failure", "cancel"].map(|act| act.parse::<Performative>().unwrap());
     for table in TABLES.iter().filter(|table| table.cancel) {
-        for way in ways(table) {
-            let state = way.last().map_or("0", |row| row.3);
+        for path in shortest_paths(table) {
+            let state = path.last().map_or("0", |row| row.3);
             if state == "0" || state.starts_with('F') {
                 continue;
             }
             let name = table.name;
-            // It worked: nothing more comes, but for what may have been under way.
-            let mut walk = Walk::along(table, &library, &way);
+            // The cancel succeeds: only crossing messages may follow.
+            let mut walk = Walk::along(table, &library, &path);
             assert!(walk.say('>', &cancel).is_accepted(), "{name} {state}");
             assert!(!walk.say('>', &cancel).is_accepted(), "{name} {state}");
             let verdict = walk.say('<', &inform);
@@ -542,8 +542,8 @@ fn cancelling_and_what_follows() {
             for act in &Performative::STANDARD {
                 assert!(!walk.say('>', act).is_accepted(), "{name} {state} {act}");
             }
-            // It did not: the protocol goes on where it was.
-            let mut walk = Walk::along(table, &library, &way);
+            // The cancel fails: the protocol continues in its state.
+            let mut walk = Walk::along(table, &library, &path);
             walk.say('>', &cancel);
             assert!(walk.say('<', &failure).is_accepted(), "{name} {state}");
             let onwards = table.rows.iter().filter(|row| row.0 == state);

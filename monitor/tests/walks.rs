@@ -1,7 +1,7 @@
-//! Random walks: the monitor and the reference hear the same messages and say the same.
+//! Random walks: the monitor and the reference get the same messages and have the same verdicts.
 //!
-//! `FIPA_WALK_STEPS` sets how many messages each seed hears, `FIPA_WALK_SEEDS` how many seeds there
-//! are, `FIPA_WALK_SEED` repeats one.
+//! `FIPA_WALK_STEPS` sets the number of messages for each seed, `FIPA_WALK_SEEDS` the number of seeds.
+//! `FIPA_WALK_SEED` repeats one seed.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 #![expect(clippy::expect_used, reason = "likewise")]
@@ -14,7 +14,7 @@ use std::time::{Duration, SystemTime};
 use fastrand::Rng;
 use fipa_acl::{Performative, Time};
 use fipa_monitor::{Header, Library, Limits, Machine, Monitor, State, Verdict};
-use reference::{Reference, Says, Words, matches, options};
+use reference::{Reference, ReferenceVerdict, Words, matches, options};
 
 static ACTS: LazyLock<Vec<&'static str>> = LazyLock::new(|| {
     let names = Performative::STANDARD.iter();
@@ -23,7 +23,7 @@ static ACTS: LazyLock<Vec<&'static str>> = LazyLock::new(|| {
 
 const AGENTS: [&str; 6] = ["ann", "ben", "cid", "dan", "host-mts", "arm_.*"];
 
-/// The form of fipa_acl, with all it can do, and our additions in one.
+/// Files with all features of the format of fipa_acl and with the attributes of the namespace.
 const OWN: [(&str, &str); 3] = [
     (
         "plain",
@@ -132,14 +132,14 @@ impl Walk<'_> {
         words
     }
 
-    /// Mostly what a state allows, for else conversations would never go on.
+    /// Mostly messages that a state allows. Otherwise conversations would not proceed.
     fn make_fitting(&mut self, words: &mut Words) {
         let Some((machine, initiators, talks)) = self.reference.states(&words.id) else {
             let machines: Vec<&Machine> = self.library.iter().collect();
             let machine = self.pick(&machines);
             words.protocol = Some(machine.name().to_owned());
             let mut first = options(machine, machine.initial().id());
-            // Now and then an answer in what others have begun.
+            // Sometimes an answer in a conversation of other agents.
             if self.rng.u8(..) < 25 {
                 first = machine
                     .states()
@@ -152,7 +152,7 @@ impl Walk<'_> {
             words.act = self.act(first.performative());
             return;
         };
-        // Who began, or somebody else to whom replies go.
+        // The initiator, or another agent that receives replies.
         let initiator = match self.rng.bool() {
             true => initiators[0],
             false => self.pick(&initiators),
@@ -163,7 +163,7 @@ impl Walk<'_> {
                 .iter()
                 .any(|state| !state.subprotocols().is_empty())
         {
-            // One of some protocols within, begun by whomever or going on.
+            // A message of an embedded protocol, from any agent.
             let inner = self.pick(&["fipa-request", "fipa-query", "fipa-contract-net", "plain"]);
             words.protocol = Some(inner.to_owned());
             let inner = self.library.find(inner).unwrap();
@@ -262,7 +262,7 @@ fn at(ms: u64) -> SystemTime {
     SystemTime::UNIX_EPOCH + Duration::from_millis(ms)
 }
 
-/// How many verdicts were what.
+/// Runs a walk. Returns the numbers of accepted messages, violations and unchecked messages.
 fn walk(seed: u64, steps: u64) -> [u64; 3] {
     let library = library();
     let shared = Arc::new(library.clone());
@@ -272,7 +272,7 @@ fn walk(seed: u64, steps: u64) -> [u64; 3] {
         Some(name) => Monitor::agent(shared, name),
         None => Monitor::observer(shared),
     };
-    // What the monitor forgets by itself is tested elsewhere.
+    // Other tests cover the removal of conversations.
     let mut limits = Limits::default();
     limits.ended = Duration::from_secs(1 << 40);
     limits.idle = limits.ended;
@@ -287,9 +287,9 @@ fn walk(seed: u64, steps: u64) -> [u64; 3] {
     };
     let mut counts = [0; 3];
     let mut ids: Vec<u64> = (0..8).collect();
-    let mut heard: Vec<String> = Vec::new();
+    let mut log: Vec<String> = Vec::new();
     for step in 0..steps {
-        // Conversations are left for new ones; what is left is never heard of again.
+        // Conversations are replaced by new ones and get no further messages.
         if walk.rng.u8(..) < 12 {
             let place = walk.rng.usize(..ids.len());
             walk.reference.forget(&format!("c{}", ids[place]));
@@ -298,37 +298,37 @@ fn walk(seed: u64, steps: u64) -> [u64; 3] {
         walk.now += walk.rng.u64(0..1_500);
         let id = format!("c{}", walk.pick(&ids));
         let words = walk.words(id);
-        let expected = walk.reference.hear(&words, walk.now);
+        let expected = walk.reference.check(&words, walk.now);
         let header = header(&words);
         let verdict = monitor.check(&header, at(walk.now));
-        let said = match &verdict {
+        let actual = match &verdict {
             Verdict::Accepted(right) => {
                 counts[0] += 1;
                 let flags = [right.opened, right.ended, right.complete, right.late];
-                Says::Right(right.state.to_owned(), flags)
+                ReferenceVerdict::Accepted(right.state.to_owned(), flags)
             }
             Verdict::Violation(violation) => {
                 counts[1] += 1;
-                Says::Wrong(violation.kind.as_str())
+                ReferenceVerdict::Violation(violation.kind.as_str())
             }
             _ => {
                 counts[2] += 1;
-                Says::Nothing
+                ReferenceVerdict::Unchecked
             }
         };
-        heard.push(format!("{words:?} -> {said:?}"));
-        if said != expected {
-            let own: Vec<&String> = heard
+        log.push(format!("{words:?} -> {actual:?}"));
+        if actual != expected {
+            let own: Vec<&String> = log
                 .iter()
                 .filter(|line| line.contains(&format!("id: {:?}", words.id)))
                 .collect();
             panic!(
-                "seed {seed}, step {step}: {said:?}, the reference says {expected:?}\n{:#?}\n{verdict:?}",
+                "seed {seed}, step {step}: {actual:?}, the reference expects {expected:?}\n{:#?}\n{verdict:?}",
                 &own[own.len().saturating_sub(12)..]
             );
         }
-        if heard.len() > 4_000 {
-            heard.drain(..2_000);
+        if log.len() > 4_000 {
+            log.drain(..2_000);
         }
         if step % 1_000 == 0 && walk.rng.bool() {
             monitor.handle_timeout(at(walk.now));

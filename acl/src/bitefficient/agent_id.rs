@@ -1,5 +1,6 @@
 //! Agent identifiers in a bit-efficient message.
 
+use crate::bitefficient::code;
 use crate::bitefficient::expression::expression;
 use crate::bitefficient::notes::{self, Notes};
 use crate::bitefficient::reader::Reader;
@@ -9,9 +10,9 @@ use crate::view::{AgentIdView, AgentIds, Encoding, List, Part, check_name};
 use crate::word::is_token;
 use crate::{AgentId, Text};
 
-const CLAUSE: &str = "FIPA00069 2.1 AID";
+const CLAUSE: &str = "FIPA00069 2.2 AgentIdentifier";
 
-/// The next of the identifiers in checked bytes, one behind the other.
+/// Reads the next of the consecutive identifiers in checked bytes.
 pub(crate) fn next<'a>(rest: &mut &'a [u8]) -> Option<AgentIdView<'a>> {
     (!rest.is_empty()).then_some(())?;
     let mut reader = Reader::new(rest);
@@ -20,7 +21,7 @@ pub(crate) fn next<'a>(rest: &mut &'a [u8]) -> Option<AgentIdView<'a>> {
     agent
 }
 
-/// The next part of a checked identifier.
+/// Reads the next part of a checked identifier.
 pub(crate) fn next_part<'a>(rest: &mut &'a [u8], list: &mut List) -> Option<Part<'a>> {
     let mut reader = Reader::new(rest);
     let part = part(&mut reader, list, AgentId::MAX_DEPTH).ok().flatten();
@@ -28,34 +29,34 @@ pub(crate) fn next_part<'a>(rest: &mut &'a [u8], list: &mut List) -> Option<Part
     part
 }
 
-/// Reads an agent identifier, whose resolvers may be nested `depth` deep.
+/// Reads an agent identifier with resolvers nested at most `depth` deep.
 #[inline(always)]
 pub(crate) fn agent_id<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     depth: usize,
 ) -> Result<AgentIdView<'a>, DecodeError> {
-    // Whoever wants every part explained has to go the long way.
-    if N::SILENT
+    // The fast path takes no notes.
+    if !N::ENABLED
         && let Some(name) = reader.short_agent_name()
     {
-        let (name, end) = (Text::plain(name), &[0x01]);
+        let (name, end) = (Text::plain(name), &[code::END]);
         return Ok(AgentIdView::new(name, Encoding::BitEfficient, end));
     }
-    other_agent_id(reader, depth)
+    agent_id_slow(reader, depth)
 }
 
 #[inline(never)]
-fn other_agent_id<'a, N: Notes>(
+fn agent_id_slow<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     depth: usize,
 ) -> Result<AgentIdView<'a>, DecodeError> {
-    let code = reader.byte(CLAUSE, "an agent identifier")?;
-    if code != 0x02 {
-        return Err(reader.unexpected(CLAUSE, code, "an agent identifier"));
+    let first = reader.byte(CLAUSE, "an agent identifier")?;
+    if first != code::agent::BEGIN {
+        return Err(reader.unexpected(CLAUSE, first, "an agent identifier"));
     }
     let offset = reader.offset();
     let name = Text::plain(word(reader, "agent name")?);
-    check_name(&name, "agent name").map_err(|wrong| DecodeError::new(offset, CLAUSE, wrong))?;
+    check_name(&name, "agent name").map_err(|problem| DecodeError::new(offset, CLAUSE, problem))?;
     reader.note(|| format!("agent identifier: name {}", notes::quoted(&name.as_str())));
     reader.notes().deeper();
     let start = reader.position();
@@ -67,22 +68,22 @@ fn other_agent_id<'a, N: Notes>(
     Ok(AgentIdView::new(name, Encoding::BitEfficient, parts))
 }
 
-/// Reads the agent identifiers of a set up to its end.
+/// Reads the agent identifiers of a set, including its end.
 #[inline(always)]
 pub(crate) fn agent_ids<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     set: &'static str,
 ) -> Result<AgentIds<'a>, DecodeError> {
-    if N::SILENT
+    if !N::ENABLED
         && let Some(members) = reader.short_agent_names()
     {
         return Ok(AgentIds::new(Encoding::BitEfficient, members));
     }
-    other_agent_ids(reader, set)
+    agent_ids_slow(reader, set)
 }
 
 #[inline(never)]
-fn other_agent_ids<'a, N: Notes>(
+fn agent_ids_slow<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     set: &'static str,
 ) -> Result<AgentIds<'a>, DecodeError> {
@@ -90,8 +91,8 @@ fn other_agent_ids<'a, N: Notes>(
     Ok(AgentIds::new(Encoding::BitEfficient, members))
 }
 
-/// The next part of an identifier, whose resolvers may be nested `depth` deep, or `None` at its
-/// end.
+/// Reads the next part of an identifier with resolvers nested at most `depth` deep. Returns `None`
+/// at its end.
 fn part<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     list: &mut List,
@@ -110,10 +111,10 @@ fn part<'a, N: Notes>(
             List::Outside => {}
         }
         match reader.byte(CLAUSE, "an agent identifier")? {
-            0x01 => return Ok(None),
-            0x02 => list.begin(List::Addresses, reader),
-            0x03 => list.begin(List::Resolvers, reader),
-            0x04 => {
+            code::END => return Ok(None),
+            code::agent::ADDRESSES => list.begin(List::Addresses, reader),
+            code::agent::RESOLVERS => list.begin(List::Resolvers, reader),
+            code::agent::USER_DEFINED => {
                 let (name, value) = user_defined(reader)?;
                 return Ok(Some(Part::UserDefined(name, value)));
             }
@@ -122,7 +123,7 @@ fn part<'a, N: Notes>(
     }
 }
 
-/// Both bit-efficient formats begin lists with a code, and end them with 01.
+/// Both bit-efficient encodings begin a list with its code and end it with [`code::END`].
 impl List {
     pub(crate) fn begin<N: Notes>(&mut self, list: Self, reader: &mut Reader<'_, N>) {
         *self = list;
@@ -130,9 +131,9 @@ impl List {
         reader.notes().deeper();
     }
 
-    /// Leaves the list if it ends here.
+    /// Leaves the list if the next byte ends it.
     pub(crate) fn end<N: Notes>(&mut self, reader: &mut Reader<'_, N>) {
-        if *self != Self::Outside && reader.take_if(0x01) {
+        if *self != Self::Outside && reader.take_if(code::END) {
             reader.notes().shallower();
             reader.note(|| format!("end of {}", self.name()));
             *self = Self::Outside;
@@ -165,11 +166,11 @@ pub(crate) fn word<'a, N: Notes>(
 ) -> Result<&'a [u8], DecodeError> {
     match reader.short_word() {
         Some((word, _)) => Ok(word),
-        None => other_word(reader, what),
+        None => word_slow(reader, what),
     }
 }
 
-/// Reads a `BinWord`, and says whether it is one but for its first character.
+/// Reads a `BinWord`. Returns whether it is a word apart from its first character.
 #[inline(always)]
 pub(crate) fn token<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
@@ -178,7 +179,7 @@ pub(crate) fn token<'a, N: Notes>(
     let (word, is_token) = match reader.short_word() {
         Some((word, kind)) => (word, !word.is_empty() && Kind::is_token(kind)),
         None => {
-            let word = other_word(reader, what)?;
+            let word = word_slow(reader, what)?;
             (word, is_token(word))
         }
     };
@@ -186,19 +187,19 @@ pub(crate) fn token<'a, N: Notes>(
 }
 
 #[inline(never)]
-fn other_word<'a, N: Notes>(
+fn word_slow<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     what: &'static str,
 ) -> Result<&'a [u8], DecodeError> {
-    const CLAUSE: &str = "FIPA00069 2.1 BinWord";
+    const CLAUSE: &str = "FIPA00069 2.2 BinWord";
     match reader.byte(CLAUSE, what)? {
-        0x10 => reader.plain(CLAUSE, what),
-        0x11 => Err(reader.error(CLAUSE, Problem::CodeTable)),
+        code::token::WORD => reader.plain(CLAUSE, what),
+        code::token::WORD_INDEX => Err(reader.error(CLAUSE, Problem::CodeTable)),
         other => Err(reader.unexpected(CLAUSE, other, what)),
     }
 }
 
-/// Reads name and value of a user-defined parameter; the name comes without `X-`.
+/// Reads the name, without its `X-`, and the value of a user-defined parameter.
 #[inline(never)]
 pub(crate) fn user_defined<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
@@ -211,7 +212,7 @@ pub(crate) fn user_defined<'a, N: Notes>(
     }
     let name = Text::plain(name);
     reader.note(|| format!("user-defined parameter {}", notes::quoted(&name.as_str())));
-    // JADE writes an empty value as a lone 00, which is no expression.
+    // JADE writes an empty value as a single 00, which is not an expression.
     if reader.take_if(0x00) {
         reader.note(|| "user-defined value: none, as JADE writes it".to_owned());
         return Ok((name, Text::plain(b"")));
@@ -221,7 +222,7 @@ pub(crate) fn user_defined<'a, N: Notes>(
     Ok((name, value))
 }
 
-/// The name of a user-defined parameter without its `X-`, which not every peer writes.
+/// Removes the `X-` of a user-defined name. Some peers write none.
 pub(crate) fn without_x(name: &[u8]) -> &[u8] {
     match name {
         [b'X' | b'x', b'-', rest @ ..] if !rest.is_empty() => rest,
@@ -234,7 +235,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn all_parts_in_any_order() {
+    fn parts_are_read_in_any_order() {
         let bytes = b"\x02\x10a\0\x04\x10X-p\0\x12\x80\x03\x02\x10r\0\x01\x01\x02\x10u:1\0\x10u:2\0\x01\x01";
         let mut reader = Reader::new(bytes);
         let view = agent_id(&mut reader, 16).unwrap();
@@ -252,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn resolvers_are_not_followed_for_ever() {
+    fn resolvers_nested_too_deep_are_refused() {
         let nested = |depth: usize| {
             let mut bytes = b"\x02\x10a\0\x03".repeat(depth);
             bytes.extend_from_slice(b"\x02\x10a\0\x01");
@@ -266,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn names_and_addresses_must_be_there() {
+    fn missing_names_and_empty_addresses_are_refused() {
         for bytes in [
             &b"\x02\x10\0\x01"[..],
             b"\x02\x10a\0\x02\x10\0\x01\x01",

@@ -1,51 +1,58 @@
-//! Messages with dynamic code tables (FIPA00069 2.4): read with a table that the caller owns, never
+//! Messages with dynamic code tables (FIPA00069 2.3): read with a table that the caller owns, never
 //! written.
 //!
-//! A message with tables is first written out as the same message without them; the one reader that
-//! there is then reads that. So nothing else has to know of tables.
+//! [`Expander`] rewrites a message with a table as the same message without one, which the usual
+//! reader then reads. So no other module handles tables.
 
 use std::collections::{BTreeSet, HashMap};
 
 use bytes::Bytes;
 
+use crate::bitefficient::code::{self, TokenKind, closes_level, opens_level};
 use crate::bitefficient::expression::MAX_EXPRESSION_DEPTH;
 use crate::bitefficient::reader::Reader;
-use crate::bitefficient::write::{Out, write_len};
+use crate::bitefficient::write::{Output, write_len};
 use crate::error::{DecodeError, Problem};
 use crate::{AgentId, Message, Payload};
 
-const CLAUSE: &str = "FIPA00069 2.4 code tables";
-const MESSAGE: &str = "FIPA00069 2.1 Message";
+const CLAUSE: &str = "FIPA00069 2.3 code tables";
+const MESSAGE: &str = "FIPA00069 2.2 Message";
 
-/// The words and strings that messages of one peer refer to by number (FIPA00069 2.4).
+/// The words and strings that messages of one peer refer to by index (FIPA00069 2.3).
 ///
-/// Both sides have to agree beforehand that they use tables, and how large they are. A table serves
-/// one direction of one connection: it fills with what the messages say, so all of them have to be
-/// read with it, in order ([`Message::decode_with_table`]).
+/// Both sides must agree beforehand to use tables, and on their size. A table serves one direction
+/// of one connection. Each message may add entries, so all messages must be read with the table,
+/// in order ([`Message::decode_with_table`]).
 #[derive(Debug, Clone)]
 pub struct CodeTable {
     size: usize,
     entries: Vec<Option<Entry>>,
     codes: HashMap<Bytes, u16>,
     free: BTreeSet<u16>,
-    /// Counts the uses of entries.
+    /// Number of uses of entries so far.
     clock: u64,
 }
 
 #[derive(Debug, Clone)]
 struct Entry {
     text: Bytes,
+    /// Value of the clock at the last use.
     used: u64,
 }
 
 impl CodeTable {
-    /// Longest text of an entry, in bytes.
+    /// Maximum length of the text of an entry, in bytes.
     pub const MAX_TEXT: usize = AgentId::MAX_NAME;
 
-    /// Most bytes that a message may have without its content once all numbers are replaced.
+    /// Maximum length of a message without its content, in bytes, after every index is replaced by
+    /// its text.
     pub const MAX_MESSAGE: usize = 1 << 20;
 
-    /// An empty table for 2 to the power of `bits` entries. Only 8 to 16 bits are possible.
+    /// Creates an empty table for 2 to the power of `bits` entries. Returns `None` unless `bits` is
+    /// from 8 to 16.
+    ///
+    /// FIPA00069 2.3: "The size of the code table, if used, is between 256 (2^8) and 65536 (2^16)
+    /// entries."
     #[must_use]
     pub fn new(bits: u8) -> Option<Self> {
         (8..=16).contains(&bits).then(|| Self {
@@ -57,19 +64,19 @@ impl CodeTable {
         })
     }
 
-    /// How many entries there are.
+    /// Number of entries.
     #[must_use]
     pub fn len(&self) -> usize {
         self.codes.len()
     }
 
-    /// Whether there are none.
+    /// Whether the table has no entries.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.codes.is_empty()
     }
 
-    /// Forgets all entries: what both sides have to do when they are out of step.
+    /// Removes all entries. Both sides must do so when their tables differ.
     pub fn clear(&mut self) {
         self.entries.clear();
         self.codes.clear();
@@ -83,7 +90,10 @@ impl CodeTable {
         Some(entry.text.clone())
     }
 
-    /// Enters a text under the lowest number that is free.
+    /// Adds a text.
+    ///
+    /// FIPA00069 2.3: "whenever a new entry is added to the code table, the smallest available code
+    /// number is allocated to it."
     fn insert(&mut self, text: &[u8]) {
         let used = self.tick();
         if let Some(known) = self.codes.get(text) {
@@ -93,7 +103,7 @@ impl CodeTable {
             return;
         }
         if self.codes.len() >= self.size {
-            self.make_room();
+            self.evict();
         }
         let text = Bytes::copy_from_slice(text);
         let entry = Some(Entry {
@@ -102,8 +112,8 @@ impl CodeTable {
         });
         let code = match self.free.pop_first() {
             Some(code) => {
-                if let Some(place) = self.entries.get_mut(usize::from(code)) {
-                    *place = entry;
+                if let Some(slot) = self.entries.get_mut(usize::from(code)) {
+                    *slot = entry;
                 }
                 code
             }
@@ -117,8 +127,11 @@ impl CodeTable {
         self.codes.insert(text, code);
     }
 
-    /// Drops an eighth of the entries, those that were not used for longest.
-    fn make_room(&mut self) {
+    /// Removes an eighth of the entries, the least recently used ones.
+    ///
+    /// FIPA00069 2.3: "the sender first removes size>>3 entries from the code table using a Least
+    /// Recently Used (LRU) algorithm and then adds a new entry to code table."
+    fn evict(&mut self) {
         let mut by_use: Vec<(u64, u16)> = Vec::with_capacity(self.codes.len());
         for code in self.codes.values() {
             if let Some(Some(entry)) = self.entries.get(usize::from(*code)) {
@@ -127,8 +140,8 @@ impl CodeTable {
         }
         by_use.sort_unstable();
         for (_, code) in by_use.into_iter().take(self.size >> 3) {
-            if let Some(place) = self.entries.get_mut(usize::from(code))
-                && let Some(entry) = place.take()
+            if let Some(slot) = self.entries.get_mut(usize::from(code))
+                && let Some(entry) = slot.take()
             {
                 self.codes.remove(&entry.text);
                 self.free.insert(code);
@@ -143,15 +156,19 @@ impl CodeTable {
 }
 
 impl Message {
-    /// Like [`decode`](Self::decode), and reads bit-efficient messages with code tables too.
+    /// Decodes a message like [`decode`](Self::decode). Bit-efficient messages with code tables are
+    /// accepted too.
     ///
     /// # Errors
-    /// When the payload is not one whole message, or does not fit the table; offsets are then those
-    /// of the message as it would be without tables. An error in a message with tables
-    /// [clears](CodeTable::clear) the table, because nobody knows what the peer has in its own.
+    /// The payload is not one whole message, or refers to an entry that the table does not have.
+    /// For a message with code tables, offsets refer to the same message without them. An error in
+    /// such a message [clears](CodeTable::clear) the table, because it may differ from the table of
+    /// the peer.
     pub fn decode_with_table(payload: &Payload, table: &mut CodeTable) -> Result<Self> {
-        let Some(id @ (0xfb | 0xfc)) = payload.head.first().copied() else {
-            return Self::decode(payload);
+        let updated = match payload.head.first() {
+            Some(&code::message_id::TABLE_UPDATED) => true,
+            Some(&code::message_id::TABLE_UNCHANGED) => false,
+            _ => return Self::decode(payload),
         };
         let whole = payload.to_bytes();
         let expander = Expander {
@@ -159,7 +176,7 @@ impl Message {
             whole: &whole,
             out: Vec::with_capacity(whole.len().min(CodeTable::MAX_MESSAGE)),
             table,
-            inserts: id == 0xfb,
+            inserts: updated,
             split: None,
             limit: CodeTable::MAX_MESSAGE,
         };
@@ -171,17 +188,29 @@ impl Message {
     }
 }
 
+/// Rewrites a message with a code table as the same message without one.
 struct Expander<'a> {
     reader: Reader<'a>,
     whole: &'a Bytes,
     out: Vec<u8>,
     table: &'a mut CodeTable,
-    /// What is new enters the table.
+    /// Whether new texts enter the table.
     inserts: bool,
-    /// The content, once it was met, and where it stands in `out`.
+    /// The content and its offset in `out`, once it was read.
     split: Option<(Bytes, usize)>,
-    /// How long `out` may become.
+    /// Maximum length of `out`.
     limit: usize,
+}
+
+/// The parenthesis that a token is fused with.
+#[derive(Clone, Copy)]
+enum Level {
+    /// No parenthesis.
+    Same,
+    /// An opening parenthesis.
+    Opened,
+    /// A closing parenthesis.
+    Closed,
 }
 
 type Result<T> = std::result::Result<T, DecodeError>;
@@ -190,39 +219,38 @@ impl Expander<'_> {
     fn message(mut self) -> Result<Payload> {
         self.reader.byte(MESSAGE, "a message")?;
         let version = self.reader.byte(MESSAGE, "the version")?;
-        self.out.slice(&[0xfa, version]);
-        if self.copy(MESSAGE, "the performative")? == 0x00 {
+        self.out.slice(&[code::message_id::PLAIN, version]);
+        if self.copy(MESSAGE, "the performative")? == code::USER_DEFINED_PERFORMATIVE {
             self.word()?;
         }
         loop {
             match self.copy(MESSAGE, "a message")? {
-                0x00 => {
-                    self.word()?;
-                    // An empty value, as JADE writes it.
-                    if self.reader.take_if(0x00) {
-                        self.out.byte(0x00);
-                    } else {
-                        self.expression()?;
-                    }
+                code::message::USER_DEFINED => self.user_defined()?,
+                code::END => break,
+                code::message::SENDER => self.agent(AgentId::MAX_DEPTH)?,
+                code::message::RECEIVER | code::message::REPLY_TO => {
+                    self.agents(AgentId::MAX_DEPTH)?;
                 }
-                0x01 => break,
-                0x02 => self.agent(AgentId::MAX_DEPTH)?,
-                0x03 | 0x08 => self.agents(AgentId::MAX_DEPTH)?,
-                0x04 => self.content()?,
-                0x05 | 0x07 | 0x09 | 0x0a | 0x0b | 0x0d => self.expression()?,
-                0x06 => {
+                code::message::CONTENT => self.content()?,
+                code::message::REPLY_WITH
+                | code::message::IN_REPLY_TO
+                | code::message::LANGUAGE
+                | code::message::ENCODING
+                | code::message::ONTOLOGY
+                | code::message::CONVERSATION_ID => self.expression()?,
+                code::message::REPLY_BY => {
                     let start = self.reader.position();
-                    self.reader.date_time("FIPA00069 2.3 BinDateTime")?;
+                    self.reader.date_time("FIPA00069 2.2 BinDateTimeToken")?;
                     self.out.slice(self.reader.since(start));
                 }
-                0x0c => self.word()?,
+                code::message::PROTOCOL => self.word()?,
                 other => {
                     let expected = "a parameter of a message";
                     return Err(self.reader.unexpected(MESSAGE, other, expected));
                 }
             }
         }
-        // What is behind the end is for the reader to refuse.
+        // The reader refuses bytes behind the end.
         self.out.slice(self.reader.rest());
         let out = Bytes::from(self.out);
         Ok(match self.split {
@@ -243,51 +271,36 @@ impl Expander<'_> {
     }
 
     fn agents(&mut self, depth: usize) -> Result<()> {
-        while !self.reader.take_if(0x01) {
-            if self.copy(CLAUSE, "an agent identifier")? != 0x02 {
-                let problem = Problem::NotAWord("agent identifier");
-                return Err(self.reader.error(MESSAGE, problem));
-            }
-            self.parts_of_agent(depth)?;
+        while !self.reader.take_if(code::END) {
+            self.agent(depth)?;
         }
-        self.out.byte(0x01);
+        self.out.byte(code::END);
         Ok(())
     }
 
     fn agent(&mut self, depth: usize) -> Result<()> {
-        if self.copy(CLAUSE, "an agent identifier")? != 0x02 {
+        const AID: &str = "FIPA00069 2.2 AgentIdentifier";
+        if self.copy(CLAUSE, "an agent identifier")? != code::agent::BEGIN {
             let problem = Problem::NotAWord("agent identifier");
             return Err(self.reader.error(MESSAGE, problem));
         }
-        self.parts_of_agent(depth)
-    }
-
-    fn parts_of_agent(&mut self, depth: usize) -> Result<()> {
-        const AID: &str = "FIPA00069 2.1 AID";
         self.word()?;
         loop {
             match self.copy(AID, "an agent identifier")? {
-                0x01 => return Ok(()),
-                0x02 => {
-                    while !self.reader.take_if(0x01) {
+                code::END => return Ok(()),
+                code::agent::ADDRESSES => {
+                    while !self.reader.take_if(code::END) {
                         self.word()?;
                     }
-                    self.out.byte(0x01);
+                    self.out.byte(code::END);
                 }
-                0x03 => {
+                code::agent::RESOLVERS => {
                     let Some(depth) = depth.checked_sub(1) else {
                         return Err(self.reader.error(AID, Problem::TooDeep("resolvers")));
                     };
                     self.agents(depth)?;
                 }
-                0x04 => {
-                    self.word()?;
-                    if self.reader.take_if(0x00) {
-                        self.out.byte(0x00);
-                    } else {
-                        self.expression()?;
-                    }
-                }
+                code::agent::USER_DEFINED => self.user_defined()?,
                 other => {
                     let expected = "a part of an agent identifier";
                     return Err(self.reader.unexpected(AID, other, expected));
@@ -296,21 +309,34 @@ impl Expander<'_> {
         }
     }
 
-    /// Content never enters the table (FIPA00069 2.1, note 9), but may be found in it.
+    fn user_defined(&mut self) -> Result<()> {
+        self.word()?;
+        // JADE writes an empty value as a single 00.
+        if self.reader.take_if(0x00) {
+            self.out.byte(0x00);
+            return Ok(());
+        }
+        self.expression()
+    }
+
+    /// Copies the content, which never enters the table. A reference to an entry is accepted.
+    ///
+    /// FIPA00069 2.4, note 9: "None of the actual content of the message (the information contained
+    /// in the content parameter of the ACL message) is coded nor are any of its components are
+    /// added to a code table."
     fn content(&mut self) -> Result<()> {
-        const CONTENT: &str = "FIPA00069 2.1 BinString";
-        let code = self.reader.byte(CONTENT, "content")?;
-        let len = match code {
-            0x16 => self.reader.u8_len(CONTENT)?,
-            0x17 => self.reader.u16_len(CONTENT)?,
-            0x19 => self.reader.u32_len(CONTENT)?,
-            0x14 => {
+        const CONTENT: &str = "FIPA00069 2.2 BinString";
+        let len = match self.reader.byte(CONTENT, "content")? {
+            code::token::LEN8 => self.reader.u8_len(CONTENT)?,
+            code::token::LEN16 => self.reader.u16_len(CONTENT)?,
+            code::token::LEN32 => self.reader.u32_len(CONTENT)?,
+            code::token::STRING => {
                 let text = self.reader.until_nul(CONTENT, "content")?;
-                self.out.framed([0x14], text, [0x00]);
+                self.out.framed([code::token::STRING], text, [0x00]);
                 self.limit += text.len();
                 return Ok(());
             }
-            code => return self.expression_of(code, false),
+            first => return self.expression_of(first, false),
         };
         let content = self.reader.bytes(len, CONTENT, "content")?;
         write_len(len, &mut self.out);
@@ -324,21 +350,21 @@ impl Expander<'_> {
     }
 
     fn word(&mut self) -> Result<()> {
-        let code = self.reader.byte(CLAUSE, "a word")?;
-        if !matches!(code, 0x10 | 0x11) {
-            return Err(self.reader.unexpected(CLAUSE, code, "a word"));
+        let first = self.reader.byte(CLAUSE, "a word")?;
+        if !matches!(first, code::token::WORD | code::token::WORD_INDEX) {
+            return Err(self.reader.unexpected(CLAUSE, first, "a word"));
         }
-        self.token(0x10, code, self.inserts)
+        self.token(Level::Same, first, self.inserts)
     }
 
     fn expression(&mut self) -> Result<()> {
-        let mut code = self.reader.byte(CLAUSE, "an expression")?;
-        // An opaque expression: the string that follows is it.
-        if code == 0xff {
-            self.out.byte(0xff);
-            code = self.reader.byte(CLAUSE, "an expression")?;
+        let mut first = self.reader.byte(CLAUSE, "an expression")?;
+        // An opaque expression: the string is its text.
+        if first == code::token::OPAQUE {
+            self.out.byte(first);
+            first = self.reader.byte(CLAUSE, "an expression")?;
         }
-        self.expression_of(code, self.inserts)
+        self.expression_of(first, self.inserts)
     }
 
     fn expression_of(&mut self, first: u8, inserts: bool) -> Result<()> {
@@ -346,14 +372,14 @@ impl Expander<'_> {
         let mut code = first;
         loop {
             let level = match code {
-                0x10..=0x19 => 0x10,
-                0x60 | 0x70..=0x79 => {
+                code::token::WORD..=code::token::LEN32 => Level::Same,
+                code if opens_level(code) => {
                     depth += 1;
-                    0x70
+                    Level::Opened
                 }
-                0x40 | 0x50..=0x59 => {
+                code if closes_level(code) => {
                     depth = depth.saturating_sub(1);
-                    0x50
+                    Level::Closed
                 }
                 other => return Err(self.reader.unexpected(CLAUSE, other, "an expression")),
             };
@@ -368,69 +394,70 @@ impl Expander<'_> {
         }
     }
 
-    /// One word, string or number, on its own (`level` 10) or fused with a parenthesis (50, 70).
-    fn token(&mut self, level: u8, code: u8, inserts: bool) -> Result<()> {
+    /// Copies one word, string or number, alone or fused with a parenthesis.
+    fn token(&mut self, level: Level, code: u8, inserts: bool) -> Result<()> {
         if self.out.len() > self.limit {
             return Err(self.reader.error(CLAUSE, Problem::TooLong("message")));
         }
-        // FIPA00069 2.1: Len32 and the last index have changed places among the levels.
-        let (len32, index) = if level == 0x10 { (9, 8) } else { (8, 9) };
-        let kind = code & 0x0f;
+        let Some(kind) = TokenKind::of(code) else {
+            return Err(self.reader.unexpected(CLAUSE, code, "an expression"));
+        };
         match kind {
-            // Nothing but the parenthesis.
-            0 if code != level => self.out.byte(code),
-            0 | 4 => {
+            TokenKind::None => self.out.byte(code),
+            TokenKind::Word | TokenKind::String => {
                 let text = self.reader.until_nul(CLAUSE, "a text")?;
                 self.enter(text, inserts)?;
                 self.out.framed([code], text, [0x00]);
             }
-            1 | 5 => {
+            TokenKind::TextIndex => {
                 let text = self.entry()?;
+                // The code of a text precedes the code of its index.
                 self.out.framed([code - 1], &text, [0x00]);
             }
-            2 | 3 => {
+            TokenKind::Number => {
                 let digits = self.reader.digits(CLAUSE)?;
                 self.out.framed([code], digits, []);
             }
-            6 | 7 => {
-                let len = if kind == 6 {
-                    self.reader.u8_len(CLAUSE)?
-                } else {
-                    self.reader.u16_len(CLAUSE)?
-                };
+            TokenKind::Len8 => {
+                let len = self.reader.u8_len(CLAUSE)?;
                 self.with_len(level, len, inserts)?;
             }
-            kind if kind == len32 => {
+            TokenKind::Len16 => {
+                let len = self.reader.u16_len(CLAUSE)?;
+                self.with_len(level, len, inserts)?;
+            }
+            TokenKind::Len32 => {
                 let len = self.reader.u32_len(CLAUSE)?;
                 self.with_len(level, len, inserts)?;
             }
-            kind if kind == index => {
+            TokenKind::LenIndex => {
                 let text = self.entry()?;
                 self.write_with_len(level, &text);
             }
-            _ => return Err(self.reader.unexpected(CLAUSE, code, "an expression")),
         }
         Ok(())
     }
 
-    fn with_len(&mut self, level: u8, len: usize, inserts: bool) -> Result<()> {
+    fn with_len(&mut self, level: Level, len: usize, inserts: bool) -> Result<()> {
         let text = self.reader.bytes(len, CLAUSE, "a text")?;
         self.enter(text, inserts)?;
         self.write_with_len(level, text);
         Ok(())
     }
 
-    fn write_with_len(&mut self, level: u8, text: &[u8]) {
+    fn write_with_len(&mut self, level: Level, text: &[u8]) {
         let at = self.out.len();
         write_len(text.len(), &mut self.out);
-        if level != 0x10
-            && let Some(code) = self.out.get_mut(at)
-        {
-            let kind = match *code {
-                0x19 => 8,
-                other => other & 0x0f,
+        if let Some(code) = self.out.get_mut(at) {
+            *code = match (level, *code) {
+                (Level::Same, code) => code,
+                (Level::Opened, code::token::LEN8) => code::start::LEN8,
+                (Level::Opened, code::token::LEN16) => code::start::LEN16,
+                (Level::Opened, _) => code::start::LEN32,
+                (Level::Closed, code::token::LEN8) => code::end::LEN8,
+                (Level::Closed, code::token::LEN16) => code::end::LEN16,
+                (Level::Closed, _) => code::end::LEN32,
             };
-            *code = level | kind;
         }
         self.out.slice(text);
     }

@@ -1,12 +1,14 @@
-//! Writing bit-efficient messages in the hand of a peer, content last as both have it.
+//! Writing bit-efficient messages in the dialect of a peer. The content is last, as both peers write
+//! it.
 
 use bytes::Bytes;
 
+use crate::bitefficient::code;
 use crate::bitefficient::reader::{Form, string_form};
 use crate::bitefficient::view::UNDEFINED_AGENT;
 use crate::bitefficient::without_x;
 use crate::bitefficient::write::{
-    Hand, Out, write_agent_id_by, write_agent_set_by, write_date_time, write_len,
+    Output, TextWriter, write_agent_id_by, write_agent_set_by, write_date_time, write_len,
     write_local_date_time,
 };
 use crate::dialect::{check_word, local_time};
@@ -14,7 +16,7 @@ use crate::error::EncodeError;
 use crate::word::is_token;
 use crate::{Message, Performative, Time};
 
-/// Whose hand to write in.
+/// The peer that reads the message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Peer {
     FipaServices,
@@ -24,76 +26,119 @@ pub(crate) enum Peer {
 /// Writes the encoded message.
 ///
 /// # Errors
-/// When the peer could not read what the message says.
-pub(crate) fn encode(message: &Message, peer: Peer, out: &mut dyn Out) -> Result<(), EncodeError> {
+/// The peer cannot read a value of the message.
+pub(crate) fn encode(
+    message: &Message,
+    peer: Peer,
+    out: &mut dyn Output,
+) -> Result<(), EncodeError> {
     Writer { out, peer }.message(message)
 }
 
 struct Writer<'a> {
-    out: &'a mut dyn Out,
+    out: &'a mut dyn Output,
     peer: Peer,
 }
 
 impl Writer<'_> {
     fn message(&mut self, message: &Message) -> Result<(), EncodeError> {
-        self.out.slice(&[0xfa, 0x10]);
+        self.out
+            .slice(&[code::message_id::PLAIN, code::VERSION_1_0]);
         self.performative(&message.performative)?;
-        // Each in its own order, though both read any.
+        // Both peers read the parameters in any order. The order here is the one each peer writes.
         match self.peer {
             Peer::FipaServices => self.as_fipa_services(message)?,
             Peer::Jade => self.as_jade(message)?,
         }
         for (name, value) in &message.user_defined {
-            self.user_defined(0x00, (name, value))?;
+            self.user_defined(code::message::USER_DEFINED, (name, value))?;
         }
         if let Some(content) = &message.content {
-            self.out.byte(0x04);
+            self.out.byte(code::message::CONTENT);
             self.content(content);
         }
-        self.out.byte(0x01);
+        self.out.byte(code::END);
         Ok(())
     }
 
     fn as_fipa_services(&mut self, message: &Message) -> Result<(), EncodeError> {
         if message.sender.is_none() {
-            // What it writes itself.
-            self.out.slice(b"\x02\x02\x10");
-            self.out.slice(UNDEFINED_AGENT.as_bytes());
-            self.out.slice(b"\0\x01");
+            // fipa_services writes this identifier itself.
+            self.out.slice(&[code::message::SENDER, code::agent::BEGIN]);
+            self.terminated(code::token::WORD, UNDEFINED_AGENT);
+            self.out.byte(code::END);
         }
         self.sender(message)?;
-        write_agent_set_by(self, 0x03, &message.receivers)?;
-        self.text(0x05, "reply-with", message.reply_with())?;
+        self.receivers(message)?;
+        self.reply_with(message)?;
         self.reply_by(message)?;
-        self.text(0x07, "in-reply-to", message.in_reply_to())?;
-        write_agent_set_by(self, 0x08, &message.reply_to)?;
-        self.text(0x09, "language", message.language())?;
-        self.text(0x0a, "encoding", message.encoding())?;
-        self.text(0x0b, "ontology", message.ontology())?;
+        self.in_reply_to(message)?;
+        self.reply_to(message)?;
+        self.language(message)?;
+        self.encoding(message)?;
+        self.ontology(message)?;
         self.protocol(message)?;
-        self.text(0x0d, "conversation-id", message.conversation_id())
+        self.conversation_id(message)
     }
 
-    /// As far as its order is known from what it wrote.
+    /// Writes the parameters in the order of the recorded messages of JADE.
     fn as_jade(&mut self, message: &Message) -> Result<(), EncodeError> {
-        self.text(0x0b, "ontology", message.ontology())?;
+        self.ontology(message)?;
         self.sender(message)?;
-        write_agent_set_by(self, 0x03, &message.receivers)?;
-        write_agent_set_by(self, 0x08, &message.reply_to)?;
-        self.text(0x0d, "conversation-id", message.conversation_id())?;
-        self.text(0x07, "in-reply-to", message.in_reply_to())?;
-        self.text(0x05, "reply-with", message.reply_with())?;
+        self.receivers(message)?;
+        self.reply_to(message)?;
+        self.conversation_id(message)?;
+        self.in_reply_to(message)?;
+        self.reply_with(message)?;
         self.reply_by(message)?;
-        self.text(0x09, "language", message.language())?;
-        self.text(0x0a, "encoding", message.encoding())?;
+        self.language(message)?;
+        self.encoding(message)?;
         self.protocol(message)
+    }
+
+    fn receivers(&mut self, message: &Message) -> Result<(), EncodeError> {
+        write_agent_set_by(self, code::message::RECEIVER, &message.receivers)
+    }
+
+    fn reply_to(&mut self, message: &Message) -> Result<(), EncodeError> {
+        write_agent_set_by(self, code::message::REPLY_TO, &message.reply_to)
+    }
+
+    fn reply_with(&mut self, message: &Message) -> Result<(), EncodeError> {
+        self.text(
+            code::message::REPLY_WITH,
+            "reply-with",
+            message.reply_with(),
+        )
+    }
+
+    fn in_reply_to(&mut self, message: &Message) -> Result<(), EncodeError> {
+        let text = message.in_reply_to();
+        self.text(code::message::IN_REPLY_TO, "in-reply-to", text)
+    }
+
+    fn language(&mut self, message: &Message) -> Result<(), EncodeError> {
+        self.text(code::message::LANGUAGE, "language", message.language())
+    }
+
+    fn encoding(&mut self, message: &Message) -> Result<(), EncodeError> {
+        self.text(code::message::ENCODING, "encoding", message.encoding())
+    }
+
+    fn ontology(&mut self, message: &Message) -> Result<(), EncodeError> {
+        self.text(code::message::ONTOLOGY, "ontology", message.ontology())
+    }
+
+    fn conversation_id(&mut self, message: &Message) -> Result<(), EncodeError> {
+        let text = message.conversation_id();
+        self.text(code::message::CONVERSATION_ID, "conversation-id", text)
     }
 
     fn sender(&mut self, message: &Message) -> Result<(), EncodeError> {
         let Some(sender) = &message.sender else {
             return Ok(());
         };
-        self.out.byte(0x02);
+        self.out.byte(code::message::SENDER);
         write_agent_id_by(self, sender)
     }
 
@@ -101,7 +146,7 @@ impl Writer<'_> {
         let Some(time) = message.reply_by else {
             return Ok(());
         };
-        self.out.byte(0x06);
+        self.out.byte(code::message::REPLY_BY);
         self.time(time)
     }
 
@@ -109,20 +154,20 @@ impl Writer<'_> {
         let Some(protocol) = &message.protocol else {
             return Ok(());
         };
-        self.out.byte(0x0c);
+        self.out.byte(code::message::PROTOCOL);
         self.word("protocol", protocol)
     }
 
     fn performative(&mut self, performative: &Performative) -> Result<(), EncodeError> {
         let what = "user-defined performative";
         match performative.code() {
-            Some(code) => self.out.byte(code),
+            Some(act) => self.out.byte(act),
             None if self.peer == Peer::Jade => {
-                let why = "JADE reads none in a bit-efficient message";
+                let why = "JADE reads only standard performatives in a bit-efficient message";
                 return Err(EncodeError::Unrepresentable { what, why });
             }
             None => {
-                self.out.byte(0x00);
+                self.out.byte(code::USER_DEFINED_PERFORMATIVE);
                 self.word(what, performative.as_str())?;
             }
         }
@@ -132,7 +177,7 @@ impl Writer<'_> {
     fn user_defined(&mut self, code: u8, (name, value): (&str, &str)) -> Result<(), EncodeError> {
         self.out.byte(code);
         let what = "name of a user-defined parameter";
-        // fipa_services keeps names without X- in its memory, and does not add it here.
+        // fipa_services stores names without X- and does not add it here.
         if self.peer == Peer::FipaServices && without_x(name.as_bytes()) == name.as_bytes() {
             self.word(what, name)?;
         } else {
@@ -152,21 +197,26 @@ impl Writer<'_> {
         self.expression(what, text)
     }
 
-    /// JADE takes for a word whatever stands up to the NUL.
+    /// Writes a word. JADE reads any text up to the NUL as one.
     fn word(&mut self, what: &'static str, word: &str) -> Result<(), EncodeError> {
         if self.peer == Peer::FipaServices {
             check_word(what, word)?;
         }
-        self.out.byte(0x10);
-        self.out.slice(word.as_bytes());
-        self.out.byte(0x00);
+        self.terminated(code::token::WORD, word);
         Ok(())
+    }
+
+    /// Writes a code, a text and a NUL.
+    fn terminated(&mut self, code: u8, text: &str) {
+        self.out.byte(code);
+        self.out.slice(text.as_bytes());
+        self.out.byte(0x00);
     }
 
     fn expression(&mut self, what: &'static str, text: &str) -> Result<(), EncodeError> {
         if self.peer == Peer::FipaServices {
-            self.out.byte(0x14);
-            // Its own writer escapes nothing, and cannot read then what it wrote.
+            self.out.byte(code::token::STRING);
+            // fipa_services itself writes these texts without escapes, and then cannot read them.
             if text.contains('"') || text.ends_with('\\') {
                 self.counted(text.as_bytes());
             } else {
@@ -182,14 +232,12 @@ impl Writer<'_> {
             return self.word(what, text);
         }
         if string_form(text.as_bytes()).0 == Form::Bare {
-            self.out.byte(0x14);
-            self.out.slice(text.as_bytes());
-            self.out.byte(0x00);
+            self.terminated(code::token::STRING, text);
             return Ok(());
         }
-        // Longer ones it takes for negative ones.
+        // JADE reads the length as a signed byte.
         if text.len() >= 128 {
-            let why = "JADE would misread a text in quotation marks of this length";
+            let why = "JADE misreads a text of 128 bytes or more that is in quotation marks";
             return Err(EncodeError::Unrepresentable { what, why });
         }
         write_len(text.len(), self.out);
@@ -197,9 +245,9 @@ impl Writer<'_> {
         Ok(())
     }
 
-    /// As a string where it can stand there as one, else with its length in front.
+    /// Writes content as a string if the peer reads it as one, and with its length otherwise.
     fn content(&mut self, content: &Bytes) {
-        // A copy, because nobody vouches that shared memory stays as it is.
+        // A copy, because another process may change shared memory at any time.
         let content = content.to_vec();
         let is_string = memchr::memchr(0, &content).is_none()
             && match self.peer {
@@ -213,7 +261,7 @@ impl Writer<'_> {
             self.out.slice(&content);
             return;
         }
-        self.out.byte(0x14);
+        self.out.byte(code::token::STRING);
         match self.peer {
             Peer::FipaServices => self.counted(&content),
             Peer::Jade => self.out.slice(&content),
@@ -237,7 +285,7 @@ impl Writer<'_> {
     }
 }
 
-impl Hand for Writer<'_> {
+impl TextWriter for Writer<'_> {
     fn byte(&mut self, byte: u8) {
         self.out.byte(byte);
     }
@@ -247,6 +295,6 @@ impl Hand for Writer<'_> {
     }
 
     fn user_defined_of_agent(&mut self, name: &str, value: &str) -> Result<(), EncodeError> {
-        self.user_defined(0x04, (name, value))
+        self.user_defined(code::agent::USER_DEFINED, (name, value))
     }
 }

@@ -1,19 +1,21 @@
-//! Expressions: words, strings, numbers, and expressions of those in parentheses.
+//! Expressions: words, strings, numbers, and sequences of expressions in parentheses (FIPA00069 2.2
+//! `BinExpression`).
 
 use std::borrow::Cow;
 
 use crate::Text;
+use crate::bitefficient::code::{self, TokenKind, closes_level, opens_level};
 use crate::bitefficient::notes::{self, Notes};
 use crate::bitefficient::reader::{Form, Reader, digit_chars, string_form, unescaped};
 use crate::error::{DecodeError, Problem};
 use crate::word::push_string_literal;
 
-/// Deepest nesting of expressions that is accepted.
+/// Maximum nesting depth of expressions that the reader accepts.
 pub(crate) const MAX_EXPRESSION_DEPTH: usize = 64;
 
-const CLAUSE: &str = "FIPA00069 2.1 BinExpression";
+const CLAUSE: &str = "FIPA00069 2.2 BinExpression";
 
-/// Reads a `BinExpression`: checked in one pass, nothing kept but where it is.
+/// Reads and checks a `BinExpression` in one pass. The result borrows its bytes.
 #[inline(always)]
 pub(crate) fn expression<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
@@ -21,67 +23,68 @@ pub(crate) fn expression<'a, N: Notes>(
 ) -> Result<Text<'a>, DecodeError> {
     match reader.short_text() {
         Some(text) => Ok(text),
-        None => other_expression(reader, what),
+        None => expression_slow(reader, what),
     }
 }
 
 #[inline(never)]
-fn other_expression<'a, N: Notes>(
+fn expression_slow<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     what: &'static str,
 ) -> Result<Text<'a>, DecodeError> {
     let start = reader.position();
-    if let Some(0x60 | 0x70..=0x79) = reader.peek() {
+    if reader.peek().is_some_and(opens_level) {
         reader.note(|| format!("{what}: an expression"));
     }
-    let code = reader.byte(CLAUSE, what)?;
-    match code {
-        0x10 => reader.plain(CLAUSE, what).map(Text::plain),
-        0x14 => reader.string(CLAUSE, what),
-        // An opaque expression, a leftover of former editions: the string that follows is it.
-        0xff => {
-            let code = reader.byte(CLAUSE, what)?;
-            string_after(reader, code, what)
+    let first = reader.byte(CLAUSE, what)?;
+    match first {
+        code::token::WORD => reader.plain(CLAUSE, what).map(Text::plain),
+        code::token::STRING => reader.string(CLAUSE, what),
+        // An opaque expression, which earlier editions used: the string is its text.
+        code::token::OPAQUE => {
+            let first = reader.byte(CLAUSE, what)?;
+            string_after(reader, first, what)
         }
-        0x16 | 0x17 | 0x19 => string_after(reader, code, what),
-        0x12 | 0x13 => {
+        code::token::LEN8 | code::token::LEN16 | code::token::LEN32 => {
+            string_after(reader, first, what)
+        }
+        code::token::NUMBER | code::token::HEX_NUMBER => {
             reader.digits(CLAUSE)?;
             Ok(Text::encoded(reader.since(start)))
         }
-        0x60 | 0x70..=0x79 => {
+        first if opens_level(first) => {
             reader.notes().deeper();
-            check_levels(reader, code, what)?;
+            check_levels(reader, first, what)?;
             reader.notes().shallower();
             Ok(Text::encoded(reader.since(start)))
         }
-        0x11 | 0x15 | 0x18 => Err(reader.error(CLAUSE, Problem::CodeTable)),
+        code::token::WORD_INDEX | code::token::STRING_INDEX | code::token::LEN_INDEX => {
+            Err(reader.error(CLAUSE, Problem::CodeTable))
+        }
         other => Err(reader.unexpected(CLAUSE, other, "an expression")),
     }
 }
 
-/// The text of a `BinString` whose code was read.
+/// Reads the text of a `BinString` whose code was read.
 fn string_after<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     code: u8,
     what: &'static str,
 ) -> Result<Text<'a>, DecodeError> {
-    if code == 0x14 {
-        return reader.string(CLAUSE, what);
-    }
-    if matches!(code, 0x15 | 0x18) {
-        return Err(reader.error(CLAUSE, Problem::CodeTable));
-    }
     let len = match code {
-        0x16 => reader.u8_len(CLAUSE)?,
-        0x17 => reader.u16_len(CLAUSE)?,
-        0x19 => reader.u32_len(CLAUSE)?,
+        code::token::STRING => return reader.string(CLAUSE, what),
+        code::token::STRING_INDEX | code::token::LEN_INDEX => {
+            return Err(reader.error(CLAUSE, Problem::CodeTable));
+        }
+        code::token::LEN8 => reader.u8_len(CLAUSE)?,
+        code::token::LEN16 => reader.u16_len(CLAUSE)?,
+        code::token::LEN32 => reader.u32_len(CLAUSE)?,
         other => return Err(reader.unexpected(CLAUSE, other, "a string")),
     };
     reader.counted(len, CLAUSE, what).map(Text::plain)
 }
 
-/// Walks over a parenthesised expression whose first byte was read, up to the parenthesis that
-/// closes it.
+/// Checks an expression in parentheses up to the closing parenthesis. Its first byte was read.
 fn check_levels<N: Notes>(
     reader: &mut Reader<'_, N>,
     first: u8,
@@ -90,17 +93,17 @@ fn check_levels<N: Notes>(
     let mut depth = 0_usize;
     let mut code = first;
     loop {
-        match code {
-            0x60 | 0x70..=0x79 => depth += 1,
-            0x40 | 0x50..=0x59 => depth = depth.saturating_sub(1),
-            _ => {}
+        if opens_level(code) {
+            depth += 1;
+        } else if closes_level(code) {
+            depth = depth.saturating_sub(1);
         }
         if depth > MAX_EXPRESSION_DEPTH {
             return Err(reader.error(CLAUSE, Problem::TooDeep("expressions")));
         }
         if depth == 0 {
-            // A token fused with the last parenthesis would stand outside of everything.
-            return if code == 0x40 {
+            // A token fused with the last parenthesis would be outside the expression.
+            return if code == code::end::ALONE {
                 let end = reader.position();
                 note_token(reader, code, end);
                 Ok(())
@@ -115,81 +118,52 @@ fn check_levels<N: Notes>(
     }
 }
 
-/// The kind of token that a code inside an expression announces.
-enum Token {
-    /// Nothing but the parenthesis.
-    None,
-    Word,
-    Number,
-    String,
-    Len8,
-    Len16,
-    Len32,
-}
-
-/// FIPA00069 2.1: the code of Len32 is x9 among the strings, and x8 among the levels.
-fn token_of(code: u8) -> Option<Token> {
-    Some(match code {
-        0x40 | 0x60 => Token::None,
-        0x10 | 0x50 | 0x70 => Token::Word,
-        0x12 | 0x13 | 0x52 | 0x53 | 0x72 | 0x73 => Token::Number,
-        0x14 | 0x54 | 0x74 => Token::String,
-        0x16 | 0x56 | 0x76 => Token::Len8,
-        0x17 | 0x57 | 0x77 => Token::Len16,
-        0x19 | 0x58 | 0x78 => Token::Len32,
-        _ => return None,
-    })
-}
-
 fn check_token<N: Notes>(
     reader: &mut Reader<'_, N>,
     code: u8,
     what: &'static str,
 ) -> Result<(), DecodeError> {
-    let Some(token) = token_of(code) else {
-        return Err(match code {
-            0x11 | 0x15 | 0x18 | 0x51 | 0x55 | 0x59 | 0x71 | 0x75 | 0x79 => {
-                reader.error(CLAUSE, Problem::CodeTable)
-            }
-            other => reader.unexpected(CLAUSE, other, "an expression"),
-        });
+    let Some(kind) = TokenKind::of(code) else {
+        return Err(reader.unexpected(CLAUSE, code, "an expression"));
     };
-    match token {
-        Token::None => {}
-        Token::Word => {
+    match kind {
+        TokenKind::None => {}
+        TokenKind::Word => {
             reader.plain(CLAUSE, what)?;
         }
-        Token::Number => {
+        TokenKind::Number => {
             reader.digits(CLAUSE)?;
         }
-        Token::String => {
+        TokenKind::String => {
             reader.string(CLAUSE, what)?;
         }
-        Token::Len8 => {
-            string_after(reader, 0x16, what)?;
+        TokenKind::Len8 => {
+            string_after(reader, code::token::LEN8, what)?;
         }
-        Token::Len16 => {
-            string_after(reader, 0x17, what)?;
+        TokenKind::Len16 => {
+            string_after(reader, code::token::LEN16, what)?;
         }
-        Token::Len32 => {
-            string_after(reader, 0x19, what)?;
+        TokenKind::Len32 => {
+            string_after(reader, code::token::LEN32, what)?;
+        }
+        TokenKind::TextIndex | TokenKind::LenIndex => {
+            return Err(reader.error(CLAUSE, Problem::CodeTable));
         }
     }
     Ok(())
 }
 
-/// Notes a token of an expression that was read from `start` on, behind its code, as FIPA00070
-/// writes it.
+/// Notes a token of an expression in the form of FIPA00070. The bytes behind its code begin at
+/// `start`.
 fn note_token<N: Notes>(reader: &mut Reader<'_, N>, code: u8, start: usize) {
     let bytes = reader.since(start);
-    let closes = matches!(code, 0x40 | 0x50..=0x59);
-    let opens = matches!(code, 0x60 | 0x70..=0x79);
+    let (opens, closes) = (opens_level(code), closes_level(code));
     if closes {
         reader.notes().shallower();
     }
     reader.note(|| {
         let mut token = String::new();
-        // The bytes were checked just now: this cannot fail.
+        // The bytes were checked, so this cannot fail.
         let _ = render_token(&mut Reader::new(bytes), code, &mut token);
         let parenthesis = match (opens, closes) {
             (true, _) => "(",
@@ -204,21 +178,19 @@ fn note_token<N: Notes>(reader: &mut Reader<'_, N>, code: u8, start: usize) {
     }
 }
 
-/// Writes a checked number or expression as FIPA00070 does.
+/// Writes a checked number or expression in the form of FIPA00070.
 pub(crate) fn render(bytes: &[u8]) -> String {
     let mut out = String::new();
     let mut reader = Reader::new(bytes);
     while let Some(code) = reader.peek() {
         reader.skip_peeked();
-        match code {
-            0x40 | 0x50..=0x59 => out.push(')'),
-            0x60 | 0x70..=0x79 => {
-                separate(&mut out);
-                out.push('(');
-            }
-            _ => {}
+        if closes_level(code) {
+            out.push(')');
+        } else if opens_level(code) {
+            separate(&mut out);
+            out.push('(');
         }
-        // The bytes were checked when the message was read: this cannot fail.
+        // The bytes were checked when the message was read, so this cannot fail.
         if render_token(&mut reader, code, &mut out).is_err() {
             break;
         }
@@ -227,22 +199,22 @@ pub(crate) fn render(bytes: &[u8]) -> String {
 }
 
 fn render_token(reader: &mut Reader<'_>, code: u8, out: &mut String) -> Result<(), DecodeError> {
-    let text = match token_of(code) {
-        None | Some(Token::None) => return Ok(()),
-        Some(Token::Word) => {
+    let text = match TokenKind::of(code) {
+        None | Some(TokenKind::None | TokenKind::TextIndex | TokenKind::LenIndex) => return Ok(()),
+        Some(TokenKind::Word) => {
             separate(out);
             out.push_str(&Text::plain(reader.plain(CLAUSE, "word")?).as_str());
             return Ok(());
         }
-        Some(Token::Number) => {
+        Some(TokenKind::Number) => {
             separate(out);
             out.extend(digit_chars(reader.digits(CLAUSE)?).flatten());
             return Ok(());
         }
-        Some(Token::String) => reader.string(CLAUSE, "string")?,
-        Some(Token::Len8) => string_after(reader, 0x16, "string")?,
-        Some(Token::Len16) => string_after(reader, 0x17, "string")?,
-        Some(Token::Len32) => string_after(reader, 0x19, "string")?,
+        Some(TokenKind::String) => reader.string(CLAUSE, "string")?,
+        Some(TokenKind::Len8) => string_after(reader, code::token::LEN8, "string")?,
+        Some(TokenKind::Len16) => string_after(reader, code::token::LEN16, "string")?,
+        Some(TokenKind::Len32) => string_after(reader, code::token::LEN32, "string")?,
     };
     separate(out);
     push_string_literal(out, &text.as_str());
@@ -255,7 +227,7 @@ fn separate(out: &mut String) {
     }
 }
 
-/// The content of a `14 String 00`, which need not be UTF-8.
+/// Returns the content of a `14 String 00`, which need not be UTF-8.
 pub(crate) fn string_content(bytes: &[u8]) -> Cow<'_, [u8]> {
     match string_form(bytes) {
         (Form::Quoted, inner) => unescaped(inner),
@@ -275,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn every_form_of_text() {
+    fn every_form_of_text_is_read() {
         for (bytes, text) in [
             (&b"\x10word\0"[..], "word"),
             (b"\x14\"a \\\"b\\\"\"\0", "a \"b\""),
@@ -295,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn expressions_are_written_out() {
+    fn expressions_are_rendered_as_strings() {
         let fused = b"\x70seq\0\x12\x53\0\x12\xe2\xf6\0\x14\"a\"\0\x40";
         assert_eq!(read(fused).unwrap(), "(seq 42 -1.5 \"a\")");
         assert_eq!(read(b"\x60\x10HI\0\x40").unwrap(), "(HI)");
@@ -323,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn nonsense_is_refused() {
+    fn malformed_expressions_are_refused() {
         for bytes in [
             &b""[..],
             b"\x10word",

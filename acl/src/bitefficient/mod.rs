@@ -1,11 +1,13 @@
-//! The bit-efficient encoding of messages (FIPA00069, edition G) and what its envelopes
+//! The bit-efficient encoding of messages (FIPA00069, edition G), and the parts that envelopes
 //! (FIPA00088) share with it.
 //!
-//! Reading is lenient: it takes the standard and what fipa_services and JADE write. Writing is
-//! strict: version 1.0, words where the text is one and string literals elsewhere, content last
-//! and with its length in front, no code tables. Those are read with a table of the caller's.
+//! The reader is lenient: it accepts the standard and what fipa_services and JADE write. The writer
+//! is strict: version 1.0, a word if the text is one and a string literal otherwise, the content
+//! last and with its length, no code tables. Messages with code tables are read with a table that
+//! the caller owns.
 
 pub(crate) mod agent_id;
+pub(crate) mod code;
 mod code_table;
 pub(crate) mod dialects;
 pub(crate) mod expression;

@@ -1,7 +1,7 @@
-//! What readers remark about the bytes they read, for [`explain`](crate::explain()).
+//! Notes that readers take about the bytes they read, for [`explain`](crate::explain()).
 //!
-//! The readers of messages and envelopes say in passing what each stretch of bytes means. Whoever
-//! only wants to decode listens with [`Silent`], of which nothing is left in the program.
+//! The readers of messages and envelopes report the meaning of each span of bytes to [`Notes`].
+//! Decoding uses [`NoNotes`], which the compiler removes.
 
 use std::borrow::Cow;
 use std::fmt::Write as _;
@@ -9,34 +9,34 @@ use std::fmt::Write as _;
 use crate::bitefficient::without_x;
 use crate::{Text, Time, Zone, escape};
 
-/// Listens to the remarks of a reader.
+/// Receives the notes of a reader.
 pub(crate) trait Notes {
-    /// Nothing is listened to.
-    const SILENT: bool = false;
+    /// Whether the notes are used. Without them, a reader may take its fast paths.
+    const ENABLED: bool = true;
 
-    /// Everything from the end of the last note up to the offset `end` means this. Nothing is to
-    /// be noted where there are no bytes.
+    /// Notes the meaning of the bytes from the end of the last note up to the offset `end`. An
+    /// empty span is ignored.
     fn note(&mut self, end: usize, meaning: impl FnOnce() -> String);
 
-    /// What follows is part of what was noted last.
+    /// Makes the following notes part of the last one.
     fn deeper(&mut self);
 
-    /// What follows is not part of it any more.
+    /// Undoes one [`deeper`](Self::deeper).
     fn shallower(&mut self);
 
-    /// Like [`note`](Self::note), of the length that an envelope says it has.
-    fn note_envelope_len(&mut self, end: usize, said: usize);
+    /// Notes the length field of an envelope like [`note`](Self::note). Its value is `announced`.
+    fn note_envelope_len(&mut self, end: usize, announced: usize);
 
-    /// Like [`note`](Self::note), of the end of that envelope.
+    /// Notes the end of that envelope like [`note`](Self::note).
     fn note_envelope_end(&mut self, end: usize, meaning: &'static str);
 }
 
-/// Nobody listens.
+/// Discards all notes.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Silent;
+pub(crate) struct NoNotes;
 
-impl Notes for Silent {
-    const SILENT: bool = true;
+impl Notes for NoNotes {
+    const ENABLED: bool = false;
 
     #[inline(always)]
     fn note(&mut self, _: usize, _: impl FnOnce() -> String) {}
@@ -54,15 +54,15 @@ impl Notes for Silent {
     fn note_envelope_end(&mut self, _: usize, _: &'static str) {}
 }
 
-/// Longest part of a text that a note repeats, in characters.
+/// Maximum number of characters of a text that a note repeats.
 const SHOWN: usize = 60;
 
-/// A parameter and its text, for example `language: 'fipa-sl'`.
+/// Formats a parameter and its text, for example `language: 'fipa-sl'`.
 pub(crate) fn named(what: &str, value: &Text<'_>) -> String {
     format!("{what}: {}", text(value))
 }
 
-/// A text and how it is written.
+/// Formats a text and the form that it is written in.
 pub(crate) fn text(text: &Text<'_>) -> String {
     let written = if text.is_counted() {
         ", with its length in front"
@@ -74,7 +74,7 @@ pub(crate) fn text(text: &Text<'_>) -> String {
     format!("{}{written}", quoted(&text.as_str()))
 }
 
-/// A user-defined parameter and its text.
+/// Formats a user-defined parameter and its text.
 pub(crate) fn user_defined(name: &Text<'_>, value: &Text<'_>) -> String {
     let name = Text::plain(without_x(name.raw()));
     named(
@@ -83,19 +83,19 @@ pub(crate) fn user_defined(name: &Text<'_>, value: &Text<'_>) -> String {
     )
 }
 
-/// A text as a note repeats it: cut, and without control characters.
+/// Formats a text in quotation marks, truncated and without control characters.
 pub(crate) fn quoted(text: &str) -> String {
     format!("'{}'{}", visible(text), ellipsis(text))
 }
 
-/// The same without quotation marks.
+/// Formats a text like [`quoted`], without quotation marks.
 pub(crate) fn plain(text: &str) -> String {
     format!("{}{}", visible(text), ellipsis(text))
 }
 
-/// Content as a note repeats it: as a text if it begins like one.
+/// Formats content: as a text if it begins with UTF-8.
 pub(crate) fn content(bytes: &[u8]) -> String {
-    // Enough for all characters that are shown, and then one more that may be cut in two.
+    // Enough for all characters shown and one more, which may be incomplete.
     let start = bytes.get(..4 * SHOWN + 4).unwrap_or(bytes);
     let text = match std::str::from_utf8(start) {
         Ok(text) => text,
@@ -103,7 +103,7 @@ pub(crate) fn content(bytes: &[u8]) -> String {
             let whole = start.get(..error.valid_up_to()).unwrap_or_default();
             std::str::from_utf8(whole).unwrap_or_default()
         }
-        Err(_) => return "bytes that are no text".to_owned(),
+        Err(_) => return "bytes that are not UTF-8".to_owned(),
     };
     let more = if text.len() < bytes.len() || !ellipsis(text).is_empty() {
         "…"
@@ -126,10 +126,10 @@ fn ellipsis(text: &str) -> &'static str {
     }
 }
 
-/// A date and time, with what its designator says of the zone.
+/// Formats a date and time and its zone.
 pub(crate) fn date(what: &str, time: Time) -> String {
     let Some(rfc3339) = time.to_rfc3339() else {
-        return format!("{what} {time}, relative to when it is read");
+        return format!("{what} {time}, relative to the time of reading");
     };
     let mut out = format!("{what} {}", rfc3339.trim_end_matches('Z'));
     // Writing to a string cannot fail.
@@ -146,7 +146,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn texts_are_cut_and_harmless() {
+    fn texts_are_truncated_and_escaped() {
         assert_eq!(quoted("a\x1b"), "'a\\u{1b}'");
         assert_eq!(quoted(&"é".repeat(60)), format!("'{}'", "é".repeat(60)));
         assert_eq!(quoted(&"é".repeat(61)), format!("'{}'…", "é".repeat(60)));
@@ -154,19 +154,19 @@ mod tests {
     }
 
     #[test]
-    fn content_is_text_or_not() {
+    fn content_is_shown_as_text_if_it_is_utf8() {
         assert_eq!(content(b"hi"), "'hi'");
-        assert_eq!(content(b"\xff"), "bytes that are no text");
+        assert_eq!(content(b"\xff"), "bytes that are not UTF-8");
         assert_eq!(content("é\u{1f980}".as_bytes()), "'é\u{1f980}'");
         for len in 50..300 {
             let long = content("\u{1f980}".repeat(len).as_bytes());
             assert_eq!(long.ends_with('…'), len > SHOWN, "{len}");
         }
-        assert_eq!(content(b"cut \xf0\x9f"), "bytes that are no text");
+        assert_eq!(content(b"cut \xf0\x9f"), "bytes that are not UTF-8");
     }
 
     #[test]
-    fn dates_say_their_zone() {
+    fn dates_are_shown_with_their_zone() {
         for (text, meaning) in [
             (
                 "20261120T112644998",
@@ -179,7 +179,7 @@ mod tests {
             ),
             (
                 "+00000000T000030000",
-                "date +00000000T000030000, relative to when it is read",
+                "date +00000000T000030000, relative to the time of reading",
             ),
         ] {
             assert_eq!(date("date", text.parse().unwrap()), meaning);

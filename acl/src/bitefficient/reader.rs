@@ -1,22 +1,22 @@
-//! Reading what both bit-efficient formats consist of, with every bound checked.
+//! A reader of the elements that both bit-efficient encodings share. It checks every bound.
 
 use std::borrow::Cow;
 
 use crate::Text;
-use crate::bitefficient::notes::{Notes, Silent};
+use crate::bitefficient::code;
+use crate::bitefficient::notes::{NoNotes, Notes};
 use crate::error::{DecodeError, Problem};
 use crate::scan::{Kind, ONES, TOPS, find_byte, near_text};
 use crate::time::{Base, Fields, Time, Zone};
 
-/// A place in bytes that came from outside.
+/// A position in bytes that came from outside.
 #[derive(Debug, Clone)]
-pub(crate) struct Reader<'a, N = Silent> {
+pub(crate) struct Reader<'a, N = NoNotes> {
     bytes: &'a [u8],
-    /// Those that were not read yet.
+    /// The bytes that were not read yet.
     rest: &'a [u8],
-    /// Where `bytes` begin in what is decoded, for errors.
+    /// Offset of `bytes` in the decoded input, for errors.
     base: usize,
-    /// Who is told what the bytes mean.
     notes: N,
 }
 
@@ -24,12 +24,12 @@ type Result<T> = std::result::Result<T, DecodeError>;
 
 impl<'a> Reader<'a> {
     pub(crate) fn new(bytes: &'a [u8]) -> Self {
-        Self::noting(bytes, 0, Silent)
+        Self::noting(bytes, 0, NoNotes)
     }
 }
 
 impl<'a, N: Notes> Reader<'a, N> {
-    /// A reader of bytes that begin at the offset `base` of what is decoded.
+    /// Creates a reader of bytes that begin at the offset `base` of the decoded input.
     pub(crate) fn noting(bytes: &'a [u8], base: usize, notes: N) -> Self {
         Self {
             bytes,
@@ -39,20 +39,21 @@ impl<'a, N: Notes> Reader<'a, N> {
         }
     }
 
-    /// What was read since the last note means this.
+    /// Notes the meaning of the bytes read since the last note.
     #[inline(always)]
     pub(crate) fn note(&mut self, meaning: impl FnOnce() -> String) {
         let end = self.offset();
         self.notes.note(end, meaning);
     }
 
-    /// Who is told what the bytes mean, to be told more.
+    /// Returns the receiver of the notes.
     #[inline(always)]
     pub(crate) fn notes(&mut self) -> &mut N {
         &mut self.notes
     }
 
-    /// Reads a set or sequence member by member up to its end, and gives the bytes in front of that.
+    /// Reads a set or sequence member by member, including its end. Returns the bytes of the
+    /// members.
     #[inline(always)]
     pub(crate) fn set<T>(
         &mut self,
@@ -64,7 +65,7 @@ impl<'a, N: Notes> Reader<'a, N> {
         let start = self.position();
         loop {
             let members = self.since(start);
-            if self.take_if(0x01) {
+            if self.take_if(code::END) {
                 self.notes().shallower();
                 self.note(|| format!("end of {name}"));
                 return Ok(members);
@@ -73,37 +74,37 @@ impl<'a, N: Notes> Reader<'a, N> {
         }
     }
 
-    /// A second reader at the same place, to look ahead; nobody is told what it reads.
+    /// Returns a second reader at the same position, to look ahead. It takes no notes.
     #[inline]
     pub(crate) fn ahead(&self) -> Reader<'a> {
         Reader {
             bytes: self.bytes,
             rest: self.rest,
             base: self.base,
-            notes: Silent,
+            notes: NoNotes,
         }
     }
 
-    /// Goes on where the one that looked ahead is.
+    /// Moves to the position of the reader that looked ahead.
     #[inline]
     pub(crate) fn follow(&mut self, ahead: &Reader<'a>) {
         self.rest = ahead.rest;
     }
 
-    /// Goes on with other bytes, which begin at the offset `base`.
-    pub(crate) fn go_on(&mut self, bytes: &'a [u8], base: usize) {
+    /// Continues with other bytes, which begin at the offset `base`.
+    pub(crate) fn continue_with(&mut self, bytes: &'a [u8], base: usize) {
         self.bytes = bytes;
         self.rest = bytes;
         self.base = base;
     }
 
-    /// How many bytes were read.
+    /// Number of bytes read.
     #[inline]
     pub(crate) fn position(&self) -> usize {
         self.bytes.len() - self.rest.len()
     }
 
-    /// Where the next byte stands in what is decoded.
+    /// Offset of the next byte in the decoded input.
     #[inline]
     pub(crate) fn offset(&self) -> usize {
         self.base + self.position()
@@ -114,12 +115,12 @@ impl<'a, N: Notes> Reader<'a, N> {
         self.rest.len()
     }
 
-    /// What was not read yet.
+    /// The bytes that were not read yet.
     pub(crate) fn rest(&self) -> &'a [u8] {
         self.rest
     }
 
-    /// What was read since `start`, a former [`position`](Self::position).
+    /// The bytes read since `start`, an earlier [`position`](Self::position).
     #[inline]
     pub(crate) fn since(&self, start: usize) -> &'a [u8] {
         self.bytes.get(start..self.position()).unwrap_or_default()
@@ -130,7 +131,7 @@ impl<'a, N: Notes> Reader<'a, N> {
         DecodeError::new(self.offset(), clause, problem)
     }
 
-    /// The error for the byte that was read last.
+    /// Returns the error for the byte that was read last.
     #[cold]
     pub(crate) fn unexpected(
         &self,
@@ -158,13 +159,13 @@ impl<'a, N: Notes> Reader<'a, N> {
         self.rest.first().copied()
     }
 
-    /// Passes over the next byte, which was peeked at.
+    /// Skips the next byte, which the caller has peeked at.
     #[inline]
     pub(crate) fn skip_peeked(&mut self) {
         self.rest = self.rest.get(1..).unwrap_or_default();
     }
 
-    /// Reads the byte if it is the next one.
+    /// Reads the next byte if it equals `byte`.
     #[inline]
     pub(crate) fn take_if(&mut self, byte: u8) -> bool {
         match self.rest.split_first() {
@@ -211,7 +212,7 @@ impl<'a, N: Notes> Reader<'a, N> {
         usize::try_from(long).map_err(|_| self.error(clause, Problem::TooLong("length")))
     }
 
-    /// The bytes up to the next NUL, which is read too.
+    /// Reads the bytes up to the next NUL, and the NUL.
     #[inline]
     pub(crate) fn until_nul(
         &mut self,
@@ -232,7 +233,7 @@ impl<'a, N: Notes> Reader<'a, N> {
         }
     }
 
-    /// UTF-8 text up to the next NUL, as it stands.
+    /// Reads UTF-8 text up to the next NUL, and the NUL.
     #[inline]
     pub(crate) fn plain(&mut self, clause: &'static str, what: &'static str) -> Result<&'a [u8]> {
         if let Some((text, rest, kind)) = near_text(self.rest)
@@ -241,22 +242,21 @@ impl<'a, N: Notes> Reader<'a, N> {
             self.rest = rest;
             return Ok(text);
         }
-        self.other_plain(clause, what)
+        self.plain_slow(clause, what)
     }
 
     #[inline(never)]
-    fn other_plain(&mut self, clause: &'static str, what: &'static str) -> Result<&'a [u8]> {
+    fn plain_slow(&mut self, clause: &'static str, what: &'static str) -> Result<&'a [u8]> {
         let bytes = self.until_nul(clause, what)?;
         self.check_utf8(bytes, 1, clause, what)?;
         Ok(bytes)
     }
 
-    /// The next text, if it is of the kind that nearly all are: short, in ASCII, and a word
-    /// (`10 … 00`) or a string (`14 … 00`).
+    /// Reads the next text in the common case: a short ASCII word (`10 … 00`) or string (`14 … 00`).
     #[inline(always)]
     pub(crate) fn short_text(&mut self) -> Option<Text<'a>> {
-        let (&code, rest) = self.rest.split_first()?;
-        if code & !0x04 != 0x10 {
+        let (&first, rest) = self.rest.split_first()?;
+        if !matches!(first, code::token::WORD | code::token::STRING) {
             return None;
         }
         let (bytes, rest, kind) = near_text(rest)?;
@@ -264,17 +264,17 @@ impl<'a, N: Notes> Reader<'a, N> {
             return None;
         }
         self.rest = rest;
-        Some(if code == 0x10 {
+        Some(if first == code::token::WORD {
             Text::plain(bytes)
         } else {
             Text::string(bytes)
         })
     }
 
-    /// The next word, if it is short and in ASCII as nearly all are, and what kind it is.
+    /// Reads the next word and its kind in the common case: a short ASCII word.
     #[inline(always)]
     pub(crate) fn short_word(&mut self) -> Option<(&'a [u8], Kind)> {
-        let [0x10, rest @ ..] = self.rest else {
+        let [code::token::WORD, rest @ ..] = self.rest else {
             return None;
         };
         let (word, rest, kind) = near_text(rest)?;
@@ -284,14 +284,14 @@ impl<'a, N: Notes> Reader<'a, N> {
         })
     }
 
-    /// The next agent identifier, if it is of the kind that nearly all are: a short name in ASCII,
-    /// and nothing else (`02 10 … 00 01`).
+    /// Reads the next agent identifier in the common case: a short ASCII name and no other part
+    /// (`02 10 … 00 01`).
     #[inline(always)]
     pub(crate) fn short_agent_name(&mut self) -> Option<&'a [u8]> {
-        let [0x02, 0x10, rest @ ..] = self.rest else {
+        let [code::agent::BEGIN, code::token::WORD, rest @ ..] = self.rest else {
             return None;
         };
-        let (name, [0x01, rest @ ..], kind) = near_text(rest)? else {
+        let (name, [code::END, rest @ ..], kind) = near_text(rest)? else {
             return None;
         };
         (kind.is_ascii() && !name.is_empty()).then(|| {
@@ -300,13 +300,13 @@ impl<'a, N: Notes> Reader<'a, N> {
         })
     }
 
-    /// The same of an envelope, where a bare text stands for a word (`02 … 00 01`).
+    /// Reads the same in an envelope, where the name is a bare string (`02 … 00 01`).
     #[inline(always)]
     pub(crate) fn short_bare_name(&mut self) -> Option<&'a [u8]> {
-        let [0x02, rest @ ..] = self.rest else {
+        let [code::agent::BEGIN, rest @ ..] = self.rest else {
             return None;
         };
-        let (name, [0x01, rest @ ..], kind) = near_text(rest)? else {
+        let (name, [code::END, rest @ ..], kind) = near_text(rest)? else {
             return None;
         };
         let bare = !matches!(name, [] | [b'"' | b'#', ..]);
@@ -316,20 +316,21 @@ impl<'a, N: Notes> Reader<'a, N> {
         })
     }
 
-    /// A set of agent identifiers of a message that are of this kind, up to its end, which is read too.
+    /// Reads a set of agent identifiers of a message, including its end, if
+    /// [`short_agent_name`](Self::short_agent_name) reads every one of them.
     #[inline(always)]
     pub(crate) fn short_agent_names(&mut self) -> Option<&'a [u8]> {
         let mut ahead = self.ahead();
         let start = ahead.position();
         while ahead.short_agent_name().is_some() {}
         let names = ahead.since(start);
-        ahead.take_if(0x01).then(|| {
+        ahead.take_if(code::END).then(|| {
             self.follow(&ahead);
             names
         })
     }
 
-    /// UTF-8 text of this length.
+    /// Reads UTF-8 text of `len` bytes.
     pub(crate) fn counted(
         &mut self,
         len: usize,
@@ -345,14 +346,16 @@ impl<'a, N: Notes> Reader<'a, N> {
         Ok(bytes)
     }
 
-    /// Text up to the next NUL, by the rule for `String 00` that fits every peer: in quotation
-    /// marks (standard, fipa_services), with its length in front (fipa_services), or bare (JADE).
+    /// Reads a `String 00`.
+    ///
+    /// The three forms that peers write are accepted: in quotation marks (standard, fipa_services),
+    /// with its length in front (fipa_services), and bare (JADE).
     #[inline(always)]
     pub(crate) fn string(&mut self, clause: &'static str, what: &'static str) -> Result<Text<'a>> {
         self.plain(clause, what).map(Text::string)
     }
 
-    /// Checks bytes, `behind` which bytes more were read.
+    /// Checks the bytes that end `behind` bytes before the current position.
     fn check_utf8(
         &self,
         bytes: &[u8],
@@ -367,19 +370,19 @@ impl<'a, N: Notes> Reader<'a, N> {
         Err(DecodeError::new(offset, clause, Problem::NotUtf8(what)))
     }
 
-    /// The next date and time, if it is of the kind that nearly all are: on the calendar, in UTC or
-    /// without a zone, and within what every month and every minute has.
+    /// Reads the next date and time in the common case: absolute, in UTC or without a zone, with a
+    /// day up to 28 and a second up to 59.
     #[inline(always)]
     fn short_date_time(&mut self) -> Option<Time> {
-        let (&[code, first @ .., last], rest) = self.rest.split_first_chunk::<10>()?;
-        let numbers = all_digits(first).filter(|numbers| Fields::are_usual(*numbers))?;
+        let (&[id, first @ .., last], rest) = self.rest.split_first_chunk::<10>()?;
+        let numbers = all_digits(first).filter(|numbers| Fields::are_common(*numbers))?;
         let [century, year, month, day, hour, minute, second, tens] = numbers.to_le_bytes();
         let (0x10..=0xa0, 0) = (last & 0xf0, last & 0x0f) else {
             return None;
         };
-        let (zone, rest) = match (code, rest) {
-            (0x20, rest) => (Zone::Unspecified, rest),
-            (0x24, [b'Z', rest @ ..]) => (Zone::Utc, rest),
+        let (zone, rest) = match (id, rest) {
+            (code::date_time::ABSOLUTE, rest) => (Zone::Unspecified, rest),
+            (code::date_time::ABSOLUTE_WITH_DESIGNATOR, [b'Z', rest @ ..]) => (Zone::Utc, rest),
             _ => return None,
         };
         self.rest = rest;
@@ -396,22 +399,25 @@ impl<'a, N: Notes> Reader<'a, N> {
         Some(Time { base, zone, fields })
     }
 
-    /// A date and time after its code byte (FIPA00069 `BinDateTime`), which says what follows.
+    /// Reads a date and time with its code (FIPA00069 2.2 `BinDateTimeToken`).
     #[inline(always)]
     pub(crate) fn date_time(&mut self, clause: &'static str) -> Result<Time> {
         match self.short_date_time() {
             Some(time) => Ok(time),
-            None => self.other_date_time(clause),
+            None => self.date_time_slow(clause),
         }
     }
 
     #[inline(never)]
-    fn other_date_time(&mut self, clause: &'static str) -> Result<Time> {
-        let code = self.byte(clause, "a date")?;
-        let base = match code {
-            0x20 | 0x24 => Base::Absolute,
-            0x21 | 0x25 => Base::After,
-            0x22 | 0x26 => Base::Before,
+    fn date_time_slow(&mut self, clause: &'static str) -> Result<Time> {
+        let id = self.byte(clause, "a date")?;
+        let (base, has_designator) = match id {
+            code::date_time::ABSOLUTE => (Base::Absolute, false),
+            code::date_time::AFTER => (Base::After, false),
+            code::date_time::BEFORE => (Base::Before, false),
+            code::date_time::ABSOLUTE_WITH_DESIGNATOR => (Base::Absolute, true),
+            code::date_time::AFTER_WITH_DESIGNATOR => (Base::After, true),
+            code::date_time::BEFORE_WITH_DESIGNATOR => (Base::Before, true),
             other => return Err(self.unexpected(clause, other, "the code of a date")),
         };
         let offset = self.offset();
@@ -419,7 +425,7 @@ impl<'a, N: Notes> Reader<'a, N> {
         let digits = self.bytes(9, clause, "a date")?;
         let digits = <[u8; 9]>::try_from(digits).map_err(|_| wrong())?;
         let fields = bin_date(digits).ok_or_else(wrong)?;
-        let zone = if code >= 0x24 {
+        let zone = if has_designator {
             let letter = self.byte(clause, "a date")?;
             Zone::of_letter(letter).ok_or_else(wrong)?
         } else {
@@ -428,7 +434,11 @@ impl<'a, N: Notes> Reader<'a, N> {
         Time::new(base, zone, fields).map_err(|_| wrong())
     }
 
-    /// Digits (FIPA00069 2.2): ends behind the first byte whose low nibble is 0.
+    /// Reads `Digits` up to the first byte with a low nibble of 0.
+    ///
+    /// FIPA00069 2.4, note 5: "If the ASCII presentation of a number contains odd number
+    /// characters, the last four bits of the coded number are set to zero (the Padding token),
+    /// otherwise an additional 0x00 byte is added to end of coded number."
     pub(crate) fn digits(&mut self, clause: &'static str) -> Result<&'a [u8]> {
         let last = self.rest.iter().position(|byte| byte & 0x0f == 0);
         let Some(last) = last else {
@@ -443,7 +453,7 @@ impl<'a, N: Notes> Reader<'a, N> {
     }
 }
 
-/// The way a `String` was written.
+/// The form in which a `String` is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Form {
     Quoted,
@@ -451,7 +461,7 @@ pub(crate) enum Form {
     Bare,
 }
 
-/// Takes off quotation marks or a byte count. The escapes in a quoted text remain.
+/// Removes quotation marks or a byte count. The escapes in a quoted text remain.
 #[inline]
 pub(crate) fn string_form(bytes: &[u8]) -> (Form, &[u8]) {
     match bytes {
@@ -464,10 +474,9 @@ pub(crate) fn string_form(bytes: &[u8]) -> (Form, &[u8]) {
     }
 }
 
-/// What stands between quotation marks: `\"` becomes `"`; a backslash before anything else is a
-/// backslash.
+/// Unescapes the text between quotation marks: `\"` becomes `"`, and any other backslash stays.
 pub(crate) fn unescaped(inner: &[u8]) -> Cow<'_, [u8]> {
-    // Nearly none has quotation marks at all, which is quicker found out.
+    // Most texts have no quotation mark. Checking for one is faster than searching for escapes.
     let mut escapes = match find_byte(inner, b'"') {
         Some(_) => memchr::memmem::find_iter(inner, b"\\\"").peekable(),
         None => return Cow::Borrowed(inner),
@@ -485,9 +494,9 @@ pub(crate) fn unescaped(inner: &[u8]) -> Cow<'_, [u8]> {
     Cow::Owned(out)
 }
 
-/// The text behind `n"`, if it is of n bytes.
+/// Returns the text behind `n"` if it has n bytes.
 fn counted(bytes: &[u8]) -> Option<&[u8]> {
-    // A length has at most 10 digits; looking no further keeps hostile input cheap.
+    // A length has at most 10 digits. The bound keeps hostile input cheap.
     let mark = bytes.iter().take(11).position(|&byte| byte == b'"')?;
     let (digits, text) = (bytes.get(..mark)?, bytes.get(mark + 1..)?);
     let mut len = 0_usize;
@@ -500,10 +509,10 @@ fn counted(bytes: &[u8]) -> Option<&[u8]> {
     (!digits.is_empty() && len == text.len()).then_some(text)
 }
 
-/// The characters of digits that were read; `None` stands for a nibble without a meaning.
+/// Returns the characters of digits. `None` stands for an unassigned nibble.
 pub(crate) fn digit_chars(digits: &[u8]) -> impl Iterator<Item = Option<char>> + '_ {
     let nibbles = digits.iter().flat_map(|byte| [byte >> 4, byte & 0x0f]);
-    // Only the last byte can have padding.
+    // Padding occurs in the last byte only.
     let count = digits.len() * 2;
     nibbles
         .enumerate()
@@ -518,8 +527,13 @@ pub(crate) fn digit_chars(digits: &[u8]) -> impl Iterator<Item = Option<char>> +
         })
 }
 
-/// The nine bytes of `BinDate` (FIPA00069 2.3). Milliseconds are three digits and padding, or four
-/// digits (fipa_services). The fields between year and milliseconds may be one digit and padding.
+/// Decodes the nine bytes of a `BinDate`.
+///
+/// FIPA00069 2.4, note 8: "These fields always have static length (two bytes for year and
+/// milliseconds, one byte for other components)."
+///
+/// Milliseconds are three digits and padding, or four digits (fipa_services). The fields between
+/// year and milliseconds may be one digit and padding.
 fn bin_date(digits: [u8; 9]) -> Option<Fields> {
     let [y1, y2, month, day, hour, minute, second, m1, m2] = digits;
     let first = [y1, y2, month, day, hour, minute, second, m1];
@@ -554,19 +568,19 @@ fn bin_date(digits: [u8; 9]) -> Option<Fields> {
     })
 }
 
-/// The numbers that eight times two digits are, if all of them are digits.
+/// Decodes eight numbers of two digits each, if all nibbles are digits.
 #[inline]
 fn all_digits(bytes: [u8; 8]) -> Option<u64> {
     let word = u64::from_le_bytes(bytes);
     let (high, low) = (word >> 4 & (ONES * 0x0f), word & (ONES * 0x0f));
-    // In every byte: the top bit is set where there is a padding nibble or none of a digit.
+    // Sets the top bit of each byte with a padding nibble or a nibble above the digits.
     let padding = |nibbles: u64| !(nibbles + ONES * 0x7f);
     let beyond = |nibbles: u64| nibbles + ONES * (0x80 - 11);
     let wrong = padding(high) | padding(low) | beyond(high) | beyond(low);
     (wrong & TOPS == 0).then(|| high * 10 + low - ONES * 11)
 }
 
-/// The number that two digits are.
+/// Decodes a number of two digits.
 fn two(byte: u8) -> Option<u8> {
     Some(nibble(byte >> 4)? * 10 + nibble(byte & 0x0f)?)
 }
@@ -587,7 +601,7 @@ mod tests {
     }
 
     #[test]
-    fn digits_of_the_clause() {
+    fn digits_are_read_as_the_standard_codes_them() {
         for (bytes, text) in [
             (&[0x80][..], "7"),
             (&[0x53, 0x00], "42"),
@@ -607,7 +621,7 @@ mod tests {
     }
 
     #[test]
-    fn milliseconds_of_three_and_of_four_digits() {
+    fn milliseconds_with_three_or_four_digits_are_read() {
         let padded = [0x20, 0x31, 0x11, 0x16, 0x19, 0x15, 0x37, 0x62, 0x59, 0x20];
         let four = [0x20, 0x31, 0x11, 0x16, 0x19, 0x15, 0x37, 0x62, 0x15, 0x92];
         for bytes in [padded, four] {
@@ -617,7 +631,7 @@ mod tests {
     }
 
     #[test]
-    fn the_form_of_strings() {
+    fn the_form_of_a_string_is_detected() {
         for (bytes, form, text) in [
             (&b"\"hi\""[..], Form::Quoted, &b"hi"[..]),
             (b"#2\"hi", Form::Counted, b"hi"),

@@ -1,29 +1,30 @@
 //! Reading a bit-efficient message.
 
 use crate::bitefficient::agent_id::{agent_id, agent_ids, token, user_defined};
+use crate::bitefficient::code;
 use crate::bitefficient::expression::expression;
-use crate::bitefficient::notes::{self, Notes, Silent};
+use crate::bitefficient::notes::{self, NoNotes, Notes};
 use crate::bitefficient::reader::{Form, Reader, string_form};
 use crate::error::{DecodeError, Problem};
 use crate::view::{AgentIdView, Content, PerformativeView, UserDefined};
 use crate::word::is_word;
 use crate::{AgentId, Message, MessageView, Payload, Performative, Representation, Text};
 
-/// The name that fipa_services writes for a sender that is not set.
+/// The name that fipa_services writes if a message has no sender.
 pub(super) const UNDEFINED_AGENT: &str = "agent_id:undefined";
 
-/// Reads a message that lies in one piece.
+/// Reads a message in one piece.
 ///
 /// # Errors
-/// When the bytes are not one whole message in this encoding.
+/// The bytes are not one whole message in this encoding.
 pub(crate) fn view(bytes: &[u8]) -> Result<MessageView<'_>, DecodeError> {
     Parser::new(Reader::new(bytes), None)?.message()
 }
 
-/// Reads a message that is split around its content, which is not touched then.
+/// Reads a message that is split around its content. The content is not accessed.
 ///
 /// # Errors
-/// When the pieces are not one whole message in this encoding.
+/// The pieces are not one whole message in this encoding.
 pub(crate) fn view_split(payload: &Payload) -> Result<MessageView<'_>, DecodeError> {
     let pieces = Pieces {
         content: &payload.content,
@@ -32,10 +33,10 @@ pub(crate) fn view_split(payload: &Payload) -> Result<MessageView<'_>, DecodeErr
     Parser::new(Reader::new(&payload.head), Some(pieces))?.message()
 }
 
-/// Reads what lies in one piece, and tells `notes` what every byte of it means.
+/// Reads a message in one piece and notes the meaning of every byte.
 ///
 /// # Errors
-/// Like [`view`].
+/// The same as of [`view`].
 pub(crate) fn view_noting(
     bytes: &[u8],
     base: usize,
@@ -44,16 +45,16 @@ pub(crate) fn view_noting(
     Parser::new(Reader::noting(bytes, base, notes), None)?.message()
 }
 
-/// The next user-defined parameter among those of a checked message.
+/// Reads the next user-defined parameter of a checked message.
 pub(crate) fn next_user_defined<'a>(pieces: &mut [&'a [u8]; 2]) -> Option<Pair<'a>> {
-    // What is passed over on the way is read into this.
-    let mut passed = MessageView::empty(PerformativeView::Standard(0));
+    // Receives the other parameters, which are skipped.
+    let mut skipped = MessageView::empty(PerformativeView::Standard(0));
     for piece in pieces {
         let mut reader = Reader::new(piece);
         while reader.remaining() > 0 {
-            // An error cannot occur in checked bytes, and would end this.
+            // An error cannot occur in checked bytes. It would end the iteration.
             let mut pair = None;
-            passed.step(&mut reader, &mut pair).ok()?;
+            skipped.step(&mut reader, &mut pair).ok()?;
             *piece = reader.rest();
             if pair.is_some() {
                 return pair;
@@ -63,12 +64,12 @@ pub(crate) fn next_user_defined<'a>(pieces: &mut [&'a [u8]; 2]) -> Option<Pair<'
     None
 }
 
-const CLAUSE: &str = "FIPA00069 2.1 Message";
+const CLAUSE: &str = "FIPA00069 2.2 Message";
 
-/// What was read of a message.
+/// The item that was read.
 #[derive(PartialEq, Eq)]
 enum Step {
-    /// A parameter that is in the view now, or beside it.
+    /// A parameter, which was stored in the view or, if user-defined, given to the caller.
     Parameter,
     End,
 }
@@ -77,58 +78,57 @@ enum Step {
 type Pair<'a> = (Text<'a>, Text<'a>);
 
 impl<'a> MessageView<'a> {
-    /// Reads one parameter. What is user-defined is given, not kept.
+    /// Reads one parameter. A user-defined one is written to `pair` and not stored.
     #[inline(always)]
     fn step<N: Notes>(
         &mut self,
         reader: &mut Reader<'a, N>,
         pair: &mut Option<Pair<'a>>,
     ) -> Result<Step, DecodeError> {
-        let code = reader.byte(CLAUSE, "a message")?;
-        let (text, what) = match code {
-            0x05 => (&mut self.reply_with, "reply-with"),
-            0x07 => (&mut self.in_reply_to, "in-reply-to"),
-            0x09 => (&mut self.language, "language"),
-            0x0a => (&mut self.encoding, "encoding"),
-            0x0b => (&mut self.ontology, "ontology"),
-            0x0d => (&mut self.conversation_id, "conversation-id"),
-            0x00 => {
+        let (text, what) = match reader.byte(CLAUSE, "a message")? {
+            code::message::REPLY_WITH => (&mut self.reply_with, "reply-with"),
+            code::message::IN_REPLY_TO => (&mut self.in_reply_to, "in-reply-to"),
+            code::message::LANGUAGE => (&mut self.language, "language"),
+            code::message::ENCODING => (&mut self.encoding, "encoding"),
+            code::message::ONTOLOGY => (&mut self.ontology, "ontology"),
+            code::message::CONVERSATION_ID => (&mut self.conversation_id, "conversation-id"),
+            code::message::USER_DEFINED => {
                 *pair = Some(user_defined(reader)?);
                 return Ok(Step::Parameter);
             }
-            0x01 => {
+            code::END => {
                 reader.note(|| "end of message".to_owned());
                 return Ok(Step::End);
             }
-            0x02 => {
+            code::message::SENDER => {
                 let sender = sender(reader)?;
                 let is_defined = sender.name().raw() != UNDEFINED_AGENT.as_bytes();
                 self.sender = is_defined.then_some(sender);
                 return Ok(Step::Parameter);
             }
-            0x03 => {
+            code::message::RECEIVER => {
                 self.receivers = agent_ids(reader, "receivers")?;
                 return Ok(Step::Parameter);
             }
-            0x04 => {
+            code::message::CONTENT => {
                 if let Some(Content::Beside(_)) = self.content {
-                    let problem = Problem::Split("there is more content behind the content");
+                    let problem = Problem::Split("the tail has a second content parameter");
                     return Err(reader.error(CLAUSE, problem));
                 }
                 self.content = Some(content(reader)?);
                 return Ok(Step::Parameter);
             }
-            0x06 => {
-                let time = reader.date_time("FIPA00069 2.3 BinDateTime")?;
+            code::message::REPLY_BY => {
+                let time = reader.date_time("FIPA00069 2.2 BinDateTimeToken")?;
                 reader.note(|| notes::date("reply-by:", time));
                 self.reply_by = Some(time);
                 return Ok(Step::Parameter);
             }
-            0x08 => {
+            code::message::REPLY_TO => {
                 self.reply_to = agent_ids(reader, "reply-to")?;
                 return Ok(Step::Parameter);
             }
-            0x0c => {
+            code::message::PROTOCOL => {
                 self.protocol = Some(protocol(reader)?);
                 return Ok(Step::Parameter);
             }
@@ -172,10 +172,10 @@ fn protocol<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<Text<'a>, Decode
 
 #[inline(always)]
 fn content<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<Content<'a>, DecodeError> {
-    const CLAUSE: &str = "FIPA00069 2.1 BinString";
+    const CLAUSE: &str = "FIPA00069 2.2 BinString";
     let len = match reader.peek() {
-        Some(0x14) => return string_content(reader),
-        Some(0x16..=0x19) => content_len(reader)?,
+        Some(code::token::STRING) => return string_content(reader),
+        Some(code::token::LEN8..=code::token::LEN32) => content_len(reader)?,
         _ => return expression_content(reader),
     };
     let bytes = reader.bytes(len, CLAUSE, "content")?;
@@ -187,7 +187,7 @@ fn content<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<Content<'a>, Deco
 
 #[inline(never)]
 fn string_content<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<Content<'a>, DecodeError> {
-    const CLAUSE: &str = "FIPA00069 2.1 BinString";
+    const CLAUSE: &str = "FIPA00069 2.2 BinString";
     reader.skip_peeked();
     let bytes = reader.until_nul(CLAUSE, "content")?;
     if bytes.len() as u64 > Message::MAX_CONTENT {
@@ -204,21 +204,21 @@ fn expression_content<'a, N: Notes>(
     Ok(Content::Expression(text(reader, "content")?))
 }
 
-/// Reads code and length of content that is given with its length.
+/// Reads the code and the length of content with a length.
 fn content_len<N: Notes>(reader: &mut Reader<'_, N>) -> Result<usize, DecodeError> {
-    const CLAUSE: &str = "FIPA00069 2.1 BinString";
-    let (len, code) = match reader.byte(CLAUSE, "content")? {
-        0x16 => (reader.u8_len(CLAUSE)?, "Len8"),
-        0x17 => (reader.u16_len(CLAUSE)?, "Len16"),
-        0x19 => (reader.u32_len(CLAUSE)?, "Len32"),
-        0x18 => return Err(reader.error(CLAUSE, Problem::CodeTable)),
+    const CLAUSE: &str = "FIPA00069 2.2 BinString";
+    let (len, size) = match reader.byte(CLAUSE, "content")? {
+        code::token::LEN8 => (reader.u8_len(CLAUSE)?, "Len8"),
+        code::token::LEN16 => (reader.u16_len(CLAUSE)?, "Len16"),
+        code::token::LEN32 => (reader.u32_len(CLAUSE)?, "Len32"),
+        code::token::LEN_INDEX => return Err(reader.error(CLAUSE, Problem::CodeTable)),
         other => return Err(reader.unexpected(CLAUSE, other, "content with its length")),
     };
-    reader.note(|| format!("content, {len} bytes ({code})"));
+    reader.note(|| format!("content, {len} bytes ({size})"));
     Ok(len)
 }
 
-/// Describes content that was read up to a NUL.
+/// Describes content that ends with a NUL.
 fn string_noted(bytes: &[u8]) -> String {
     let (form, inner) = string_form(bytes);
     let written = match form {
@@ -230,41 +230,43 @@ fn string_noted(bytes: &[u8]) -> String {
     format!("content, {len} bytes{written}: {content}")
 }
 
-/// What comes behind the head of a split message.
+/// The pieces behind the head of a split message.
 #[derive(Clone, Copy)]
 struct Pieces<'a> {
     content: &'a [u8],
     tail: &'a [u8],
 }
 
-struct Parser<'a, N = Silent> {
+struct Parser<'a, N = NoNotes> {
     reader: Reader<'a, N>,
-    /// The rest of a split message, until its content was met.
+    /// The other pieces of a split message, until the content is reached.
     split: Option<Pieces<'a>>,
     performative: PerformativeView<'a>,
 }
 
 impl<'a, N: Notes> Parser<'a, N> {
-    /// Reads what comes before the parameters.
+    /// Reads the identifier, the version and the performative.
     #[inline(always)]
     fn new(mut reader: Reader<'a, N>, split: Option<Pieces<'a>>) -> Result<Self, DecodeError> {
         let start = reader.ahead();
         match reader.byte(CLAUSE, "a message")? {
-            0xfa => {}
-            0xfb | 0xfc => return Err(start.error(CLAUSE, Problem::CodeTable)),
+            code::message_id::PLAIN => {}
+            code::message_id::TABLE_UPDATED | code::message_id::TABLE_UNCHANGED => {
+                return Err(start.error(CLAUSE, Problem::CodeTable));
+            }
             _ => return Err(not_bit_efficient(&start)),
         }
         reader.note(|| "message, bit-efficient, without code tables".to_owned());
-        // Peers write other versions than 1.0 and mean the same.
+        // Test messages of fipa_services have version 0.1 and the format of 1.0.
         let version = reader.byte(CLAUSE, "the version")?;
         reader.note(|| match version {
-            0x10 => "version 1.0".to_owned(),
-            other => format!("version {}.{}, taken for 1.0", other >> 4, other & 0x0f),
+            code::VERSION_1_0 => "version 1.0".to_owned(),
+            other => format!("version {}.{}, read as 1.0", other >> 4, other & 0x0f),
         });
         let offset = reader.offset();
         let wrong = |clause, problem| DecodeError::new(offset, clause, problem);
-        let code = reader.byte(CLAUSE, "the performative")?;
-        let performative = if code == 0 {
+        let act = reader.byte(CLAUSE, "the performative")?;
+        let performative = if act == code::USER_DEFINED_PERFORMATIVE {
             let (name, _) = token(&mut reader, "performative")?;
             if !is_word(name.raw()) {
                 let problem = Problem::NotAWord("performative");
@@ -272,16 +274,15 @@ impl<'a, N: Notes> Parser<'a, N> {
             }
             PerformativeView::Other(name)
         } else {
-            if Performative::name_of_code(code).is_empty() {
-                let found = code;
-                let expected = "the code of a performative";
+            if Performative::name_of_code(act).is_empty() {
+                let (found, expected) = (act, "the code of a performative");
                 return Err(wrong(CLAUSE, Problem::Unexpected { found, expected }));
             }
-            PerformativeView::Standard(code)
+            PerformativeView::Standard(act)
         };
         reader.note(|| match performative {
-            PerformativeView::Standard(code) => {
-                format!("performative: {}", Performative::name_of_code(code))
+            PerformativeView::Standard(act) => {
+                format!("performative: {}", Performative::name_of_code(act))
             }
             PerformativeView::Other(name) => {
                 format!(
@@ -323,15 +324,15 @@ impl<'a, N: Notes> Parser<'a, N> {
         Ok(view)
     }
 
-    /// Of a split message, the content if it is next. Reading goes on behind it then.
+    /// Returns the content of a split message if it is next. The reader then continues behind it.
     #[inline]
     fn content_beside(&mut self) -> Result<Option<&'a [u8]>, DecodeError> {
-        const CLAUSE: &str = "FIPA00069 2.1 BinString";
+        const CLAUSE: &str = "FIPA00069 2.2 BinString";
         let Some(Pieces { content, tail }) = self.split else {
             return Ok(None);
         };
-        // Code of the parameter, code and length of the string, and nothing more.
-        if self.reader.peek() != Some(0x04) || self.reader.remaining() > 6 {
+        // The head ends with the code of the parameter and the code and length of the string.
+        if self.reader.peek() != Some(code::message::CONTENT) || self.reader.remaining() > 6 {
             return Ok(None);
         }
         let mut ahead = self.reader.ahead();
@@ -341,10 +342,11 @@ impl<'a, N: Notes> Parser<'a, N> {
             return Ok(None);
         }
         if len != content.len() {
-            let problem = Problem::Split("the length of the content differs");
+            let problem = Problem::Split("the content has another length than the head announces");
             return Err(self.reader.error(CLAUSE, problem));
         }
-        self.reader.go_on(tail, ahead.offset().saturating_add(len));
+        let base = ahead.offset().saturating_add(len);
+        self.reader.continue_with(tail, base);
         self.split = None;
         Ok(Some(content))
     }
@@ -355,7 +357,7 @@ impl<'a, N: Notes> Parser<'a, N> {
             return Err(self.reader.error(CLAUSE, Problem::Trailing(rest)));
         }
         if self.split.is_some() {
-            let problem = Problem::Split("the head is a whole message already");
+            let problem = Problem::Split("the head alone is a whole message");
             return Err(self.reader.error(CLAUSE, problem));
         }
         Ok(())

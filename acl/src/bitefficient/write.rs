@@ -1,13 +1,14 @@
-//! Writing bit-efficient messages: FIPA00069 to the letter, content last.
+//! Writing bit-efficient messages strictly as FIPA00069 defines them, with the content last.
 
 use bytes::{BufMut, Bytes, BytesMut};
 
+use crate::bitefficient::code;
 use crate::error::EncodeError;
 use crate::time::{Base, Fields, Time, Zone};
 use crate::word::{self, Piece, Shape, is_word};
 use crate::{AgentId, Message, Payload};
 
-/// Length of the encoded message in bytes.
+/// Length of the encoded message in the standard's dialect, in bytes.
 #[must_use]
 pub fn encoded_len(message: &Message) -> usize {
     let mut counter = Counter(0);
@@ -16,10 +17,10 @@ pub fn encoded_len(message: &Message) -> usize {
     counter.0 + content_len.unwrap_or(0) + TAIL.len()
 }
 
-/// Writes the encoded message: [`encoded_len`] bytes.
+/// Writes the encoded message, [`encoded_len`] bytes, in the standard's dialect.
 ///
 /// # Panics
-/// When the buffer has a limit and less room than that.
+/// If the buffer has a fixed capacity and less space than that.
 pub fn encode(message: &Message, out: &mut impl BufMut) {
     let content_len = message.content.as_ref().map(Bytes::len);
     let mut sink = Sink::new(out);
@@ -30,7 +31,8 @@ pub fn encode(message: &Message, out: &mut impl BufMut) {
 }
 
 impl Message {
-    /// The encoded message (FIPA00069), in pieces that share the memory of the content.
+    /// Encodes the message (FIPA00069) in the standard's dialect. The result shares the memory of
+    /// the content.
     #[must_use]
     pub fn to_payload(&self) -> Payload {
         match &self.content {
@@ -47,12 +49,14 @@ impl Message {
         }
     }
 
-    /// What stands in front of content of `content_len` bytes, its length included, and what
-    /// stands behind it. The content that the message has is left out: this is for writing around
-    /// memory that the application fills itself.
+    /// Encodes the message (FIPA00069) without its content. Returns the bytes in front of content
+    /// of `content_len` bytes, including its length, and the bytes behind it.
+    ///
+    /// This is for content that the application writes in place. The content of the message itself
+    /// is ignored.
     ///
     /// # Errors
-    /// When the content is longer than [`Message::MAX_CONTENT`].
+    /// `content_len` exceeds [`Message::MAX_CONTENT`].
     pub fn around_content(&self, content_len: usize) -> Result<(Bytes, Bytes), EncodeError> {
         if content_len as u64 > Self::MAX_CONTENT {
             return Err(EncodeError::ContentTooLong(content_len));
@@ -61,8 +65,8 @@ impl Message {
     }
 }
 
-/// What follows the content: the end of the message.
-const TAIL: &[u8] = &[0x01];
+/// The bytes behind the content: the end of the message.
+const TAIL: &[u8] = &[code::END];
 
 fn head(message: &Message, content_len: usize) -> Bytes {
     let mut counter = Counter(0);
@@ -74,18 +78,19 @@ fn head(message: &Message, content_len: usize) -> Bytes {
     out.freeze()
 }
 
-/// Where bytes go: into a buffer, or only counted, so that both always agree.
-pub(crate) trait Out {
+/// Receives encoded bytes: a buffer, or a counter of their number. One code path serves both, so
+/// they always agree.
+pub(crate) trait Output {
     fn byte(&mut self, byte: u8);
     fn slice(&mut self, bytes: &[u8]);
 
-    /// Appends bytes whose copy satisfies a condition. Returns whether they were appended; what cannot
-    /// check its own copy appends none.
+    /// Appends bytes if their copy satisfies a condition. Returns whether they were appended. An
+    /// output that cannot check its own copy appends none.
     fn slice_if(&mut self, _bytes: &[u8], _is_wanted: &dyn Fn(&[u8]) -> bool) -> bool {
         false
     }
 
-    /// The same as three slices.
+    /// Appends three slices.
     #[inline]
     fn framed<const N: usize, const M: usize>(
         &mut self,
@@ -103,7 +108,7 @@ pub(crate) trait Out {
 
 pub(crate) struct Counter(pub(crate) usize);
 
-impl Out for Counter {
+impl Output for Counter {
     #[inline]
     fn byte(&mut self, _: u8) {
         self.0 += 1;
@@ -115,8 +120,8 @@ impl Out for Counter {
     }
 }
 
-/// Collects the many small pieces of a head, because every one of them costs a growing buffer a
-/// check of its room.
+/// Collects the many small pieces of a head, because a growing buffer checks its capacity for each
+/// of them.
 pub(crate) struct Sink<'a, B: BufMut> {
     out: &'a mut B,
     collected: [u8; 256],
@@ -137,7 +142,7 @@ impl<'a, B: BufMut> Sink<'a, B> {
         slices.into_iter().for_each(|slice| self.slice(slice));
     }
 
-    /// Hands on what was collected; to be called in the end.
+    /// Writes the collected bytes to the buffer. The caller must call this at the end.
     pub(crate) fn flush(&mut self) {
         let collected = self.collected.get(..self.len).unwrap_or_default();
         self.out.put_slice(collected);
@@ -145,7 +150,7 @@ impl<'a, B: BufMut> Sink<'a, B> {
     }
 }
 
-impl<B: BufMut> Out for Sink<'_, B> {
+impl<B: BufMut> Output for Sink<'_, B> {
     #[inline]
     fn byte(&mut self, byte: u8) {
         self.slice(&[byte]);
@@ -157,16 +162,16 @@ impl<B: BufMut> Out for Sink<'_, B> {
             self.flush();
         }
         match self.collected.get_mut(self.len..self.len + bytes.len()) {
-            Some(room) => {
-                room.copy_from_slice(bytes);
+            Some(free) => {
+                free.copy_from_slice(bytes);
                 self.len += bytes.len();
             }
-            // Longer than all the room there is, which is empty now.
+            // The slice is longer than the whole array, which is empty now.
             None => self.out.put_slice(bytes),
         }
     }
 
-    /// All at once, where there is room.
+    /// Copies all three slices at once if there is space.
     #[inline(always)]
     fn framed<const N: usize, const M: usize>(
         &mut self,
@@ -174,10 +179,10 @@ impl<B: BufMut> Out for Sink<'_, B> {
         bytes: &[u8],
         behind: [u8; M],
     ) {
-        let room = self.collected.get_mut(self.len..).unwrap_or_default();
-        if let Some((first, room)) = room.split_first_chunk_mut::<N>()
-            && let Some((middle, room)) = room.split_at_mut_checked(bytes.len())
-            && let Some((last, _)) = room.split_first_chunk_mut::<M>()
+        let free = self.collected.get_mut(self.len..).unwrap_or_default();
+        if let Some((first, free)) = free.split_first_chunk_mut::<N>()
+            && let Some((middle, free)) = free.split_at_mut_checked(bytes.len())
+            && let Some((last, _)) = free.split_first_chunk_mut::<M>()
         {
             *first = before;
             copy_short(middle, bytes);
@@ -189,7 +194,7 @@ impl<B: BufMut> Out for Sink<'_, B> {
     }
 }
 
-/// Copies a few bytes: in two that overlap, which is quicker than to call the function for many.
+/// Copies a few bytes as two overlapping chunks, which is faster than a call of `memcpy`.
 #[inline(always)]
 fn copy_short(to: &mut [u8], from: &[u8]) {
     if from.len() <= 16
@@ -207,7 +212,7 @@ fn copy_short(to: &mut [u8], from: &[u8]) {
     }
 }
 
-impl Out for Vec<u8> {
+impl Output for Vec<u8> {
     fn byte(&mut self, byte: u8) {
         self.push(byte);
     }
@@ -227,173 +232,193 @@ impl Out for Vec<u8> {
     }
 }
 
-/// Everything in front of the content, its length included.
-fn write_head(message: &Message, content_len: Option<usize>, out: &mut impl Out) {
-    out.slice(&[0xfa, 0x10]);
+/// Writes the bytes in front of the content, including its length.
+fn write_head(message: &Message, content_len: Option<usize>, out: &mut impl Output) {
+    out.slice(&[code::message_id::PLAIN, code::VERSION_1_0]);
     match message.performative.code() {
-        Some(code) => out.byte(code),
+        Some(act) => out.byte(act),
         None => {
-            out.byte(0x00);
+            out.byte(code::USER_DEFINED_PERFORMATIVE);
             write_word(message.performative.as_str(), out);
         }
     }
     match &message.sender {
-        Some(sender) if sender.is_plain() => {
-            out.framed(*b"\x02\x02\x10", sender.name().as_bytes(), *b"\x00\x01");
-        }
+        Some(sender) if sender.is_plain() => out.framed(
+            [code::message::SENDER, code::agent::BEGIN, code::token::WORD],
+            sender.name().as_bytes(),
+            [0x00, code::END],
+        ),
         Some(sender) => {
-            out.byte(0x02);
+            out.byte(code::message::SENDER);
             write_agent_id(sender, out);
         }
         None => {}
     }
-    write_set(0x03, &message.receivers, out);
-    write_text(0x05, message.reply_with.as_deref(), out);
+    write_set(code::message::RECEIVER, &message.receivers, out);
+    write_text(
+        code::message::REPLY_WITH,
+        message.reply_with.as_deref(),
+        out,
+    );
     if let Some(reply_by) = message.reply_by {
-        out.byte(0x06);
+        out.byte(code::message::REPLY_BY);
         write_date_time(reply_by, out);
     }
-    write_text(0x07, message.in_reply_to.as_deref(), out);
-    write_set(0x08, &message.reply_to, out);
-    write_text(0x09, message.language.as_deref(), out);
-    write_text(0x0a, message.encoding.as_deref(), out);
-    write_text(0x0b, message.ontology.as_deref(), out);
+    write_text(
+        code::message::IN_REPLY_TO,
+        message.in_reply_to.as_deref(),
+        out,
+    );
+    write_set(code::message::REPLY_TO, &message.reply_to, out);
+    write_text(code::message::LANGUAGE, message.language.as_deref(), out);
+    write_text(code::message::ENCODING, message.encoding.as_deref(), out);
+    write_text(code::message::ONTOLOGY, message.ontology.as_deref(), out);
     if let Some(protocol) = &message.protocol {
-        out.byte(0x0c);
+        out.byte(code::message::PROTOCOL);
         write_word(protocol, out);
     }
-    write_text(0x0d, message.conversation_id.as_deref(), out);
+    let conversation_id = message.conversation_id.as_deref();
+    write_text(code::message::CONVERSATION_ID, conversation_id, out);
     for (name, value) in &message.user_defined {
-        out.byte(0x00);
+        out.byte(code::message::USER_DEFINED);
         write_user_defined(name, value, out);
     }
     if let Some(len) = content_len {
-        out.byte(0x04);
+        out.byte(code::message::CONTENT);
         write_len(len, out);
     }
 }
 
-fn write_text(code: u8, text: Option<&str>, out: &mut impl Out) {
+fn write_text(parameter: u8, text: Option<&str>, out: &mut impl Output) {
     let Some(text) = text else { return };
     let bytes = text.as_bytes();
     match Shape::of(text) {
-        Shape::Word => out.framed([code, 0x10], bytes, [0x00]),
-        Shape::Quotable => out.framed([code, 0x14, b'"'], bytes, [b'"', 0x00]),
+        Shape::Word => out.framed([parameter, code::token::WORD], bytes, [0x00]),
+        Shape::Quotable => {
+            out.framed([parameter, code::token::STRING, b'"'], bytes, [b'"', 0x00]);
+        }
         Shape::Other => {
-            out.byte(code);
+            out.byte(parameter);
             write_expression(text, out);
         }
     }
 }
 
-fn write_set(code: u8, agents: &[AgentId], out: &mut impl Out) {
+fn write_set(parameter: u8, agents: &[AgentId], out: &mut impl Output) {
     match agents {
         [] => {}
         [agent] if agent.is_plain() => {
             out.framed(
-                [code, 0x02, 0x10],
+                [parameter, code::agent::BEGIN, code::token::WORD],
                 agent.name().as_bytes(),
-                *b"\x00\x01\x01",
+                [0x00, code::END, code::END],
             );
         }
         _ => {
-            out.byte(code);
+            out.byte(parameter);
             write_agent_ids(agents, out);
         }
     }
 }
 
-fn write_agent_ids(agents: &[AgentId], out: &mut impl Out) {
+fn write_agent_ids(agents: &[AgentId], out: &mut impl Output) {
     for agent in agents {
         write_agent_id(agent, out);
     }
-    out.byte(0x01);
+    out.byte(code::END);
 }
 
-fn write_agent_id(agent: &AgentId, out: &mut impl Out) {
-    out.framed([0x02, 0x10], agent.name().as_bytes(), [0x00]);
+fn write_agent_id(agent: &AgentId, out: &mut impl Output) {
+    out.framed(
+        [code::agent::BEGIN, code::token::WORD],
+        agent.name().as_bytes(),
+        [0x00],
+    );
     if !agent.addresses().is_empty() {
-        out.byte(0x02);
+        out.byte(code::agent::ADDRESSES);
         for address in agent.addresses() {
             write_word(address, out);
         }
-        out.byte(0x01);
+        out.byte(code::END);
     }
     if !agent.resolvers().is_empty() {
-        out.byte(0x03);
+        out.byte(code::agent::RESOLVERS);
         write_agent_ids(agent.resolvers(), out);
     }
     for (name, value) in agent.user_defined() {
-        out.byte(0x04);
+        out.byte(code::agent::USER_DEFINED);
         write_user_defined(name, value, out);
     }
-    out.byte(0x01);
+    out.byte(code::END);
 }
 
-/// How texts are written in one of the bit-efficient formats for one of the readers.
-pub(crate) trait Hand {
+/// Writes texts in one of the bit-efficient encodings and one of the dialects.
+pub(crate) trait TextWriter {
     fn byte(&mut self, byte: u8);
 
-    /// A name or an address.
+    /// Writes a name or an address.
     fn name(&mut self, what: &'static str, text: &str) -> Result<(), EncodeError>;
 
-    /// A user-defined parameter of an agent identifier, with its code.
+    /// Writes a user-defined parameter of an agent identifier, including its code.
     fn user_defined_of_agent(&mut self, name: &str, value: &str) -> Result<(), EncodeError>;
 }
 
-/// An agent identifier, the parts in the only order that fipa_services reads.
-pub(crate) fn write_agent_id_by(hand: &mut impl Hand, agent: &AgentId) -> Result<(), EncodeError> {
-    hand.byte(0x02);
-    hand.name("name of an agent", agent.name())?;
+/// Writes an agent identifier, with its parts in the only order that fipa_services reads.
+pub(crate) fn write_agent_id_by(
+    writer: &mut impl TextWriter,
+    agent: &AgentId,
+) -> Result<(), EncodeError> {
+    writer.byte(code::agent::BEGIN);
+    writer.name("name of an agent", agent.name())?;
     if !agent.addresses().is_empty() {
-        hand.byte(0x02);
+        writer.byte(code::agent::ADDRESSES);
         for address in agent.addresses() {
-            hand.name("address of an agent", address)?;
+            writer.name("address of an agent", address)?;
         }
-        hand.byte(0x01);
+        writer.byte(code::END);
     }
-    write_agent_set_by(hand, 0x03, agent.resolvers())?;
+    write_agent_set_by(writer, code::agent::RESOLVERS, agent.resolvers())?;
     for (name, value) in agent.user_defined() {
-        hand.user_defined_of_agent(name, value)?;
+        writer.user_defined_of_agent(name, value)?;
     }
-    hand.byte(0x01);
+    writer.byte(code::END);
     Ok(())
 }
 
-/// A set of agent identifiers with its code, unless it is empty.
+/// Writes a set of agent identifiers and the code in front of it, unless the set is empty.
 pub(crate) fn write_agent_set_by(
-    hand: &mut impl Hand,
-    code: u8,
+    writer: &mut impl TextWriter,
+    parameter: u8,
     agents: &[AgentId],
 ) -> Result<(), EncodeError> {
     if agents.is_empty() {
         return Ok(());
     }
-    hand.byte(code);
+    writer.byte(parameter);
     for agent in agents {
-        write_agent_id_by(hand, agent)?;
+        write_agent_id_by(writer, agent)?;
     }
-    hand.byte(0x01);
+    writer.byte(code::END);
     Ok(())
 }
 
-fn write_user_defined(name: &str, value: &str, out: &mut impl Out) {
-    out.framed(*b"\x10X-", name.as_bytes(), [0x00]);
+fn write_user_defined(name: &str, value: &str, out: &mut impl Output) {
+    out.framed([code::token::WORD, b'X', b'-'], name.as_bytes(), [0x00]);
     write_expression(value, out);
 }
 
-fn write_word(word: &str, out: &mut impl Out) {
-    out.framed([0x10], word.as_bytes(), [0x00]);
+fn write_word(word: &str, out: &mut impl Output) {
+    out.framed([code::token::WORD], word.as_bytes(), [0x00]);
 }
 
-/// A word where it is one, else a string literal. Text is never taken apart into coded numbers and
-/// sub-expressions: no peer reads those without errors.
-fn write_expression(text: &str, out: &mut impl Out) {
+/// Writes a text as a word if it is one, and as a string literal otherwise. It is never split into
+/// coded numbers and sub-expressions, because no peer reads those without errors.
+fn write_expression(text: &str, out: &mut impl Output) {
     if is_word(text) {
         write_word(text, out);
         return;
     }
-    out.byte(0x14);
+    out.byte(code::token::STRING);
     word::string_literal(text, |piece| match piece {
         Piece::Text(text) => out.slice(text.as_bytes()),
         Piece::LengthPrefix(len) => {
@@ -405,34 +430,37 @@ fn write_expression(text: &str, out: &mut impl Out) {
     out.byte(0x00);
 }
 
-/// Code and length of a `BinString` that is given with its length.
-pub(crate) fn write_len(len: usize, out: &mut (impl Out + ?Sized)) {
+/// Writes the code and the length of a `BinString` with a length.
+pub(crate) fn write_len(len: usize, out: &mut (impl Output + ?Sized)) {
     if let Ok(len) = u8::try_from(len) {
-        out.slice(&[0x16, len]);
+        out.slice(&[code::token::LEN8, len]);
     } else if let Ok(len) = u16::try_from(len) {
-        out.byte(0x17);
+        out.byte(code::token::LEN16);
         out.slice(&len.to_be_bytes());
     } else {
-        // A message has no more content than this can say (`Message::MAX_CONTENT`).
+        // `Message::MAX_CONTENT` bounds the length.
         let len = u32::try_from(len).unwrap_or(u32::MAX);
-        out.byte(0x19);
+        out.byte(code::token::LEN32);
         out.slice(&len.to_be_bytes());
     }
 }
 
-/// A `BinDateTime` (FIPA00069 2.3), three digits of milliseconds and padding.
-pub(crate) fn write_date_time(time: Time, out: &mut (impl Out + ?Sized)) {
+/// Writes a `BinDateTimeToken` (FIPA00069 2.2) with three digits of milliseconds and padding.
+pub(crate) fn write_date_time(time: Time, out: &mut (impl Output + ?Sized)) {
     let base = match time.base {
-        Base::Absolute => 0x20,
-        Base::After => 0x21,
-        Base::Before => 0x22,
+        Base::Absolute => code::date_time::ABSOLUTE,
+        Base::After => code::date_time::AFTER,
+        Base::Before => code::date_time::BEFORE,
     };
     let letter = match time.zone {
         Zone::Unspecified => None,
         Zone::Utc => Some(b'Z'),
         Zone::Letter(letter) => u8::try_from(letter).ok(),
     };
-    out.byte(base + if letter.is_some() { 4 } else { 0 });
+    out.byte(match letter {
+        Some(_) => base + code::date_time::WITH_DESIGNATOR,
+        None => base,
+    });
     write_seconds(time, out);
     let millisecond = time.fields.millisecond;
     out.slice(&[
@@ -444,16 +472,17 @@ pub(crate) fn write_date_time(time: Time, out: &mut (impl Out + ?Sized)) {
     }
 }
 
-/// The same as fipa_services writes it, whatever the zone: four digits of milliseconds.
-pub(crate) fn write_local_date_time(time: Time, out: &mut (impl Out + ?Sized)) {
-    out.byte(0x20);
+/// Writes an absolute time as fipa_services does: without its zone, with four digits of
+/// milliseconds.
+pub(crate) fn write_local_date_time(time: Time, out: &mut (impl Output + ?Sized)) {
+    out.byte(code::date_time::ABSOLUTE);
     write_seconds(time, out);
     let millisecond = time.fields.millisecond;
     out.slice(&[two_digits(millisecond / 100), two_digits(millisecond % 100)]);
 }
 
-/// Year to seconds.
-fn write_seconds(time: Time, out: &mut (impl Out + ?Sized)) {
+/// Writes the fields from year to second.
+fn write_seconds(time: Time, out: &mut (impl Output + ?Sized)) {
     let Fields {
         year,
         month,
@@ -468,7 +497,7 @@ fn write_seconds(time: Time, out: &mut (impl Out + ?Sized)) {
     out.slice(&fields.map(two_digits));
 }
 
-/// A number below 100.
+/// Encodes a number below 100.
 #[inline]
 fn two_digits(number: u16) -> u8 {
     const DIGITS: [u8; 100] = {
@@ -480,15 +509,15 @@ fn two_digits(number: u16) -> u8 {
         }
         digits
     };
-    // No field of a time is above that.
+    // No field of a time exceeds 99.
     DIGITS.get(usize::from(number)).copied().unwrap_or(0x11)
 }
 
-/// Digits (FIPA00069 2.2) of a number.
-pub(crate) fn write_digits(number: u64, out: &mut impl Out) {
+/// Writes a number as `Digits` (FIPA00069 2.4, note 5).
+pub(crate) fn write_digits(number: u64, out: &mut impl Output) {
     let text = number.to_string();
     for pair in text.as_bytes().chunks(2) {
-        let nibble = |place: usize| pair.get(place).map_or(0, |digit| digit - b'0' + 1);
+        let nibble = |index: usize| pair.get(index).map_or(0, |digit| digit - b'0' + 1);
         out.byte(nibble(0) << 4 | nibble(1));
     }
     if text.len().is_multiple_of(2) {
@@ -501,7 +530,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn digits_of_the_clause() {
+    fn digits_are_written_as_the_standard_codes_them() {
         for (number, bytes) in [
             (0, &[0x10][..]),
             (7, &[0x80]),
@@ -516,7 +545,7 @@ mod tests {
     }
 
     #[test]
-    fn date_of_the_clause() {
+    fn dates_are_written_as_the_standard_codes_them() {
         let mut out = Vec::new();
         write_date_time("20000508T042651481".parse().unwrap(), &mut out);
         let expected = [0x20, 0x31, 0x11, 0x16, 0x19, 0x15, 0x37, 0x62, 0x59, 0x20];
@@ -528,7 +557,7 @@ mod tests {
     }
 
     #[test]
-    fn texts_of_any_length_are_written_in_order() {
+    fn texts_longer_than_the_sink_are_written_in_order() {
         for len in [200, 255, 256, 257, 600] {
             let message = Message::builder(crate::Performative::Inform)
                 .language("l".repeat(len))
@@ -543,7 +572,7 @@ mod tests {
     }
 
     #[test]
-    fn lengths_take_as_few_bytes_as_they_can() {
+    fn lengths_have_the_shortest_form() {
         for (len, bytes) in [
             (0, &[0x16, 0][..]),
             (255, &[0x16, 255]),

@@ -1,6 +1,9 @@
-//! Agent identifiers in a bit-efficient envelope. They differ from those in messages: plain
-//! strings instead of words, and another code for user-defined parameters.
+//! Agent identifiers in a bit-efficient envelope.
+//!
+//! Unlike in messages, names and addresses are strings without a code, and user-defined parameters
+//! have another code.
 
+use crate::bitefficient::code;
 use crate::bitefficient::notes::{self, Notes};
 use crate::bitefficient::reader::Reader;
 use crate::envelope::read::any;
@@ -11,7 +14,7 @@ use crate::{AgentId, Text};
 
 const CLAUSE: &str = "FIPA00088 AID";
 
-/// The next of the identifiers in checked bytes, one behind the other.
+/// Reads the next of the consecutive identifiers in checked bytes.
 pub(crate) fn next<'a>(rest: &mut &'a [u8]) -> Option<AgentIdView<'a>> {
     (!rest.is_empty()).then_some(())?;
     let mut reader = Reader::new(rest);
@@ -20,7 +23,7 @@ pub(crate) fn next<'a>(rest: &mut &'a [u8]) -> Option<AgentIdView<'a>> {
     agent
 }
 
-/// The next part of a checked identifier.
+/// Reads the next part of a checked identifier.
 pub(crate) fn next_part<'a>(rest: &mut &'a [u8], list: &mut List) -> Option<Part<'a>> {
     let mut reader = Reader::new(rest);
     let part = part(&mut reader, list, AgentId::MAX_DEPTH).ok().flatten();
@@ -28,34 +31,34 @@ pub(crate) fn next_part<'a>(rest: &mut &'a [u8], list: &mut List) -> Option<Part
     part
 }
 
-/// Reads an agent identifier, whose resolvers may be nested `depth` deep.
+/// Reads an agent identifier with resolvers nested at most `depth` deep.
 #[inline]
 pub(super) fn agent_id<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     depth: usize,
 ) -> Result<AgentIdView<'a>, DecodeError> {
-    // Whoever wants every part explained has to go the long way.
-    if N::SILENT
+    // The fast path takes no notes.
+    if !N::ENABLED
         && let Some(name) = reader.short_bare_name()
     {
-        let (name, end) = (Text::plain(name), &[0x01]);
+        let (name, end) = (Text::plain(name), &[code::END]);
         return Ok(AgentIdView::new(name, Encoding::Envelope, end));
     }
-    other_agent_id(reader, depth)
+    agent_id_slow(reader, depth)
 }
 
 #[inline(never)]
-fn other_agent_id<'a, N: Notes>(
+fn agent_id_slow<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     depth: usize,
 ) -> Result<AgentIdView<'a>, DecodeError> {
-    let code = reader.byte(CLAUSE, "an agent identifier")?;
-    if code != 0x02 {
-        return Err(reader.unexpected(CLAUSE, code, "an agent identifier"));
+    let first = reader.byte(CLAUSE, "an agent identifier")?;
+    if first != code::agent::BEGIN {
+        return Err(reader.unexpected(CLAUSE, first, "an agent identifier"));
     }
     let offset = reader.offset();
     let name = reader.string(CLAUSE, "agent name")?;
-    check_name(&name, "agent name").map_err(|wrong| DecodeError::new(offset, CLAUSE, wrong))?;
+    check_name(&name, "agent name").map_err(|problem| DecodeError::new(offset, CLAUSE, problem))?;
     reader.note(|| format!("agent identifier: name {}", notes::text(&name)));
     reader.notes().deeper();
     let start = reader.position();
@@ -67,7 +70,7 @@ fn other_agent_id<'a, N: Notes>(
     Ok(AgentIdView::new(name, Encoding::Envelope, parts))
 }
 
-/// Reads the agent identifiers of a set up to its end.
+/// Reads the agent identifiers of a sequence, including its end.
 pub(super) fn agent_ids<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     set: &'static str,
@@ -76,8 +79,8 @@ pub(super) fn agent_ids<'a, N: Notes>(
     Ok(AgentIds::new(Encoding::Envelope, members))
 }
 
-/// The next part of an identifier, whose resolvers may be nested `depth` deep, or `None` at its
-/// end.
+/// Reads the next part of an identifier with resolvers nested at most `depth` deep. Returns `None`
+/// at its end.
 fn part<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     list: &mut List,
@@ -96,13 +99,13 @@ fn part<'a, N: Notes>(
             List::Outside => {}
         }
         match reader.byte(CLAUSE, "an agent identifier")? {
-            0x01 => return Ok(None),
-            0x02 => list.begin(List::Addresses, reader),
-            0x03 => list.begin(List::Resolvers, reader),
-            // 05 since edition C; JADE writes 04 with a string behind it.
-            code @ (0x04 | 0x05) => {
+            code::END => return Ok(None),
+            code::agent::ADDRESSES => list.begin(List::Addresses, reader),
+            code::agent::RESOLVERS => list.begin(List::Resolvers, reader),
+            // JADE writes the code of messages and a string, as editions before C did.
+            id @ (code::agent::USER_DEFINED | code::agent::USER_DEFINED_IN_ENVELOPE) => {
                 let name = user_defined_name(reader, CLAUSE)?;
-                let value = if code == 0x04 {
+                let value = if id == code::agent::USER_DEFINED {
                     reader.string(CLAUSE, "user-defined value")?
                 } else {
                     any(reader, "user-defined value")?
@@ -124,7 +127,7 @@ fn address<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<Part<'a>, DecodeE
     Ok(Part::Address(address))
 }
 
-/// Reads the name of a user-defined parameter; an `X-` is still there.
+/// Reads the name of a user-defined parameter, including its `X-`.
 pub(super) fn user_defined_name<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     clause: &'static str,

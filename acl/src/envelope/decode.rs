@@ -1,46 +1,47 @@
-//! From encoded envelopes and letters to owned values.
+//! Decoding of envelopes and letters into owned values.
 
 use bytes::Bytes;
 
 use crate::envelope::parts::{Event, Events, Parameter, Part, ReceivedView, UserDefined};
-use crate::envelope::read::Walk;
-use crate::envelope::view::{Origin, is_xml};
+use crate::envelope::read::EnvelopeReader;
+use crate::envelope::view::{ValuePosition, is_xml};
 use crate::error::{DecodeError, Problem};
 use crate::view::AgentIds;
 use crate::{AgentId, Envelope, EnvelopeParams, EnvelopeView, Letter, Received, Text, xml};
 
 impl Envelope {
-    /// Reads an encoded envelope with its extensions, behind which the payload may follow, and
-    /// says how long it is in bytes.
+    /// Decodes an envelope with its extensions and returns its length in bytes. A payload may
+    /// follow.
     ///
-    /// The reader is lenient: it takes what the standard says and what fipa_services and JADE
-    /// write. Texts that are empty and stamps without a name, which is how fipa_services says that
-    /// there is none, become absent. XML envelopes (FIPA00085) are told by their `<`.
+    /// Bit-efficient envelopes (FIPA00088) and XML envelopes (FIPA00085), which begin with `<`, are
+    /// accepted. The reader is lenient: it accepts the standard and what fipa_services and JADE
+    /// write. Empty texts and stamps without a name, which fipa_services writes for missing values,
+    /// become absent.
     ///
     /// # Errors
-    /// When the bytes do not begin with a whole envelope.
+    /// The bytes do not begin with a whole envelope.
     pub fn decode(bytes: &[u8]) -> Result<(Self, usize), DecodeError> {
         if is_xml(bytes) {
-            decode(xml::Walk::new(bytes))
+            decode(xml::EnvelopeReader::new(bytes))
         } else {
-            decode(Walk::new(bytes))
+            decode(EnvelopeReader::new(bytes))
         }
     }
 }
 
-fn decode<'a>(mut walk: impl Events<'a>) -> Result<(Envelope, usize), DecodeError> {
-    let mut parts: Vec<(Origin, EnvelopeParams)> = Vec::new();
+fn decode<'a>(mut reader: impl Events<'a>) -> Result<(Envelope, usize), DecodeError> {
+    let mut parts: Vec<(ValuePosition, EnvelopeParams)> = Vec::new();
     let mut current = 0;
-    while let Some(event) = walk.next()? {
+    while let Some(event) = reader.next()? {
         match event {
             Event::Part(part) => {
-                let origin = Origin::of(&part, parts.len() + 1);
-                current = origin.part.saturating_sub(1);
-                // In XML, one may go on that another was in.
+                let position = ValuePosition::of(&part, parts.len() + 1);
+                current = position.part.saturating_sub(1);
+                // In XML, an outer part may continue behind a nested one.
                 if current == parts.len() {
                     let mut params = EnvelopeParams::default();
                     begin(&mut params, part);
-                    parts.push((origin, params));
+                    parts.push((position, params));
                 }
             }
             Event::Parameter(parameter) => {
@@ -50,40 +51,41 @@ fn decode<'a>(mut walk: impl Events<'a>) -> Result<(Envelope, usize), DecodeErro
             }
         }
     }
-    parts.sort_by_key(|(origin, _)| (origin.age, origin.part));
+    parts.sort_by_key(|(position, _)| (position.recency, position.part));
     let mut parts = parts.into_iter().map(|(_, params)| params);
     let envelope = Envelope {
         base: parts.next().unwrap_or_default(),
         extensions: parts.collect(),
     };
-    Ok((envelope, walk.position()))
+    Ok((envelope, reader.position()))
 }
 
 impl Letter {
-    /// Takes a letter that lies in one piece apart. Nothing is copied.
+    /// Splits a letter in one piece of memory into envelope and payload. Nothing is copied, and the
+    /// payload is not checked.
     ///
     /// # Errors
-    /// When the bytes do not begin with a whole envelope. The message behind it is not looked at.
+    /// The bytes do not begin with a whole envelope.
     pub fn split(mut bytes: Bytes) -> Result<Self, DecodeError> {
         let envelope_len = EnvelopeView::parse(&bytes)?.len();
         let envelope = bytes.split_to(envelope_len);
         Ok(Self::new(envelope, bytes))
     }
 
-    /// Takes a letter that lies in one piece apart and reads its envelope.
+    /// Splits a letter like [`split`](Self::split) and decodes its envelope.
     ///
     /// # Errors
-    /// Like [`Letter::split`].
+    /// The same as of [`split`](Self::split).
     pub fn decode(mut bytes: Bytes) -> Result<(Envelope, Self), DecodeError> {
         let (envelope, envelope_len) = Envelope::decode(&bytes)?;
         let encoded = bytes.split_to(envelope_len);
         Ok((envelope, Self::new(encoded, bytes)))
     }
 
-    /// Reads the envelope, stamps included.
+    /// Decodes the envelope, including the stamps.
     ///
     /// # Errors
-    /// When the bytes of the envelope are not one whole envelope.
+    /// The bytes of the envelope are not one whole envelope.
     pub fn parse_envelope(&self) -> Result<Envelope, DecodeError> {
         let bytes = self.envelope();
         let (envelope, used) = Envelope::decode(&bytes)?;
@@ -123,7 +125,7 @@ fn set(params: &mut EnvelopeParams, parameter: Parameter<'_>) -> Result<(), Deco
         Parameter::PayloadLength(len) => params.payload_length = Some(len),
         Parameter::PayloadEncoding(text) => params.payload_encoding = present(Some(text)),
         Parameter::IntendedReceivers(ids) => add(&mut params.intended_receivers, ids)?,
-        // fipa_services repeats the stamp of an extension here, with more in it.
+        // fipa_services repeats the stamp of an extension here with more parameters.
         Parameter::Received(view) => params.received = received(view).or(params.received.take()),
         Parameter::TransportBehaviour(text) => params.transport_behaviour = present(Some(text)),
         Parameter::UserDefined(pair) => params.user_defined.push(owned_pair(pair)),
@@ -131,7 +133,8 @@ fn set(params: &mut EnvelopeParams, parameter: Parameter<'_>) -> Result<(), Deco
     Ok(())
 }
 
-/// The lists of one part add up in XML; a list that is empty is how JADE says that there is none.
+/// Adds a list of agents. In XML, the lists of one part add up. In the bit-efficient encoding, the
+/// last one counts. JADE writes an empty list for a missing one.
 fn add(agents: &mut Vec<AgentId>, ids: AgentIds<'_>) -> Result<(), DecodeError> {
     let more = ids.to_agent_ids()?;
     if !ids.is_xml() && !more.is_empty() {

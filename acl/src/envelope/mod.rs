@@ -1,4 +1,4 @@
-//! The envelope (FIPA00067): what message transport services need to know of a letter.
+//! The envelope (FIPA00067): the parameters of a letter that message transport services read.
 
 pub(crate) mod agent_id;
 mod decode;
@@ -12,46 +12,49 @@ use std::collections::HashSet;
 pub use view::{EnvelopeView, ReceiverNames, StampView, Stamps};
 pub(crate) use write::encode;
 
+use crate::error::EncodeError;
 use crate::{AclRepresentation, AgentId, Time};
 
-/// An envelope: what the sender's transport service wrote, and what others put in front since.
+/// An envelope (FIPA00067): a base and the extensions that services have added.
 ///
-/// Nobody changes what is there already. A service that forwards a letter adds an extension with
-/// its stamp ([`EnvelopeParams::received`]) and the parameters it overrides; the newest value of a
-/// parameter counts ([`effective`](Self::effective)).
+/// A service never changes existing parameters. A service that forwards a letter adds an extension
+/// with its stamp ([`EnvelopeParams::received`]) and the parameters that it overrides. The newest
+/// value of a parameter counts ([`effective`](Self::effective)).
+///
+/// Encodings: bit-efficient (FIPA00088) and XML (FIPA00085).
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Envelope {
-    /// What the sender's transport service wrote.
+    /// The parameters that the sender's transport service wrote.
     pub base: EnvelopeParams,
-    /// What was added on the way, oldest first.
+    /// The extensions that other services have added, oldest first.
     pub extensions: Vec<EnvelopeParams>,
 }
 
-/// The parameters of a base or an extension envelope. What is absent is `None` or empty.
+/// The parameters of a base or an extension envelope. An absent parameter is `None` or empty.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct EnvelopeParams {
-    /// Whom the letter is for, as its sender wrote it.
+    /// Receivers of the letter, as the sender named them.
     pub to: Vec<AgentId>,
-    /// Who sent the letter, and gets to know when it fails.
+    /// Sender of the letter. It receives failure reports.
     pub from: Option<AgentId>,
-    /// For the final recipient to read.
+    /// Comments for the final recipient.
     pub comments: Option<String>,
-    /// How the message is encoded.
+    /// Encoding of the message.
     pub acl_representation: Option<AclRepresentation>,
     /// Length of the encoded message in bytes.
     pub payload_length: Option<u64>,
-    /// Charset of the encoded message; US-ASCII if absent.
+    /// Character set of the encoded message. US-ASCII if absent.
     pub payload_encoding: Option<String>,
-    /// When the envelope was made.
+    /// Time at which the envelope was made.
     pub date: Option<Time>,
-    /// Whom this copy of the letter is for; counts instead of [`to`](Self::to).
+    /// Receivers of this copy of the letter. They override [`to`](Self::to).
     pub intended_receivers: Vec<AgentId>,
     /// The stamp of the transport service that received the letter.
     pub received: Option<Received>,
     /// Requirements on the transport.
     pub transport_behaviour: Option<String>,
-    /// User-defined parameters, names without `X-`. Of several with the same name the last one
-    /// counts.
+    /// Names, without their `X-`, and values of user-defined parameters. The last of several with
+    /// the same name counts.
     pub user_defined: Vec<(String, String)>,
 }
 
@@ -60,20 +63,20 @@ pub struct EnvelopeParams {
 pub struct Received {
     /// Address or name of the service that received the letter.
     pub by: String,
-    /// Address of the service that sent it.
+    /// Address of the service that sent the letter.
     pub from: Option<String>,
-    /// When it was received.
+    /// Time at which the service received the letter.
     pub date: Time,
-    /// Identifies the letter at the service that sent it.
+    /// Identifier of the letter at the service that sent it.
     pub id: Option<String>,
-    /// The kind of transport it came by.
+    /// Type of the transport that delivered the letter.
     pub via: Option<String>,
-    /// User-defined parameters, names without `X-`.
+    /// Names, without their `X-`, and values of user-defined parameters.
     pub user_defined: Vec<(String, String)>,
 }
 
 impl Received {
-    /// A stamp with nothing but what every stamp has.
+    /// Creates a stamp with the mandatory parameters only.
     #[must_use]
     pub fn new(by: impl Into<String>, date: Time) -> Self {
         Self {
@@ -88,7 +91,11 @@ impl Received {
 }
 
 impl Envelope {
-    /// The parameters that count: of each the newest value (FIPA00067 4.2).
+    /// Returns the newest value of each parameter.
+    ///
+    /// FIPA00088 2.2 (of a reader that begins with the newest envelope): "if ((this parameter has
+    /// no value in EnvelopeWithAllParams) AND (this parameter has a value in tempEnvelope)) then
+    /// copy the value of this parameter to EnvelopeWithAllParams".
     #[must_use]
     pub fn effective(&self) -> EnvelopeParams {
         let mut result = EnvelopeParams::default();
@@ -127,12 +134,19 @@ fn newest_list<T: Clone>(result: &mut Vec<T>, older: &[T]) {
     }
 }
 
+/// Refuses an empty text, which a reader would take for an absent one.
+pub(crate) fn present<'a>(what: &'static str, text: &'a str) -> Result<&'a str, EncodeError> {
+    (!text.is_empty())
+        .then_some(text)
+        .ok_or(EncodeError::Empty(what))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn the_newest_value_counts_parameter_by_parameter() {
+    fn the_newest_value_of_each_parameter_is_effective() {
         let agent = |name: &str| AgentId::new(name).unwrap();
         let pair = |name: &str, value: &str| (name.to_owned(), value.to_owned());
         let base = EnvelopeParams {

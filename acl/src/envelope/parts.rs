@@ -1,4 +1,4 @@
-//! What envelopes consist of, whatever their encoding: a walk through one comes by these.
+//! The events of reading an envelope, for every encoding.
 
 use crate::bitefficient::reader::Reader;
 use crate::envelope::read::{ReceivedPart, received_part};
@@ -6,33 +6,32 @@ use crate::error::DecodeError;
 use crate::view::{AgentIdView, AgentIds};
 use crate::{AclRepresentation, Representation, Text, Time, xml};
 
-/// A walk through an envelope, part by part.
+/// A pull parser of an envelope.
 pub(crate) trait Events<'a> {
-    /// The next thing, or `None` behind the envelope.
+    /// Reads the next event. Returns `None` behind the envelope.
     fn next(&mut self) -> Result<Option<Event<'a>>, DecodeError>;
 
-    /// How many bytes were walked through: in the end, the length of the envelope.
+    /// Number of bytes read: at the end, the length of the envelope.
     fn position(&self) -> usize;
 }
 
-/// What a walk comes by.
 #[derive(Debug)]
 pub(crate) enum Event<'a> {
-    /// A part begins, or one goes on that another was in.
+    /// A part begins, or an outer part continues behind a nested one.
     Part(Part<'a>),
-    /// A parameter of that part.
+    /// A parameter of the current part.
     Parameter(Parameter<'a>),
 }
 
-/// One of the envelopes that an envelope consists of.
+/// A base or an extension envelope.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Part<'a> {
-    /// An extension, with the stamp it begins with (FIPA00088).
+    /// An extension and the stamp in its header (FIPA00088).
     Extension(ReceivedView<'a>),
-    /// The base, which is the last one (FIPA00088).
+    /// The base, which comes last (FIPA00088).
     Base(AclRepresentationView<'a>, Time),
-    /// Either (FIPA00085): which part it is, counted from 1, and the index that tells how new it
-    /// is; the base is the one with the lowest.
+    /// A base or an extension in XML (FIPA00085). `part` counts the parts from 1. A newer part has a
+    /// higher `index`, and the base has the lowest.
     Params { part: usize, index: u64 },
 }
 
@@ -58,12 +57,12 @@ pub(crate) struct ReceivedView<'a> {
     pub(crate) from: Option<Text<'a>>,
     pub(crate) id: Option<Text<'a>>,
     pub(crate) via: Option<Text<'a>>,
-    pub(crate) rest: Stamp<'a>,
+    pub(crate) parts: StampParts<'a>,
 }
 
-/// Where a stamp has its user-defined parameters, among other things.
+/// The encoded parts of a stamp, among them its user-defined parameters.
 #[derive(Debug, Clone, Copy)]
-pub(crate) enum Stamp<'a> {
+pub(crate) enum StampParts<'a> {
     BitEfficient(&'a [u8]),
     Xml(&'a [u8]),
 }
@@ -86,18 +85,18 @@ pub(crate) enum Parameter<'a> {
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum UserDefined<'a> {
     Pair(Text<'a>, Text<'a>),
-    /// Name, a blank, value (JADE).
+    /// Name, blank and value in one string (JADE).
     Joined(Text<'a>),
 }
 
 impl<'a> ReceivedView<'a> {
-    /// The user-defined parameters of the stamp.
+    /// Iterates over the user-defined parameters of the stamp.
     pub(super) fn user_defined(&self) -> impl Iterator<Item = UserDefined<'a>> + use<'a> {
-        let mut rest = self.rest;
-        // An error cannot occur in checked bytes, and would end the list.
+        let mut rest = self.parts;
+        // An error cannot occur in checked bytes. It would end the iteration.
         std::iter::from_fn(move || match &mut rest {
-            Stamp::Xml(rest) => xml::next_received_user_defined(rest),
-            Stamp::BitEfficient(rest) => {
+            StampParts::Xml(rest) => xml::next_received_user_defined(rest),
+            StampParts::BitEfficient(rest) => {
                 let mut reader = Reader::new(rest);
                 while reader.remaining() > 0 {
                     let part = received_part(&mut reader).ok()??;

@@ -1,15 +1,20 @@
-//! Reading the parts of a bit-efficient envelope (FIPA00088), checked and borrowed.
+//! A reader of the parts of a bit-efficient envelope (FIPA00088). It checks and borrows them.
 //!
-//! What is lenient here: lengths of envelopes are passed over (fipa_services writes wrong ones,
-//! and structure says it all); the tag that JADE writes in front of a stamp; the tags that
-//! fipa_services writes in front of numbers; strings in every form.
+//! The reader accepts these deviations:
+//!
+//! * any length of an envelope: fipa_services writes wrong ones, and the structure determines the
+//!   end;
+//! * the code that JADE writes in front of the stamp of an extension;
+//! * the code that fipa_services writes in front of a number;
+//! * strings in every form.
 
-use crate::bitefficient::notes::{self, Notes, Silent};
+use crate::bitefficient::code;
+use crate::bitefficient::notes::{self, NoNotes, Notes};
 use crate::bitefficient::reader::{Reader, digit_chars};
 use crate::bitefficient::without_x;
 use crate::envelope::agent_id::{agent_id, agent_ids, user_defined_name};
 use crate::envelope::parts::{
-    AclRepresentationView, Event, Events, Parameter, Part, ReceivedView, Stamp, UserDefined,
+    AclRepresentationView, Event, Events, Parameter, Part, ReceivedView, StampParts, UserDefined,
 };
 use crate::error::{DecodeError, Problem};
 use crate::view::AgentIdView;
@@ -17,48 +22,48 @@ use crate::word::is_token;
 use crate::{AclRepresentation, AgentId, Representation, Text};
 
 const CLAUSE: &str = "FIPA00088 MessageEnvelope";
-const DATE: &str = "FIPA00069 2.3 BinDateTime";
+const DATE: &str = "FIPA00069 2.2 BinDateTimeToken";
 
-/// Most extension envelopes that are accepted in front of a base.
+/// Maximum number of extension envelopes that the reader accepts.
 const MAX_EXTENSIONS: usize = 1024;
 
-/// A walk through an envelope, part by part.
+/// A pull parser of a bit-efficient envelope.
 #[derive(Debug, Clone)]
-pub(super) struct Walk<'a, N = Silent> {
+pub(super) struct EnvelopeReader<'a, N = NoNotes> {
     reader: Reader<'a, N>,
-    place: Place,
+    state: ReaderState,
     extensions: usize,
 }
 
 #[derive(Debug, Clone, Copy)]
-enum Place {
+enum ReaderState {
     BetweenParts,
     InExtension,
     InBase,
-    Behind,
+    Ended,
 }
 
-impl<'a> Walk<'a> {
+impl<'a> EnvelopeReader<'a> {
     pub(super) fn new(bytes: &'a [u8]) -> Self {
-        Self::noting(bytes, Silent)
+        Self::noting(bytes, NoNotes)
     }
 }
 
-impl<'a, N: Notes> Walk<'a, N> {
-    /// A walk that tells `notes` what every byte means.
+impl<'a, N: Notes> EnvelopeReader<'a, N> {
+    /// Creates a reader that notes the meaning of every byte.
     pub(super) fn noting(bytes: &'a [u8], notes: N) -> Self {
         Self {
             reader: Reader::noting(bytes, 0, notes),
-            place: Place::BetweenParts,
+            state: ReaderState::BetweenParts,
             extensions: 0,
         }
     }
 
     fn begin_part(&mut self) -> Result<Event<'a>, DecodeError> {
         let part = part(&mut self.reader)?;
-        self.place = match part {
-            Part::Extension(_) => Place::InExtension,
-            Part::Base(..) | Part::Params { .. } => Place::InBase,
+        self.state = match part {
+            Part::Extension(_) => ReaderState::InExtension,
+            Part::Base(..) | Part::Params { .. } => ReaderState::InBase,
         };
         self.extensions += 1;
         if self.extensions > MAX_EXTENSIONS + 1 {
@@ -69,7 +74,7 @@ impl<'a, N: Notes> Walk<'a, N> {
     }
 }
 
-impl<'a, N: Notes> Events<'a> for Walk<'a, N> {
+impl<'a, N: Notes> Events<'a> for EnvelopeReader<'a, N> {
     fn position(&self) -> usize {
         self.reader.position()
     }
@@ -77,38 +82,42 @@ impl<'a, N: Notes> Events<'a> for Walk<'a, N> {
     #[inline]
     fn next(&mut self) -> Result<Option<Event<'a>>, DecodeError> {
         loop {
-            match self.place {
-                Place::BetweenParts => return self.begin_part().map(Some),
-                Place::InExtension | Place::InBase => {
+            match self.state {
+                ReaderState::BetweenParts => return self.begin_part().map(Some),
+                ReaderState::InExtension | ReaderState::InBase => {
                     if let Some(parameter) = parameter(&mut self.reader)? {
                         return Ok(Some(Event::Parameter(parameter)));
                     }
-                    let (next, end) = match self.place {
-                        Place::InExtension => (Place::BetweenParts, "end of extension envelope"),
-                        _ => (Place::Behind, "end of base envelope"),
+                    let (next, end) = match self.state {
+                        ReaderState::InExtension => {
+                            (ReaderState::BetweenParts, "end of extension envelope")
+                        }
+                        _ => (ReaderState::Ended, "end of base envelope"),
                     };
-                    self.place = next;
+                    self.state = next;
                     let offset = self.reader.offset();
                     self.reader.notes().shallower();
                     self.reader.notes().note_envelope_end(offset, end);
                 }
-                Place::Behind => return Ok(None),
+                ReaderState::Ended => return Ok(None),
             }
         }
     }
 }
 
-/// Reads what every part begins with.
+/// Reads the header of a part.
 fn part<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<Part<'a>, DecodeError> {
     let id = reader.byte(CLAUSE, "an envelope")?;
-    if !matches!(id, 0xfd | 0xfe) {
+    if !matches!(id, code::envelope::EXTENSION | code::envelope::BASE) {
         return Err(not_bit_efficient(reader, id));
     }
+    let is_extension = id == code::envelope::EXTENSION;
     reader.note(|| {
-        let part = if id == 0xfd { "extension" } else { "base" };
+        let part = if is_extension { "extension" } else { "base" };
         format!("{part} envelope")
     });
-    // The length. Two bytes of zero announce one of four.
+    // FIPA00088 2.4, note 1: "the sender sets the reserved envelope length parameter (two bytes) to
+    // length zero and the following four bytes are used to represent the real length".
     let mut len = reader.u16_len("FIPA00088 EnvLen")?;
     if len == 0 {
         len = reader.u32_len("FIPA00088 EnvLen")?;
@@ -116,9 +125,9 @@ fn part<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<Part<'a>, DecodeErro
     let offset = reader.offset();
     reader.notes().note_envelope_len(offset, len);
     reader.notes().deeper();
-    if id == 0xfd {
-        // JADE writes the tag of a stamp here.
-        if reader.take_if(0x0a) {
+    if is_extension {
+        // JADE writes the code of a stamp here.
+        if reader.take_if(code::envelope::RECEIVED) {
             reader.note(|| "the code of a stamp, as JADE writes it".to_owned());
         }
         return Ok(Part::Extension(received(reader)?));
@@ -129,27 +138,29 @@ fn part<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<Part<'a>, DecodeErro
     Ok(Part::Base(representation, date))
 }
 
-/// The next parameter, or `None` at the end of the part.
+/// Reads the next parameter. Returns `None` at the end of the part.
 fn parameter<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
 ) -> Result<Option<Parameter<'a>>, DecodeError> {
     const CLAUSE: &str = "FIPA00088 Parameter";
-    let code = reader.byte(CLAUSE, "an envelope")?;
-    Ok(Some(match code {
-        0x00 => Parameter::UserDefined(user_defined(reader)?),
-        0x01 => return Ok(None),
-        0x02 => Parameter::To(agent_ids(reader, "to")?),
-        0x03 => Parameter::From(from(reader)?),
-        0x04 => Parameter::AclRepresentation(acl_representation(reader)?),
-        0x05 => Parameter::Comments(text(reader, CLAUSE, "comments")?),
-        0x06 => Parameter::PayloadLength(payload_length(reader)?),
-        0x07 => Parameter::PayloadEncoding(text(reader, CLAUSE, "payload-encoding")?),
-        0x09 => {
-            let set = "intended-receiver";
-            Parameter::IntendedReceivers(agent_ids(reader, set)?)
+    Ok(Some(match reader.byte(CLAUSE, "an envelope")? {
+        code::envelope::USER_DEFINED => Parameter::UserDefined(user_defined(reader)?),
+        code::END => return Ok(None),
+        code::envelope::TO => Parameter::To(agent_ids(reader, "to")?),
+        code::envelope::FROM => Parameter::From(from(reader)?),
+        code::envelope::ACL_REPRESENTATION => {
+            Parameter::AclRepresentation(acl_representation(reader)?)
         }
-        0x0a => Parameter::Received(received(reader)?),
-        0x0b => {
+        code::envelope::COMMENTS => Parameter::Comments(text(reader, CLAUSE, "comments")?),
+        code::envelope::PAYLOAD_LENGTH => Parameter::PayloadLength(payload_length(reader)?),
+        code::envelope::PAYLOAD_ENCODING => {
+            Parameter::PayloadEncoding(text(reader, CLAUSE, "payload-encoding")?)
+        }
+        code::envelope::INTENDED_RECEIVER => {
+            Parameter::IntendedReceivers(agent_ids(reader, "intended-receiver")?)
+        }
+        code::envelope::RECEIVED => Parameter::Received(received(reader)?),
+        code::envelope::TRANSPORT_BEHAVIOR => {
             let text = any(reader, "transport-behaviour")?;
             reader.note(|| notes::named("transport-behaviour", &text));
             Parameter::TransportBehaviour(text)
@@ -182,12 +193,12 @@ fn acl_representation<'a, N: Notes>(
 ) -> Result<AclRepresentationView<'a>, DecodeError> {
     const CLAUSE: &str = "FIPA00088 ACLRepresentation";
     let standard = match reader.peek() {
-        Some(0x10) => Representation::BitEfficient,
-        Some(0x11) => Representation::String,
-        Some(0x12) => Representation::Xml,
+        Some(code::representation::BIT_EFFICIENT) => Representation::BitEfficient,
+        Some(code::representation::STRING) => Representation::String,
+        Some(code::representation::XML) => Representation::Xml,
         // JADE writes and reads a name without the code.
         _ => {
-            reader.take_if(0x00);
+            reader.take_if(code::representation::NAMED);
             let name = text(reader, CLAUSE, "acl-representation")?;
             return Ok(AclRepresentationView::Named(name));
         }
@@ -202,9 +213,9 @@ fn acl_representation<'a, N: Notes>(
 
 fn payload_length<N: Notes>(reader: &mut Reader<'_, N>) -> Result<u64, DecodeError> {
     const CLAUSE: &str = "FIPA00088 payload-length";
-    // As digits these would be a zero in front, which nobody writes: they are the tags that
-    // fipa_services puts there.
-    let tagged = reader.take_if(0x12) || reader.take_if(0x13);
+    // fipa_services writes the code of a number here. As digits, the codes would be "01" and "02",
+    // and no peer writes leading zeros.
+    let tagged = reader.take_if(code::token::NUMBER) || reader.take_if(code::token::HEX_NUMBER);
     let offset = reader.offset();
     let number = digit_chars(reader.digits(CLAUSE)?).try_fold(None, |number: Option<u64>, char| {
         let digit = char.and_then(|char| char.to_digit(10))?;
@@ -238,7 +249,7 @@ fn received<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<ReceivedView<'a>
         from: None,
         id: None,
         via: None,
-        rest: Stamp::BitEfficient(&[]),
+        parts: StampParts::BitEfficient(&[]),
     };
     let start = reader.position();
     loop {
@@ -251,7 +262,7 @@ fn received<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<ReceivedView<'a>
             None => {
                 reader.notes().shallower();
                 reader.note(|| "end of received".to_owned());
-                view.rest = Stamp::BitEfficient(rest);
+                view.parts = StampParts::BitEfficient(rest);
                 return Ok(view);
             }
         }
@@ -269,13 +280,12 @@ pub(super) fn received_part<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
 ) -> Result<Option<ReceivedPart<'a>>, DecodeError> {
     const CLAUSE: &str = "FIPA00088 ReceivedObject";
-    let code = reader.byte(CLAUSE, "a stamp")?;
-    Ok(Some(match code {
-        0x00 => ReceivedPart::UserDefined(user_defined(reader)?),
-        0x01 => return Ok(None),
-        0x02 => ReceivedPart::From(text(reader, CLAUSE, "received-from")?),
-        0x03 => ReceivedPart::Id(text(reader, CLAUSE, "received-id")?),
-        0x04 => ReceivedPart::Via(text(reader, CLAUSE, "received-via")?),
+    Ok(Some(match reader.byte(CLAUSE, "a stamp")? {
+        code::stamp::USER_DEFINED => ReceivedPart::UserDefined(user_defined(reader)?),
+        code::END => return Ok(None),
+        code::stamp::FROM => ReceivedPart::From(text(reader, CLAUSE, "received-from")?),
+        code::stamp::ID => ReceivedPart::Id(text(reader, CLAUSE, "received-id")?),
+        code::stamp::VIA => ReceivedPart::Via(text(reader, CLAUSE, "received-via")?),
         other => return Err(reader.unexpected(CLAUSE, other, "a part of a stamp")),
     }))
 }
@@ -284,7 +294,7 @@ fn user_defined<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<UserDefined<
     const CLAUSE: &str = "FIPA00088 user-defined";
     let mut ahead = reader.ahead();
     let first = ahead.string(CLAUSE, "user-defined name")?;
-    // A name has no blank: with one, it is name and value in one string, as JADE writes it.
+    // A name has no blank. JADE writes name, blank and value in one string.
     if let Some(blank) = memchr::memchr(b' ', first.raw())
         && first.raw().get(..blank).is_some_and(is_token)
     {
@@ -304,17 +314,17 @@ fn user_defined<'a, N: Notes>(reader: &mut Reader<'a, N>) -> Result<UserDefined<
     Ok(UserDefined::Pair(name.without_x(), value))
 }
 
-/// Reads an `Any`, which has to be text.
+/// Reads an `Any`, which must be text.
 pub(super) fn any<'a, N: Notes>(
     reader: &mut Reader<'a, N>,
     what: &'static str,
 ) -> Result<Text<'a>, DecodeError> {
     const CLAUSE: &str = "FIPA00088 Any";
     let len = match reader.byte(CLAUSE, what)? {
-        0x14 => return reader.string(CLAUSE, what),
-        0x16 => reader.u8_len(CLAUSE)?,
-        0x17 => reader.u16_len(CLAUSE)?,
-        0x19 => reader.u32_len(CLAUSE)?,
+        code::token::STRING => return reader.string(CLAUSE, what),
+        code::token::LEN8 => reader.u8_len(CLAUSE)?,
+        code::token::LEN16 => reader.u16_len(CLAUSE)?,
+        code::token::LEN32 => reader.u32_len(CLAUSE)?,
         other => return Err(reader.unexpected(CLAUSE, other, "a value")),
     };
     reader.counted(len, CLAUSE, what).map(Text::plain)

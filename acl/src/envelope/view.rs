@@ -1,17 +1,17 @@
-//! What a transport service looks at in an envelope, without allocating.
+//! A borrowed view of the parameters that a transport service reads in an envelope.
 
 use crate::bitefficient::notes::Notes;
 use crate::envelope::parts::{AclRepresentationView, Event, Events, Parameter, Part};
-use crate::envelope::read::Walk;
+use crate::envelope::read::EnvelopeReader;
 use crate::error::DecodeError;
 use crate::view::{AgentIdView, AgentIds};
 use crate::{AclRepresentation, Representation, Text, xml};
 
 /// An encoded envelope (FIPA00088 or FIPA00085), checked once and read without allocating.
 ///
-/// Gives what delivery needs: from whom, to whom, and who has stamped it. The values are the
-/// effective ones (the newest of each parameter). For everything else there is
-/// [`Envelope::decode`](crate::Envelope::decode).
+/// The view has the parameters for delivery: sender, receivers, encoding of the message, and
+/// stamps. Apart from the stamps, the values are the effective ones, the newest of each parameter.
+/// [`Envelope::decode`](crate::Envelope::decode) reads all parameters.
 #[derive(Debug, Clone)]
 pub struct EnvelopeView<'a> {
     bytes: &'a [u8],
@@ -22,26 +22,26 @@ pub struct EnvelopeView<'a> {
 }
 
 impl<'a> EnvelopeView<'a> {
-    /// Reads an envelope with its extensions, behind which the payload may follow. XML is told by
-    /// its `<`.
+    /// Reads an envelope with its extensions. A payload may follow. An envelope in XML begins with
+    /// `<`.
     ///
     /// # Errors
-    /// When the bytes do not begin with a whole envelope.
+    /// The bytes do not begin with a whole envelope.
     pub fn parse(bytes: &'a [u8]) -> Result<Self, DecodeError> {
         if is_xml(bytes) {
-            Self::walk(bytes, xml::Walk::new(bytes))
+            Self::read(bytes, xml::EnvelopeReader::new(bytes))
         } else {
-            Self::walk(bytes, Walk::new(bytes))
+            Self::read(bytes, EnvelopeReader::new(bytes))
         }
     }
 
-    /// Reads a bit-efficient envelope, and tells `notes` what every byte of it means.
+    /// Reads a bit-efficient envelope and notes the meaning of every byte.
     pub(crate) fn parse_noting(bytes: &'a [u8], notes: impl Notes) -> Result<Self, DecodeError> {
-        Self::walk(bytes, Walk::noting(bytes, notes))
+        Self::read(bytes, EnvelopeReader::noting(bytes, notes))
     }
 
     #[inline]
-    fn walk(bytes: &'a [u8], mut walk: impl Events<'a>) -> Result<Self, DecodeError> {
+    fn read(bytes: &'a [u8], mut reader: impl Events<'a>) -> Result<Self, DecodeError> {
         let mut view = Self {
             bytes: &[],
             from: Newest::default(),
@@ -49,11 +49,11 @@ impl<'a> EnvelopeView<'a> {
             intended: Newest::default(),
             acl_representation: Newest::default(),
         };
-        let mut at = Origin::default();
-        while let Some(event) = walk.next()? {
+        let mut at = ValuePosition::default();
+        while let Some(event) = reader.next()? {
             match event {
                 Event::Part(part) => {
-                    at = Origin::of(&part, at.part + 1);
+                    at = ValuePosition::of(&part, at.part + 1);
                     if let Part::Base(representation, _) = part {
                         view.acl_representation.offer(representation, at);
                     }
@@ -69,25 +69,25 @@ impl<'a> EnvelopeView<'a> {
                 Event::Parameter(_) => {}
             }
         }
-        view.bytes = bytes.get(..walk.position()).unwrap_or_default();
+        view.bytes = bytes.get(..reader.position()).unwrap_or_default();
         Ok(view)
     }
 
-    /// The name of the agent that sent the letter.
+    /// Name of the agent that sent the letter.
     #[must_use]
     pub fn from_name(&self) -> Option<Text<'a>> {
         self.from.value.map(|agent| agent.name())
     }
 
-    /// The names of the agents that this copy of the letter is for: the intended receivers, or
-    /// those in `to` when there are none.
+    /// Names of the agents that this copy of the letter is for: the intended receivers, or those in
+    /// `to` if there are none.
     #[must_use]
     pub fn receivers(&self) -> ReceiverNames<'a> {
         let ids = self.intended.value.as_ref().or(self.to.value.as_ref());
         ReceiverNames(ids.cloned().unwrap_or_default())
     }
 
-    /// How the message is encoded.
+    /// Encoding of the message.
     #[must_use]
     pub fn acl_representation(&self) -> Option<AclRepresentation> {
         self.acl_representation
@@ -95,18 +95,18 @@ impl<'a> EnvelopeView<'a> {
             .map(AclRepresentationView::to_owned)
     }
 
-    /// The stamps of the services that the letter passed, in the order of the bytes. A peer may
-    /// have written one twice.
+    /// Stamps of the services that received the letter, in the order of the bytes. fipa_services
+    /// writes some stamps twice.
     #[must_use]
     pub fn stamps(&self) -> Stamps<'a> {
         Stamps(if is_xml(self.bytes) {
-            AnyWalk::Xml(xml::Walk::new(self.bytes))
+            AnyReader::Xml(xml::EnvelopeReader::new(self.bytes))
         } else {
-            AnyWalk::BitEfficient(Walk::new(self.bytes))
+            AnyReader::BitEfficient(EnvelopeReader::new(self.bytes))
         })
     }
 
-    /// Length of the envelope with its extensions in bytes: the payload begins here.
+    /// Length of the envelope with its extensions, in bytes. The payload begins at this offset.
     #[must_use]
     #[allow(
         clippy::len_without_is_empty,
@@ -117,7 +117,7 @@ impl<'a> EnvelopeView<'a> {
     }
 }
 
-/// The names of the agents that a letter is for: see [`EnvelopeView::receivers`].
+/// Names of the agents that a letter is for: see [`EnvelopeView::receivers`].
 #[derive(Debug, Clone)]
 pub struct ReceiverNames<'a>(AgentIds<'a>);
 
@@ -129,7 +129,7 @@ impl<'a> Iterator for ReceiverNames<'a> {
     }
 }
 
-/// The stamp of a transport service, as far as loops are to be noticed.
+/// The parameters of a stamp that a transport service needs to detect loops.
 #[derive(Debug, Clone, Copy)]
 pub struct StampView<'a> {
     by: Text<'a>,
@@ -143,7 +143,7 @@ impl<'a> StampView<'a> {
         self.by
     }
 
-    /// What identifies the letter at the service that sent it.
+    /// Identifier of the letter at the service that sent it.
     #[must_use]
     pub fn id(&self) -> Option<Text<'a>> {
         self.id
@@ -152,27 +152,27 @@ impl<'a> StampView<'a> {
 
 /// The stamps on a letter: see [`EnvelopeView::stamps`].
 #[derive(Debug, Clone)]
-pub struct Stamps<'a>(AnyWalk<'a>);
+pub struct Stamps<'a>(AnyReader<'a>);
 
 #[derive(Debug, Clone)]
 #[allow(
     clippy::large_enum_variant,
-    reason = "nobody keeps one, and a box would allocate"
+    reason = "it is short-lived, and a box would allocate"
 )]
-enum AnyWalk<'a> {
-    BitEfficient(Walk<'a>),
-    Xml(xml::Walk<'a>),
+enum AnyReader<'a> {
+    BitEfficient(EnvelopeReader<'a>),
+    Xml(xml::EnvelopeReader<'a>),
 }
 
 impl<'a> Iterator for Stamps<'a> {
     type Item = StampView<'a>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        // An error cannot occur in bytes that were checked, and would end the list.
+        // An error cannot occur in checked bytes. It would end the iteration.
         loop {
             let event = match &mut self.0 {
-                AnyWalk::BitEfficient(walk) => walk.next(),
-                AnyWalk::Xml(walk) => walk.next(),
+                AnyReader::BitEfficient(reader) => reader.next(),
+                AnyReader::Xml(reader) => reader.next(),
             };
             let received = match event.ok()?? {
                 Event::Part(Part::Extension(received)) => received,
@@ -189,73 +189,75 @@ impl<'a> Iterator for Stamps<'a> {
     }
 }
 
-/// Where a value stands.
+/// The position of a value: the part of the envelope that has it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(super) struct Origin {
-    /// Counts the parts in the order of the bytes, from 1.
+pub(super) struct ValuePosition {
+    /// Number of the part in the order of the bytes, from 1.
     pub(super) part: usize,
-    /// How new the part is, compared to others; of two as new as each other, the later one counts.
+    /// Order of the parts: a newer part has a higher value. Of two equal parts, the later one is
+    /// newer.
     ///
-    /// In XML the index says so. In the bit-efficient encoding the base is older than every
-    /// extension, and the standard puts the newest extension first. fipa_services puts the oldest
-    /// first; its hand is known by the byte counts in front of its texts. Where both are there,
-    /// ours is the one that came later: fipa_services writes everything anew when it forwards a
-    /// letter.
-    pub(super) age: u64,
+    /// In XML, this is the index. In the bit-efficient encoding, the base is older than every
+    /// extension, and the standard writes the newest extension first (FIPA00088 2.2: "by adding a
+    /// new ExtEnvelope element at the beginning"). fipa_services writes the oldest first. Its
+    /// extensions have a byte count in front of each text. If a letter has extensions of both
+    /// kinds, those of the standard are newer: fipa_services encodes the whole envelope again when
+    /// it forwards a letter.
+    pub(super) recency: u64,
 }
 
-impl Origin {
-    /// Of a part, which is this one unless it says itself.
+impl ValuePosition {
+    /// Returns the position of a part. `count` is its number unless the part has its own.
     pub(super) fn of(part: &Part<'_>, count: usize) -> Self {
-        let (part, age) = match part {
+        let (part, recency) = match part {
             Part::Params { part, index } => (*part, *index),
             Part::Base(..) => (count, 0),
             Part::Extension(received) if received.by.is_counted() => (count, count as u64),
             Part::Extension(_) => (count, u64::MAX - count as u64),
         };
-        Self { part, age }
+        Self { part, recency }
     }
 }
 
-/// The newest value of a parameter among those met so far; within one part, the last one.
+/// The newest value of a parameter so far. Within one part, the last value counts.
 #[derive(Debug, Clone, Copy)]
 struct Newest<T> {
     value: Option<T>,
-    origin: Origin,
+    position: ValuePosition,
 }
 
 impl<T> Default for Newest<T> {
     fn default() -> Self {
         Self {
             value: None,
-            origin: Origin::default(),
+            position: ValuePosition::default(),
         }
     }
 }
 
 impl<T> Newest<T> {
-    fn offer(&mut self, value: T, origin: Origin) {
-        let (known, new) = (&self.origin, &origin);
-        let newer = known.part == new.part || (new.age, new.part) > (known.age, known.part);
+    fn offer(&mut self, value: T, position: ValuePosition) {
+        let (known, new) = (&self.position, &position);
+        let newer = known.part == new.part || (new.recency, new.part) > (known.recency, known.part);
         if self.value.is_none() || newer {
             self.value = Some(value);
-            self.origin = origin;
+            self.position = position;
         }
     }
 }
 
 impl<'a> Newest<AgentIds<'a>> {
-    /// The lists of one part add up in XML; a list that is empty is how JADE says that there is
-    /// none.
-    fn offer_agents(&mut self, ids: AgentIds<'a>, origin: Origin) {
+    /// Offers a list of agents. In XML, the lists of one part add up. JADE writes an empty list for
+    /// a missing one.
+    fn offer_agents(&mut self, ids: AgentIds<'a>, position: ValuePosition) {
         if let Some(known) = &mut self.value
-            && self.origin == origin
+            && self.position == position
             && known.add(&ids)
         {
             return;
         }
         if !ids.is_empty() {
-            self.offer(ids, origin);
+            self.offer(ids, position);
         }
     }
 }

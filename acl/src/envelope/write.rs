@@ -1,19 +1,21 @@
 //! Writing bit-efficient envelopes.
 //!
-//! The standard is FIPA00088 as its examples have it (texts bare), newest extension first, with the
-//! right lengths. fipa_services and JADE cannot read each other's envelopes: the former demands
-//! every text with its length in front, a code in front of numbers and the oldest extension first;
-//! the latter takes whatever stands in front of a text for a part of it.
+//! The standard's dialect follows the examples of FIPA00088: texts without quotation marks, the
+//! newest extension first, correct lengths. fipa_services and JADE cannot read each other's
+//! envelopes: fipa_services requires a byte count in front of every text, a code in front of numbers
+//! and the oldest extension first. JADE reads a byte count as part of the text.
 
 use bytes::Bytes;
 
+use crate::bitefficient::code;
 use crate::bitefficient::reader::{Form, string_form};
 use crate::bitefficient::without_x;
 use crate::bitefficient::write::{
-    Hand, Out, write_agent_id_by, write_agent_set_by, write_date_time, write_digits,
+    Output, TextWriter, write_agent_id_by, write_agent_set_by, write_date_time, write_digits,
     write_local_date_time,
 };
 use crate::dialect::local_time;
+use crate::envelope::present;
 use crate::error::EncodeError;
 use crate::word::{self, is_token};
 use crate::{AclRepresentation, AgentId, Dialect, Envelope, EnvelopeParams, Received, Time};
@@ -21,10 +23,10 @@ use crate::{AclRepresentation, AgentId, Dialect, Envelope, EnvelopeParams, Recei
 const BASE: &str = "a base envelope";
 const EXTENSION: &str = "an extension envelope";
 
-/// The encoded envelope, all extensions included, in the hand that a reader needs.
+/// Encodes the envelope with all extensions in a dialect.
 ///
 /// # Errors
-/// When a mandatory parameter is missing, or one has a value that cannot be written for the reader.
+/// A mandatory parameter is missing, or the dialect cannot represent a value.
 pub(crate) fn encode(envelope: &Envelope, dialect: Dialect) -> Result<Bytes, EncodeError> {
     let mut writer = Writer::new(dialect);
     if dialect == Dialect::FipaServices {
@@ -41,21 +43,23 @@ pub(crate) fn encode(envelope: &Envelope, dialect: Dialect) -> Result<Bytes, Enc
 }
 
 impl Envelope {
-    /// The encoded envelope, all extensions included, in the standard's dialect.
+    /// Encodes the envelope with all extensions bit-efficiently (FIPA00088) in the standard's
+    /// dialect.
     ///
     /// # Errors
-    /// When a mandatory parameter is missing, or one has a value that cannot be encoded. An
-    /// extension needs a stamp and has no place for a date.
+    /// A mandatory parameter is missing, or the encoding cannot represent a value. A base needs
+    /// `acl_representation` and `date`. An extension needs `received` and cannot have a `date`.
     pub fn encode_standard(&self) -> Result<Bytes, EncodeError> {
         encode(self, Dialect::Standard)
     }
 
-    /// The envelope that a sender puts around a message, encoded in the standard's dialect from
-    /// borrowed parts: to the receivers, who are all intended, from the sender, with the length of
-    /// the payload and the date. What every letter needs is made without a value in between.
+    /// Encodes the envelope of a new letter bit-efficiently (FIPA00088) in the standard's dialect,
+    /// without an [`Envelope`] value.
+    ///
+    /// `receivers` become `to` and `intended-receiver`. `payload_length` is in bytes.
     ///
     /// # Errors
-    /// Like [`encode_standard`](Self::encode_standard).
+    /// The encoding cannot represent a value.
     pub fn encode_around(
         receivers: &[AgentId],
         from: Option<&AgentId>,
@@ -64,36 +68,36 @@ impl Envelope {
         date: Time,
     ) -> Result<Bytes, EncodeError> {
         let mut writer = Writer::new(Dialect::Standard);
-        // Enough for names of usual length, so that the buffer rarely has to grow.
+        // Enough for names of usual length, so that the buffer rarely grows.
         writer.out.reserve(128 + 96 * receivers.len().min(16));
-        let start = writer.begin(0xfe);
+        let start = writer.begin(code::envelope::BASE);
         writer.acl_representation(representation)?;
         writer.time("date", date)?;
         let to = writer.out.len();
-        write_agent_set_by(&mut writer, 0x02, receivers)?;
+        write_agent_set_by(&mut writer, code::envelope::TO, receivers)?;
         let list = to..writer.out.len();
         if let Some(from) = from {
-            writer.out.byte(0x03);
+            writer.out.byte(code::envelope::FROM);
             write_agent_id_by(&mut writer, from)?;
         }
-        writer.out.byte(0x06);
+        writer.out.byte(code::envelope::PAYLOAD_LENGTH);
         writer.payload_length(payload_length)?;
-        // The same list under another code.
+        // The same list with another code.
         let intended = writer.out.len();
         writer.out.extend_from_within(list);
-        if let Some(code) = writer.out.get_mut(intended) {
-            *code = 0x09;
+        if let Some(parameter) = writer.out.get_mut(intended) {
+            *parameter = code::envelope::INTENDED_RECEIVER;
         }
-        writer.out.byte(0x01);
+        writer.out.byte(code::END);
         writer.end(start)?;
         Ok(writer.out.into())
     }
 
-    /// One encoded extension envelope, to be put in front of a letter
-    /// ([`Letter::stamped`](crate::Letter::stamped)).
+    /// Encodes one extension envelope bit-efficiently (FIPA00088) in the standard's dialect.
+    /// [`Letter::stamped`](crate::Letter::stamped) adds it to a letter.
     ///
     /// # Errors
-    /// Like [`encode_standard`](Self::encode_standard).
+    /// `received` is missing, `date` is set, or the encoding cannot represent a value.
     pub fn encode_extension(params: &EnvelopeParams) -> Result<Bytes, EncodeError> {
         let mut writer = Writer::new(Dialect::Standard);
         writer.extension(params)?;
@@ -121,7 +125,7 @@ impl Writer {
             let (parameter, of) = ("date", EXTENSION);
             return Err(EncodeError::NoPlace { parameter, of });
         }
-        let start = self.begin(0xfd);
+        let start = self.begin(code::envelope::EXTENSION);
         match &params.received {
             Some(stamp) => self.received(stamp, !self.for_fipa_services())?,
             None if self.for_fipa_services() => self.no_stamp(),
@@ -129,9 +133,9 @@ impl Writer {
         }
         let parameters = self.out.len();
         self.parameters(params)?;
-        self.out.byte(0x01);
+        self.out.byte(code::END);
         if self.for_fipa_services() {
-            // It counts neither the stamp nor right, and looks at it as little as others.
+            // fipa_services writes this length, which leaves out the stamp. Its reader ignores it.
             let counted = self.out.len() - parameters + 4;
             let len = u16::try_from(counted).map_err(|_| EncodeError::EnvelopeTooLong(counted))?;
             self.set_len(start, len);
@@ -141,30 +145,32 @@ impl Writer {
     }
 
     fn base(&mut self, params: &EnvelopeParams) -> Result<(), EncodeError> {
-        let start = self.begin(0xfe);
+        let start = self.begin(code::envelope::BASE);
         let representation = params.acl_representation.as_ref();
         let representation = representation.ok_or_else(|| missing("acl-representation", BASE))?;
         self.acl_representation(representation)?;
         self.time("date", params.date.ok_or_else(|| missing("date", BASE))?)?;
         self.parameters(params)?;
-        self.out.byte(0x01);
+        self.out.byte(code::END);
         if self.for_fipa_services() {
-            // Whatever the length.
+            // fipa_services writes this length in every base.
             self.set_len(start, 16);
             return Ok(());
         }
         self.end(start)
     }
 
-    /// Id, and room for a length. Gives where that is.
+    /// Writes the identifier of an envelope and space for its length. Returns the offset behind it.
     fn begin(&mut self, id: u8) -> usize {
         self.out.byte(id);
         self.out.slice(&[0, 0]);
         self.out.len()
     }
 
-    /// Puts in the length of an envelope that is there up to its end; it counts all of it
-    /// (FIPA00088 `EnvLen`).
+    /// Inserts the length of a complete envelope.
+    ///
+    /// FIPA00088 2.4, note 1: "The length of the envelope comprises all the parts of the envelope,
+    /// including the message identifier and the length parameter itself."
     fn end(&mut self, start: usize) -> Result<(), EncodeError> {
         let len = self.out.len() - start + 3;
         if let Ok(len) = u16::try_from(len) {
@@ -178,31 +184,31 @@ impl Writer {
     }
 
     fn set_len(&mut self, start: usize, len: u16) {
-        if let Some(room) = self.out.get_mut(start - 2..start) {
-            room.copy_from_slice(&len.to_be_bytes());
+        if let Some(field) = self.out.get_mut(start - 2..start) {
+            field.copy_from_slice(&len.to_be_bytes());
         }
     }
 
-    /// The parameters that base and extension have in common, in the order of their codes, which
-    /// is that of fipa_services too.
+    /// Writes the parameters that base and extension share, in the order of their codes.
+    /// fipa_services uses the same order.
     fn parameters(&mut self, params: &EnvelopeParams) -> Result<(), EncodeError> {
         let base = params.date.is_some();
-        write_agent_set_by(self, 0x02, &params.to)?;
+        write_agent_set_by(self, code::envelope::TO, &params.to)?;
         if let Some(from) = &params.from {
-            self.out.byte(0x03);
+            self.out.byte(code::envelope::FROM);
             write_agent_id_by(self, from)?;
         }
-        // In a base envelope it stands in front already. fipa_services says it twice.
+        // The header of a base envelope has it already. fipa_services writes it twice.
         if let Some(representation) = &params.acl_representation
             && (!base || self.for_fipa_services())
         {
-            self.out.byte(0x04);
+            self.out.byte(code::envelope::ACL_REPRESENTATION);
             match self.dialect {
-                // It reads a name here, not the code.
+                // JADE reads a name here, not the code.
                 Dialect::Jade => {
                     let what = "acl-representation";
                     if representation.as_str().starts_with(char::is_control) {
-                        let why = "others than JADE would take it for the code of one";
+                        let why = "readers other than JADE take its first character for a code";
                         return Err(EncodeError::Unrepresentable { what, why });
                     }
                     self.string(what, representation.as_str())?;
@@ -210,27 +216,30 @@ impl Writer {
                 _ => self.acl_representation(representation)?,
             }
         }
-        self.text(0x05, "comments", params.comments.as_deref())?;
+        let comments = params.comments.as_deref();
+        self.text(code::envelope::COMMENTS, "comments", comments)?;
         if let Some(len) = params.payload_length {
-            self.out.byte(0x06);
+            self.out.byte(code::envelope::PAYLOAD_LENGTH);
             self.payload_length(len)?;
         }
+        let parameter = code::envelope::PAYLOAD_ENCODING;
         match params.payload_encoding.as_deref() {
             None if base && self.for_fipa_services() => {
-                self.out.byte(0x07);
+                self.out.byte(parameter);
                 self.string("payload-encoding", "")?;
             }
-            encoding => self.text(0x07, "payload-encoding", encoding)?,
+            encoding => self.text(parameter, "payload-encoding", encoding)?,
         }
-        write_agent_set_by(self, 0x09, &params.intended_receivers)?;
+        let intended = &params.intended_receivers;
+        write_agent_set_by(self, code::envelope::INTENDED_RECEIVER, intended)?;
         if let Some(received) = &params.received
             && (base || self.for_fipa_services())
         {
-            self.out.byte(0x0a);
+            self.out.byte(code::envelope::RECEIVED);
             self.received(received, true)?;
         }
         if let Some(text) = &params.transport_behaviour {
-            self.out.byte(0x0b);
+            self.out.byte(code::envelope::TRANSPORT_BEHAVIOR);
             self.any(present("transport-behaviour", text)?)?;
         }
         if self.for_fipa_services() && !params.user_defined.is_empty() {
@@ -246,10 +255,10 @@ impl Writer {
         if self.for_fipa_services() {
             if u32::try_from(len).is_err() {
                 let what = "payload-length";
-                let why = "fipa_services reads none above 4294967295";
+                let why = "fipa_services reads no number above 4294967295";
                 return Err(EncodeError::Unrepresentable { what, why });
             }
-            self.out.byte(0x12);
+            self.out.byte(code::token::NUMBER);
         }
         write_digits(len, &mut self.out);
         Ok(())
@@ -258,41 +267,44 @@ impl Writer {
     fn received(&mut self, received: &Received, whole: bool) -> Result<(), EncodeError> {
         self.string("received-by", present("received-by", &received.by)?)?;
         self.time("date of the stamp", received.date)?;
-        self.text(0x02, "received-from", received.from.as_deref())?;
-        self.text(0x03, "received-id", received.id.as_deref())?;
-        self.text(0x04, "received-via", received.via.as_deref())?;
-        // fipa_services writes stamps of extensions twice, first without them.
+        let from = received.from.as_deref();
+        self.text(code::stamp::FROM, "received-from", from)?;
+        self.text(code::stamp::ID, "received-id", received.id.as_deref())?;
+        self.text(code::stamp::VIA, "received-via", received.via.as_deref())?;
+        // fipa_services writes the stamp of an extension twice, first without these.
         if whole {
             self.user_defined(&received.user_defined)?;
         }
-        self.out.byte(0x01);
+        self.out.byte(code::END);
         Ok(())
     }
 
-    /// The way of fipa_services to say that there is no stamp: no name and the first of all times.
+    /// Writes the stamp that fipa_services writes for a missing one: an empty name and the first
+    /// instant of 1970.
     fn no_stamp(&mut self) {
         self.out.slice(b"#0\"\0");
-        self.out
-            .slice(b"\x20\x2a\x81\x12\x12\x11\x11\x11\x11\x11\x01");
+        self.out.byte(code::date_time::ABSOLUTE);
+        self.out.slice(b"\x2a\x81\x12\x12\x11\x11\x11\x11\x11");
+        self.out.byte(code::END);
     }
 
     fn acl_representation(
         &mut self,
         representation: &AclRepresentation,
     ) -> Result<(), EncodeError> {
-        // A standard name spelled out is the standard one.
+        // `Other` may hold a standard name.
         match AclRepresentation::from(representation.as_str()) {
-            AclRepresentation::BitEfficient => self.out.byte(0x10),
-            AclRepresentation::String => self.out.byte(0x11),
-            AclRepresentation::Xml => self.out.byte(0x12),
+            AclRepresentation::BitEfficient => self.out.byte(code::representation::BIT_EFFICIENT),
+            AclRepresentation::String => self.out.byte(code::representation::STRING),
+            AclRepresentation::Xml => self.out.byte(code::representation::XML),
             AclRepresentation::Other(_) if self.for_fipa_services() => {
                 return Err(EncodeError::Unrepresentable {
                     what: "acl-representation",
-                    why: "fipa_services knows only those of the standard",
+                    why: "fipa_services reads only the representations of the standard",
                 });
             }
             AclRepresentation::Other(name) => {
-                self.out.byte(0x00);
+                self.out.byte(code::representation::NAMED);
                 self.string("acl-representation", present("acl-representation", &name)?)?;
             }
         }
@@ -305,7 +317,7 @@ impl Writer {
                 let shown = name.chars().take(60).collect();
                 return Err(EncodeError::UserDefinedName(shown));
             }
-            self.out.byte(0x00);
+            self.out.byte(code::envelope::USER_DEFINED);
             self.user_defined_name(name)?;
             self.string("user-defined value", value)?;
         }
@@ -314,7 +326,7 @@ impl Writer {
 
     fn user_defined_name(&mut self, name: &str) -> Result<(), EncodeError> {
         let what = "user-defined name";
-        // fipa_services keeps names without X- in its memory, and does not add it here.
+        // fipa_services stores names without X- and does not add it here.
         if self.for_fipa_services() && without_x(name.as_bytes()) == name.as_bytes() {
             self.string(what, name)
         } else {
@@ -323,28 +335,28 @@ impl Writer {
     }
 
     fn any(&mut self, value: &str) -> Result<(), EncodeError> {
-        self.out.byte(0x14);
+        self.out.byte(code::token::STRING);
         self.string("value", value)
     }
 
     fn text(
         &mut self,
-        code: u8,
+        parameter: u8,
         what: &'static str,
         text: Option<&str>,
     ) -> Result<(), EncodeError> {
         match text {
             None => Ok(()),
             Some(text) => {
-                self.out.byte(code);
+                self.out.byte(parameter);
                 self.string(what, present(what, text)?)
             }
         }
     }
 
-    /// In the standard, bare: only a text that would be taken for a text in another form, for the
-    /// end of a list (01), or for the code (0a) that JADE puts in front of stamps, is put in
-    /// quotation marks.
+    /// Writes a string. The standard's dialect writes it in quotation marks only if a reader would
+    /// otherwise take it for a text in another form, for the end of a list (01), or for the code
+    /// (0a) that JADE writes in front of stamps.
     fn string(&mut self, what: &'static str, text: &str) -> Result<(), EncodeError> {
         if text.contains('\0') {
             return Err(EncodeError::Nul(what));
@@ -358,7 +370,7 @@ impl Writer {
             }
             _ if bare => self.out.slice(text.as_bytes()),
             Dialect::Jade => {
-                let why = "JADE has no quotation marks in envelopes, which it would need";
+                let why = "it needs quotation marks, which JADE does not read in envelopes";
                 return Err(EncodeError::Unrepresentable { what, why });
             }
             Dialect::Standard => word::quoted(text, |piece| self.out.slice(piece.as_bytes())),
@@ -377,7 +389,7 @@ impl Writer {
     }
 }
 
-impl Hand for Writer {
+impl TextWriter for Writer {
     fn byte(&mut self, byte: u8) {
         self.out.byte(byte);
     }
@@ -387,13 +399,13 @@ impl Hand for Writer {
     }
 
     fn user_defined_of_agent(&mut self, name: &str, value: &str) -> Result<(), EncodeError> {
-        // JADE keeps to the code of messages, and to plain strings.
+        // JADE uses the code of messages and writes the value without a code.
         if self.dialect == Dialect::Jade {
-            self.out.byte(0x04);
+            self.out.byte(code::agent::USER_DEFINED);
             self.user_defined_name(name)?;
             return self.string("user-defined value", value);
         }
-        self.out.byte(0x05);
+        self.out.byte(code::agent::USER_DEFINED_IN_ENVELOPE);
         self.user_defined_name(name)?;
         self.any(value)
     }
@@ -401,11 +413,4 @@ impl Hand for Writer {
 
 fn missing(parameter: &'static str, of: &'static str) -> EncodeError {
     EncodeError::Missing { parameter, of }
-}
-
-/// An empty text is how peers say that there is none.
-fn present<'a>(what: &'static str, text: &'a str) -> Result<&'a str, EncodeError> {
-    (!text.is_empty())
-        .then_some(text)
-        .ok_or(EncodeError::Empty(what))
 }

@@ -1,51 +1,50 @@
-//! What every byte of a bit-efficient message, envelope or letter means, for people.
+//! Explains every byte of a bit-efficient message, envelope or letter, for people.
 //!
-//! There is no second grammar here: the readers that decode say in passing what they read
-//! ([`Notes`](crate::bitefficient::notes::Notes)), and this module writes it down.
+//! This module has no grammar of its own. The readers that decode take notes
+//! ([`Notes`](crate::bitefficient::notes::Notes)), and this module collects them.
 
 mod record;
 
-use crate::bitefficient::{notes, view_noting};
+use crate::bitefficient::{code, notes, view_noting};
 use crate::explain::record::Record;
 use crate::{DecodeError, EnvelopeView, Representation};
 
-/// A stretch of bytes and what it means.
+/// A span of bytes and its meaning.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Span {
-    /// Where it begins, counted from the start of what is explained.
+    /// Offset of its first byte in the explained bytes.
     pub offset: usize,
-    /// How many bytes it has; at least one.
+    /// Number of bytes, at least 1.
     pub len: usize,
-    /// How deep it is nested: the parts of an agent identifier lie deeper than the identifier.
+    /// Nesting depth. The parts of an agent identifier are deeper than the identifier.
     pub depth: usize,
-    /// What it means, in the words of the standards; on one line and without control characters.
-    /// Of long texts only the beginning is repeated.
+    /// Meaning in the terms of the standards: one line without control characters. A long text is
+    /// truncated.
     pub meaning: String,
 }
 
-/// Bytes and their meaning: see [`explain`].
+/// The meaning of bytes: see [`explain`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Explanation {
-    /// The spans in order. The first one begins at offset 0 and each where the one in front of it
-    /// ends; together they are all bytes, or with an [`error`](Self::error) those up to it. There
+    /// The spans in the order of their offsets, without gaps. The first one begins at offset 0. The
+    /// last one ends with the bytes or, if there is an [`error`](Self::error), at its offset. There
     /// are at most [`MAX_SPANS`](Self::MAX_SPANS).
     pub spans: Vec<Span>,
-    /// Why the bytes that follow the last span have no meaning: the error that decoding gives,
-    /// with its offset in all of the bytes.
+    /// The error of decoding the bytes, if any. Its offset is relative to all explained bytes.
     pub error: Option<DecodeError>,
 }
 
 impl Explanation {
-    /// Most spans that are told apart; the last of that many stands for all that follow.
+    /// Maximum number of spans. The last one covers all remaining bytes.
     pub const MAX_SPANS: usize = 1 << 16;
 }
 
 /// Explains a message (FIPA00069), or an envelope (FIPA00088) and the message behind it, byte by
-/// byte, in whatever dialect it is written.
+/// byte. All dialects are accepted.
 ///
-/// A message behind an envelope is explained if it is bit-efficient; any other payload is one span.
+/// A message behind an envelope is explained if it is bit-efficient. Any other payload is one span.
 ///
 /// ```
 /// let explanation = fipa_acl::explain(b"\xfa\x10\x08\x01");
@@ -65,12 +64,12 @@ impl Explanation {
 pub fn explain(bytes: &[u8]) -> Explanation {
     let mut record = Record::default();
     let read = match bytes.first() {
-        Some(0xfd | 0xfe) => letter(bytes, &mut record),
+        Some(&(code::envelope::EXTENSION | code::envelope::BASE)) => letter(bytes, &mut record),
         _ => message(bytes, 0, &mut record),
     };
     let error = read.err();
     if let Some(error) = &error {
-        record.broken_off(error.offset().min(bytes.len()));
+        record.incomplete(error.offset().min(bytes.len()));
     }
     Explanation {
         spans: record.into_spans(),

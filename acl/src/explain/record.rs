@@ -1,4 +1,4 @@
-//! Writes down what readers remark.
+//! Collects the notes of a reader as spans.
 
 use crate::bitefficient::notes::Notes;
 use crate::explain::{Explanation, Span};
@@ -7,33 +7,33 @@ use crate::explain::{Explanation, Span};
 #[derive(Debug, Default)]
 pub(super) struct Record {
     spans: Vec<Span>,
-    /// Where the last span ends.
+    /// Offset of the end of the last span.
     end: usize,
     depth: usize,
-    /// The length that the current envelope says it has.
+    /// The length field of the current envelope.
     envelope_len: Option<EnvelopeLen>,
 }
 
 #[derive(Debug, Clone, Copy)]
 struct EnvelopeLen {
-    said: usize,
-    /// Where the envelope begins.
+    announced: usize,
+    /// Offset of the envelope.
     start: usize,
-    /// Which span it is.
+    /// Index of the span of the length field.
     span: usize,
 }
 
 impl Record {
-    /// What the bytes up to `end` mean, which no reader looks at.
+    /// Notes the meaning of a payload, which no reader reads and which ends at `end`.
     pub(super) fn payload(&mut self, end: usize, meaning: impl FnOnce() -> String) {
         let mut notes = self;
         notes.note(end, meaning);
     }
 
-    /// An error at this offset ended the reading.
-    pub(super) fn broken_off(&mut self, offset: usize) {
+    /// Notes that an error at this offset ended the reading.
+    pub(super) fn incomplete(&mut self, offset: usize) {
         let mut notes = self;
-        notes.note(offset, || "begun, and broken off by the error".to_owned());
+        notes.note(offset, || "incomplete, ended by the error".to_owned());
     }
 
     pub(super) fn into_spans(self) -> Vec<Span> {
@@ -51,7 +51,7 @@ impl Notes for &mut Record {
         match self.spans.last_mut() {
             Some(last) if full => {
                 last.len += len;
-                "and so on, not told apart".clone_into(&mut last.meaning);
+                "the remaining bytes, not explained".clone_into(&mut last.meaning);
             }
             _ => self.spans.push(Span {
                 offset,
@@ -70,26 +70,30 @@ impl Notes for &mut Record {
         self.depth = self.depth.saturating_sub(1);
     }
 
-    fn note_envelope_len(&mut self, end: usize, said: usize) {
-        // In front of the length there is the one byte that begins the envelope.
+    fn note_envelope_len(&mut self, end: usize, announced: usize) {
+        // The byte in front of the length begins the envelope.
         let start = self.end.saturating_sub(1);
-        self.note(end, || format!("EnvLen: {said} bytes"));
+        self.note(end, || format!("EnvLen: {announced} bytes"));
         let span = self.spans.len().saturating_sub(1);
-        self.envelope_len = Some(EnvelopeLen { said, start, span });
+        self.envelope_len = Some(EnvelopeLen {
+            announced,
+            start,
+            span,
+        });
     }
 
     fn note_envelope_end(&mut self, end: usize, meaning: &'static str) {
         self.note(end, || meaning.to_owned());
-        let Some(EnvelopeLen { said, start, span }) = self.envelope_len.take() else {
+        let Some(length) = self.envelope_len.take() else {
             return;
         };
-        let found = end - start;
-        // One that is not told apart any more is not the place for it.
-        if span + 1 < Explanation::MAX_SPANS
-            && found != said
-            && let Some(span) = self.spans.get_mut(span)
+        let (announced, found) = (length.announced, end - length.start);
+        // The last possible span stands for several items.
+        if length.span + 1 < Explanation::MAX_SPANS
+            && found != announced
+            && let Some(span) = self.spans.get_mut(length.span)
         {
-            span.meaning = format!("EnvLen says {said}; {found} found (ignored)");
+            span.meaning = format!("EnvLen: {announced} bytes, but {found} found (ignored)");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! From JSON to messages and letters.
+//! Conversion of JSON to messages and letters.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
@@ -12,22 +12,22 @@ use crate::{
     PerformativeError, Received, Time, TimeError,
 };
 
-/// What a JSON document describes.
+/// A message or a letter that a JSON document describes.
 #[derive(Debug, Clone, PartialEq, Eq)]
-#[allow(clippy::exhaustive_enums, reason = "there is nothing else to describe")]
+#[allow(clippy::exhaustive_enums, reason = "the format has only these kinds")]
 pub enum Document {
     /// A message.
     Message(Message),
     /// A letter with a message.
     Letter(Box<Envelope>, Message),
-    /// A letter with an encoded payload, which is empty if the envelope travels alone.
+    /// A letter with an encoded payload. The payload is empty for an envelope alone.
     EncodedLetter(Box<Envelope>, Vec<u8>),
 }
 
-/// The message or letter that the JSON describes: see the [module](super).
+/// Reads a message or a letter from JSON: see the [module](super).
 ///
 /// # Errors
-/// When the JSON has another shape, unknown keys, or values that a message or an envelope cannot
+/// The JSON has another structure, unknown keys, or values that a message or an envelope cannot
 /// have.
 pub fn document_from_json(json: &Value) -> Result<Document, JsonError> {
     if json.get("envelope").is_some() {
@@ -41,10 +41,10 @@ pub fn document_from_json(json: &Value) -> Result<Document, JsonError> {
     message_from_json(json).map(Document::Message)
 }
 
-/// The message that the JSON describes.
+/// Reads a message from JSON: see the [module](super).
 ///
 /// # Errors
-/// When the JSON has another shape, unknown keys, or values that a message cannot have.
+/// The JSON has another structure, unknown keys, or values that a message cannot have.
 pub fn message_from_json(json: &Value) -> Result<Message, JsonError> {
     let json: MessageJson = shaped(json)?;
     let performative = json.performative.parse();
@@ -92,7 +92,7 @@ pub fn message_from_json(json: &Value) -> Result<Message, JsonError> {
     builder.build().map_err(at(""))
 }
 
-/// JSON that describes no message and no letter: where, and what is wrong.
+/// Error of reading a message or a letter from JSON: the path of the value and the problem.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}{problem}", if path.is_empty() { String::new() } else { format!("{path}: ") })]
 pub struct JsonError {
@@ -101,46 +101,46 @@ pub struct JsonError {
 }
 
 impl JsonError {
-    /// Where the offending value is, for example `message.receivers[1].name`; empty for the whole
+    /// Path of the invalid value, for example `message.receivers[1].name`. Empty for the whole
     /// document.
     #[must_use]
     pub fn path(&self) -> &str {
         &self.path
     }
 
-    /// What is wrong with it.
+    /// The problem of the value.
     #[must_use]
     pub fn problem(&self) -> &JsonProblem {
         &self.problem
     }
 }
 
-/// What can be wrong with a JSON document.
+/// A problem of a JSON document.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum JsonProblem {
-    /// The JSON has another shape.
+    /// The JSON has another structure.
     #[error("{0}")]
     Shape(String),
-    /// A performative that is no word.
+    /// A performative that is not a word.
     #[error(transparent)]
     Performative(#[from] PerformativeError),
-    /// An agent identifier that cannot be.
+    /// An invalid agent identifier.
     #[error(transparent)]
     AgentId(#[from] AgentIdError),
-    /// A time that is none.
+    /// An invalid time.
     #[error(transparent)]
     Time(#[from] TimeError),
     /// Text that is not base64.
     #[error("not base64: {0}")]
     Base64(String),
-    /// Content is given twice.
+    /// The content is given twice.
     #[error("give either content or content_base64, not both")]
     TwoContents,
     /// The payload of a letter is given twice.
     #[error("give either message or payload_base64, not both")]
     TwoPayloads,
-    /// A value that no message can have.
+    /// A value that a message cannot have.
     #[error(transparent)]
     Build(#[from] BuildError),
 }
@@ -261,19 +261,19 @@ fn base64(encoded: &str) -> Result<Vec<u8>, JsonProblem> {
     decoded.map_err(|error| JsonProblem::Base64(error.to_string()))
 }
 
-/// The structure that the JSON has.
+/// Deserializes the JSON.
 fn shaped<T: DeserializeOwned>(json: &Value) -> Result<T, JsonError> {
     serde_path_to_error::deserialize(json).map_err(|error| {
         let path = error.path().to_string();
         JsonError {
-            // The crate's word for the whole document.
+            // `serde_path_to_error` writes "." for the whole document.
             path: if path == "." { String::new() } else { path },
             problem: JsonProblem::Shape(error.inner().to_string()),
         }
     })
 }
 
-/// Says at which key a problem is.
+/// Makes an error of a problem at a key.
 fn at<P: Into<JsonProblem>>(key: &str) -> impl Fn(P) -> JsonError {
     move |problem| JsonError {
         path: key.to_owned(),
@@ -281,7 +281,7 @@ fn at<P: Into<JsonProblem>>(key: &str) -> impl Fn(P) -> JsonError {
     }
 }
 
-/// Says below which key an error is.
+/// Puts a key in front of the path of an error.
 fn within(key: &str) -> impl Fn(JsonError) -> JsonError {
     move |error| JsonError {
         path: match &*error.path {
@@ -300,7 +300,7 @@ mod tests {
     use crate::json::{letter_to_json, message_to_json};
 
     #[test]
-    fn a_message_survives() {
+    fn a_message_is_the_same_after_a_round_trip() {
         let json = json!({
             "performative": "request",
             "sender": { "name": "a", "addresses": ["tcp://h:1"], "resolvers": [{ "name": "r" }],
@@ -318,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn content_comes_either_way_but_not_both() {
+    fn content_is_text_or_base64_but_not_both() {
         let with = |content: Value| {
             let mut json = json!({ "performative": "inform" });
             json.as_object_mut()
@@ -339,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn mistakes_are_named_with_their_place() {
+    fn errors_have_the_path_and_the_problem() {
         let base = json!({ "acl_representation": "x", "date": "2026-11-20T11:26:44.998Z" });
         let agents = json!([{ "name": "a" }, { "name": "b", "resolvers": [{ "name": "" }] }]);
         for (json, path, part) in [
@@ -358,7 +358,7 @@ mod tests {
             (
                 json!({ "message": { "performative": "inform", "sender": { "name": "" } } }),
                 "message.sender.name",
-                "not empty",
+                "must not be empty",
             ),
             (
                 json!({ "performative": "inform", "sender": { "name": 7 } }),
@@ -385,7 +385,7 @@ mod tests {
             (
                 json!({ "envelope": { "base": { "to": agents } } }),
                 "envelope.base.to[1].resolvers[0].name",
-                "not empty",
+                "must not be empty",
             ),
             (
                 json!({ "envelope": { "base": base, "extensions": [{ "date": "soon" }] } }),
@@ -420,7 +420,7 @@ mod tests {
     }
 
     #[test]
-    fn a_letter_survives() {
+    fn a_letter_is_the_same_after_a_round_trip() {
         let letter = json!({
             "envelope": {
                 "base": {
@@ -445,7 +445,7 @@ mod tests {
             panic!("a letter with a message expected");
         };
         let mut printed = letter_to_json(&envelope, &message.to_payload());
-        // What is printed is read again, with the parameters that count.
+        // The output, which has the effective parameters too, is accepted as input.
         let again = document_from_json(&printed).unwrap();
         assert_eq!(again, Document::Letter(envelope.clone(), message));
         printed.as_object_mut().unwrap().remove("effective");

@@ -17,7 +17,7 @@ pub(super) enum Slot {
 }
 
 impl Slot {
-    /// The one of this name in small letters.
+    /// Returns the slot with this lowercase name.
     fn of(name: &[u8]) -> Option<Self> {
         match name {
             b"name" => Some(Self::Name),
@@ -34,7 +34,7 @@ pub(super) const SLOTS: &Keywords<Slot> = &[
     ("resolvers", Follows::Parenthesis, Slot::Resolvers),
 ];
 
-/// The next of the identifiers in checked bytes, one behind the other.
+/// Reads the next of the consecutive identifiers in checked bytes.
 pub(crate) fn next<'a>(rest: &mut &'a [u8]) -> Option<AgentIdView<'a>> {
     let mut lexer = Lexer::new(rest);
     lexer.skip_space();
@@ -44,7 +44,7 @@ pub(crate) fn next<'a>(rest: &mut &'a [u8]) -> Option<AgentIdView<'a>> {
     agent
 }
 
-/// The next part of a checked identifier, whose name was read.
+/// Reads the next part of a checked identifier.
 pub(crate) fn next_part<'a>(rest: &mut &'a [u8], list: &mut List) -> Option<Part<'a>> {
     let mut lexer = Lexer::new(rest);
     let part = part(&mut lexer, list, AgentId::MAX_DEPTH, &mut None);
@@ -66,7 +66,7 @@ pub(super) fn agent_set<'a>(lexer: &mut Lexer<'a>) -> Result<AgentIds<'a>, Decod
     }
 }
 
-/// Reads an agent identifier, whose resolvers may be nested `depth` deep.
+/// Reads an agent identifier with resolvers nested at most `depth` deep.
 pub(super) fn agent<'a>(
     lexer: &mut Lexer<'a>,
     depth: usize,
@@ -84,7 +84,8 @@ pub(super) fn agent<'a>(
     Ok(AgentIdView::new(name, Encoding::String, parts))
 }
 
-/// The next part of an identifier, or `None` at its end; a name on the way is told.
+/// Reads the next part of an identifier. Returns `None` at its end. If the name is read on the way,
+/// it is stored in `name`.
 fn part<'a>(
     lexer: &mut Lexer<'a>,
     list: &mut List,
@@ -115,8 +116,8 @@ fn part<'a>(
                 return Ok(Some(Part::UserDefined(name, value)));
             }
             Keyword::Known(Slot::Name) => {
-                let glued = (!lexer.skip_space()).then_some(SLOTS);
-                *name = Some(lexer.text(glued, "name of an agent")?);
+                let terminators = (!lexer.skip_space()).then_some(SLOTS);
+                *name = Some(lexer.text(terminators, "name of an agent")?);
                 continue;
             }
             Keyword::Known(Slot::Addresses) => List::Addresses,

@@ -4,19 +4,19 @@ use crate::Text;
 use crate::error::{DecodeError, Problem};
 use crate::scan::{self, TOPS};
 
-/// Deepest nesting of expressions that is accepted.
+/// Maximum nesting depth of expressions that the reader accepts.
 pub(super) const MAX_EXPRESSION_DEPTH: usize = 64;
 
-/// No keyword is longer, with what follows it. Without a bound, one that is followed by no blank would
-/// be looked for in all that is left.
+/// Number of bytes in which the end of a keyword is searched. No keyword is longer. The bound keeps
+/// the time linear for input without blanks.
 const NEAR: usize = 16;
 
 const WORD: &str = "FIPA00070 Word";
 const STRING: &str = "FIPA00070 String";
 const EXPRESSION: &str = "FIPA00070 Expression";
 
-/// What has to follow a keyword directly for it to be one where no white space stands in front:
-/// fipa_services writes none, and a word may contain colons.
+/// The text that must follow a keyword without white space in front, to tell it from a part of a
+/// word. fipa_services writes no white space, and a word may contain colons.
 #[derive(Clone, Copy)]
 pub(super) enum Follows {
     /// An opening parenthesis.
@@ -27,17 +27,17 @@ pub(super) enum Follows {
     DateTime,
     /// Any word.
     Word,
-    /// Nothing: it never comes behind a word.
+    /// The keyword never follows a word.
     Never,
 }
 
-/// The keywords that can stand in some place, without their colon.
+/// The keywords that are allowed at a position, without their colon.
 pub(super) type Keywords<T> = [(&'static str, Follows, T)];
 
-/// Goes over the bytes of a message once, from front to back.
+/// Reads the tokens of a message in one pass.
 pub(super) struct Lexer<'a> {
     bytes: &'a [u8],
-    /// Those that were not read yet.
+    /// The bytes that were not read yet.
     rest: &'a [u8],
 }
 
@@ -46,7 +46,7 @@ impl<'a> Lexer<'a> {
         Self { bytes, rest: bytes }
     }
 
-    /// Bytes read so far.
+    /// Number of bytes read.
     pub(super) fn offset(&self) -> usize {
         self.bytes.len() - self.rest.len()
     }
@@ -55,7 +55,7 @@ impl<'a> Lexer<'a> {
         self.rest
     }
 
-    /// What was read since `start`, a former [`offset`](Self::offset).
+    /// The bytes read since `start`, an earlier [`offset`](Self::offset).
     pub(super) fn since(&self, start: usize) -> &'a [u8] {
         self.bytes.get(start..self.offset()).unwrap_or_default()
     }
@@ -64,12 +64,12 @@ impl<'a> Lexer<'a> {
         self.rest.first().copied()
     }
 
-    /// Passes over as many bytes, which the caller has seen to be there.
+    /// Skips a number of bytes. The caller has checked that they exist.
     pub(super) fn skip(&mut self, bytes: usize) {
         self.rest = self.rest.get(bytes..).unwrap_or_default();
     }
 
-    /// Passes over white space and says whether there was any.
+    /// Skips white space. Returns whether there was any.
     #[inline]
     pub(super) fn skip_space(&mut self) -> bool {
         match self.rest {
@@ -93,7 +93,7 @@ impl<'a> Lexer<'a> {
         self.rest.len() < before
     }
 
-    /// Passes over white space and the byte, if it stands there.
+    /// Skips white space, and the byte if it is next. Returns whether it was.
     pub(super) fn accept(&mut self, byte: u8) -> bool {
         self.skip_space();
         match self.rest.split_first() {
@@ -105,7 +105,7 @@ impl<'a> Lexer<'a> {
         }
     }
 
-    /// Passes over white space and the parenthesis that must stand there.
+    /// Skips white space and an opening parenthesis, which must be next.
     pub(super) fn open(&mut self, clause: &'static str) -> Result<(), DecodeError> {
         if self.accept(b'(') {
             Ok(())
@@ -114,7 +114,7 @@ impl<'a> Lexer<'a> {
         }
     }
 
-    /// Passes over white space and a name that must stand there, in any case.
+    /// Skips white space and a name, which must be next, in any case.
     pub(super) fn name(
         &mut self,
         name: &str,
@@ -130,7 +130,7 @@ impl<'a> Lexer<'a> {
         }
     }
 
-    /// Passes over a colon and the keyword behind it, in any case.
+    /// Reads a colon and the keyword behind it, in any case.
     #[inline]
     pub(super) fn keyword<T: Copy>(
         &mut self,
@@ -142,7 +142,7 @@ impl<'a> Lexer<'a> {
         let Some((b':', rest)) = self.rest().split_first() else {
             return Err(self.unexpected(clause, expected));
         };
-        // Nearly everybody writes small letters, and a blank or a parenthesis behind them.
+        // The common case: lowercase letters, and then a blank or a parenthesis.
         let near = rest.get(..NEAR).unwrap_or(rest);
         if let Some(len) = scan::find(near, scan::no_token, |byte| !is_token_byte(byte))
             && let Some((name, behind)) = rest.split_at_checked(len)
@@ -151,11 +151,11 @@ impl<'a> Lexer<'a> {
             self.rest = behind;
             return Ok(Keyword::Known(parameter));
         }
-        self.other_keyword(keywords, clause, expected)
+        self.keyword_slow(keywords, clause, expected)
     }
 
     #[inline(never)]
-    fn other_keyword<T: Copy>(
+    fn keyword_slow<T: Copy>(
         &mut self,
         keywords: &Keywords<T>,
         clause: &'static str,
@@ -175,15 +175,15 @@ impl<'a> Lexer<'a> {
         Ok(Keyword::Known(*parameter))
     }
 
-    /// A word, whatever it begins with, up to white space or a parenthesis. If keywords are given,
-    /// one of them ends it too.
+    /// Reads a word up to white space, a parenthesis, or one of the keywords `terminators`. Its first
+    /// character is not checked.
     pub(super) fn word<T>(
         &mut self,
-        glued: Option<&Keywords<T>>,
+        terminators: Option<&Keywords<T>>,
         what: &'static str,
     ) -> Result<Text<'a>, DecodeError> {
-        let len = match glued {
-            Some(keywords) => glued_len(self.rest, keywords),
+        let len = match terminators {
+            Some(keywords) => len_to_keyword(self.rest, keywords),
             None => scan::find(self.rest, scan::no_token, |byte| !is_token_byte(byte)),
         };
         let word = self.rest.get(..len.unwrap_or(self.rest.len()));
@@ -201,26 +201,26 @@ impl<'a> Lexer<'a> {
         Ok(Text::plain(word))
     }
 
-    /// An expression as text: words and numbers as they stand, strings without their quotation
-    /// marks, parenthesised expressions with all that is in them.
+    /// Reads an expression as text: words and numbers unchanged, strings without their quotation
+    /// marks, expressions in parentheses unchanged.
     pub(super) fn expression<T>(
         &mut self,
-        glued: Option<&Keywords<T>>,
+        terminators: Option<&Keywords<T>>,
         what: &'static str,
     ) -> Result<Text<'a>, DecodeError> {
         if self.peek() != Some(b'(') {
-            return self.text(glued, what);
+            return self.text(terminators, what);
         }
         let start = self.offset();
-        let text = Text::plain(self.parenthesised(what)?);
+        let text = Text::plain(self.parenthesized(what)?);
         check_text(&text, start, what)?;
         Ok(text)
     }
 
-    /// A word, a number or a string.
+    /// Reads a word, a number or a string.
     pub(super) fn text<T>(
         &mut self,
-        glued: Option<&Keywords<T>>,
+        terminators: Option<&Keywords<T>>,
         what: &'static str,
     ) -> Result<Text<'a>, DecodeError> {
         let start = self.offset();
@@ -234,15 +234,15 @@ impl<'a> Lexer<'a> {
                 }
             }
             Some(b'#') => Text::plain(self.counted(what)?),
-            _ => return self.word(glued, what),
+            _ => return self.word(terminators, what),
         };
         check_text(&text, start, what)?;
         Ok(text)
     }
 
-    /// A parenthesised expression, which must stand here, as it stands. Only its nesting is
+    /// Reads an expression in parentheses, which must be next. Only its tokens and its nesting are
     /// checked.
-    pub(super) fn parenthesised(&mut self, what: &'static str) -> Result<&'a [u8], DecodeError> {
+    pub(super) fn parenthesized(&mut self, what: &'static str) -> Result<&'a [u8], DecodeError> {
         let start = self.offset();
         let mut depth = 0_usize;
         while let Some(byte) = self.peek() {
@@ -278,8 +278,8 @@ impl<'a> Lexer<'a> {
         Err(self.error(EXPRESSION, Problem::Truncated(what)))
     }
 
-    /// A `StringLiteral`, which must stand here: what is inside, and whether there are escapes in
-    /// it. A quotation mark behind a backslash always is one.
+    /// Reads a `StringLiteral`, which must be next. Returns its inside, and whether that has escapes.
+    /// A quotation mark behind a backslash is always an escape.
     pub(super) fn quoted(&mut self, what: &'static str) -> Result<(&'a [u8], bool), DecodeError> {
         let inside = self.rest.get(1..).unwrap_or_default();
         let mut from = 0;
@@ -298,7 +298,7 @@ impl<'a> Lexer<'a> {
         Err(self.error(STRING, Problem::Truncated(what)))
     }
 
-    /// A `ByteLengthEncodedString`: `#n"` and as many bytes.
+    /// Reads a `ByteLengthEncodedString`: `#n"` and n bytes.
     pub(super) fn counted(&mut self, what: &'static str) -> Result<&'a [u8], DecodeError> {
         let rest = self.rest().get(1..).unwrap_or_default();
         let digits = rest.iter().take_while(|byte| byte.is_ascii_digit()).count();
@@ -332,7 +332,7 @@ impl<'a> Lexer<'a> {
         DecodeError::new(self.offset(), clause, problem)
     }
 
-    /// What stands here, or that nothing does, is not what should.
+    /// Returns the error for a wrong next byte, or for a missing one.
     pub(super) fn unexpected(&self, clause: &'static str, expected: &'static str) -> DecodeError {
         match self.peek() {
             Some(found) => self.error(clause, Problem::Unexpected { found, expected }),
@@ -366,7 +366,8 @@ fn check_text(text: &Text<'_>, start: usize, what: &'static str) -> Result<(), D
     }
 }
 
-/// The text of a string in parentheses, as fipa_services wraps user-defined values: `(#n"…)`.
+/// Returns the text of a string in parentheses, the form in which fipa_services writes user-defined
+/// values: `(#n"…)`.
 pub(super) fn unwrapped<'a>(text: &Text<'a>) -> Option<Text<'a>> {
     let inner = text.raw().strip_prefix(b"(")?.strip_suffix(b")")?;
     let mut lexer = Lexer::new(inner);
@@ -375,7 +376,7 @@ pub(super) fn unwrapped<'a>(text: &Text<'a>) -> Option<Text<'a>> {
     lexer.rest().is_empty().then_some(Text::plain(counted))
 }
 
-/// Whether a reader of fipa_services' text might find a keyword inside of a word.
+/// Whether a reader that expects no white space may find a keyword inside the word.
 pub(super) fn holds_keyword<T>(word: &str, keywords: &Keywords<T>) -> bool {
     memchr::memchr_iter(b':', word.as_bytes()).any(|colon| {
         let behind = word.as_bytes().get(colon + 1..).unwrap_or_default();
@@ -384,8 +385,9 @@ pub(super) fn holds_keyword<T>(word: &str, keywords: &Keywords<T>) -> bool {
     })
 }
 
-/// Where the word at the beginning of the bytes ends, a keyword behind its first byte ending it too.
-fn glued_len<T>(bytes: &[u8], keywords: &Keywords<T>) -> Option<usize> {
+/// Returns the length of the word at the beginning of the bytes. A keyword behind its first byte ends
+/// it.
+fn len_to_keyword<T>(bytes: &[u8], keywords: &Keywords<T>) -> Option<usize> {
     let marks = |word| scan::no_token(word) | scan::is(word, b':');
     let ends = |byte: u8| !is_token_byte(byte) || byte == b':';
     let mut from = 0;
@@ -395,16 +397,16 @@ fn glued_len<T>(bytes: &[u8], keywords: &Keywords<T>) -> Option<usize> {
             return Some(at);
         }
         let behind = bytes.get(at + 1..).unwrap_or_default();
-        if at > 0 && is_glued_keyword(behind, keywords) {
+        if at > 0 && is_keyword_with_value(behind, keywords) {
             return Some(at);
         }
         from = at + 1;
     }
 }
 
-fn is_glued_keyword<T>(behind_colon: &[u8], keywords: &Keywords<T>) -> bool {
+fn is_keyword_with_value<T>(behind_colon: &[u8], keywords: &Keywords<T>) -> bool {
     if starts_with(behind_colon, USER_DEFINED) {
-        // The next colon ends it, so that many of them do not cost quadratic time.
+        // The next colon ends the name. Otherwise many colons would cost quadratic time.
         let name = behind_colon
             .iter()
             .position(|byte| !is_token_byte(*byte) || *byte == b':');
@@ -427,7 +429,7 @@ fn is_glued_keyword<T>(behind_colon: &[u8], keywords: &Keywords<T>) -> bool {
 
 #[inline(always)]
 fn starts_with(bytes: &[u8], name: &str) -> bool {
-    // Most names begin otherwise, which is quickly found out.
+    // Most names differ in the first letter, which is fast to check.
     let (Some(one), Some(other)) = (bytes.first(), name.as_bytes().first()) else {
         return false;
     };
@@ -437,7 +439,7 @@ fn starts_with(bytes: &[u8], name: &str) -> bool {
 #[inline(never)]
 fn starts_with_all(bytes: &[u8], name: &str) -> bool {
     let name = name.as_bytes();
-    // Nearly everybody writes small letters.
+    // Lowercase letters are the common case.
     bytes.starts_with(name)
         || bytes
             .get(..name.len())
@@ -466,7 +468,7 @@ mod tests {
     }
 
     #[test]
-    fn expressions_of_every_form() {
+    fn every_form_of_expression_is_read() {
         for (bytes, expected) in [
             ("word rest", "word"),
             ("a\"b)", "a\"b"),
@@ -485,7 +487,7 @@ mod tests {
     }
 
     #[test]
-    fn nonsense_is_refused() {
+    fn malformed_expressions_are_refused() {
         for (bytes, problem) in [
             (&b""[..], Problem::Truncated("test")),
             (b"\"a", Problem::Truncated("test")),
@@ -508,7 +510,7 @@ mod tests {
     }
 
     #[test]
-    fn a_word_ends_at_a_keyword_that_has_its_value_behind_it() {
+    fn a_keyword_with_its_value_ends_a_word() {
         let keywords: &Keywords<()> = &[
             ("sender", Follows::Parenthesis, ()),
             ("content", Follows::Counted, ()),

@@ -1,9 +1,8 @@
 //! The string encoding of messages (FIPA00070, edition I).
 //!
-//! Reading is lenient: it takes the standard and what fipa_services (no white space at all) and
-//! JADE (upper case, quoted words, Base64) write. Writing is strict, in the hand of one of the
-//! three. Here the grammar; [`crate::Message::decode`] and [`crate::Message::encode`] are the way
-//! in.
+//! The reader is lenient: it accepts the standard and what fipa_services (no white space) and JADE
+//! (upper case, quoted words, Base64) write. The writer is strict and writes one of the three
+//! dialects. [`crate::Message::decode`] and [`crate::Message::encode`] use this module.
 
 pub(crate) mod agent_id;
 mod lex;

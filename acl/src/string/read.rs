@@ -1,4 +1,4 @@
-//! Reading string messages, leniently.
+//! The lenient reader of string messages.
 
 use super::agent_id::{agent, agent_set};
 use super::lex::{Follows, Keyword, Keywords, Lexer, unwrapped};
@@ -9,7 +9,7 @@ use crate::{AgentId, Message, MessageView, Text, Time};
 /// Reads a string message.
 ///
 /// # Errors
-/// When the bytes are not one whole string message.
+/// The bytes are not one whole string message.
 pub(crate) fn view(bytes: &[u8]) -> Result<MessageView<'_>, DecodeError> {
     let mut lexer = Lexer::new(bytes);
     if lexer.rest().starts_with(BYTE_ORDER_MARK) {
@@ -19,7 +19,7 @@ pub(crate) fn view(bytes: &[u8]) -> Result<MessageView<'_>, DecodeError> {
     lexer.skip_space();
     let mut view = MessageView::empty(performative(&mut lexer)?);
     let parameters = lexer.rest();
-    // Where the content stood, to say so when it is found not to be Base64.
+    // Offset of the content, for the error if it is not valid Base64.
     let mut content_offset = 0;
     while !lexer.accept(b')') {
         match view.parameter(&mut lexer, &mut None)? {
@@ -30,21 +30,21 @@ pub(crate) fn view(bytes: &[u8]) -> Result<MessageView<'_>, DecodeError> {
     }
     lexer.skip_space();
     match lexer.rest().len() {
-        0 => view.settle_base64(content_offset, "JADE X-JADE-Encoding")?,
+        0 => view.check_for_base64(content_offset, "JADE X-JADE-Encoding")?,
         behind => return Err(lexer.error(MESSAGE, Problem::Trailing(behind))),
     }
     Ok(view)
 }
 
-/// The next user-defined parameter of those behind the performative of a checked message.
+/// Reads the next user-defined parameter behind the performative of a checked message.
 pub(crate) fn next_user_defined<'a>(rest: &mut &'a [u8]) -> Option<(Text<'a>, Text<'a>)> {
-    // What is passed over on the way is read into this.
-    let mut passed = MessageView::empty(PerformativeView::Standard(0));
+    // Receives the other parameters, which are skipped.
+    let mut skipped = MessageView::empty(PerformativeView::Standard(0));
     let mut lexer = Lexer::new(rest);
     while !lexer.accept(b')') {
-        // An error cannot occur in checked bytes, and would end this.
+        // An error cannot occur in checked bytes. It would end the iteration.
         let mut pair = None;
-        passed.parameter(&mut lexer, &mut pair).ok()?;
+        skipped.parameter(&mut lexer, &mut pair).ok()?;
         *rest = lexer.rest();
         if pair.is_some() {
             return pair;
@@ -53,18 +53,19 @@ pub(crate) fn next_user_defined<'a>(rest: &mut &'a [u8]) -> Option<(Text<'a>, Te
     None
 }
 
-/// What was read of a message.
+/// The item that was read.
 enum Step {
-    /// A parameter that is in the view now.
+    /// A parameter, which was stored in the view.
     Parameter,
-    /// The content, which is there too, and where it stands.
+    /// The content, which was stored in the view. The value is its offset.
     Content(usize),
-    /// A user-defined parameter, which is not there.
+    /// A user-defined parameter, which was not stored.
     UserDefined,
 }
 
 impl<'a> MessageView<'a> {
-    /// Reads one parameter of a string message. What is user-defined is given, not kept.
+    /// Reads one parameter of a string message. A user-defined one is written to `pair` and not
+    /// stored.
     #[inline]
     fn parameter(
         &mut self,
@@ -81,8 +82,8 @@ impl<'a> MessageView<'a> {
             *pair = Some(user_defined(lexer)?);
             return Ok(Step::UserDefined);
         };
-        // Without white space in front, the value ends where the next keyword begins.
-        let glued = (!lexer.skip_space()).then_some(PARAMETERS);
+        // Without white space in front of the value, the next keyword ends it.
+        let terminators = (!lexer.skip_space()).then_some(PARAMETERS);
         let (text, what) = match parameter {
             Parameter::ReplyWith => (&mut self.reply_with, "reply-with"),
             Parameter::InReplyTo => (&mut self.in_reply_to, "in-reply-to"),
@@ -103,7 +104,7 @@ impl<'a> MessageView<'a> {
                 return Ok(Step::Parameter);
             }
             Parameter::Protocol => {
-                self.protocol = Some(protocol(lexer, glued)?);
+                self.protocol = Some(protocol(lexer, terminators)?);
                 return Ok(Step::Parameter);
             }
             Parameter::ReplyBy => {
@@ -112,11 +113,11 @@ impl<'a> MessageView<'a> {
             }
             Parameter::Content => {
                 let offset = lexer.offset();
-                self.content = Some(content(lexer, glued)?);
+                self.content = Some(content(lexer, terminators)?);
                 return Ok(Step::Content(offset));
             }
         };
-        *text = Some(lexer.expression(glued, what)?);
+        *text = Some(lexer.expression(terminators, what)?);
         Ok(Step::Parameter)
     }
 }
@@ -141,8 +142,8 @@ pub(super) enum Parameter {
 }
 
 impl Parameter {
-    /// The parameter of this name in small letters; by length first, so that few have to be
-    /// compared.
+    /// Returns the parameter with this lowercase name. The match on the length limits the
+    /// comparisons.
     #[inline]
     fn of(name: &[u8]) -> Option<Self> {
         Some(match name.len() {
@@ -192,13 +193,13 @@ fn performative<'a>(lexer: &mut Lexer<'a>) -> Result<PerformativeView<'a>, Decod
     PerformativeView::of_name(name).ok_or_else(|| DecodeError::new(offset, MESSAGE, problem))
 }
 
-/// JADE may write it in quotation marks; a word it must be all the same.
+/// Reads the protocol, which must be a word. JADE may write it in quotation marks.
 fn protocol<'a>(
     lexer: &mut Lexer<'a>,
-    glued: Option<&Keywords<Parameter>>,
+    terminators: Option<&Keywords<Parameter>>,
 ) -> Result<Text<'a>, DecodeError> {
     let offset = lexer.offset();
-    let text = lexer.text(glued, "protocol")?;
+    let text = lexer.text(terminators, "protocol")?;
     if text.is_token() {
         Ok(text)
     } else {
@@ -216,17 +217,17 @@ fn date_time(lexer: &mut Lexer<'_>) -> Result<Time, DecodeError> {
         .map_err(|_| DecodeError::new(offset, clause, Problem::DateTime))
 }
 
-/// A string by the standard, a word from JADE, and an expression from before edition F.
+/// Reads the content: a string (standard), a word (JADE) or an expression (editions before F).
 fn content<'a>(
     lexer: &mut Lexer<'a>,
-    glued: Option<&Keywords<Parameter>>,
+    terminators: Option<&Keywords<Parameter>>,
 ) -> Result<Content<'a>, DecodeError> {
     let offset = lexer.offset();
     let (bytes, escaped) = match lexer.peek() {
         Some(b'"') => lexer.quoted("content")?,
         Some(b'#') => (lexer.counted("content")?, false),
-        Some(b'(') => (lexer.parenthesised("content")?, false),
-        _ => (lexer.word(glued, "content")?.raw(), false),
+        Some(b'(') => (lexer.parenthesized("content")?, false),
+        _ => (lexer.word(terminators, "content")?.raw(), false),
     };
     if bytes.len() as u64 > Message::MAX_CONTENT {
         let problem = Problem::TooLong("content");
@@ -239,7 +240,7 @@ fn content<'a>(
     })
 }
 
-/// Name and value of a user-defined parameter, whose `:X-` was read.
+/// Reads the name and the value of a user-defined parameter. The `:X-` was read.
 pub(super) fn user_defined<'a>(lexer: &mut Lexer<'a>) -> Result<(Text<'a>, Text<'a>), DecodeError> {
     let name = lexer.word::<()>(None, "name of a user-defined parameter")?;
     lexer.skip_space();

@@ -1,4 +1,4 @@
-//! Writing string messages, strictly, in the hand of one of three readers.
+//! The strict writer of string messages in one of the three dialects.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64_ENGINE;
@@ -7,24 +7,25 @@ use bytes::Bytes;
 use super::agent_id::SLOTS;
 use super::lex::{Keywords, holds_keyword};
 use super::read::PARAMETERS;
-use crate::bitefficient::write::Out;
+use crate::bitefficient::write::Output;
 use crate::dialect::{BASE64, JADE_ENCODING, announces_base64, check_word, local_time, not_a_word};
 use crate::error::EncodeError;
 use crate::time::Time;
 use crate::word::{Piece, is_quotable, is_token, is_word, quoted, string_literal};
 use crate::{AgentId, Dialect, Message, Performative, Text};
 
-/// Writes the string message: parameters in the order of the standard, but content last.
+/// Writes the string message with the parameters in the order of the standard, except for the
+/// content.
 pub(crate) fn encode(
     message: &Message,
     dialect: Dialect,
-    out: &mut dyn Out,
+    out: &mut dyn Output,
 ) -> Result<(), EncodeError> {
     Writer { out, dialect }.message(message)
 }
 
 struct Writer<'a> {
-    out: &'a mut dyn Out,
+    out: &'a mut dyn Output,
     dialect: Dialect,
 }
 
@@ -37,7 +38,7 @@ impl Writer<'_> {
         if message.content.is_some() && message.user_defined.iter().any(announced) {
             return Err(EncodeError::Unrepresentable {
                 what: "user-defined parameter JADE-Encoding",
-                why: "readers would take the content for Base64",
+                why: "readers would decode the content as Base64",
             });
         }
         self.push("(");
@@ -47,7 +48,7 @@ impl Writer<'_> {
             self.agent(sender, 0)?;
         }
         self.agent_set("receiver", &message.receivers)?;
-        // fipa_services writes it here; nobody minds where it stands.
+        // fipa_services writes the content here. No reader depends on its position.
         if self.dialect == Dialect::FipaServices {
             self.content(message.content.as_ref());
         }
@@ -87,7 +88,7 @@ impl Writer<'_> {
                     why: "neither fipa_services nor JADE reads one in a string message",
                 });
             }
-            // The spelling that JADE itself uses.
+            // JADE writes upper case.
             (_, Dialect::Jade) => self.push(&name.to_ascii_uppercase()),
             _ => self.push(name),
         }
@@ -112,7 +113,7 @@ impl Writer<'_> {
         self.push("(agent-identifier");
         self.key("name");
         if self.dialect == Dialect::Jade && !is_word(agent.name()) {
-            // JADE takes strings for names.
+            // JADE accepts strings as names.
             self.literal(agent.name(), "name of an agent")?;
         } else {
             self.word(agent.name(), "name of an agent", SLOTS)?;
@@ -163,7 +164,7 @@ impl Writer<'_> {
         }
         self.push(address);
         if self.dialect == Dialect::FipaServices {
-            // The only white space there is: a URL has no other end.
+            // The blank ends the URL. fipa_services writes no other white space.
             self.push(" ");
         }
         Ok(())
@@ -175,14 +176,14 @@ impl Writer<'_> {
             if self.dialect == Dialect::FipaServices && name.contains(':') {
                 return Err(EncodeError::Unrepresentable {
                     what: "name of a user-defined parameter",
-                    why: "without white space, as fipa_services writes, a colon would end it",
+                    why: "it has a colon, which ends it for a reader without white space",
                 });
             }
             self.colon("X-");
             self.push(name);
             self.space();
             if self.dialect == Dialect::FipaServices {
-                // Its own reader demands the parentheses.
+                // The reader of fipa_services requires the parentheses.
                 self.push("(");
                 self.counted(value.as_bytes());
                 self.push(")");
@@ -199,7 +200,8 @@ impl Writer<'_> {
         self.expression(text, key)
     }
 
-    /// A word where the text is one, else a string; for fipa_services always a counted string.
+    /// Writes a text as a word if it is one, and as a string otherwise. For fipa_services, it is
+    /// always a string with its length.
     fn expression(&mut self, text: &str, what: &'static str) -> Result<(), EncodeError> {
         if self.dialect == Dialect::FipaServices {
             self.counted(text.as_bytes());
@@ -254,15 +256,15 @@ impl Writer<'_> {
         if self.dialect == Dialect::Jade {
             self.content_for_jade(content);
         } else {
-            // Its length in front: any bytes will do, and no reader has to look at them.
+            // With its length, the content may be any bytes, and no reader scans them.
             self.key("content");
             self.counted(content);
         }
     }
 
-    /// In quotation marks if it is text that can stand there, else in Base64.
+    /// Writes content in quotation marks if it is text that allows them, and in Base64 otherwise.
     fn content_for_jade(&mut self, content: &Bytes) {
-        // A copy, because nobody vouches that shared memory stays as it is.
+        // A copy, because another process may change shared memory at any time.
         let content = content.to_vec();
         let text = std::str::from_utf8(&content)
             .ok()
@@ -291,13 +293,13 @@ impl Writer<'_> {
         Ok(())
     }
 
-    /// `:key`, and blanks around it where the dialect has them.
+    /// Writes `:key` and, if the dialect has white space, a blank on both sides.
     fn key(&mut self, key: &str) {
         self.colon(key);
         self.space();
     }
 
-    /// `:key` without the blank behind it.
+    /// Writes `:key` and, if the dialect has white space, a blank in front.
     fn colon(&mut self, key: &str) {
         self.space();
         self.push(":");
@@ -322,14 +324,14 @@ impl Writer<'_> {
     }
 }
 
-/// A reader that expects no white space would see the end of the word there.
+/// Refuses a word with a keyword, which ends the word for a reader that expects no white space.
 fn refuse_keyword<T>(
     word: &str,
     what: &'static str,
     keywords: &Keywords<T>,
 ) -> Result<(), EncodeError> {
     if holds_keyword(word, keywords) {
-        let why = "it has a colon and the name of a parameter in it";
+        let why = "it contains a colon followed by the name of a parameter";
         return Err(EncodeError::Unrepresentable { what, why });
     }
     Ok(())

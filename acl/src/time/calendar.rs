@@ -11,8 +11,8 @@ pub(super) fn days_of_month(year: u16, month: u8) -> u8 {
     }
 }
 
-/// Days since 1970-01-01 of a date of the proleptic Gregorian calendar. Years are counted from
-/// March, so that the leap day is the last one of its year.
+/// Returns the days from 1970-01-01 to a date of the proleptic Gregorian calendar. The calculation
+/// uses years that begin in March, so the leap day is the last day of its year.
 pub(super) fn days_from_civil(year: i64, month: u8, day: u8) -> i64 {
     let month = i64::from(month);
     let year = if month <= 2 { year - 1 } else { year };

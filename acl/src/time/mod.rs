@@ -1,5 +1,5 @@
-//! Points in time and spans of it, as FIPA writes them (FIPA00070 `DateTime`, FIPA00069
-//! `BinDateTime`). No clock lives here: what is relative to now gets its now handed in.
+//! Absolute and relative times of FIPA (FIPA00070 `DateTime`, FIPA00069 `BinDateTimeToken`). This
+//! module has no clock: the caller passes the current time.
 
 mod calendar;
 mod text;
@@ -12,8 +12,9 @@ use self::calendar::{civil_from_days, days_from_civil, days_of_month};
 
 /// A FIPA date-time with milliseconds.
 ///
-/// Either absolute, in UTC or in a zone that its text leaves open, or relative to when it is read.
-/// The text form is `20000508T042651481Z`, for relative times with a sign in front.
+/// A time is either absolute, in UTC or in an unspecified zone, or relative to the time at which it
+/// is read. The text form is `20000508T042651481Z`. A relative time has a sign in front:
+/// `+00000000T000030000`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Time {
     pub(crate) base: Base,
@@ -21,27 +22,27 @@ pub struct Time {
     pub(crate) fields: Fields,
 }
 
-/// What a [`Time`] counts from.
+/// The reference of a [`Time`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[allow(clippy::exhaustive_enums, reason = "the standard is final")]
 pub enum Base {
     /// The calendar.
     Absolute,
-    /// Now, forward.
+    /// The current time. The fields are added to it.
     After,
-    /// Now, backward.
+    /// The current time. The fields are subtracted from it.
     Before,
 }
 
-/// The zone of a [`Time`], as its type designator says.
+/// The zone of a [`Time`], which its type designator names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[allow(clippy::exhaustive_enums, reason = "the standard is final")]
 pub enum Zone {
-    /// No designator: the local time of whoever wrote it (fipa_services, JADE).
+    /// No designator: the local time of the writer (fipa_services, JADE).
     Unspecified,
     /// `Z`: UTC.
     Utc,
-    /// Another letter, whose meaning the standard leaves open.
+    /// Another letter. The standard does not define its meaning.
     Letter(char),
 }
 
@@ -56,43 +57,43 @@ pub(crate) struct Fields {
     pub(crate) millisecond: u16,
 }
 
-/// Text or digits that are not a FIPA date-time, or one that cannot be expressed as asked.
+/// Error of making a [`Time`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum TimeError {
     /// The text has another form.
     #[error(
-        "not a date-time: {0:?} (expected for example 20000508T042651481Z, +00000000T000030000 or \
-         2000-05-08T04:26:51.481Z)"
+        "not a date-time: {0:?}; write for example 20000508T042651481Z, +00000000T000030000 or \
+         2000-05-08T04:26:51.481Z"
     )]
     Syntax(String),
     /// A field is out of its range, for example month 13.
-    #[error("no such date or time of day: {0}")]
+    #[error("invalid date or time of day: {0}")]
     Range(String),
     /// The year does not have four digits.
-    #[error("a time before the year 0 or after the year 9999 cannot be written")]
+    #[error("the year of the time is not between 0 and 9999")]
     Year,
-    /// The span of time is longer than a relative time can say.
+    /// The span is too long for a relative time. The value is in seconds.
     #[error("a span of {0} s is too long for a relative time")]
     Span(u64),
 }
 
 const DAY: u64 = 24 * 60 * 60;
-/// How JADE reads the years and months of relative times.
+/// Lengths of a year and a month in relative times, as JADE reads them.
 const DAYS_PER_YEAR: u64 = 365;
 const DAYS_PER_MONTH: u64 = 30;
 const MS_PER_DAY: i64 = 86_400_000;
 
 impl Time {
-    /// The time, in UTC and cut to milliseconds.
+    /// Converts a system time to UTC, truncated to milliseconds.
     ///
     /// # Errors
-    /// When the year does not have four digits.
+    /// The year does not have four digits.
     pub fn from_system_time(time: SystemTime) -> Result<Self, TimeError> {
         let ms = match time.duration_since(SystemTime::UNIX_EPOCH) {
             Ok(after) => i64::try_from(after.as_millis()).map_err(|_| TimeError::Year)?,
             Err(before) => {
-                // Cut towards the past, as it is done after 1970.
+                // Truncates toward the past, as for times after 1970.
                 let before = before.duration().as_nanos().div_ceil(1_000_000);
                 -i64::try_from(before).map_err(|_| TimeError::Year)?
             }
@@ -100,43 +101,44 @@ impl Time {
         Self::from_unix_ms(ms)
     }
 
-    /// So much later than when it will be read; cut to milliseconds.
+    /// Creates a relative time: `span`, truncated to milliseconds, after the time of reading.
     ///
     /// # Errors
-    /// When the span is 9999 years or more.
+    /// The span is 10,000 years or more.
     pub fn after(span: Duration) -> Result<Self, TimeError> {
         Self::relative(Base::After, span)
     }
 
-    /// So much earlier than when it will be read; cut to milliseconds.
+    /// Creates a relative time: `span`, truncated to milliseconds, before the time of reading.
     ///
     /// # Errors
-    /// When the span is 9999 years or more.
+    /// The span is 10,000 years or more.
     pub fn before(span: Duration) -> Result<Self, TimeError> {
         Self::relative(Base::Before, span)
     }
 
-    /// What it counts from.
+    /// The reference of the time.
     #[must_use]
     pub fn base(self) -> Base {
         self.base
     }
 
-    /// Whether it is relative to when it is read.
+    /// Whether the time is relative to the time of reading.
     #[must_use]
     pub fn is_relative(self) -> bool {
         self.base != Base::Absolute
     }
 
-    /// The zone its designator names.
+    /// The zone of the time.
     #[must_use]
     pub fn zone(self) -> Zone {
         self.zone
     }
 
-    /// The point in time. A relative time counts from `now`, with years of 365 and months of 30
-    /// days; an absolute one without `Z` is taken as UTC (see
-    /// [`with_local_offset`](Self::with_local_offset)).
+    /// Converts to a system time.
+    ///
+    /// A relative time is relative to `now`, with years of 365 and months of 30 days. An absolute
+    /// time without `Z` is taken as UTC (see [`with_local_offset`](Self::with_local_offset)).
     #[must_use]
     pub fn to_system_time(self, now: SystemTime) -> SystemTime {
         let moved = match self.base {
@@ -152,16 +154,16 @@ impl Time {
             Base::After => now.checked_add(self.span()),
             Base::Before => now.checked_sub(self.span()),
         };
-        // Four-digit years always fit what operating systems count with, except around a
-        // `now` that is itself at the end of it.
+        // System times have four-digit years. Only a `now` at the limit of their range fails.
         moved.unwrap_or(now)
     }
 
-    /// The same point in time in UTC, if it is an absolute time without `Z` that was written
-    /// where clocks are `seconds_east` ahead of UTC; otherwise unchanged.
+    /// Converts an absolute time without `Z` from local time to UTC. Other times are unchanged.
+    ///
+    /// `seconds_east` is the number of seconds that the local time is ahead of UTC.
     ///
     /// # Errors
-    /// When the year would no longer have four digits.
+    /// The year in UTC does not have four digits.
     pub fn with_local_offset(self, seconds_east: i32) -> Result<Self, TimeError> {
         if self.is_relative() || self.zone == Zone::Utc {
             return Ok(self);
@@ -169,7 +171,7 @@ impl Time {
         Self::from_unix_ms(self.unix_ms() - i64::from(seconds_east) * 1000)
     }
 
-    /// Checks the ranges.
+    /// Creates a time after checking the ranges of its fields.
     pub(crate) fn new(base: Base, zone: Zone, fields: Fields) -> Result<Self, TimeError> {
         let Fields {
             year,
@@ -181,7 +183,7 @@ impl Time {
             millisecond,
         } = fields;
         let fits = match base {
-            // A leap second is a legal 60; nobody here counts them.
+            // A leap second is 60. System times do not count leap seconds.
             Base::Absolute => {
                 (1..=12).contains(&month)
                     && (1..=days_of_month(year, month)).contains(&day)
@@ -259,7 +261,7 @@ impl Time {
         Self::new(Base::Absolute, Zone::Utc, fields)
     }
 
-    /// Milliseconds since 1970, the zone taken as UTC.
+    /// Milliseconds since 1970, with the zone taken as UTC.
     fn unix_ms(self) -> i64 {
         let Fields {
             year,
@@ -278,13 +280,16 @@ impl Time {
 }
 
 impl Fields {
-    /// Whether the numbers from century to tens of milliseconds, the lowest byte first and none
-    /// above 99, are within the bounds of each, for February, too: as nearly all are.
+    /// Whether a time is in the common range: a valid month, a day up to 28, a valid hour and minute,
+    /// and a second up to 59.
+    ///
+    /// The bytes of `numbers` are, from the lowest: century, year of the century, month, day, hour,
+    /// minute, second, tens of milliseconds. None exceeds 99.
     #[inline]
-    pub(crate) fn are_usual(numbers: u64) -> bool {
+    pub(crate) fn are_common(numbers: u64) -> bool {
         const LEAST: u64 = u64::from_le_bytes([0, 0, 1, 1, 0, 0, 0, 0]);
         const MOST: u64 = u64::from_le_bytes([99, 99, 12, 28, 23, 59, 59, 99]);
-        // None of these carries into the next.
+        // No byte carries into the next.
         let too_low = (numbers | TOPS) - LEAST;
         let too_high = numbers + (ONES * 0x7f - MOST);
         (!too_low | too_high) & TOPS == 0
@@ -292,7 +297,7 @@ impl Fields {
 }
 
 impl Zone {
-    /// The zone with this designator, which must be an ASCII letter.
+    /// Returns the zone with this designator, which must be an ASCII letter.
     pub(crate) fn of_letter(letter: u8) -> Option<Self> {
         match letter {
             b'Z' | b'z' => Some(Self::Utc),
@@ -313,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn known_dates() {
+    fn known_dates_are_converted() {
         for (ms, text, rfc3339) in [
             (0, "19700101T000000000Z", "1970-01-01T00:00:00.000Z"),
             (
@@ -343,7 +348,7 @@ mod tests {
     }
 
     #[test]
-    fn local_time_stays_local_until_somebody_knows_where() {
+    fn local_times_have_no_zone_until_they_get_an_offset() {
         let local: Time = "20101223T120037980".parse().unwrap();
         assert_eq!(local.zone(), Zone::Unspecified);
         assert_eq!(local.to_rfc3339().unwrap(), "2010-12-23T12:00:37.980Z");
@@ -354,7 +359,7 @@ mod tests {
     }
 
     #[test]
-    fn offsets_and_fractions_of_rfc3339() {
+    fn offsets_and_fractions_of_rfc3339_are_read() {
         for (text, expected) in [
             ("2010-12-23T12:00:37+01:30", "20101223T103037000Z"),
             ("2010-12-23t12:00:37.9z", "20101223T120037900Z"),
@@ -376,7 +381,7 @@ mod tests {
     }
 
     #[test]
-    fn relative_times_count_from_now() {
+    fn relative_times_are_relative_to_now() {
         let time = Time::after(Duration::from_secs(30)).unwrap();
         assert_eq!(time.to_string(), "+00000000T000030000");
         assert_eq!(time.to_rfc3339(), None);
@@ -387,7 +392,7 @@ mod tests {
     }
 
     #[test]
-    fn nonsense_is_refused() {
+    fn malformed_times_are_refused() {
         for text in [
             "",
             "20000508",
@@ -405,7 +410,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn every_time_survives_its_texts(ms in 0_u64..253_402_300_800_000) {
+        fn every_time_is_the_same_after_a_round_trip(ms in 0_u64..253_402_300_800_000) {
             let time = Time::from_system_time(at(ms)).unwrap();
             prop_assert_eq!(time.to_string().parse(), Ok(time));
             prop_assert_eq!(Time::from_rfc3339(&time.to_rfc3339().unwrap()), Ok(time));
@@ -413,13 +418,13 @@ mod tests {
         }
 
         #[test]
-        fn every_span_survives(ms in 0_u64..9_999 * 365 * 86_400_000) {
+        fn every_span_is_the_same_after_a_round_trip(ms in 0_u64..9_999 * 365 * 86_400_000) {
             let span = Duration::from_millis(ms);
             prop_assert_eq!(Time::after(span).unwrap().span(), span);
         }
 
         #[test]
-        fn any_text_is_read_or_refused(text in "\\PC{0,40}") {
+        fn any_text_is_parsed_or_refused(text in "\\PC{0,40}") {
             let _ = text.parse::<Time>();
             let _ = Time::from_rfc3339(&text);
         }

@@ -8,8 +8,8 @@ use crate::scan::{ONES, TOPS};
 use super::{Base, Fields, Time, TimeError, Zone};
 
 impl Time {
-    /// RFC 3339 text in UTC with milliseconds, or `None` for a relative time. A time without `Z`
-    /// is taken as UTC.
+    /// Formats the time as RFC 3339 in UTC with milliseconds. Returns `None` for a relative time. A
+    /// time without `Z` is taken as UTC.
     #[must_use]
     pub fn to_rfc3339(self) -> Option<String> {
         if self.is_relative() {
@@ -29,11 +29,11 @@ impl Time {
         ))
     }
 
-    /// Reads RFC 3339 text with any offset and any number of fractional digits, which are cut to
-    /// milliseconds. The result is in UTC.
+    /// Parses RFC 3339 text with any offset and any number of fractional digits, which are truncated
+    /// to milliseconds. The result is in UTC.
     ///
     /// # Errors
-    /// When the text is none, or the year in UTC does not have four digits.
+    /// The text is not RFC 3339, or the year in UTC does not have four digits.
     pub fn from_rfc3339(text: &str) -> Result<Self, TimeError> {
         let parsed = parse_rfc3339(text).ok_or_else(|| syntax(text))?;
         let (fields, seconds_east) = parsed;
@@ -42,7 +42,7 @@ impl Time {
     }
 }
 
-/// The text form of FIPA00070.
+/// Writes the form of FIPA00070 (`DateTime`).
 impl fmt::Display for Time {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let sign = match self.base {
@@ -74,9 +74,9 @@ impl fmt::Display for Time {
 impl FromStr for Time {
     type Err = TimeError;
 
-    /// Reads the text form of FIPA00070; `Z` in place of the `T` is accepted too (JADE).
+    /// Parses the form of FIPA00070 (`DateTime`). `Z` instead of `T` is accepted too (JADE).
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        if let Some(time) = usual(text.as_bytes()) {
+        if let Some(time) = parse_common(text.as_bytes()) {
             return Ok(time);
         }
         let (base, rest) = match text.as_bytes() {
@@ -94,10 +94,10 @@ impl FromStr for Time {
     }
 }
 
-/// A time of the kind that nearly all are: on the calendar, in UTC or without a zone, and within
-/// what every month and every minute has. All digits are looked at in one.
+/// Parses a time in the common case: absolute, in UTC or without a zone, with a day up to 28 and a
+/// second up to 59. All digits of a word are checked at once.
 #[inline]
-fn usual(text: &[u8]) -> Option<Time> {
+fn parse_common(text: &[u8]) -> Option<Time> {
     let (date, [b'T' | b'Z', rest @ ..]) = text.split_first_chunk::<8>()? else {
         return None;
     };
@@ -113,7 +113,7 @@ fn usual(text: &[u8]) -> Option<Time> {
     let [century, year, month, day] = date;
     let [hour, minute, second, tens] = time;
     let numbers = [century, year, month, day, hour, minute, second, tens];
-    if !Fields::are_usual(u64::from_le_bytes(numbers)) {
+    if !Fields::are_common(u64::from_le_bytes(numbers)) {
         return None;
     }
     let fields = Fields {
@@ -129,13 +129,13 @@ fn usual(text: &[u8]) -> Option<Time> {
     Some(Time { base, zone, fields })
 }
 
-/// The numbers that four times two digits are, if all of them are digits.
+/// Parses four numbers of two digits each, if all bytes are digits.
 #[inline]
 fn pairs(digits: [u8; 8]) -> Option<[u8; 4]> {
     const ZEROS: u64 = ONES * b'0' as u64;
     let word = u64::from_le_bytes(digits);
     let numbers = word ^ ZEROS;
-    // In every byte: the top bit is set if it is no digit.
+    // Sets the top bit of each byte that is not a digit.
     let wrong = numbers | ((numbers & !TOPS) + ONES * (0x80 - 10));
     if wrong & TOPS != 0 {
         return None;
@@ -166,14 +166,15 @@ fn parse_fipa(text: &[u8]) -> Option<(Fields, &[u8])> {
     Some((fields, designator))
 }
 
-/// `YYYY-MM-DDThh:mm:ss[.fraction](Z|+hh:mm|-hh:mm)`: the fields, and seconds east of UTC.
+/// Parses `YYYY-MM-DDThh:mm:ss[.fraction](Z|+hh:mm|-hh:mm)`. Returns the fields and the seconds east
+/// of UTC.
 fn parse_rfc3339(text: &str) -> Option<(Fields, i32)> {
     let text = text.as_bytes();
     let (local, rest) = text.split_at_checked(19)?;
     let separators: [(usize, &[u8]); 5] =
         [(4, b"-"), (7, b"-"), (10, b"Tt "), (13, b":"), (16, b":")];
-    for (place, allowed) in separators {
-        if !allowed.contains(local.get(place)?) {
+    for (at, allowed) in separators {
+        if !allowed.contains(local.get(at)?) {
             return None;
         }
     }
@@ -185,8 +186,8 @@ fn parse_rfc3339(text: &str) -> Option<(Fields, i32)> {
         }
         _ => (&b""[..], rest),
     };
-    let millisecond = (0..3).fold(0, |ms, place| {
-        ms * 10 + u16::from(fraction.get(place).map_or(0, |digit| digit - b'0'))
+    let millisecond = (0..3).fold(0, |ms, at| {
+        ms * 10 + u16::from(fraction.get(at).map_or(0, |digit| digit - b'0'))
     });
     let seconds_east = match zone {
         b"Z" | b"z" => 0,
@@ -213,7 +214,7 @@ fn parse_rfc3339(text: &str) -> Option<(Fields, i32)> {
     Some((fields, seconds_east))
 }
 
-/// At most four digits.
+/// Parses a number of at most four digits.
 fn number(digits: &[u8]) -> Option<u16> {
     digits.iter().try_fold(0_u16, |value, digit| {
         let digit = digit.is_ascii_digit().then(|| digit - b'0')?;

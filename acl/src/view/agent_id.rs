@@ -11,7 +11,7 @@ pub struct AgentIdView<'a> {
 }
 
 impl<'a> AgentIdView<'a> {
-    /// An identifier that was checked: see [`check`].
+    /// Creates the view of a checked identifier. `parts` are the encoded parts behind its name.
     #[inline]
     pub(crate) fn new(name: Text<'a>, encoding: Encoding, parts: &'a [u8]) -> Self {
         let parts = Parts {
@@ -22,7 +22,7 @@ impl<'a> AgentIdView<'a> {
         Self { name, parts }
     }
 
-    /// The name.
+    /// Name of the agent.
     #[must_use]
     pub fn name(&self) -> Text<'a> {
         self.name
@@ -44,7 +44,7 @@ impl<'a> AgentIdView<'a> {
         })
     }
 
-    /// User-defined parameters, names without `X-`.
+    /// Names, without their `X-`, and values of user-defined parameters.
     pub fn user_defined(&self) -> impl Iterator<Item = (Text<'a>, Text<'a>)> + use<'a> {
         self.parts.filter_map(|part| match part {
             Part::UserDefined(name, value) => Some((name, value)),
@@ -52,10 +52,9 @@ impl<'a> AgentIdView<'a> {
         })
     }
 
-    /// The identifier as an owned value.
+    /// Converts the identifier to an owned value.
     pub(crate) fn to_agent_id(self) -> Result<AgentId, DecodeError> {
-        // What an identifier can be refused for was checked when it was read; should it be
-        // refused all the same, the error is told.
+        // The reader has checked the identifier, so this does not fail.
         self.owned()
             .map_err(|error| DecodeError::new(0, "FIPA00023 3.1", problem(&error)))
     }
@@ -90,7 +89,7 @@ enum Set<'a> {
 }
 
 impl<'a> AgentIds<'a> {
-    /// The identifiers in checked bytes, one behind the other.
+    /// Creates a set of the consecutive identifiers in checked bytes.
     #[inline]
     pub(crate) fn new(encoding: Encoding, bytes: &'a [u8]) -> Self {
         Self(match encoding {
@@ -102,17 +101,17 @@ impl<'a> AgentIds<'a> {
         })
     }
 
-    /// The identifiers in checked elements.
+    /// Creates a set of the identifiers in checked elements.
     pub(crate) fn xml(set: xml::AgentSet<'a>) -> Self {
         Self(Set::Xml(set))
     }
 
-    /// Whether they are in elements of XML.
+    /// Whether the identifiers are in XML elements.
     pub(crate) fn is_xml(&self) -> bool {
         matches!(self.0, Set::Xml(_))
     }
 
-    /// Whether there are none.
+    /// Whether the set is empty.
     pub(crate) fn is_empty(&self) -> bool {
         match &self.0 {
             Set::Empty => true,
@@ -121,7 +120,8 @@ impl<'a> AgentIds<'a> {
         }
     }
 
-    /// Adds the agents that follow in the same bytes, if both are elements of XML.
+    /// Adds identifiers that follow in the same bytes, if both sets are XML elements. Returns whether
+    /// they were added.
     pub(crate) fn add(&mut self, others: &Self) -> bool {
         match (&mut self.0, &others.0) {
             (Set::Xml(set), Set::Xml(others)) => {
@@ -141,7 +141,7 @@ impl<'a> Iterator for AgentIds<'a> {
     type Item = AgentIdView<'a>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        // Checked when they were read: an error cannot occur, and would end the list.
+        // An error cannot occur in checked bytes. It would end the iteration.
         match &mut self.0 {
             Set::Empty => None,
             Set::BitEfficient(rest) => bitefficient::agent_id::next(rest),
@@ -152,7 +152,7 @@ impl<'a> Iterator for AgentIds<'a> {
     }
 }
 
-/// In which encoding an identifier is.
+/// The encoding of an identifier.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Encoding {
     /// FIPA00069.
@@ -165,7 +165,7 @@ pub(crate) enum Encoding {
     Xml,
 }
 
-/// What a checked identifier has beside its name, up to its end.
+/// The encoded parts of a checked identifier behind its name.
 #[derive(Debug, Clone, Copy)]
 struct Parts<'a> {
     encoding: Encoding,
@@ -173,14 +173,14 @@ struct Parts<'a> {
     list: List,
 }
 
-/// One of these parts.
+/// A part of an identifier.
 pub(crate) enum Part<'a> {
     Address(Text<'a>),
     Resolver(AgentIdView<'a>),
     UserDefined(Text<'a>, Text<'a>),
 }
 
-/// Which list whoever reads part by part is in.
+/// The list that contains the current position, while an identifier is read part by part.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum List {
     Outside,
@@ -204,7 +204,7 @@ impl<'a> Iterator for Parts<'a> {
 
 /// Checks a name as [`AgentId::new`] does.
 pub(crate) fn check_name(name: &Text<'_>, what: &'static str) -> Result<(), Problem> {
-    // Most are far from being too long, escaped or not.
+    // Unescaping never makes a text longer, so most names need no unescaping here.
     let raw = name.raw();
     if raw.len() > AgentId::MAX_NAME && name.as_str().len() > AgentId::MAX_NAME {
         return Err(Problem::TooLong(what));

@@ -1,4 +1,4 @@
-//! Content, borrowed from the message it was read from.
+//! Content, borrowed from an encoded message.
 
 use std::borrow::Cow;
 
@@ -9,20 +9,20 @@ use crate::bitefficient::expression::string_content;
 use crate::bitefficient::reader::unescaped;
 use crate::{Text, xml};
 
-/// Content as it lies in a message.
+/// Encoded content of a message.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Content<'a> {
-    /// The bytes as they are.
+    /// The bytes of the content.
     Bytes(&'a [u8]),
-    /// The same, beside the message: see [`Payload`](crate::Payload).
+    /// The bytes of the content, in a piece of their own: see [`Payload`](crate::Payload).
     Beside(&'a [u8]),
-    /// Up to a NUL: perhaps in quotation marks, perhaps with a byte count.
+    /// A string in quotation marks, with a byte count, or bare.
     String(&'a [u8]),
-    /// The inside of quotation marks with escapes.
+    /// The inside of quotation marks, with escapes.
     Quoted(&'a [u8]),
-    /// An expression, from peers of before the edition of November 2002.
+    /// An expression, as in editions of FIPA00069 before F (November 2002).
     Expression(Text<'a>),
-    /// The inside of an element.
+    /// The inside of an XML element.
     Xml(&'a [u8]),
 }
 
@@ -36,23 +36,24 @@ impl<'a> Content<'a> {
                 Cow::Borrowed(text) => Cow::Borrowed(text.as_bytes()),
                 Cow::Owned(text) => Cow::Owned(text.into_bytes()),
             },
-            Self::Xml(inner) => xml::unescaped(inner, xml::Space::Counts),
+            Self::Xml(inner) => xml::unescaped(inner, xml::Whitespace::Preserve),
         }
     }
 
-    /// The bytes that checked Base64 stands for.
+    /// Decodes checked Base64.
     pub(crate) fn of_base64(self) -> Cow<'a, [u8]> {
-        // The check of the message has seen to it that this can be decoded.
-        Cow::Owned(STANDARD.decode(dense(&self.bytes())).unwrap_or_default())
+        // `check_base64` has accepted the bytes, so this cannot fail.
+        let dense = without_white_space(&self.bytes());
+        Cow::Owned(STANDARD.decode(dense).unwrap_or_default())
     }
 }
 
-/// Whether these bytes are Base64, but for white space between them.
+/// Whether the bytes are Base64, apart from white space.
 pub(crate) fn check_base64(bytes: &[u8]) -> bool {
-    STANDARD.decode(dense(bytes)).is_ok()
+    STANDARD.decode(without_white_space(bytes)).is_ok()
 }
 
-fn dense(bytes: &[u8]) -> Vec<u8> {
+fn without_white_space(bytes: &[u8]) -> Vec<u8> {
     let dense = bytes.iter().filter(|byte| !byte.is_ascii_whitespace());
     dense.copied().collect()
 }

@@ -1,7 +1,7 @@
-//! Encoded messages, checked once and borrowed, whatever the encoding.
+//! Views of encoded messages in any encoding: checked once, borrowed from the bytes.
 //!
-//! Here is what a view gives; how the bytes are read is the business of the modules that know one
-//! encoding each. Owned messages are made of views.
+//! This module has the values of a view. The modules of the encodings read the bytes. An owned
+//! message is made from a view.
 
 mod agent_id;
 mod content;
@@ -23,10 +23,10 @@ use crate::{
 
 /// An encoded message, read without allocating.
 ///
-/// The bytes are checked once, when the view is made; everything else hands out what lies in them.
-/// Every encoding is read (FIPA00069, FIPA00070, FIPA00071), and leniently: what the standard says
-/// and what fipa_services and JADE write. Of a parameter that is there several times the last one
-/// counts, but for user-defined ones and the lists of agents in XML, which add up.
+/// The bytes are checked once, when the view is made. The methods return parts of them. All
+/// encodings are accepted (FIPA00069, FIPA00070, FIPA00071). The reader is lenient: it accepts the
+/// standard and what fipa_services and JADE write. If a parameter is repeated, the last value counts.
+/// User-defined parameters, and the lists of agents in XML, add up.
 #[derive(Debug, Clone)]
 pub struct MessageView<'a> {
     pub(crate) performative: PerformativeView<'a>,
@@ -43,20 +43,20 @@ pub struct MessageView<'a> {
     pub(crate) in_reply_to: Option<Text<'a>>,
     pub(crate) reply_by: Option<Time>,
     pub(crate) user_defined: UserDefined<'a>,
-    /// The content is in Base64, as one of the user-defined parameters says.
+    /// Whether a user-defined parameter marks the content as Base64.
     pub(crate) is_base64: bool,
 }
 
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum PerformativeView<'a> {
-    /// The code of one of the standard.
+    /// The code of a standard act.
     Standard(u8),
-    /// A word.
+    /// The name of a user-defined act.
     Other(Text<'a>),
 }
 
 impl<'a> PerformativeView<'a> {
-    /// The act of this name, if it can be one.
+    /// Returns the act with this name. Returns `None` if the name is not a word.
     pub(crate) fn of_name(name: Text<'a>) -> Option<Self> {
         match Performative::code_of_name(name.raw()) {
             Some(code) => Some(Self::Standard(code)),
@@ -74,24 +74,24 @@ impl<'a> PerformativeView<'a> {
     }
 }
 
-/// Where the user-defined parameters of a message are.
+/// The bytes that contain the user-defined parameters of a message, among others.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum UserDefined<'a> {
     None,
-    /// Among the parameters of a bit-efficient message; those in front of the content of a split
-    /// one, and all others.
+    /// The parameters of a bit-efficient message. The first piece is in front of the content of a
+    /// split message and otherwise empty.
     BitEfficient([&'a [u8]; 2]),
-    /// Behind the performative of a string message.
+    /// The bytes behind the performative of a string message.
     String(&'a [u8]),
-    /// Inside of the outermost element.
+    /// The inside of the outermost XML element.
     Xml(&'a [u8]),
 }
 
 impl<'a> MessageView<'a> {
-    /// Reads a message that lies in one piece; its first bytes tell the encoding.
+    /// Reads a message in one piece. The first bytes determine the encoding.
     ///
     /// # Errors
-    /// When the bytes are not one whole message.
+    /// The bytes are not one whole message.
     pub fn parse(bytes: &'a [u8]) -> Result<Self, DecodeError> {
         match Representation::detect(bytes) {
             Some(Representation::String) => string::view(bytes),
@@ -100,11 +100,12 @@ impl<'a> MessageView<'a> {
         }
     }
 
-    /// Reads a message that may be split around its content, which is not touched then.
+    /// Reads a message that may be split around its content. The content of a split message is not
+    /// accessed.
     ///
     /// # Errors
-    /// When the pieces are not one whole message. A split one must be bit-efficient, and split just
-    /// where its content is: `head` ends with the length of `content`.
+    /// The pieces are not one whole message. A split message must be bit-efficient, and its `head`
+    /// must end with the length of `content`.
     pub fn parse_payload(payload: &'a Payload) -> Result<Self, DecodeError> {
         if payload.is_split() {
             bitefficient::view_split(payload)
@@ -113,10 +114,10 @@ impl<'a> MessageView<'a> {
         }
     }
 
-    /// What the message does; allocates for a user-defined act.
+    /// The communicative act. A user-defined act is allocated.
     #[must_use]
     pub fn performative(&self) -> Performative {
-        // Checked when the message was read: there is such an act, or the name is a word.
+        // The reader has checked the code or the name, so the fallback is never used.
         match self.performative {
             PerformativeView::Standard(code) => Performative::of_code(code),
             PerformativeView::Other(name) => name.as_str().parse().ok(),
@@ -124,7 +125,7 @@ impl<'a> MessageView<'a> {
         .unwrap_or(Performative::NotUnderstood)
     }
 
-    /// The name of what the message does.
+    /// The name of the communicative act.
     #[must_use]
     pub fn performative_name(&self) -> Text<'a> {
         match self.performative {
@@ -135,26 +136,26 @@ impl<'a> MessageView<'a> {
         }
     }
 
-    /// Who sent it.
+    /// The sender.
     #[must_use]
     pub fn sender(&self) -> Option<AgentIdView<'a>> {
         self.sender
     }
 
-    /// Whom it is for.
+    /// The receivers.
     #[must_use]
     pub fn receivers(&self) -> AgentIds<'a> {
         self.receivers.clone()
     }
 
-    /// Whom to send replies to, instead of the sender.
+    /// The agents that receive replies instead of the sender.
     #[must_use]
     pub fn reply_to(&self) -> AgentIds<'a> {
         self.reply_to.clone()
     }
 
-    /// What it says: a slice of the encoded message, unless it was written with escapes, as an
-    /// expression or in Base64.
+    /// The content: a slice of the encoded message. It is allocated if it was encoded with escapes,
+    /// as an expression or in Base64.
     #[must_use]
     pub fn content(&self) -> Option<Cow<'a, [u8]>> {
         let content = self.content?;
@@ -189,31 +190,31 @@ impl<'a> MessageView<'a> {
         self.protocol
     }
 
-    /// The conversation.
+    /// The conversation identifier.
     #[must_use]
     pub fn conversation_id(&self) -> Option<Text<'a>> {
         self.conversation_id
     }
 
-    /// What a reply is to have as `in-reply-to`.
+    /// The `in-reply-to` that a reply must have.
     #[must_use]
     pub fn reply_with(&self) -> Option<Text<'a>> {
         self.reply_with
     }
 
-    /// The `reply-with` of the message that this one answers.
+    /// The `reply-with` of the message that this message answers.
     #[must_use]
     pub fn in_reply_to(&self) -> Option<Text<'a>> {
         self.in_reply_to
     }
 
-    /// The latest time for the next message.
+    /// The latest time for a reply.
     #[must_use]
     pub fn reply_by(&self) -> Option<Time> {
         self.reply_by
     }
 
-    /// User-defined parameters in the order of the message, names without `X-`.
+    /// Names, without their `X-`, and values of user-defined parameters, in the order of the message.
     pub fn user_defined(&self) -> impl Iterator<Item = (Text<'a>, Text<'a>)> + use<'a> {
         let mut rest = self.user_defined;
         let hidden = self.is_base64;
@@ -223,12 +224,12 @@ impl<'a> MessageView<'a> {
             UserDefined::String(rest) => string::next_user_defined(rest),
             UserDefined::Xml(rest) => xml::next_user_defined(rest),
         })
-        // That is part of the encoding, not of the message.
+        // The mark for Base64 belongs to the encoding, not to the message.
         .filter(move |(name, value)| !(hidden && dialect::announces_base64(name, value)))
     }
 
-    /// An owned message. Its content shares the memory of the payload that was read, unless it has
-    /// to be written out.
+    /// Converts the view to an owned message. The content shares the memory of the payload unless it
+    /// must be unescaped.
     pub(crate) fn to_message(&self, payload: &Payload) -> Result<Message, DecodeError> {
         let text = |text: Option<Text<'_>>| text.map(|text| text.as_str().into_owned());
         Ok(Message {
@@ -252,7 +253,7 @@ impl<'a> MessageView<'a> {
         })
     }
 
-    /// A message with nothing but its act.
+    /// Creates a view of a message with a performative only.
     #[inline(always)]
     pub(crate) fn empty(performative: PerformativeView<'a>) -> Self {
         Self {
@@ -274,8 +275,8 @@ impl<'a> MessageView<'a> {
         }
     }
 
-    /// Finds out, once all was read, whether the content is in Base64, and checks it then.
-    pub(crate) fn settle_base64(
+    /// Detects and checks content in Base64, after all parameters were read.
+    pub(crate) fn check_for_base64(
         &mut self,
         offset: usize,
         clause: &'static str,
@@ -298,7 +299,7 @@ fn shared(payload: &Payload, content: Cow<'_, [u8]>) -> Bytes {
     match content {
         Cow::Borrowed([]) => Bytes::new(),
         Cow::Borrowed(slice) if payload.is_split() => {
-            // Of a split message, the content is that piece, or unusual enough for a copy.
+            // The content of a split message is its own piece. Otherwise it is in the head.
             if std::ptr::eq(slice, &*payload.content) {
                 payload.content.clone()
             } else {

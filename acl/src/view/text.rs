@@ -1,4 +1,4 @@
-//! Text parameters, borrowed from the bytes they were read from.
+//! Text parameters, borrowed from an encoded message or envelope.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -11,30 +11,30 @@ use crate::xml;
 
 /// A text in an encoded message or envelope.
 ///
-/// Most are there byte by byte; what has escapes or is an expression has to be written out, which
-/// [`as_str`](Self::as_str) does when it is called.
+/// [`as_str`](Self::as_str) borrows most texts. It allocates a text with escapes, a number or an
+/// expression.
 #[derive(Clone, Copy)]
 pub struct Text<'a>(Repr<'a>);
 
-/// The bytes were checked to be UTF-8 when they were read. They are kept as bytes because asking
-/// again where somebody wants the text costs less than asking twice where nobody does.
+/// The encoded bytes of a text. The reader has checked that they are UTF-8. They are not a `str`
+/// because making one checks them again, and many texts are never accessed.
 #[derive(Clone, Copy)]
 enum Repr<'a> {
-    /// As it stands.
+    /// The text itself.
     Plain(&'a [u8]),
     /// A `String 00` of the bit-efficient encodings: in quotation marks, behind a byte count, or
     /// bare.
     String(&'a [u8]),
-    /// The inside of quotation marks, `\"` standing for `"`.
+    /// The inside of quotation marks. `\"` stands for `"`.
     Quoted(&'a [u8]),
     /// A number or an expression in its bit-efficient form.
     Encoded(&'a [u8]),
-    /// What is inside of an XML element or attribute; white space around it may count or not.
-    Xml(&'a [u8], xml::Space),
+    /// The inside of an XML element or attribute.
+    Xml(&'a [u8], xml::Whitespace),
 }
 
 impl<'a> Text<'a> {
-    /// The text; numbers and expressions as FIPA00070 writes them.
+    /// The text. Numbers and expressions are in the form of FIPA00070.
     #[must_use]
     pub fn as_str(&self) -> Cow<'a, str> {
         match self.0 {
@@ -49,7 +49,7 @@ impl<'a> Text<'a> {
         }
     }
 
-    /// Whether the text is a `Word` but for its first character.
+    /// Whether the text is a `Word` apart from its first character.
     pub(crate) fn is_token(&self) -> bool {
         match self.0 {
             Repr::Plain(text) => is_token(text),
@@ -68,7 +68,7 @@ impl<'a> Text<'a> {
         }
     }
 
-    /// The bytes as they stand, escapes included; those around the text are left out.
+    /// The encoded bytes, including escapes, without quotation marks or a byte count.
     pub(crate) fn raw(&self) -> &'a [u8] {
         match self.0 {
             Repr::Plain(text) | Repr::Quoted(text) => text,
@@ -77,7 +77,7 @@ impl<'a> Text<'a> {
         }
     }
 
-    /// The name of a user-defined parameter without its `X-`, which not every peer writes.
+    /// Removes the `X-` of a user-defined name. Some peers write none.
     pub(crate) fn without_x(self) -> Self {
         Self(match self.0 {
             Repr::Plain(text) => Repr::Plain(without_x(text)),
@@ -87,35 +87,35 @@ impl<'a> Text<'a> {
         })
     }
 
-    /// Checked UTF-8, as it stands.
+    /// Creates a text of checked UTF-8.
     #[inline(always)]
     pub(crate) fn plain(text: &'a [u8]) -> Self {
         Self(Repr::Plain(text))
     }
 
-    /// A checked `String 00` without its NUL.
+    /// Creates a text of a checked `String 00` without its NUL.
     #[inline(always)]
     pub(crate) fn string(bytes: &'a [u8]) -> Self {
         Self(Repr::String(bytes))
     }
 
-    /// Checked UTF-8 between quotation marks.
+    /// Creates a text of checked UTF-8 between quotation marks.
     #[inline]
     pub(crate) fn quoted(inner: &'a [u8]) -> Self {
         Self(Repr::Quoted(inner))
     }
 
-    /// A checked number or expression of FIPA00069.
+    /// Creates a text of a checked number or expression of FIPA00069.
     pub(crate) fn encoded(bytes: &'a [u8]) -> Self {
         Self(Repr::Encoded(bytes))
     }
 
-    /// Checked XML.
-    pub(crate) fn xml(bytes: &'a [u8], space: xml::Space) -> Self {
+    /// Creates a text of checked XML.
+    pub(crate) fn xml(bytes: &'a [u8], space: xml::Whitespace) -> Self {
         Self(Repr::Xml(bytes, space))
     }
 
-    /// Whether the text was written in quotation marks.
+    /// Whether the text is encoded in quotation marks.
     pub(crate) fn is_quoted(&self) -> bool {
         match self.0 {
             Repr::String(bytes) => string_form(bytes).0 == Form::Quoted,
@@ -124,7 +124,7 @@ impl<'a> Text<'a> {
         }
     }
 
-    /// Whether the text was written with a byte count, as only fipa_services does in envelopes.
+    /// Whether the text is encoded with a byte count. In envelopes, only fipa_services writes one.
     pub(crate) fn is_counted(&self) -> bool {
         matches!(self.0, Repr::String(bytes) if string_form(bytes).0 == Form::Counted)
     }
@@ -133,7 +133,7 @@ impl<'a> Text<'a> {
 fn checked(text: &[u8]) -> Cow<'_, str> {
     match std::str::from_utf8(text) {
         Ok(text) => Cow::Borrowed(text),
-        // Whoever made the text has seen to it that this does not occur.
+        // The reader has checked the bytes, so this does not occur.
         Err(_) => String::from_utf8_lossy(text),
     }
 }
@@ -148,7 +148,7 @@ fn all_checked(text: Cow<'_, [u8]>) -> Cow<'_, str> {
     }
 }
 
-/// Compares the texts, however they are encoded.
+/// Compares the texts, not their encoded bytes.
 impl PartialEq for Text<'_> {
     fn eq(&self, other: &Self) -> bool {
         self.as_str() == other.as_str()

@@ -1,30 +1,33 @@
-//! Agent identifiers, whose names and addresses are attributes in messages and text in envelopes.
-//! Either is read in both.
+//! Agent identifiers in XML.
+//!
+//! Names and addresses are attributes in messages and text in envelopes. The reader accepts both
+//! forms in both.
 
 use crate::error::{DecodeError, EncodeError, Problem};
 use crate::view::{AgentIdView, AgentIds, Encoding, List, Part, check_name};
-use crate::xml::out::Out;
 use crate::xml::reader::{Element, Elements, Event};
 use crate::xml::tag::Tag;
-use crate::xml::value::Space;
+use crate::xml::value::Whitespace;
+use crate::xml::writer::XmlWriter;
 use crate::{AgentId, Dialect, Text};
 
-/// The agents in all elements of one kind among the bytes of a document.
+/// The agents in all elements of one kind in the bytes of a document.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct AgentSet<'a> {
     bytes: &'a [u8],
-    /// Where the next agent is looked for, and where there are no more.
+    /// Offset at which the search for the next agent begins.
     at: usize,
+    /// Offset behind the last element.
     end: usize,
     tag: Tag,
-    /// One of the elements has begun.
+    /// Whether `at` is inside one of the elements.
     inside: bool,
-    /// There are agents.
+    /// Whether there is at least one agent.
     any: bool,
 }
 
 impl AgentSet<'_> {
-    /// Adds those of further elements of the same document.
+    /// Adds the agents in later elements of the same document.
     pub(crate) fn add(&mut self, others: &Self) {
         self.end = others.end;
         self.any |= others.any;
@@ -40,7 +43,7 @@ impl<'a> Iterator for AgentSet<'a> {
 
     fn next(&mut self) -> Option<Self::Item> {
         let mut elements = Elements::inside(self.bytes.get(self.at..self.end)?);
-        // An error cannot occur in checked bytes, and would end this.
+        // An error cannot occur in checked bytes. It would end the iteration.
         let agent = loop {
             match elements.next().ok()?? {
                 Event::Text(_) => {}
@@ -59,8 +62,7 @@ impl<'a> Iterator for AgentSet<'a> {
     }
 }
 
-/// Reads the agent identifiers in the element that was begun last, to its end, and adds them to
-/// those of the same kind.
+/// Reads the agent identifiers in the current element, including its end, and adds them to `agents`.
 pub(super) fn read_all<'a>(
     elements: &mut Elements<'a>,
     begin: &Element<'a>,
@@ -89,7 +91,7 @@ pub(super) fn read_all<'a>(
     Ok(())
 }
 
-/// Reads the first of the agent identifiers in the element that was begun last, to its end.
+/// Reads the current element, including its end. Returns its first agent identifier.
 pub(super) fn read_one<'a>(
     elements: &mut Elements<'a>,
 ) -> Result<Option<AgentIdView<'a>>, DecodeError> {
@@ -105,7 +107,7 @@ pub(super) fn read_one<'a>(
     Ok(agent)
 }
 
-/// Reads an identifier, whose resolvers may be nested `depth` deep.
+/// Reads an identifier with resolvers nested at most `depth` deep.
 fn read<'a>(
     elements: &mut Elements<'a>,
     begin: &Element<'a>,
@@ -122,7 +124,7 @@ fn read<'a>(
     Ok(AgentIdView::new(name, Encoding::Xml, inside))
 }
 
-/// The next part of a checked identifier.
+/// Reads the next part of a checked identifier.
 pub(crate) fn next_part<'a>(rest: &mut &'a [u8], list: &mut List) -> Option<Part<'a>> {
     let mut elements = Elements::inside(rest);
     let part = part(&mut elements, list, AgentId::MAX_DEPTH, &mut None);
@@ -130,7 +132,8 @@ pub(crate) fn next_part<'a>(rest: &mut &'a [u8], list: &mut List) -> Option<Part
     part.ok().flatten()
 }
 
-/// The next part of an identifier, or `None` at its end; a name on the way is told.
+/// Reads the next part of an identifier. Returns `None` at its end. If the name is read on the way,
+/// it is stored in `name`.
 fn part<'a>(
     elements: &mut Elements<'a>,
     list: &mut List,
@@ -176,8 +179,8 @@ fn part<'a>(
     }
 }
 
-/// Reads an element to its end: a user-defined parameter in either form, name without `X-`, or
-/// `None` for an element that is not known.
+/// Reads a user-defined parameter in either form, including the end of its element. The name has no
+/// `X-`. Returns `None` for an unknown element.
 pub(super) fn user_defined<'a>(
     elements: &mut Elements<'a>,
     element: &Element<'a>,
@@ -203,11 +206,11 @@ pub(super) fn user_defined<'a>(
     let value = elements.value(element, &[])?;
     Ok(Some((
         name,
-        value.text(Space::Counts, "user-defined value")?,
+        value.text(Whitespace::Preserve, "user-defined value")?,
     )))
 }
 
-/// How identifiers are written.
+/// The form in which identifiers are written.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum Form {
     /// Name and addresses as attributes (FIPA00071).
@@ -216,22 +219,22 @@ pub(super) enum Form {
     Envelope,
 }
 
-/// Writes elements with agent identifiers in them, all in one where the dialect's reader takes it.
+/// Writes agent identifiers in one element or, for JADE, in one element each.
 pub(super) fn write_all(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     element: &str,
     agents: &[AgentId],
     form: Form,
     dialect: Dialect,
 ) -> Result<(), EncodeError> {
-    // JADE writes one agent in each element and reads no more from one of a message;
-    // fipa_services reads only the last element of an envelope.
-    let at_once = if dialect == Dialect::Jade {
+    // JADE reads only one agent in each element of a message. fipa_services reads only the last
+    // element of an envelope.
+    let per_element = if dialect == Dialect::Jade {
         1
     } else {
         agents.len().max(1)
     };
-    for group in agents.chunks(at_once) {
+    for group in agents.chunks(per_element) {
         out.open(element);
         for agent in group {
             write(out, agent, form, dialect)?;
@@ -242,14 +245,14 @@ pub(super) fn write_all(
 }
 
 pub(super) fn write(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     agent: &AgentId,
     form: Form,
     dialect: Dialect,
 ) -> Result<(), EncodeError> {
     out.open("agent-identifier");
     write_value(out, ("name", "id"), "agent name", agent.name(), form)?;
-    // JADE writes the element even where there is nothing in it.
+    // JADE writes the element even if it is empty.
     let as_jade = form == Form::Envelope && dialect == Dialect::Jade;
     if !agent.addresses().is_empty() || as_jade {
         out.open("addresses");
@@ -280,8 +283,8 @@ pub(super) fn write(
     for (name, value) in agent.user_defined() {
         match dialect {
             Dialect::Standard => out.user_defined(name, value, false)?,
-            // Inside an identifier it reads elements whose own name begins with `X-` only, and
-            // takes name and type from their attributes.
+            // In an identifier, fipa_services reads only elements with a name that begins with
+            // `X-`. It takes name and type from their attributes.
             Dialect::FipaServices => out.user_element_with_name(name, value)?,
             Dialect::Jade => out.user_element(name, value)?,
         }
@@ -291,7 +294,7 @@ pub(super) fn write(
 }
 
 fn write_value(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     (element, attribute): (&str, &str),
     what: &'static str,
     value: &str,

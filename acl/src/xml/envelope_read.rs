@@ -1,52 +1,53 @@
-//! Reading envelopes (FIPA00085).
+//! Reader of envelopes (FIPA00085).
 
 use crate::Text;
 use crate::envelope::parts::{
-    AclRepresentationView, Event, Events, Parameter, Part, ReceivedView, Stamp, UserDefined,
+    AclRepresentationView, Event, Events, Parameter, Part, ReceivedView, StampParts, UserDefined,
 };
 use crate::error::{DecodeError, Problem};
 use crate::view::AgentIds;
 use crate::xml::agent_id;
 use crate::xml::reader::{Element, Elements};
 use crate::xml::tag::Tag;
-use crate::xml::value::Space;
+use crate::xml::value::Whitespace;
 
 const CLAUSE: &str = "FIPA00085";
 
-/// Most elements with parameters: the same bound as for bit-efficient extensions.
+/// Maximum number of `params` elements: the same bound as for a bit-efficient base and its extensions.
 const MAX_PARTS: usize = 1025;
 
-/// Deepest nesting of such elements, which only JADE nests; elements nest no deeper.
+/// Maximum nesting depth of `params` elements. Only JADE nests them. The depth of all elements has
+/// the same bound.
 const MAX_NESTING: usize = 64;
 
-/// A walk through an envelope, directly behind which the payload may follow.
+/// A pull parser of an envelope. A payload may follow the envelope.
 #[derive(Debug, Clone)]
-pub(crate) struct Walk<'a> {
+pub(crate) struct EnvelopeReader<'a> {
     elements: Elements<'a>,
-    /// Where the outermost element begins, once it has.
+    /// Offset of the outermost element, once it was read.
     root: Option<usize>,
-    /// The parts that are open, and how many there are.
-    open: [Opened; MAX_NESTING],
+    /// The open parts. Only the first `depth` are valid.
+    open: [OpenPart; MAX_NESTING],
     depth: usize,
-    /// How many parts have begun.
+    /// Number of parts that have begun.
     parts: usize,
-    /// The index of the part that began last.
+    /// Index of the part that began last.
     index: u64,
     ended: bool,
 }
 
 #[derive(Debug, Clone, Copy, Default)]
-struct Opened {
+struct OpenPart {
     part: usize,
     index: u64,
 }
 
-impl<'a> Walk<'a> {
+impl<'a> EnvelopeReader<'a> {
     pub(crate) fn new(bytes: &'a [u8]) -> Self {
         Self {
             elements: Elements::new(bytes, CLAUSE),
             root: None,
-            open: [Opened::default(); MAX_NESTING],
+            open: [OpenPart::default(); MAX_NESTING],
             depth: 0,
             parts: 0,
             index: 1,
@@ -64,13 +65,13 @@ impl<'a> Walk<'a> {
                 let number = value.trimmed("index")?.as_str().parse();
                 self.index = number.map_err(|_| wrong(Problem::Number))?;
             }
-            // Where peers leave it out, the order counts.
+            // Without an index, the part has the one of the previous part, and the order counts.
             _ => {}
         }
         self.parts += 1;
         let (part, index) = (self.parts, self.index);
         match self.open.get_mut(self.depth) {
-            Some(open) => *open = Opened { part, index },
+            Some(open) => *open = OpenPart { part, index },
             None => return Err(wrong(Problem::TooDeep("params"))),
         }
         self.depth += 1;
@@ -78,7 +79,7 @@ impl<'a> Walk<'a> {
     }
 }
 
-impl<'a> Events<'a> for Walk<'a> {
+impl<'a> Events<'a> for EnvelopeReader<'a> {
     fn next(&mut self) -> Result<Option<Event<'a>>, DecodeError> {
         if self.ended {
             return Ok(None);
@@ -101,10 +102,10 @@ impl<'a> Events<'a> for Walk<'a> {
                     return Ok(None);
                 }
                 self.depth -= 1;
-                // What follows belongs to the part that this one was in.
-                let around = self.depth.checked_sub(1).and_then(|at| self.open.get(at));
-                match around {
-                    Some(Opened { part, index }) => {
+                // The following elements belong to the enclosing part.
+                let enclosing = self.depth.checked_sub(1).and_then(|at| self.open.get(at));
+                match enclosing {
+                    Some(OpenPart { part, index }) => {
                         let (part, index) = (*part, *index);
                         return Ok(Some(Event::Part(Part::Params { part, index })));
                     }
@@ -127,14 +128,14 @@ impl<'a> Events<'a> for Walk<'a> {
     }
 }
 
-/// Reads what an element inside of a part says, to its end; `None` if it says nothing.
+/// Reads an element of a part, including its end. Returns `None` if it has no parameter.
 fn parameter<'a>(
     elements: &mut Elements<'a>,
     child: &Element<'a>,
 ) -> Result<Option<Parameter<'a>>, DecodeError> {
     let text = |elements: &mut Elements<'a>, what| {
         let value = elements.value(child, &["value"])?;
-        value.text(Space::Counts, what)
+        value.text(Whitespace::Preserve, what)
     };
     Ok(Some(match child.tag {
         Tag::To => Parameter::To(agents(elements, child)?),
@@ -165,7 +166,7 @@ fn parameter<'a>(
             let digits = elements.value(child, &["value"])?;
             let digits = digits.trimmed("payload-length")?;
             let digits = digits.as_str();
-            // JADE writes -1, and nothing, where it does not know.
+            // JADE writes -1 or an empty text for an unknown length.
             if digits.is_empty() || digits == "-1" {
                 return Ok(None);
             }
@@ -188,7 +189,7 @@ fn agents<'a>(
     Ok(agents)
 }
 
-/// A stamp, its parts in any order; `None` if it does not say by whom.
+/// Reads a stamp with its parts in any order. Returns `None` if it has no `received-by`.
 fn received<'a>(
     elements: &mut Elements<'a>,
     begin: &Element<'a>,
@@ -224,14 +225,14 @@ fn received<'a>(
         from,
         id,
         via,
-        rest: Stamp::Xml(inside.unwrap_or_default()),
+        parts: StampParts::Xml(inside.unwrap_or_default()),
     }))
 }
 
-/// The next user-defined parameter of those in a checked stamp.
+/// Reads the next user-defined parameter of a checked stamp.
 pub(crate) fn next_received_user_defined<'a>(rest: &mut &'a [u8]) -> Option<UserDefined<'a>> {
     let mut elements = Elements::inside(rest);
-    // An error cannot occur in checked bytes, and would end this.
+    // An error cannot occur in checked bytes. It would end the iteration.
     while let Some(child) = elements.child().ok()? {
         let pair = match child.tag {
             Tag::ReceivedDate

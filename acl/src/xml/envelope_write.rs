@@ -1,29 +1,30 @@
-//! Writing envelopes (FIPA00085).
+//! Writer of envelopes (FIPA00085).
 
 use crate::bitefficient::write;
 use crate::dialect::local_time;
+use crate::envelope::present;
 use crate::error::EncodeError;
 use crate::xml::agent_id::{self, Form};
-use crate::xml::out::Out;
+use crate::xml::writer::XmlWriter;
 use crate::{Dialect, Envelope, EnvelopeParams, Received, Time};
 
-/// Writes the encoded envelope, all extensions included.
+/// Writes the envelope with all extensions.
 ///
-/// JADE reads one part only and gets the parameters that count; older stamps are not among them.
-/// fipa_services reads times without a zone only; it gets them without.
+/// JADE reads one part only: its envelope has the effective parameters, without older stamps.
+/// fipa_services reads only times without a zone: its envelope has no zones.
 ///
 /// # Errors
-/// When XML cannot carry it, or the reader that the dialect is for cannot read what it says.
+/// XML or the dialect cannot represent a value.
 pub(crate) fn encode(
     envelope: &Envelope,
     dialect: Dialect,
-    out: &mut dyn write::Out,
+    out: &mut dyn write::Output,
 ) -> Result<(), EncodeError> {
-    let mut out = Out::new(out, dialect);
+    let mut out = XmlWriter::new(out, dialect);
     out.raw(match dialect {
         Dialect::Standard => "<?xml version=\"1.0\"?>",
         Dialect::FipaServices => "<?xml version=\"1.0\" ?>",
-        // The line break is JADE's own.
+        // JADE writes this line break.
         Dialect::Jade => "<?xml version=\"1.0\"?>\n",
     });
     out.open("envelope");
@@ -39,7 +40,7 @@ pub(crate) fn encode(
 }
 
 fn write_part(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     index: usize,
     params: &EnvelopeParams,
     dialect: Dialect,
@@ -80,7 +81,7 @@ fn write_part(
         write_text(out, "transport-behaviour", Some(behaviour))?;
     }
     let user_defined = &params.user_defined;
-    // JADE writes them before, fipa_services behind the stamp.
+    // JADE writes these in front of the stamp, fipa_services behind it.
     if dialect == Dialect::Jade {
         write_user_defined(out, user_defined, dialect)?;
     }
@@ -95,7 +96,7 @@ fn write_part(
 }
 
 fn write_received(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     received: &Received,
     dialect: Dialect,
 ) -> Result<(), EncodeError> {
@@ -122,7 +123,7 @@ fn write_received(
 }
 
 fn write_text(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     element: &'static str,
     text: Option<&str>,
 ) -> Result<(), EncodeError> {
@@ -133,7 +134,7 @@ fn write_text(
 }
 
 fn write_user_defined(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     pairs: &[(String, String)],
     dialect: Dialect,
 ) -> Result<(), EncodeError> {
@@ -141,13 +142,6 @@ fn write_user_defined(
         out.user_defined(name, value, dialect != Dialect::Standard)?;
     }
     Ok(())
-}
-
-/// An empty text is how peers say that there is none.
-fn present<'a>(what: &'static str, text: &'a str) -> Result<&'a str, EncodeError> {
-    (!text.is_empty())
-        .then_some(text)
-        .ok_or(EncodeError::Empty(what))
 }
 
 fn time_text(what: &'static str, time: Time, dialect: Dialect) -> Result<String, EncodeError> {
@@ -158,7 +152,7 @@ fn time_text(what: &'static str, time: Time, dialect: Dialect) -> Result<String,
     Ok(match dialect {
         Dialect::Standard => time.to_string(),
         Dialect::FipaServices => local_time(what, time)?.to_string(),
-        // JADE puts a Z where the standard has the T, and ignores a letter in the end.
+        // JADE writes Z instead of T, and ignores a letter at the end.
         Dialect::Jade => time.to_string().replacen('T', "Z", 1),
     })
 }

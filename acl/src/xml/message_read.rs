@@ -1,4 +1,4 @@
-//! Reading messages (FIPA00071).
+//! Reader of messages (FIPA00071).
 
 use crate::MessageView;
 use crate::Text;
@@ -7,14 +7,14 @@ use crate::view::{Content, PerformativeView, UserDefined};
 use crate::xml::agent_id;
 use crate::xml::reader::{Element, Elements};
 use crate::xml::tag::Tag;
-use crate::xml::value::Space;
+use crate::xml::value::Whitespace;
 
 const CLAUSE: &str = "FIPA00071";
 
 /// Reads a message.
 ///
 /// # Errors
-/// When the bytes are not one whole message in this encoding.
+/// The bytes are not one whole message in this encoding.
 pub(crate) fn view(bytes: &[u8]) -> Result<MessageView<'_>, DecodeError> {
     let mut elements = Elements::new(bytes, CLAUSE);
     let problem = "the outermost element is not fipa-message";
@@ -25,7 +25,7 @@ pub(crate) fn view(bytes: &[u8]) -> Result<MessageView<'_>, DecodeError> {
     let act = PerformativeView::of_name(act.trimmed("act")?);
     let act = act.ok_or_else(|| wrong(Problem::NotAWord("act")))?;
     let mut view = MessageView::empty(act);
-    // fipa_services writes it here too, empty if there is none; the element counts.
+    // fipa_services writes the identifier here too, empty if it is absent. The element overrides it.
     let conversation = elements.attribute(&root, "conversation-id")?;
     let inside = elements.rest();
     let mut content_offset = 0;
@@ -40,21 +40,21 @@ pub(crate) fn view(bytes: &[u8]) -> Result<MessageView<'_>, DecodeError> {
     if let (None, Some(value)) = (view.conversation_id, conversation)
         && !value.is_empty()
     {
-        view.conversation_id = Some(value.text(Space::Counts, "conversation-id")?);
+        view.conversation_id = Some(value.text(Whitespace::Preserve, "conversation-id")?);
     }
-    view.settle_base64(content_offset, CLAUSE)?;
+    view.check_for_base64(content_offset, CLAUSE)?;
     elements.finish()?;
     Ok(view)
 }
 
-/// The next user-defined parameter of those in a checked message.
+/// Reads the next user-defined parameter of a checked message.
 pub(crate) fn next_user_defined<'a>(rest: &mut &'a [u8]) -> Option<(Text<'a>, Text<'a>)> {
-    // What is passed over on the way is read into this.
-    let mut passed = MessageView::empty(PerformativeView::Standard(0));
+    // Receives the other parameters, which are skipped.
+    let mut skipped = MessageView::empty(PerformativeView::Standard(0));
     let mut elements = Elements::inside(rest);
-    // An error cannot occur in checked bytes, and would end this.
+    // An error cannot occur in checked bytes. It would end the iteration.
     while let Some(child) = elements.child().ok()? {
-        let pair = passed.element(&mut elements, &child).ok()?;
+        let pair = skipped.element(&mut elements, &child).ok()?;
         *rest = elements.rest();
         if pair.is_some() {
             return pair;
@@ -64,8 +64,8 @@ pub(crate) fn next_user_defined<'a>(rest: &mut &'a [u8]) -> Option<(Text<'a>, Te
 }
 
 impl<'a> MessageView<'a> {
-    /// Reads what an element inside of the outermost one says, to its end. What is user-defined
-    /// is given, not kept.
+    /// Reads an element inside the outermost one, including its end. A user-defined parameter is
+    /// returned and not stored.
     fn element(
         &mut self,
         elements: &mut Elements<'a>,
@@ -104,7 +104,11 @@ impl<'a> MessageView<'a> {
             }
             _ => return agent_id::user_defined(elements, child),
         };
-        *text = Some(elements.value(child, &[])?.text(Space::Counts, what)?);
+        *text = Some(
+            elements
+                .value(child, &[])?
+                .text(Whitespace::Preserve, what)?,
+        );
         Ok(None)
     }
 }
@@ -129,7 +133,7 @@ fn content<'a>(
 ) -> Result<Content<'a>, DecodeError> {
     let reference = elements.attribute(child, "href")?;
     if reference.is_some_and(|reference| !reference.is_empty()) {
-        let problem = Problem::Xml("content that lies elsewhere (href) is not fetched");
+        let problem = Problem::Xml("external content (href) is not supported");
         return Err(elements.error(child.offset, problem));
     }
     let value = elements.value(child, &[])?;

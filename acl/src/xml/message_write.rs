@@ -1,24 +1,24 @@
-//! Writing messages (FIPA00071).
+//! Writer of messages (FIPA00071).
 
 use crate::bitefficient::write;
 use crate::dialect::{JADE_ENCODING, local_time};
 use crate::error::EncodeError;
 use crate::xml::agent_id::{self, Form};
-use crate::xml::out::Out;
+use crate::xml::writer::XmlWriter;
 use crate::{Dialect, Message, Performative, Time};
 
-/// Writes the encoded message.
+/// Writes the message.
+///
+/// fipa_services reads only times without a zone, as local times: its message has no zones.
 ///
 /// # Errors
-/// When XML cannot carry it (bytes that are no text, control characters), or the reader that the
-/// dialect is for cannot read what it says. fipa_services reads times without a zone only; it
-/// gets them without, and takes them as its local time.
+/// XML cannot represent a value (bytes that are not text, control characters), or the dialect cannot.
 pub(crate) fn encode(
     message: &Message,
     dialect: Dialect,
-    out: &mut dyn write::Out,
+    out: &mut dyn write::Output,
 ) -> Result<(), EncodeError> {
-    let mut out = Out::new(out, dialect);
+    let mut out = XmlWriter::new(out, dialect);
     let jade = dialect == Dialect::Jade;
     match dialect {
         Dialect::Standard => out.raw("<?xml version=\"1.0\"?>"),
@@ -79,7 +79,7 @@ pub(crate) fn encode(
         if name.eq_ignore_ascii_case(JADE_ENCODING) {
             return Err(EncodeError::Unrepresentable {
                 what: "user-defined parameter JADE-Encoding",
-                why: "it would be taken for the encoding of the content",
+                why: "readers would take it for the encoding of the content",
             });
         }
         match dialect {
@@ -99,7 +99,7 @@ fn act(message: &Message, jade: bool) -> Result<String, EncodeError> {
     match message.performative() {
         Performative::Other(_) if jade => Err(EncodeError::Unrepresentable {
             what: "performative",
-            why: "JADE drops messages with others than those of the standard",
+            why: "JADE drops messages with a user-defined performative",
         }),
         act if jade => Ok(act.as_str().to_ascii_uppercase()),
         act => Ok(act.as_str().to_owned()),
@@ -107,7 +107,7 @@ fn act(message: &Message, jade: bool) -> Result<String, EncodeError> {
 }
 
 fn write_content(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     message: &Message,
     dialect: Dialect,
 ) -> Result<(), EncodeError> {
@@ -116,7 +116,7 @@ fn write_content(
     };
     out.open("content");
     if dialect == Dialect::Jade {
-        // Copied before it is checked: shared memory may change meanwhile.
+        // A copy, because another process may change shared memory at any time.
         let content = content.to_vec();
         let text = std::str::from_utf8(&content).map_err(|_| EncodeError::Unrepresentable {
             what: "content",
@@ -132,7 +132,7 @@ fn write_content(
 }
 
 fn write_text(
-    out: &mut Out<'_>,
+    out: &mut XmlWriter<'_>,
     element: &'static str,
     text: Option<&str>,
     dialect: Dialect,
@@ -144,15 +144,15 @@ fn write_text(
     out.element(element, element, text)
 }
 
-/// JADE takes white space around a text away, and puts a blank wherever its parser hands a text
-/// over in pieces, which it does at escaped characters.
+/// Refuses a text that JADE misreads. JADE removes the white space around a text, and its parser
+/// inserts blanks at escaped characters.
 fn readable_by_jade(what: &'static str, text: &str) -> Result<(), EncodeError> {
     if text.trim() != text {
-        let why = "JADE would cut off the white space around it";
+        let why = "JADE removes the white space around it";
         return Err(EncodeError::Unrepresentable { what, why });
     }
     if text.contains(['<', '>', '&', '\r']) {
-        let why = "JADE would put blanks around its escaped characters";
+        let why = "JADE inserts blanks at its escaped characters";
         return Err(EncodeError::Unrepresentable { what, why });
     }
     Ok(())

@@ -1,35 +1,36 @@
-//! Looking for content that needs no escaping, with loops that the compiler turns into vector
+//! Detection of content that needs no escaping. The compiler turns the loops into vector
 //! instructions.
 
-/// What stands around a text.
+/// The position of a piece in its text.
 #[derive(Clone, Copy)]
-pub(super) struct Around {
-    /// The byte in front of it.
+pub(super) struct TextContext {
+    /// The byte in front of the piece.
     pub(super) before: Option<u8>,
-    /// Whether nothing follows.
+    /// Whether the piece ends the text.
     pub(super) is_last: bool,
 }
 
-impl Around {
-    pub(super) const NOTHING: Self = Self {
+impl TextContext {
+    /// The context of a whole text.
+    pub(super) const WHOLE: Self = Self {
         before: None,
         is_last: true,
     };
 }
 
-/// Whether all bytes are ASCII characters of content that need no escaping; if `guards_space`, for a
-/// reader that condenses white space.
-pub(super) fn is_plain(bytes: &[u8], guards_space: bool, around: Around) -> bool {
+/// Whether all bytes are ASCII characters of content that need no escaping. With `guards_space`, this
+/// is for a reader that condenses white space.
+pub(super) fn is_plain(bytes: &[u8], guards_space: bool, context: TextContext) -> bool {
     (is_printable(bytes) || !guards_space && is_text(bytes))
         && memchr::memchr3(b'<', b'&', b'>', bytes).is_none()
-        && (!guards_space || keeps_space(bytes, around))
+        && (!guards_space || keeps_space(bytes, context))
 }
 
-/// Whether all bytes are ASCII characters, none of them a control character but perhaps DEL.
+/// Whether all bytes are ASCII characters without control characters. DEL is accepted.
 fn is_printable(bytes: &[u8]) -> bool {
-    // Other characters wrap around or are beyond the bound anyway.
+    // Other bytes wrap around or exceed the bound.
     let over = |byte: &u8| byte.wrapping_sub(b' ');
-    // Two halves side by side, so that one does not wait for the other.
+    // Two halves in parallel, so that neither waits for the other.
     let (one, other) = bytes.split_at(bytes.len() / 2);
     let both = one.iter().zip(other);
     let most = both.fold(0, |most: u8, (one, other)| {
@@ -39,7 +40,7 @@ fn is_printable(bytes: &[u8]) -> bool {
     most.max(last) < 0x60
 }
 
-/// The same, with line feeds and tabulators.
+/// Like [`is_printable`], but line feeds and tabs are accepted too.
 fn is_text(bytes: &[u8]) -> bool {
     bytes.iter().fold(0, |others, byte| {
         let printable = byte.wrapping_sub(b' ') < 0x60;
@@ -47,10 +48,10 @@ fn is_text(bytes: &[u8]) -> bool {
     }) == 0
 }
 
-/// Whether a reader that condenses white space leaves bytes without control characters as they are.
-fn keeps_space(bytes: &[u8], around: Around) -> bool {
-    let begins = bytes.first() == Some(&b' ') && around.before.is_none_or(|byte| byte == b' ');
-    let ends = bytes.last() == Some(&b' ') && around.is_last;
+/// Whether a reader that condenses white space reads bytes without control characters unchanged.
+fn keeps_space(bytes: &[u8], context: TextContext) -> bool {
+    let begins = bytes.first() == Some(&b' ') && context.before.is_none_or(|byte| byte == b' ');
+    let ends = bytes.last() == Some(&b' ') && context.is_last;
     let behind = bytes.get(1..).unwrap_or_default();
     let doubled = bytes.iter().zip(behind).fold(false, |found, (one, next)| {
         found | ((*one == b' ') & (*next == b' '))

@@ -1,10 +1,9 @@
-//! Walking over XML elements without trust and without allocating: bounded depth, offsets in every
-//! error, linear time.
+//! A parser of XML elements in untrusted input: no allocation, bounded depth, linear time, an offset
+//! in every error.
 //!
-//! Of XML 1.0 this knows tags, text, CDATA sections and references to characters, and passes over
-//! comments, instructions and the name of a document type. There are no entities but the five of
-//! XML itself. Text and CDATA sections need not be UTF-8 here, because fipa_services puts any bytes
-//! there.
+//! It reads tags, text, CDATA sections and references to characters of XML 1.0. It skips comments,
+//! processing instructions and the name of a document type. The only entities are the five of XML.
+//! Text and CDATA sections need not be UTF-8, because fipa_services writes any bytes there.
 
 use memchr::memmem;
 
@@ -13,30 +12,30 @@ use crate::scan;
 use crate::xml::tag::Tag;
 use crate::xml::value::{Piece, Value};
 
-/// Deepest nesting of elements: more than resolvers nested as deep as they may be need.
+/// Maximum nesting depth of elements. Resolvers of the maximum depth need less.
 const MAX_DEPTH: usize = 64;
 
 const CDATA: &[u8] = b"<![CDATA[";
 
-/// The elements of a document, in their order.
+/// A pull parser of the elements of a document.
 #[derive(Debug, Clone)]
 pub(super) struct Elements<'a> {
     bytes: &'a [u8],
-    /// Those that were not read yet.
+    /// The bytes that were not read yet.
     rest: &'a [u8],
     pub(super) clause: &'static str,
-    /// The names of the elements that are open.
+    /// The names of the open elements. Only the first `depth` are valid.
     open: [&'a [u8]; MAX_DEPTH],
     depth: usize,
-    /// Where what was read last begins.
+    /// Offset of the item that was read last.
     begin: usize,
-    /// The element that began last was an empty one, and its end is still to be told.
+    /// Whether the current element is an empty one, with a pending end event.
     ends: bool,
-    /// Elements that began in front of the bytes may end in them.
+    /// Whether the bytes may end elements that began in front of them.
     inside: bool,
 }
 
-/// What a document consists of.
+/// An item of a document.
 pub(super) enum Event<'a> {
     Start(Element<'a>),
     End,
@@ -44,7 +43,7 @@ pub(super) enum Event<'a> {
 }
 
 impl<'a> Elements<'a> {
-    /// The elements in bytes that begin with a document; errors will name the clause.
+    /// Parses bytes that begin with a document. Errors have the clause.
     pub(super) fn new(bytes: &'a [u8], clause: &'static str) -> Self {
         Self {
             bytes,
@@ -58,7 +57,7 @@ impl<'a> Elements<'a> {
         }
     }
 
-    /// What follows in checked bytes that lie somewhere inside of elements.
+    /// Parses checked bytes from inside a document.
     pub(super) fn inside(bytes: &'a [u8]) -> Self {
         Self {
             rest: bytes,
@@ -67,7 +66,7 @@ impl<'a> Elements<'a> {
         }
     }
 
-    /// The outermost element, which must have this tag.
+    /// Reads the start of the outermost element, which must have this tag.
     pub(super) fn root(
         &mut self,
         tag: Tag,
@@ -84,8 +83,9 @@ impl<'a> Elements<'a> {
         }
     }
 
-    /// The next element inside the one that was begun last, or `None` at its end. What was given
-    /// must be read to its end: with this, with [`value`](Self::value) or [`skip`](Self::skip).
+    /// Reads the start of the next element in the current element. Returns `None` at the end of the
+    /// current element. The caller must read the returned element to its end with this function,
+    /// with [`value`](Self::value) or with [`skip`](Self::skip).
     pub(super) fn child(&mut self) -> Result<Option<Element<'a>>, DecodeError> {
         loop {
             match self.next()? {
@@ -97,8 +97,8 @@ impl<'a> Elements<'a> {
         }
     }
 
-    /// Reads the element, which was begun last, to its end. Its value is the first of these
-    /// attributes that is there and not empty, else its text, else the value of a `url` inside.
+    /// Reads the current element, including its end. Its value is the first of `attributes` that is
+    /// not empty, or its text, or the value of a `url` inside, in this order.
     pub(super) fn value(
         &mut self,
         element: &Element<'a>,
@@ -136,8 +136,7 @@ impl<'a> Elements<'a> {
         })
     }
 
-    /// Reads the element that was begun last to its end, if there is nothing but a text in it, as
-    /// in nearly all.
+    /// Reads the current element, including its end, in the common case: it has only a text.
     #[inline]
     fn whole_text(&mut self) -> Option<&'a [u8]> {
         if self.ends {
@@ -156,7 +155,7 @@ impl<'a> Elements<'a> {
         Some(text)
     }
 
-    /// Reads the element that was begun last to its end.
+    /// Skips the current element, including its end.
     pub(super) fn skip(&mut self) -> Result<(), DecodeError> {
         let outside = self.depth.saturating_sub(1);
         while self.depth > outside {
@@ -167,7 +166,7 @@ impl<'a> Elements<'a> {
         Ok(())
     }
 
-    /// The value of an attribute, whose name may be in any case and with any prefix.
+    /// Returns the value of an attribute. The case and the prefix of its name are ignored.
     pub(super) fn attribute(
         &self,
         element: &Element<'a>,
@@ -197,17 +196,17 @@ impl<'a> Elements<'a> {
         }
     }
 
-    /// How many bytes were read.
+    /// Number of bytes read.
     pub(super) fn position(&self) -> usize {
         self.bytes.len() - self.rest.len()
     }
 
-    /// What was not read yet.
+    /// The bytes that were not read yet.
     pub(super) fn rest(&self) -> &'a [u8] {
         self.rest
     }
 
-    /// Where what was read last begins.
+    /// Offset of the item that was read last.
     pub(super) fn begin(&self) -> usize {
         self.begin
     }
@@ -217,7 +216,7 @@ impl<'a> Elements<'a> {
         self.bytes
     }
 
-    /// Checks that nothing but white space, comments and instructions follows.
+    /// Checks that only white space, comments and processing instructions follow.
     pub(super) fn finish(mut self) -> Result<(), DecodeError> {
         loop {
             self.rest = self.rest.trim_ascii_start();
@@ -228,7 +227,7 @@ impl<'a> Elements<'a> {
                 let problem = Problem::Trailing(self.rest.len());
                 return Err(self.error(self.position(), problem));
             }
-            self.pass()?;
+            self.skip_markup()?;
         }
     }
 
@@ -241,7 +240,7 @@ impl<'a> Elements<'a> {
         self.error(self.position(), Problem::Truncated("an element"))
     }
 
-    /// What comes next, or `None` where the bytes end.
+    /// Reads the next event. Returns `None` at the end of the bytes.
     pub(super) fn next(&mut self) -> Result<Option<Event<'a>>, DecodeError> {
         self.begin = self.position();
         if self.ends {
@@ -257,7 +256,7 @@ impl<'a> Elements<'a> {
                 [b'<', b'!', ..] if self.rest.starts_with(CDATA) => {
                     return self.cdata().map(Some);
                 }
-                [b'<', b'!' | b'?', ..] => self.pass()?,
+                [b'<', b'!' | b'?', ..] => self.skip_markup()?,
                 [b'<', behind @ ..] => return self.start_tag(behind).map(Some),
                 _ => {
                     let len = scan::find_byte(self.rest, b'<').unwrap_or(self.rest.len());
@@ -309,7 +308,7 @@ impl<'a> Elements<'a> {
                 self.open.get(depth).copied().unwrap_or_default()
             }
             None if self.inside => {
-                // It was compared when the bytes were checked.
+                // The name was compared when the bytes were checked.
                 let end = scan::find_byte(behind, b'>').and_then(|end| behind.get(end + 1..));
                 self.rest = end.unwrap_or_default();
                 return Ok(Event::End);
@@ -342,8 +341,8 @@ impl<'a> Elements<'a> {
         Ok(Event::Text(Piece::literal(raw, self.begin + CDATA.len())))
     }
 
-    /// Passes over a comment, an instruction or a document type, which begins here.
-    fn pass(&mut self) -> Result<(), DecodeError> {
+    /// Skips a comment, a processing instruction or a document type, which must be next.
+    fn skip_markup(&mut self) -> Result<(), DecodeError> {
         let offset = self.position();
         let (opening, end): (usize, &[u8]) = match self.rest {
             [b'<', b'!', b'-', b'-', ..] => (4, b"-->"),
@@ -357,7 +356,7 @@ impl<'a> Elements<'a> {
                     return Err(self.error(offset, Problem::Truncated("markup")));
                 };
                 if inside.contains(&b'[') {
-                    let problem = Problem::Xml("an internal document type is not accepted");
+                    let problem = Problem::Xml("an internal document type is not supported");
                     return Err(self.error(offset, problem));
                 }
                 self.rest = rest;
@@ -381,17 +380,16 @@ impl<'a> Elements<'a> {
     }
 }
 
-/// The bytes up to the angle bracket that closes a tag, which may have others in the values of its
-/// attributes, and those behind it.
+/// Splits bytes at the `>` that ends a tag. The values of its attributes may contain others.
 #[inline]
 fn markup(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
     if let [b'>', behind @ ..] = bytes {
         return Some((&[], behind));
     }
-    other_markup(bytes)
+    markup_slow(bytes)
 }
 
-fn other_markup(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
+fn markup_slow(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
     let mut len = 0;
     loop {
         let rest = bytes.get(len..)?;
@@ -406,18 +404,18 @@ fn other_markup(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
     }
 }
 
-/// The beginning of an element.
+/// The start of an element.
 pub(super) struct Element<'a> {
     pub(super) tag: Tag,
     /// The name with its prefix.
     name: &'a [u8],
     attributes: &'a [u8],
-    /// Where it begins.
+    /// Offset of the element.
     pub(super) offset: usize,
 }
 
 impl<'a> Element<'a> {
-    /// The name of the user-defined parameter that it stands for: what follows `X-`.
+    /// Returns the name of the user-defined parameter that an element `X-name` stands for.
     pub(super) fn user_defined(&self) -> Option<&'a [u8]> {
         match self.name {
             [b'X' | b'x', b'-', name @ ..] if !name.is_empty() => Some(name),
@@ -427,7 +425,7 @@ impl<'a> Element<'a> {
 }
 
 fn local(name: &[u8]) -> &[u8] {
-    // Names are a few bytes long: a vectorised search takes longer.
+    // Names are a few bytes long. A vectorized search takes longer.
     let colon = name.iter().rposition(|byte| *byte == b':');
     colon.map_or(name, |colon| name.get(colon + 1..).unwrap_or_default())
 }

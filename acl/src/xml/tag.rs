@@ -1,6 +1,6 @@
-//! The names of elements.
+//! The names of the elements of FIPA.
 
-/// What an element is, by its name in any case and without its prefix.
+/// The type of an element, by its name in any case and without its prefix.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Tag {
     AclRepresentation,
@@ -39,11 +39,11 @@ pub(super) enum Tag {
     TransportBehaviour,
     Url,
     UserDefined,
-    /// Any other.
+    /// Any other element.
     Other,
 }
 
-/// No name is longer.
+/// Length of the longest name.
 const LONGEST: usize = 19;
 
 impl Tag {
@@ -67,7 +67,7 @@ impl Tag {
         Self::of_lower(lower)
     }
 
-    /// By length first, so that few names have to be compared.
+    /// Returns the tag with this lowercase name. The match on the length limits the comparisons.
     #[inline]
     fn of_lower(name: &[u8]) -> Self {
         match name.len() {
@@ -141,7 +141,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_in_any_case() {
+    fn names_are_read_in_any_case() {
         assert_eq!(Tag::of(b"Transport-BEHAVIOUR"), Tag::TransportBehaviour);
         assert_eq!(Tag::of(b"to"), Tag::To);
         assert_eq!(Tag::of(b"tu"), Tag::Other);

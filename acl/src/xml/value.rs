@@ -1,4 +1,4 @@
-//! The values of elements and attributes: texts and CDATA sections in a row, references in them.
+//! The values of elements and attributes: sequences of texts and CDATA sections, with references.
 
 use std::borrow::Cow;
 
@@ -9,14 +9,14 @@ use crate::scan::{self, find_byte};
 use crate::xml::reader::{Elements, Event};
 use crate::{Text, Time};
 
-/// Longest reference to a character, from `&` to `;`.
+/// Maximum length of a reference to a character, from `&` to `;`, in bytes.
 const MAX_REFERENCE: usize = 12;
 
-/// Whether the white space around a text belongs to it. Escaped, it always does.
+/// The treatment of the white space around a text. Escaped white space is always preserved.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Space {
-    Counts,
-    Around,
+pub(crate) enum Whitespace {
+    Preserve,
+    Trim,
 }
 
 /// A text without markup, or a CDATA section.
@@ -24,7 +24,7 @@ pub(crate) enum Space {
 pub(super) struct Piece<'a> {
     raw: &'a [u8],
     offset: usize,
-    /// From a CDATA section, where nothing is escaped.
+    /// Whether the piece is from a CDATA section, which has no escapes.
     literal: bool,
 }
 
@@ -51,7 +51,7 @@ impl<'a> Piece<'a> {
         !self.literal && self.raw.trim_ascii().is_empty()
     }
 
-    /// Whether the bytes are as they are meant.
+    /// Whether the piece has no escapes.
     fn is_plain(&self) -> bool {
         self.literal || memchr::memchr(b'&', self.raw).is_none()
     }
@@ -66,8 +66,8 @@ impl<'a> Piece<'a> {
         })
     }
 
-    /// Refuses what XML allows in CDATA sections only (XML 1.0 clause 2.4). fipa_services writes
-    /// content with `]]>` into one section, unescaped: without its `]]>` it would be another text.
+    /// Refuses `]]>` outside of a CDATA section (XML 1.0 clause 2.4). fipa_services writes content
+    /// with `]]>` into one section without escaping it. Accepting the rest would change the text.
     fn check_end_of_section(&self, clause: &'static str) -> Result<(), DecodeError> {
         match memmem::find(self.raw, b"]]>") {
             Some(at) if !self.literal => {
@@ -82,12 +82,13 @@ impl<'a> Piece<'a> {
         if self.literal {
             out.extend_from_slice(self.raw);
         } else {
-            // Wrong references were refused when the value was read.
+            // Malformed references were refused when the value was read.
             let _ = self.each(|bytes| out.extend_from_slice(bytes));
         }
     }
 
-    /// Gives what is meant, stretch by stretch, or how many bytes are left at a wrong reference.
+    /// Passes the unescaped text to `give` in pieces. At a malformed reference, fails with the number
+    /// of remaining bytes.
     fn each(&self, mut give: impl FnMut(&[u8])) -> Result<(), usize> {
         let mut rest = self.raw;
         while let Some(start) = memchr::memchr(b'&', rest) {
@@ -106,7 +107,7 @@ impl<'a> Piece<'a> {
     }
 }
 
-/// The character that is meant by what stands between `&` and `;`.
+/// Returns the character that the text between `&` and `;` stands for.
 fn character(reference: &[u8]) -> Option<char> {
     let (digits, radix) = match reference {
         b"lt" => return Some('<'),
@@ -128,10 +129,10 @@ fn character(reference: &[u8]) -> Option<char> {
 
 /// The value of an element or attribute, still escaped.
 pub(super) struct Value<'a> {
-    /// All that is inside, markup included.
+    /// All bytes inside, including markup.
     pub(super) all: &'a [u8],
-    /// The first piece, and how many there are.
     first: Piece<'a>,
+    /// Number of pieces.
     pieces: usize,
     is_blank: bool,
     pub(super) offset: usize,
@@ -139,7 +140,7 @@ pub(super) struct Value<'a> {
 }
 
 impl<'a> Value<'a> {
-    /// A value without pieces, so far.
+    /// Creates a value without pieces.
     pub(super) fn new(offset: usize, clause: &'static str) -> Self {
         Self {
             all: &[],
@@ -171,7 +172,7 @@ impl<'a> Value<'a> {
         self.is_blank = self.is_blank && piece.is_blank();
     }
 
-    /// Whether there is not even white space; of an attribute, whether it is empty.
+    /// Whether the value has no text, not even white space.
     pub(super) fn is_empty(&self) -> bool {
         self.pieces == 0 || self.pieces == 1 && self.first.raw.is_empty()
     }
@@ -180,7 +181,7 @@ impl<'a> Value<'a> {
         self.is_blank
     }
 
-    /// The bytes, if they are there in one piece as they are meant; the others are checked.
+    /// Returns the bytes if they are in one piece without escapes. Otherwise checks them.
     pub(super) fn bytes(&self) -> Result<Option<&'a [u8]>, DecodeError> {
         if self.pieces == 0 || self.pieces == 1 && self.first.is_plain() {
             return Ok(Some(self.first.raw));
@@ -207,21 +208,25 @@ impl<'a> Value<'a> {
         Ok(None)
     }
 
-    /// The text.
+    /// Returns the text.
     #[inline]
-    pub(super) fn text(&self, space: Space, what: &'static str) -> Result<Text<'a>, DecodeError> {
+    pub(super) fn text(
+        &self,
+        space: Whitespace,
+        what: &'static str,
+    ) -> Result<Text<'a>, DecodeError> {
         let odd = |word| scan::zero(word) | word | scan::is(word, b'&') | scan::is(word, b'<');
         if self.pieces <= 1 && !scan::any(self.first.raw, odd) {
             return Ok(Text::plain(match space {
-                Space::Around if !self.first.literal => self.first.raw.trim_ascii(),
+                Whitespace::Trim if !self.first.literal => self.first.raw.trim_ascii(),
                 _ => self.first.raw,
             }));
         }
-        self.other_text(space, what)
+        self.text_slow(space, what)
     }
 
     #[inline(never)]
-    fn other_text(&self, space: Space, what: &'static str) -> Result<Text<'a>, DecodeError> {
+    fn text_slow(&self, space: Whitespace, what: &'static str) -> Result<Text<'a>, DecodeError> {
         let wrong = |problem| DecodeError::new(self.offset, self.clause, problem);
         if std::str::from_utf8(self.all).is_err() {
             return Err(wrong(Problem::NotUtf8(what)));
@@ -230,7 +235,9 @@ impl<'a> Value<'a> {
             return Err(wrong(Problem::Nul(what)));
         }
         let text = match self.bytes()? {
-            Some(plain) if self.first.literal || space == Space::Counts => Text::plain(plain),
+            Some(plain) if self.first.literal || space == Whitespace::Preserve => {
+                Text::plain(plain)
+            }
             Some(plain) => Text::plain(plain.trim_ascii()),
             None if self.pieces == 1 => Text::xml(self.first.raw, space),
             None => Text::xml(self.all, space),
@@ -238,29 +245,29 @@ impl<'a> Value<'a> {
         Ok(text)
     }
 
-    /// The text without the white space around it.
+    /// Returns the text without the white space around it.
     #[inline]
     pub(super) fn trimmed(&self, what: &'static str) -> Result<Text<'a>, DecodeError> {
-        self.text(Space::Around, what)
+        self.text(Whitespace::Trim, what)
     }
 
-    /// The date and time that it says.
+    /// Parses the text as a date and time.
     pub(super) fn time(&self) -> Result<Time, DecodeError> {
         let wrong = |_| DecodeError::new(self.offset, self.clause, Problem::DateTime);
         self.trimmed("date")?.as_str().parse().map_err(wrong)
     }
 }
 
-/// The bytes that are meant by what is inside of an element or attribute.
-pub(crate) fn unescaped(inside: &[u8], space: Space) -> Cow<'_, [u8]> {
-    let around = space == Space::Around;
+/// Unescapes the inside of an element or attribute.
+pub(crate) fn unescaped(inside: &[u8], space: Whitespace) -> Cow<'_, [u8]> {
+    let trims = space == Whitespace::Trim;
     if find_byte(inside, b'<').is_none() && find_byte(inside, b'&').is_none() {
-        return Cow::Borrowed(if around { inside.trim_ascii() } else { inside });
+        return Cow::Borrowed(if trims { inside.trim_ascii() } else { inside });
     }
     let mut out = Vec::with_capacity(inside.len());
     let mut last: Option<Piece<'_>> = None;
     let mut elements = Elements::inside(inside);
-    // An error cannot occur in checked bytes, and would end this.
+    // An error cannot occur in checked bytes. It would end the text.
     while let Ok(Some(event)) = elements.next() {
         let mut piece = match event {
             Event::Text(piece) => piece,
@@ -272,13 +279,13 @@ pub(crate) fn unescaped(inside: &[u8], space: Space) -> Cow<'_, [u8]> {
         };
         match last {
             Some(last) => last.unescape(&mut out),
-            None if around && !piece.literal => piece.raw = piece.raw.trim_ascii_start(),
+            None if trims && !piece.literal => piece.raw = piece.raw.trim_ascii_start(),
             None => {}
         }
         last = Some(piece);
     }
     if let Some(mut last) = last {
-        if around && !last.literal {
+        if trims && !last.literal {
             last.raw = last.raw.trim_ascii_end();
         }
         last.unescape(&mut out);
@@ -291,8 +298,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_meant_by_what_is_written() {
-        for (inside, counts, around) in [
+    fn values_are_unescaped_and_trimmed() {
+        for (inside, preserved, trimmed) in [
             (" a ", " a ", "a"),
             (" &lt;&#x20;", " < ", "< "),
             (" <![CDATA[ a ]]> ", "  a  ", " a "),
@@ -300,8 +307,8 @@ mod tests {
             ("<![CDATA[&amp;]]>", "&amp;", "&amp;"),
         ] {
             let text = |space| unescaped(inside.as_bytes(), space).into_owned();
-            assert_eq!(text(Space::Counts), counts.as_bytes(), "{inside}");
-            assert_eq!(text(Space::Around), around.as_bytes(), "{inside}");
+            assert_eq!(text(Whitespace::Preserve), preserved.as_bytes(), "{inside}");
+            assert_eq!(text(Whitespace::Trim), trimmed.as_bytes(), "{inside}");
         }
     }
 }

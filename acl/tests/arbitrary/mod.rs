@@ -1,4 +1,4 @@
-//! Messages and envelopes of all kinds, for property tests.
+//! Strategies for messages and envelopes in property tests.
 
 #![allow(dead_code, reason = "every test uses its part")]
 
@@ -11,7 +11,7 @@ use proptest::collection::vec;
 use proptest::option;
 use proptest::prelude::*;
 
-/// Text that an encoding has to be careful with.
+/// Text that encodings must escape or quote.
 pub(crate) fn text() -> BoxedStrategy<String> {
     prop_oneof![
         "[a-z@#0-9-]{0,8}",
@@ -48,7 +48,7 @@ pub(crate) fn agent() -> BoxedStrategy<AgentId> {
     agent_of(some_text(), some_text(), pairs().boxed())
 }
 
-/// An agent with these names, addresses and user-defined parameters, and the same of its resolvers.
+/// An agent with these names, addresses and user-defined parameters. Its resolvers have the same.
 pub(crate) fn agent_of(
     name: BoxedStrategy<String>,
     url: BoxedStrategy<String>,
@@ -115,7 +115,7 @@ pub(crate) fn message() -> impl Strategy<Value = Message> {
     message_of(Kinds::default())
 }
 
-/// What messages are made of.
+/// The values of the parameters of messages.
 pub(crate) struct Kinds {
     pub(crate) performative: BoxedStrategy<Performative>,
     pub(crate) agent: BoxedStrategy<AgentId>,
@@ -126,7 +126,7 @@ pub(crate) struct Kinds {
     pub(crate) pairs: BoxedStrategy<Vec<(String, String)>>,
 }
 
-/// All kinds that there are.
+/// All values that a message can have.
 impl Default for Kinds {
     fn default() -> Self {
         Self {
@@ -142,7 +142,7 @@ impl Default for Kinds {
 }
 
 prop_compose! {
-    /// A message of these kinds.
+    /// A message with these values.
     pub(crate) fn message_of(kinds: Kinds)(
         performative in kinds.performative,
         sender in option::of(kinds.agent.clone()),

@@ -1,4 +1,4 @@
-//! The recordings in `tests/vectors`, and what they mean.
+//! The recordings in `tests/vectors` and their expected values.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
@@ -11,7 +11,7 @@ use fipa_acl::Message;
 use fipa_acl::json::message_to_json;
 use serde_json::Value;
 
-/// The recorded JSON has all content as Base64.
+/// Converts a message to JSON with its content in Base64, as in the recorded JSON.
 pub(crate) fn with_base64(message: &Message) -> Value {
     let mut json = message_to_json(message);
     let object = json.as_object_mut().unwrap();
@@ -22,24 +22,24 @@ pub(crate) fn with_base64(message: &Message) -> Value {
     json
 }
 
-/// What a recording means.
+/// Reads the expected JSON of a recording.
 pub(crate) fn expected(path: &Path) -> Value {
     serde_json::from_slice(&fs::read(path.with_extension("json")).unwrap()).unwrap()
 }
 
-/// The name of a recording, without what it is encoded in.
+/// Returns the name of a recording without its extension.
 pub(crate) fn name(path: &Path) -> &str {
     path.file_stem().unwrap().to_str().unwrap()
 }
 
-/// Where a recording lies.
+/// Returns the path of a recording.
 pub(crate) fn vector(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("tests/vectors")
         .join(name)
 }
 
-/// All recordings with this first letter and in this encoding.
+/// Returns the paths of all recordings with this first letter and this extension.
 pub(crate) fn vectors(initial: char, extension: &str) -> Vec<PathBuf> {
     let mut found: Vec<_> = fs::read_dir(vector(""))
         .unwrap()

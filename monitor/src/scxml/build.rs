@@ -1,4 +1,4 @@
-//! From a document to a machine: every name resolved, every check made, all mistakes told.
+//! Builds a machine from a document: resolves all names, makes all checks, collects all mistakes.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -10,7 +10,7 @@ use crate::machine::{
     After, Cancel, MAX_ROLES, Machine, Roles, Scope, State, Subprotocol, Timeout, Transition,
 };
 
-/// Most transitions that a state may have after optional steps were left out.
+/// Maximum number of transitions of a state, including those behind optional transitions.
 const MAX_STEPS: usize = 100;
 
 pub(super) fn machine(document: &Document, file_name: &str) -> Result<Machine, Vec<Mistake>> {
@@ -34,13 +34,13 @@ struct Builder<'d> {
     mistakes: Vec<Mistake>,
     roles: Vec<String>,
     ids: HashMap<&'d str, u16>,
-    /// What was compiled already: most files say the same few things again and again.
+    /// Compiled patterns. Most files repeat the same few.
     known_acts: HashMap<&'d str, Acts>,
     known_roles: HashMap<&'d str, Roles>,
 }
 
 impl<'d> Builder<'d> {
-    /// The machine; it is wrong if there are mistakes afterwards.
+    /// Builds the machine. It is valid only if there are no mistakes.
     fn machine(&mut self, file_name: &str) -> Option<Machine> {
         let document = self.document;
         if document.states.is_empty() {
@@ -80,7 +80,7 @@ impl<'d> Builder<'d> {
             states,
         };
         self.bound_roles(&machine);
-        self.leave_out_optional(&mut machine);
+        self.skip_optional(&mut machine);
         self.reachable(&machine);
         self.unambiguous(&machine);
         machine.initiator = self.beginner(&machine)?;
@@ -102,7 +102,7 @@ impl<'d> Builder<'d> {
         }
     }
 
-    /// Roles are all names that stand for themselves.
+    /// Collects the roles: all `from` and `to` that are plain names.
     fn name_roles(&mut self) -> Option<()> {
         let document = self.document;
         for state in &document.states {
@@ -264,7 +264,7 @@ impl<'d> Builder<'d> {
         Some(roles)
     }
 
-    /// Somebody can only speak when he has been spoken to, but for who begins.
+    /// Checks that every sending role begins the protocol or receives a message.
     fn bound_roles(&mut self, machine: &Machine) {
         let all = || machine.states.iter().flat_map(|state| &state.transitions);
         let begin = &machine.initial().transitions;
@@ -273,21 +273,21 @@ impl<'d> Builder<'d> {
             let first = begin.iter().any(|step| step.from.mask & bit != 0);
             let addressed = all().any(|step| step.to.includes(bit));
             let states = machine.states.iter().enumerate();
-            let mut spoken = states.flat_map(|(at, state)| {
+            let mut sent = states.flat_map(|(at, state)| {
                 let steps = state.transitions.iter();
                 steps
                     .filter(|step| step.from.text == *role)
                     .map(move |step| (at, step))
             });
-            if let Some((state, step)) = spoken.next().filter(|_| !first && !addressed) {
+            if let Some((state, step)) = sent.next().filter(|_| !first && !addressed) {
                 let line = self.line_of_step(state, step);
                 self.wrong(line, Problem::UnboundRole(role.clone()));
             }
         }
     }
 
-    /// Gives states the transitions of those that are reached by leaving out optional steps.
-    fn leave_out_optional(&mut self, machine: &mut Machine) {
+    /// Adds to each state the transitions of the states behind its optional transitions.
+    fn skip_optional(&mut self, machine: &mut Machine) {
         for index in 0..machine.states.len() {
             let (mut steps, mut embedded) = (Vec::new(), Vec::new());
             let mut reached = vec![index];
@@ -353,8 +353,8 @@ impl<'d> Builder<'d> {
 
     fn unambiguous(&mut self, machine: &Machine) {
         for (index, state) in machine.states.iter().enumerate() {
-            for (place, one) in state.steps.iter().enumerate() {
-                for other in state.steps.iter().take(place) {
+            for (index_of_one, one) in state.steps.iter().enumerate() {
+                for other in state.steps.iter().take(index_of_one) {
                     let apart = one.target == other.target
                         || !one.from.overlaps(&other.from)
                         || !one.to.overlaps(&other.to);
@@ -372,7 +372,7 @@ impl<'d> Builder<'d> {
                             other_line: self.line_of_step(index, other),
                         }));
                         self.wrong(self.line_of_step(index, one), problem);
-                        // One of a state is enough: others follow from the same mistake.
+                        // One per transition is enough: further ones have the same cause.
                         break;
                     }
                 }
@@ -482,7 +482,7 @@ impl<'d> Builder<'d> {
             value: text.to_owned(),
             reason: match error {
                 regex::Error::CompiledTooBig(_) => "it is too large when compiled".to_owned(),
-                // The last line of what the parser says is the reason; above it is a drawing.
+                // The last line of the error is the reason. The lines above show the position.
                 other => other
                     .to_string()
                     .lines()
@@ -509,8 +509,8 @@ impl<'d> Builder<'d> {
         state.map_or(self.document.line, |state| state.line)
     }
 
-    /// The line of a step: of the transition it stands for, or of the state, if it comes from
-    /// leaving out others.
+    /// Returns the line of a step: that of its transition or, if the step is from behind an optional
+    /// transition, that of the state.
     fn line_of_step(&self, state: usize, step: &Transition) -> usize {
         let own = self.document.states.get(state).and_then(|state| {
             let mut messages = state.transitions.iter().filter(|one| one.after.is_none());
@@ -528,7 +528,7 @@ impl<'d> Builder<'d> {
     }
 }
 
-/// Reads a span of at most a day.
+/// Parses a span of at most a day.
 fn duration(text: &str) -> Option<Duration> {
     const DAY: u64 = 24 * 60 * 60 * 1000;
     let digits = text.find(|c: char| !c.is_ascii_digit())?;
@@ -544,7 +544,7 @@ fn duration(text: &str) -> Option<Duration> {
     (1..=DAY).contains(&ms).then_some(Duration::from_millis(ms))
 }
 
-/// Whether one inserted, left out or changed character makes one of the other.
+/// Whether the texts differ in one inserted, omitted or changed character.
 fn one_edit_apart(one: &str, other: &str) -> bool {
     let (short, long): (Vec<char>, Vec<char>) = if one.len() <= other.len() {
         (one.chars().collect(), other.chars().collect())
@@ -552,7 +552,7 @@ fn one_edit_apart(one: &str, other: &str) -> bool {
         (other.chars().collect(), one.chars().collect())
     };
     let same = short.iter().zip(&long).take_while(|(a, b)| a == b).count();
-    // Of names of one or two characters, all would be near.
+    // All names of one or two characters would be near.
     if short.len() < 3 {
         return false;
     }

@@ -1,4 +1,4 @@
-//! From XML to elements with lines, nothing of which is checked against anything else yet.
+//! Reads XML into elements with line numbers. References between elements are not checked yet.
 
 use std::borrow::Cow;
 
@@ -9,21 +9,21 @@ use quick_xml::reader::NsReader;
 
 use super::{MAX_FILE, Mistake, NAMESPACE, Problem};
 
-/// Deepest nesting: a protocol needs three levels, and what else is in the file is not looked at.
+/// Maximum nesting depth of elements. A protocol needs three levels. Other elements are skipped.
 const MAX_DEPTH: usize = 32;
 const MAX_STATES: usize = 500;
 const MAX_TRANSITIONS: usize = 2_000;
-/// Longest value of an attribute, in bytes.
+/// Maximum length of the value of an attribute, in bytes.
 const MAX_VALUE: usize = 256;
-/// Most attributes of an element.
+/// Maximum number of attributes of an element.
 const MAX_ATTRIBUTES: usize = 64;
 
-/// What an `<scxml>` says.
+/// The attributes and states of an `<scxml>` element.
 #[derive(Debug, Default)]
 pub(super) struct Document {
     pub(super) line: usize,
     pub(super) initial: Option<String>,
-    /// Whether our namespace is declared.
+    /// Whether [`NAMESPACE`] is declared.
     pub(super) extended: bool,
     pub(super) name: Option<String>,
     pub(super) aliases: Option<String>,
@@ -61,7 +61,7 @@ pub(super) struct Subprotocol {
     pub(super) proxied_to: Option<String>,
 }
 
-/// Reads a document; stops at the first thing that is not as it must be.
+/// Reads a document up to its first mistake.
 pub(super) fn read(text: &str) -> Result<Document, Mistake> {
     if text.len() > MAX_FILE {
         let problem = Problem::TooLarge(text.len());
@@ -80,8 +80,9 @@ pub(super) fn read(text: &str) -> Result<Document, Mistake> {
 struct Reader<'a> {
     text: &'a str,
     xml: NsReader<&'a [u8]>,
-    /// Up to which byte lines have been counted, and how many there were.
+    /// Offset up to which lines were counted.
     counted: usize,
+    /// Line at that offset.
     line: usize,
     transitions: usize,
 }
@@ -111,10 +112,10 @@ impl<'a> Reader<'a> {
             Tag::Eof => Ok(document),
             Tag::Begin(element, _) => {
                 let element = shown(&local(&element));
-                let problem = Problem::Xml(format!("<{element}> stands behind </scxml>"));
+                let problem = Problem::Xml(format!("<{element}> follows </scxml>"));
                 Err(self.wrong(problem))
             }
-            Tag::End => Err(self.wrong(Problem::Xml("an end without a beginning".to_owned()))),
+            Tag::End => Err(self.wrong(Problem::Xml("an end tag without a start tag".to_owned()))),
         }
     }
 
@@ -198,7 +199,7 @@ impl<'a> Reader<'a> {
             match local(&element).as_ref() {
                 "transition" => state.transitions.push(self.transition(&element)?),
                 "subprotocol" => state.subprotocols.push(self.subprotocol(&element)?),
-                // Not looked at by fipa_acl, which leaves their authors wondering.
+                // fipa_acl ignores these silently.
                 name @ ("state" | "final" | "parallel" | "initial" | "history") => {
                     return Err(self.misplaced(name, "state"));
                 }
@@ -256,10 +257,10 @@ impl<'a> Reader<'a> {
         })
     }
 
-    /// The attributes: whether of our namespace, local name, value.
+    /// Returns the attributes: whether they have [`NAMESPACE`], their local names and their values.
     fn attributes(&self, element: &BytesStart<'a>) -> Result<Vec<(bool, String, String)>, Mistake> {
         let mut found = Vec::new();
-        // Looking for duplicates takes quadratic time; the last one counts.
+        // A check for duplicates takes quadratic time. The last one counts.
         for attribute in element.attributes().with_checks(false) {
             let attribute =
                 attribute.map_err(|error| self.wrong(Problem::Xml(error.to_string())))?;
@@ -274,7 +275,7 @@ impl<'a> Reader<'a> {
                 .map_err(|error| self.wrong(Problem::Xml(error.to_string())))?;
             let (namespace, key) = self.xml.resolver().resolve_attribute(attribute.key);
             let ours = namespace == ResolveResult::Bound(Namespace(NAMESPACE));
-            // What another namespace says is not for us.
+            // Attributes of other namespaces are ignored.
             if ours || namespace == ResolveResult::Unbound {
                 found.push((ours, shown(key.into_inner()), value.into_owned()));
             }
@@ -282,7 +283,7 @@ impl<'a> Reader<'a> {
         Ok(found)
     }
 
-    /// Reads the element that began last to its end.
+    /// Skips the current element, including its end.
     fn skip(&mut self) -> Result<(), Mistake> {
         let mut depth = 1_usize;
         while depth > 0 {
@@ -303,13 +304,13 @@ impl<'a> Reader<'a> {
         loop {
             let begin = self.xml.buffer_position();
             let event = self.xml.read_event();
-            // An element is in the line in which it begins, a mistake where it was noticed.
-            let place = match &event {
+            // An element has the line of its start, and an error the line of its position.
+            let offset = match &event {
                 Ok(Event::Start(_) | Event::Empty(_)) => begin,
                 Ok(_) => self.xml.buffer_position(),
                 Err(_) => self.xml.error_position(),
             };
-            self.count_lines(usize::try_from(place).unwrap_or(usize::MAX));
+            self.count_lines(usize::try_from(offset).unwrap_or(usize::MAX));
             match event {
                 Ok(Event::Start(tag)) => return Ok(Tag::Begin(tag, true)),
                 Ok(Event::Empty(tag)) => return Ok(Tag::Begin(tag, false)),
@@ -322,17 +323,17 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Sets the line to the one in which `place` is.
-    fn count_lines(&mut self, place: usize) {
+    /// Sets the line to that of `offset`.
+    fn count_lines(&mut self, offset: usize) {
         let mark = self.text.len() - self.text.trim_start_matches('\u{feff}').len();
-        let place = place.saturating_add(mark).min(self.text.len());
-        let passed = self.text.as_bytes().get(self.counted..place);
+        let offset = offset.saturating_add(mark).min(self.text.len());
+        let passed = self.text.as_bytes().get(self.counted..offset);
         self.line += passed
             .unwrap_or_default()
             .iter()
             .filter(|byte| **byte == b'\n')
             .count();
-        self.counted = self.counted.max(place);
+        self.counted = self.counted.max(offset);
     }
 
     fn required(
@@ -366,7 +367,7 @@ impl<'a> Reader<'a> {
     }
 
     fn truncated(&self) -> Mistake {
-        self.wrong(Problem::Xml("the file ends within an element".to_owned()))
+        self.wrong(Problem::Xml("the file ends inside an element".to_owned()))
     }
 
     fn wrong(&self, problem: Problem) -> Mistake {
@@ -381,7 +382,7 @@ fn local<'t>(element: &'t BytesStart<'_>) -> Cow<'t, str> {
     Cow::Borrowed(element.local_name().into_inner())
 }
 
-/// A name from the file, for an error: not without end.
+/// Truncates a name of the file for an error.
 fn shown(name: &str) -> String {
     name.chars().take(60).collect()
 }

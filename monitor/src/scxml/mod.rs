@@ -1,6 +1,6 @@
-//! Protocols as SCXML files.
+//! Reading of protocols from SCXML files.
 //!
-//! The form is the one of fipa_acl, whose files are read unchanged:
+//! The format is that of fipa_acl. Its files are read unchanged:
 //!
 //! ```xml
 //! <scxml version="1.0" initial="1">
@@ -16,19 +16,19 @@
 //! ```
 //!
 //! `performative`, the `name` of a subprotocol and roles are regular expressions that match whole
-//! names. What this form cannot say is said with attributes of the namespace [`NAMESPACE`]:
+//! names. The namespace [`NAMESPACE`] adds these attributes:
 //!
 //! | element | attribute | meaning |
 //! |---|---|---|
-//! | `scxml` | `name` | the standard name; without it, the name of the file |
+//! | `scxml` | `name` | name of the protocol; without it, the name of the file |
 //! | `scxml` | `aliases` | other names, separated by blanks |
-//! | `scxml` | `title` | what it is, in a line |
-//! | `scxml` | `scope` | `participant`: each participant has a state of its own; `conversation` (default): there is one |
-//! | `scxml` | `cancel` | who may cancel: `initiator` (default in a file with this namespace), `anyone` (default in one without), `nobody` |
-//! | `transition` | `optional` | `yes`: the step may be left out |
-//! | `transition` | `after` | instead of a performative and roles: taken when no message has come by the `reply-by` of the last one (`reply-by`), or for so long (`500ms`, `30s`, `10min`, `1h`) |
+//! | `scxml` | `title` | description in one line |
+//! | `scxml` | `scope` | `participant`: each participant has a state of its own; `conversation` (default): the conversation has one state |
+//! | `scxml` | `cancel` | agents that may cancel: `initiator` (default in a file with this namespace), `anyone` (default in a file without it), `nobody` |
+//! | `transition` | `optional` | `yes`: the transition may be skipped |
+//! | `transition` | `after` | makes the transition a timeout, without a performative and roles: it is taken when no message has come by the `reply-by` of the last one (`reply-by`), or within a span (`500ms`, `30s`, `10min`, `1h`) |
 //!
-//! What must not live here: running a machine (see [`crate::Monitor`]).
+//! [`crate::Monitor`] runs the machines.
 
 mod build;
 mod document;
@@ -37,22 +37,23 @@ use std::fmt;
 
 use crate::Machine;
 
-/// The namespace of the attributes that go beyond fipa_acl.
+/// The namespace of the attributes that fipa_acl does not have.
 pub const NAMESPACE: &str = "urn:fipa-rs:protocol";
 
-/// Largest file, in bytes.
+/// Maximum size of a file, in bytes.
 pub const MAX_FILE: usize = 1 << 20;
 
-/// Most mistakes that are told of one file.
+/// Maximum number of mistakes in an error.
 const MAX_MISTAKES: usize = 50;
 
 impl Machine {
-    /// Reads a protocol from the text of an SCXML file. `file` is its name or path: it stands in
-    /// errors, and its last part without `.scxml` or `.xml` is the protocol's name unless the file
-    /// says another.
+    /// Reads a protocol from the text of an SCXML file.
+    ///
+    /// `file` is the name or path of the file. Errors contain it. Unless the file has a name for the
+    /// protocol, the name is the last part of `file` without `.scxml` or `.xml`.
     ///
     /// # Errors
-    /// With all mistakes that were found, each with its line.
+    /// The file has mistakes. The error has all of them, each with its line.
     pub fn read(file: &str, text: &str) -> Result<Self, ScxmlError> {
         let made = document::read(text)
             .map_err(|mistake| vec![mistake])
@@ -76,21 +77,21 @@ fn protocol_name(file: &str) -> &str {
     stem.unwrap_or(last)
 }
 
-/// Why a file is no protocol.
+/// Error of reading a protocol: the mistakes of its file.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub struct ScxmlError {
-    /// The file, as it was given.
+    /// Name or path of the file.
     pub file: String,
-    /// What is wrong with it, in the order of lines.
+    /// Mistakes in the order of their lines.
     pub mistakes: Vec<Mistake>,
 }
 
-/// One mistake in a file.
+/// A mistake in a file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Mistake {
-    /// The line, counted from 1.
+    /// Line of the mistake, counted from 1.
     pub line: usize,
-    /// What is wrong there.
+    /// The problem.
     pub problem: Problem,
 }
 
@@ -104,42 +105,42 @@ impl fmt::Display for ScxmlError {
     }
 }
 
-/// What can be wrong with a protocol.
+/// A problem of a protocol.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Problem {
     /// The file is too large.
-    #[error("a file of {0} bytes; a protocol has at most {MAX_FILE}")]
+    #[error("the file has {0} bytes (maximum {MAX_FILE})")]
     TooLarge(usize),
-    /// There is more of something than can be.
+    /// The file has too many items of one kind.
     #[error("more than {limit} {what}")]
     TooMany {
-        /// Of what.
+        /// Kind of the items.
         what: &'static str,
-        /// How many there may be.
+        /// Maximum number.
         limit: usize,
     },
-    /// It is no XML.
+    /// The file is not XML.
     #[error("not well-formed XML: {0}")]
     Xml(String),
-    /// A document type definition could make a small file large.
-    #[error("a document type is not accepted; remove the <!DOCTYPE …>")]
+    /// The file has a document type definition, which could expand a small file to a large one.
+    #[error("document types are not supported; remove the <!DOCTYPE …>")]
     DocumentType,
-    /// It has no element.
-    #[error("no element is there, but a protocol is an <scxml>")]
+    /// The file has no element.
+    #[error("the file has no element; a protocol is an <scxml> element")]
     Empty,
-    /// The outermost element is another one.
-    #[error("the outermost element is <{0}>, but a protocol is an <scxml>")]
+    /// The outermost element is not `scxml`.
+    #[error("the outermost element is <{0}>; a protocol is an <scxml> element")]
     NotScxml(String),
-    /// An element is not where it may be.
-    #[error("<{element}> does not belong inside <{inside}>")]
+    /// An element is at a position where it is not allowed.
+    #[error("<{element}> is not allowed inside <{inside}>")]
     Misplaced {
         /// The element.
         element: String,
-        /// Where it stands.
+        /// The enclosing element.
         inside: String,
     },
-    /// A necessary attribute is not there.
+    /// A mandatory attribute is missing.
     #[error("<{element}> lacks the attribute {attribute:?}")]
     Missing {
         /// The element.
@@ -147,81 +148,81 @@ pub enum Problem {
         /// The attribute.
         attribute: &'static str,
     },
-    /// An attribute of our namespace is not known.
-    #[error("unknown attribute {attribute:?} on <{element}>; known there: {known}")]
+    /// An attribute of [`NAMESPACE`] is unknown.
+    #[error("unknown attribute {attribute:?} of <{element}>; known attributes: {known}")]
     UnknownAttribute {
         /// The element.
         element: &'static str,
-        /// The attribute, without prefix.
+        /// Name of the attribute, without prefix.
         attribute: String,
-        /// Those that are known there.
+        /// Known attributes of the element.
         known: &'static str,
     },
-    /// A value is not one of those it can be.
-    #[error("{attribute}={value:?} is not understood; expected {expected}")]
+    /// An attribute has an invalid value.
+    #[error("invalid value {attribute}={value:?}; expected {expected}")]
     Value {
         /// The attribute.
         attribute: &'static str,
-        /// What it says.
+        /// Its value.
         value: String,
-        /// What it can say.
+        /// Valid values.
         expected: &'static str,
     },
-    /// A regular expression is none.
-    #[error("{attribute}={value:?} is no regular expression: {reason}")]
+    /// A value is not a regular expression.
+    #[error("{attribute}={value:?} is not a regular expression: {reason}")]
     Pattern {
         /// The attribute.
         attribute: &'static str,
-        /// What it says.
+        /// Its value.
         value: String,
-        /// Why not.
+        /// Reason of the parser.
         reason: String,
     },
-    /// There is no state at all.
+    /// The protocol has no state.
     #[error("the protocol has no state")]
     NoState,
-    /// Two states have the same name.
-    #[error("there is a state {id:?} already, in line {first}")]
+    /// Two states have the same identifier.
+    #[error("line {first} already has a state {id:?}")]
     DuplicateState {
-        /// Its name.
+        /// The identifier.
         id: String,
-        /// Where it is first.
+        /// Line of the first state.
         first: usize,
     },
-    /// A state that is named does not exist.
+    /// A target does not exist.
     #[error("there is no state {id:?}{}", near(.nearest))]
     UnknownState {
-        /// Its name.
+        /// The identifier.
         id: String,
-        /// A state with a name much like it.
+        /// A state with a similar identifier.
         nearest: Option<String>,
     },
     /// No sequence of messages leads to a state.
-    #[error("no transition leads to state {0:?}; remove it, or lead to it")]
+    #[error("no transition leads to state {0:?}; remove it, or add a transition to it")]
     UnreachableState(String),
-    /// A state has no way out and is not final.
+    /// A state has no transition and is not final.
     #[error("state {0:?} has no transition and is not final; add one, or final=\"yes\"")]
     DeadEnd(String),
-    /// A message would have two meanings.
+    /// A message would lead to two states.
     #[error("{0}")]
     Ambiguous(Box<Ambiguity>),
-    /// A role of which nobody could know who has it.
+    /// No message determines the agent that has a role.
     #[error(
-        "role {0:?} is never bound: no message is sent to it, and it does not begin; send it one, \
-         or correct its name"
+        "role {0:?} is never bound: no message is sent to it, and it does not begin; send it a \
+         message, or correct its name"
     )]
     UnboundRole(String),
-    /// A state for each participant needs just two roles.
-    #[error("scope=\"participant\" needs two roles, and there are {0}: {1}")]
+    /// A protocol with a state for each participant does not have two roles.
+    #[error("scope=\"participant\" needs two roles, but there are {0}: {1}")]
     RolesOfScope(usize, String),
-    /// The first message can be sent by several roles.
-    #[error("the first message has several senders: {0}; one role must begin")]
+    /// Several roles can send the first message.
+    #[error("the first message has several senders: {0}; only one role may begin")]
     Beginners(String),
-    /// A state has several time-outs.
-    #[error("state {0:?} has more than one time-out")]
+    /// A state has several timeouts.
+    #[error("state {0:?} has more than one timeout")]
     TwoTimeouts(String),
-    /// Leaving out optional steps would lead in a circle.
-    #[error("optional steps lead from state {0:?} back to it")]
+    /// Optional transitions form a cycle.
+    #[error("optional transitions lead from state {0:?} back to it")]
     OptionalCircle(String),
 }
 
@@ -229,19 +230,19 @@ pub enum Problem {
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Ambiguity {
-    /// The state in which it comes.
+    /// State with both transitions.
     pub state: String,
-    /// A performative that both transitions take.
+    /// Performative of both transitions.
     pub performative: String,
-    /// The sending role.
+    /// Sending role.
     pub from: String,
-    /// The receiving role.
+    /// Receiving role.
     pub to: String,
-    /// Where this transition leads.
+    /// Target of this transition.
     pub target: String,
-    /// Where the other leads.
+    /// Target of the other transition.
     pub other_target: String,
-    /// The line of the other.
+    /// Line of the other transition.
     pub other_line: usize,
 }
 

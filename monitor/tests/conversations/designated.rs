@@ -1,5 +1,5 @@
-//! Who gets replies instead of the initiator, because a `reply-to` names him, and goes on instead
-//! (FIPA00061, FIPA00034).
+//! Agents that a `reply-to` names: they receive replies instead of the initiator and may continue in
+//! its place (FIPA00061, FIPA00034).
 
 use super::*;
 
@@ -8,7 +8,7 @@ fn recruit(words: &'static str) -> Header<'static> {
 }
 
 #[test]
-fn replies_go_to_whom_reply_to_names() {
+fn replies_may_go_to_the_agents_in_reply_to() {
     let mut stage = Stage::observer();
     stage.right(request("request ann>ben").reply_to(["zoe"]));
     stage.right(request("agree ben>zoe"));
@@ -20,7 +20,7 @@ fn replies_go_to_whom_reply_to_names() {
 }
 
 #[test]
-fn the_recruited_answer_whom_they_are_told_to() {
+fn recruited_agents_answer_the_agent_in_reply_to() {
     let mut stage = Stage::observer();
     stage.right(recruit("proxy ann>rec"));
     stage.right(recruit("agree rec>ann"));
@@ -31,7 +31,7 @@ fn the_recruited_answer_whom_they_are_told_to() {
     stage.wrong(recruit("inform rec>ann"));
 }
 
-/// A recruited contract net up to its proposals, which go to dan.
+/// A recruited contract net up to its proposals, which are sent to dan.
 fn recruited(monitor: Monitor) -> Stage {
     let mut stage = Stage::new(monitor);
     stage.right(recruit("proxy ann>rec"));
@@ -44,7 +44,7 @@ fn recruited(monitor: Monitor) -> Stage {
 }
 
 #[test]
-fn who_gets_the_proposals_of_the_recruited_accepts_one() {
+fn the_receiver_of_recruited_proposals_accepts_one() {
     let mut stage = recruited(Monitor::observer(library()));
     assert_eq!(
         stage.wrong(say("accept-proposal zoe>ben")).kind,
@@ -62,19 +62,19 @@ fn who_gets_the_proposals_of_the_recruited_accepts_one() {
 }
 
 #[test]
-fn who_goes_on_brings_nobody_in() {
+fn a_continuing_agent_cannot_add_participants() {
     let mut stage = recruited(Monitor::observer(library()));
     for words in ["cfp dan>eve", "cfp dan>eve,ben", "cfp dan>arm_.*"] {
         assert_eq!(stage.wrong(say(words)).kind, Kind::WrongReceiver, "{words}");
     }
-    // The recruiter does, and its multicast is one that dan may go on with.
+    // The recruiter can, and dan may continue its multicast.
     stage.right(say("cfp rec>arm_.*"));
     stage.right(say("cancel dan>arm_.*"));
     stage.right(say("inform arm_1>dan"));
 }
 
 #[test]
-fn who_goes_on_cancels_and_hands_on() {
+fn a_continuing_agent_may_cancel_and_name_further_agents() {
     let mut stage = Stage::observer();
     let subscribe = |words| say_in("fipa-subscribe", words);
     stage.right(subscribe("subscribe ann>ben").reply_to(["dan"]));
@@ -90,7 +90,7 @@ fn who_goes_on_cancels_and_hands_on() {
     assert_eq!(stage.right(subscribe("failure ben>eve")), "active");
     stage.right(subscribe("cancel eve>ben"));
     assert_eq!(stage.right(subscribe("inform ben>eve")), "cancelled");
-    // Who takes part otherwise names nobody.
+    // The `reply-to` of another participant has no effect.
     let mut stage = Stage::observer();
     stage.right(request("request ann>ben"));
     stage.right(request("agree ben>ann").reply_to(["dan"]));
@@ -98,13 +98,13 @@ fn who_goes_on_cancels_and_hands_on() {
 }
 
 #[test]
-fn who_takes_part_may_go_on_with_the_others() {
+fn a_participant_in_reply_to_may_continue_with_the_others() {
     let mut stage = Stage::observer();
     stage.right(say("cfp ann>ben,cid").reply_to(["ben"]));
     stage.right(say("propose ben>ann"));
     stage.right(say("propose cid>ben"));
     assert_eq!(stage.right(say("accept-proposal ben>cid")), "accepted");
-    // Each part has faults of its own.
+    // Each of its two parts has violations of its own.
     assert_eq!(
         stage.wrong(say("accept-proposal ben>cid")).kind,
         Kind::Unexpected
@@ -116,7 +116,7 @@ fn who_takes_part_may_go_on_with_the_others() {
 }
 
 #[test]
-fn who_goes_on_is_told_of_what_was_not_delivered() {
+fn a_continuing_agent_receives_failure_reports() {
     let mut stage = Stage::observer();
     stage.right(say("cfp ann>ben").reply_to(["dan"]));
     stage.right(say("propose ben>dan").reply_with("b"));
@@ -131,7 +131,7 @@ fn who_goes_on_is_told_of_what_was_not_delivered() {
 }
 
 #[test]
-fn where_all_have_one_state_it_is_the_initiators_part() {
+fn with_one_state_a_continuing_agent_has_the_role_of_the_initiator() {
     let text = r#"<scxml initial="1">
         <state id="1"><transition performative="cfp" from="a" to="b" target="2"/></state>
         <state id="2"><transition performative="propose" from="b" to="a" target="3"/></state>
@@ -148,7 +148,7 @@ fn where_all_have_one_state_it_is_the_initiators_part() {
     assert_eq!(stage.wrong(unasked).kind, Kind::WrongReply);
     let accept = own("accept-proposal dan>ben").in_reply_to("b");
     assert_eq!(stage.right(accept), "4");
-    // Who watches himself knows nobody's role here: nothing is wrong that the initiator may say.
+    // The monitor of dan does not know the roles: every message that the initiator may send fits.
     let mut stage = Stage::new(Monitor::agent(library, "dan"));
     let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
     for words in [
@@ -163,7 +163,7 @@ fn where_all_have_one_state_it_is_the_initiators_part() {
 }
 
 #[test]
-fn the_recruited_know_who_goes_on() {
+fn recruited_agents_accept_messages_of_the_agent_in_reply_to() {
     let mut stage = Stage::new(Monitor::agent(library(), "ben"));
     stage.right(say("cfp rec>ben,cid").reply_to(["dan"]));
     stage.right(say("propose ben>dan"));
@@ -175,7 +175,7 @@ fn the_recruited_know_who_goes_on() {
     assert_eq!(stage.right(say("inform ben>dan")), "done");
 }
 
-/// Dan knows nothing but what he is told.
+/// A monitor of dan, which has not seen the beginning of the conversation.
 fn as_dan(with: impl FnOnce(&mut Stage)) -> Stage {
     let mut stage = Stage::new(Monitor::agent(library(), "dan"));
     with(&mut stage);
@@ -185,9 +185,9 @@ fn as_dan(with: impl FnOnce(&mut Stage)) -> Stage {
 }
 
 #[test]
-fn who_was_not_told_the_beginning_goes_on_by_the_rules() {
+fn an_agent_that_joins_late_is_checked_from_its_first_answer_on() {
     let mut stage = as_dan(|stage| {
-        // Not before he knows of a proposal.
+        // Not before dan has received a proposal.
         assert_eq!(
             stage.wrong(say("accept-proposal dan>ben")).kind,
             Kind::NotOpened
@@ -217,36 +217,36 @@ fn who_was_not_told_the_beginning_goes_on_by_the_rules() {
 }
 
 #[test]
-fn who_was_not_told_the_beginning_learns_of_others_by_what_they_answer() {
+fn an_agent_that_joins_late_infers_participants_from_their_answers() {
     let mut stage = as_dan(|_| {});
     let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
     assert_eq!(stage.check(&say("propose cid>dan")), elsewhere);
     stage.right(say("reject-proposal dan>cid"));
-    // That ann has called again, he was not told; nor that it was she who began.
+    // Dan has not received the second call of ann, and does not know the initiator.
     assert_eq!(stage.check(&say("propose cid>dan")), elsewhere);
     stage.right(say("accept-proposal dan>cid,ben"));
     assert_eq!(stage.check(&say("cfp ann>dan")), elsewhere);
-    // What answers nothing in this protocol is wrong, whatever was said before.
+    // A message that is no answer in this protocol is a violation in every state.
     assert_eq!(stage.wrong(say("agree ben>dan")).kind, Kind::Unexpected);
-    // Another protocol around this one is as unknown.
+    // An enclosing protocol is unknown too.
     assert_eq!(stage.check(&recruit("inform rec>dan")), elsewhere);
     assert_eq!(stage.monitor.len(), 1);
-    // How far it has come is not known: nothing is said about its end.
+    // The state is unknown, so the end of the conversation is not reported.
     assert_eq!(stage.pass(10_000), []);
     assert!(stage.monitor.is_empty());
 }
 
 #[test]
-fn who_lets_others_get_the_answers_does_not_hear_all() {
+fn an_initiator_with_reply_to_does_not_receive_all_messages() {
     let mut stage = Stage::new(Monitor::agent(library(), "ann"));
     let due = Time::from_system_time(stage.now + Duration::from_secs(5)).unwrap();
     stage.right(say("cfp ann>ben,cid").reply_to(["dan"]).reply_by(due));
-    // What was proposed to dan, and that he has accepted it, ann has not heard.
+    // Ann has not received the proposal to dan or its acceptance.
     let done = || say("inform ben>ann,dan").reply_with("b");
     let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
     assert_eq!(stage.check(&done()), elsewhere);
     assert_eq!(stage.wrong(done()).kind, Kind::Repeated);
-    // She knows whom she has asked, and what can be answered.
+    // She knows the participants and the possible answers.
     for (words, kind) in [
         ("inform eve>ann", Kind::Stranger),
         ("inform ben>eve", Kind::WrongReceiver),
@@ -256,24 +256,24 @@ fn who_lets_others_get_the_answers_does_not_hear_all() {
     ] {
         assert_eq!(stage.wrong(say(words)).kind, kind, "{words}");
     }
-    // Nor does she hear whether something is overdue.
+    // Her monitor does not know whether a message is overdue.
     assert_eq!(stage.pass(6), []);
     assert_eq!(stage.pass(10_000), []);
     assert!(stage.monitor.is_empty());
-    // Within another conversation as well.
+    // The same holds within another conversation.
     let mut stage = Stage::new(Monitor::agent(library(), "rec"));
     stage.right(recruit("proxy ann>rec"));
     stage.right(recruit("agree rec>ann"));
     stage.right(say("cfp rec>ben").reply_to(["ann"]));
     assert_eq!(stage.check(&say("inform ben>rec")), elsewhere);
-    // Who gets the answers himself hears all.
+    // An initiator that names itself receives all answers.
     let mut stage = Stage::new(Monitor::agent(library(), "ann"));
     stage.right(say("cfp ann>ben").reply_to(["ann"]));
     assert_eq!(stage.wrong(say("inform ben>ann")).kind, Kind::OutOfOrder);
 }
 
 #[test]
-fn what_may_lead_to_several_states_is_not_judged() {
+fn an_answer_that_may_lead_to_several_states_is_not_checked() {
     let text = r#"<scxml initial="1" xmlns:f="urn:fipa-rs:protocol" f:scope="participant">
         <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
         <state id="2"><transition performative="inform" from="b" to="a" target="3"/></state>
@@ -293,13 +293,13 @@ fn what_may_lead_to_several_states_is_not_judged() {
     );
     let stranger = stage.wrong(own("confirm dan>cid"));
     assert_eq!(stranger.kind, Kind::WrongReceiver);
-    // As little after something was not delivered.
+    // The same holds after an undelivered message.
     assert_eq!(stage.right(own("failure host-mts>dan")), "elsewhere");
     assert_eq!(stage.check(&own("confirm dan>ben")), elsewhere);
 }
 
 #[test]
-fn who_had_others_recruited_goes_on_with_them() {
+fn the_initiator_of_a_recruiting_continues_with_the_recruited_agents() {
     let mut stage = Stage::new(Monitor::agent(library(), "ann"));
     stage.right(recruit("proxy ann>rec"));
     stage.right(recruit("agree rec>ann"));
@@ -322,14 +322,14 @@ fn who_had_others_recruited_goes_on_with_them() {
 }
 
 #[test]
-fn what_is_told_keeps_a_conversation_from_being_forgotten() {
+fn unchecked_answers_keep_a_conversation_from_being_removed() {
     let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
     let mut stage = as_dan(|_| {});
     stage.pass(3_000);
     assert_eq!(stage.check(&say("propose ben>dan")), elsewhere);
     stage.pass(1_000);
     assert_eq!(stage.monitor.len(), 1);
-    // Within another conversation it keeps that one.
+    // Within another conversation, they keep that one too.
     let mut stage = Stage::new(Monitor::agent(library(), "ann"));
     stage.right(recruit("proxy ann>rec"));
     stage.right(recruit("agree rec>ann"));
@@ -344,7 +344,7 @@ fn what_is_told_keeps_a_conversation_from_being_forgotten() {
 }
 
 #[test]
-fn what_began_elsewhere_is_bounded_like_all_else() {
+fn the_limits_apply_to_conversations_that_began_elsewhere() {
     let mut limits = Limits::default();
     (limits.conversations, limits.participants, limits.embedded) = (4, 3, 1);
     let monitor = Monitor::agent(library(), "dan").with_limits(limits);
@@ -367,7 +367,7 @@ fn what_began_elsewhere_is_bounded_like_all_else() {
     stage.right(say("accept-proposal dan>3"));
     let fourth = stage.wrong(say("accept-proposal dan>4"));
     assert_eq!(fourth.kind, Kind::WrongReceiver);
-    // Within another.
+    // Embedded conversations.
     let monitor = Monitor::agent(library(), "ann").with_limits(limits);
     let mut stage = Stage::new(monitor);
     stage.right(recruit("proxy ann>rec"));

@@ -1,4 +1,4 @@
-//! Small print: what a violation says was expected, and bounds that are met exactly.
+//! Details: the expected messages of violations, and bounds that are met exactly.
 
 use super::*;
 
@@ -19,11 +19,11 @@ fn expected(violation: &Violation) -> Vec<String> {
 }
 
 #[test]
-fn what_is_expected_is_told_of_the_participant_concerned() {
+fn expected_messages_are_those_of_the_concerned_participant() {
     let mut stage = Stage::observer();
     stage.right(say("cfp ann>ben,cid"));
     stage.right(say("propose ben>ann"));
-    // Of both a message was not delivered, in different states.
+    // A message to each participant was not delivered, in different states.
     stage.right(say("failure ams>ben"));
     stage.right(say("refuse cid>ann"));
     stage.right(say("failure ams>cid"));
@@ -38,7 +38,7 @@ fn what_is_expected_is_told_of_the_participant_concerned() {
 }
 
 #[test]
-fn while_cancelling_its_answer_is_expected() {
+fn the_answer_to_a_cancel_is_expected_during_the_cancel() {
     let mut stage = Stage::observer();
     stage.right(request("request ann>ben"));
     stage.right(request("cancel ann>ben"));
@@ -47,14 +47,14 @@ fn while_cancelling_its_answer_is_expected() {
         panic!("{violation:?}");
     };
     assert_eq!(answer.performative, "inform, failure");
-    // Only then.
+    // Only during a cancel.
     stage.right(request("inform ben>ann"));
     let violation = stage.wrong(request("agree ben>ann"));
     assert_eq!(expected(&violation), Vec::<String>::new());
 }
 
 #[test]
-fn what_is_expected_is_listed_by_who_says_it_to_whom() {
+fn expected_messages_are_grouped_by_sender_and_receiver() {
     let mut stage = stage_of(
         r#"<scxml initial="1">
         <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
@@ -111,7 +111,7 @@ fn the_initiator_need_not_be_the_first_role_of_the_file() {
 }
 
 #[test]
-fn a_failure_ends_only_what_is_written_in_the_form_of_fipa_acl() {
+fn a_failure_of_a_party_ends_only_protocols_in_the_format_of_fipa_acl() {
     let text = r#"<scxml initial="1" NAMESPACE>
         <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
         <state id="2"><transition performative="inform" from="b" to="a" target="3"/></state>
@@ -127,7 +127,7 @@ fn a_failure_ends_only_what_is_written_in_the_form_of_fipa_acl() {
 }
 
 #[test]
-fn as_many_participants_as_may_be() {
+fn the_limit_of_participants_is_exact() {
     let text = r#"<scxml initial="1">
         <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
         <state id="2"><transition performative="agree" from="b" to="a" target="3"/></state>
@@ -144,12 +144,12 @@ fn as_many_participants_as_may_be() {
 }
 
 #[test]
-fn an_answer_that_crossed_the_cancel_may_come_after_it_was_not_delivered() {
+fn an_answer_that_crossed_an_undelivered_cancel_is_accepted() {
     let mut stage = Stage::observer();
     stage.right(request("request ann>ben"));
     stage.right(request("agree ben>ann"));
     stage.right(request("cancel ann>ben"));
-    // This may be the result as well as the answer to the cancel.
+    // This may be the result or the answer to the cancel.
     assert_eq!(stage.right(request("inform ben>ann")), "cancelled");
     stage.right(request("failure ams>ben"));
     assert_eq!(stage.right(request("inform ben>ann")), "cancelled");
@@ -157,11 +157,11 @@ fn an_answer_that_crossed_the_cancel_may_come_after_it_was_not_delivered() {
 }
 
 #[test]
-fn of_many_deadlines_those_that_count_are_kept() {
+fn valid_deadlines_are_kept_among_many_stale_ones() {
     let mut stage = Stage::observer();
     let due = Time::from_system_time(stage.now + Duration::from_secs(50)).unwrap();
     stage.right(say("cfp ann>ben").reply_by(due));
-    // Deadlines that were met, far more than there are conversations.
+    // Stale deadlines, many more than there are conversations.
     for number in 0..3_000 {
         let id = format!("s{number}");
         let subscribe = say_in("fipa-contract-net", "cfp ann>ben").conversation_id(id.clone());
@@ -183,7 +183,7 @@ fn of_many_deadlines_those_that_count_are_kept() {
 }
 
 #[test]
-fn so_many_get_replies_instead_of_the_initiator() {
+fn the_number_of_agents_in_reply_to_is_bounded() {
     let mut stage = Stage::observer();
     let names = (1..=65).map(|number| format!("d{number}"));
     stage.right(request("request ann>ben").reply_to(names));
@@ -193,7 +193,7 @@ fn so_many_get_replies_instead_of_the_initiator() {
 }
 
 #[test]
-fn nothing_is_cancelled_with_who_was_told_nothing() {
+fn a_cancel_to_an_agent_without_a_message_is_refused() {
     let mut stage = Stage::observer();
     stage.right(request("request ann>ben"));
     for words in ["cancel ann>cid", "not-understood ann>cid"] {
@@ -207,7 +207,7 @@ fn nothing_is_cancelled_with_who_was_told_nothing() {
 }
 
 #[test]
-fn what_one_side_asked_is_not_what_the_other_did() {
+fn in_reply_to_is_compared_with_the_other_side_only() {
     let mut stage = Stage::observer();
     stage.right(request("request ann>ben").reply_with("q"));
     stage.right(request("agree ben>ann").in_reply_to("q").reply_with("a"));
@@ -219,7 +219,7 @@ fn what_one_side_asked_is_not_what_the_other_did() {
 }
 
 #[test]
-fn among_three_nobody_knows_what_an_answer_is_to() {
+fn in_reply_to_is_not_compared_among_three_participants() {
     let mut stage = stage_of(
         r#"<scxml initial="1">
         <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
@@ -233,7 +233,7 @@ fn among_three_nobody_knows_what_an_answer_is_to() {
 }
 
 #[test]
-fn who_has_cancelled_waits() {
+fn the_side_that_canceled_must_wait_for_the_answer() {
     let mut stage = Stage::observer();
     let ask = || request("request ann>ben").reply_with("q");
     stage.right(ask());
@@ -244,7 +244,7 @@ fn who_has_cancelled_waits() {
 }
 
 #[test]
-fn a_member_of_a_multicast_is_brought_in_by_its_answer() {
+fn the_answer_of_a_multicast_member_adds_it_as_participant() {
     let mut stage = Stage::observer();
     let mut opens = |words| match stage.check(&say(words)) {
         Verdict::Accepted(accepted) => accepted.opened,
@@ -257,7 +257,7 @@ fn a_member_of_a_multicast_is_brought_in_by_its_answer() {
 }
 
 #[test]
-fn what_is_due_now_is_not_late() {
+fn a_message_at_its_deadline_is_not_late() {
     let mut stage = Stage::observer();
     let due = Time::from_system_time(stage.now + Duration::from_secs(5)).unwrap();
     stage.right(say("cfp ann>ben,cid").reply_by(due));
@@ -274,7 +274,7 @@ fn what_is_due_now_is_not_late() {
 }
 
 #[test]
-fn who_begins_may_begin_protocols_within() {
+fn the_initiator_may_begin_embedded_protocols() {
     let mut stage = stage_of(
         r#"<scxml initial="start" xmlns:fipa="urn:fipa-rs:protocol" fipa:scope="participant">
         <state id="asked">
@@ -294,7 +294,7 @@ fn who_begins_may_begin_protocols_within() {
 }
 
 #[test]
-fn what_was_not_understood_need_not_be_cancelled() {
+fn not_understood_during_a_cancel_ends_the_conversation() {
     let mut stage = Stage::observer();
     stage.right(request("request ann>ben").reply_with("q"));
     stage.right(request("cancel ann>ben").reply_with("x"));
@@ -304,7 +304,7 @@ fn what_was_not_understood_need_not_be_cancelled() {
 }
 
 #[test]
-fn an_acceptance_is_repeated_like_all_else() {
+fn a_repeated_acceptance_is_a_violation() {
     let mut stage = Stage::observer();
     stage.right(say("cfp ann>ben"));
     stage.right(say("propose ben>ann"));
@@ -319,14 +319,14 @@ const ONE_STATE: &str = r#"<scxml initial="1">
     <state id="3" final="yes"/></scxml>"#;
 
 #[test]
-fn who_is_told_twice_is_told() {
+fn a_receiver_that_is_named_twice_is_accepted() {
     let mut stage = stage_of(ONE_STATE);
     stage.right(own("request ann>ben,ben"));
     assert_eq!(stage.right(own("agree ben>ann")), "3");
 }
 
 #[test]
-fn who_begins_may_name_himself_and_others_for_the_replies() {
+fn the_initiator_may_name_itself_and_others_in_reply_to() {
     let mut stage = stage_of(ONE_STATE);
     stage.right(own("request ann>ben").reply_to(["ann", "dan"]));
     assert_eq!(stage.right(own("agree ben>ann,dan")), "3");
@@ -343,7 +343,7 @@ fn who_begins_may_name_himself_and_others_for_the_replies() {
 }
 
 #[test]
-fn among_many_participants_each_goes_its_own_way() {
+fn many_participants_have_independent_states() {
     let mut stage = Stage::observer();
     stage.right(say("cfp ann>1,2,3,4,5,6,7,8,9,10"));
     stage.right(say("refuse 9>ann"));
@@ -354,7 +354,7 @@ fn among_many_participants_each_goes_its_own_way() {
 }
 
 #[test]
-fn the_longest_text_is_taken() {
+fn texts_of_the_maximum_length_are_accepted() {
     let mut stage = Stage::observer();
     let with = |length| request("request ann>ben").conversation_id("x".repeat(length));
     stage.right(with(4_096));
@@ -363,20 +363,20 @@ fn the_longest_text_is_taken() {
 }
 
 #[test]
-fn what_is_over_within_does_not_end_what_it_is_within() {
+fn the_end_of_an_embedded_conversation_does_not_end_the_outer_one() {
     let mut stage = Stage::observer();
     let broker = |words| say_in("fipa-brokering", words);
     stage.right(broker("proxy ann>bro"));
     stage.right(broker("agree bro>ann"));
     stage.right(request("request bro>ben"));
     stage.right(request("inform ben>bro"));
-    // What is over is forgotten after a minute, what is silent after an hour.
+    // A conversation is removed one minute after its end, or one hour after its last message.
     assert_eq!(stage.pass(120), []);
     stage.right(broker("inform bro>ann"));
 }
 
 #[test]
-fn what_time_has_ended_is_kept_no_longer_than_what_has_ended_otherwise() {
+fn a_conversation_that_a_timeout_ended_is_kept_as_long_as_any_ended_one() {
     let mut stage = stage_of(
         r#"<scxml initial="1" xmlns:fipa="urn:fipa-rs:protocol" fipa:scope="participant">
         <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>

@@ -1,5 +1,5 @@
-//! What a monitor makes of whole conversations: several participants, crossing and repeated
-//! messages, time, conversations within others, and what it forgets.
+//! Verdicts on whole conversations: several participants, crossing and repeated messages, timeouts,
+//! embedded conversations, and the removal of conversations.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -19,7 +19,7 @@ use fipa_monitor::{
 
 const START: Duration = Duration::from_secs(1_700_000_000);
 
-/// A monitor, and a clock that is moved by hand.
+/// A monitor and a simulated clock.
 struct Stage {
     monitor: Monitor,
     now: SystemTime,
@@ -43,7 +43,7 @@ impl Stage {
         self.monitor.check(header, self.now)
     }
 
-    /// The new state.
+    /// Checks a message that must be accepted. Returns the new state.
     fn right(&mut self, header: Header<'_>) -> String {
         match self.check(&header) {
             Verdict::Accepted(accepted) => accepted.state.to_owned(),
@@ -68,7 +68,7 @@ fn act(name: &str) -> Performative {
     name.parse().unwrap()
 }
 
-/// `"cfp ann>ben,cid"` in conversation c of the contract net.
+/// The message `"cfp ann>ben,cid"` in conversation c of the contract net.
 fn say(words: &'static str) -> Header<'static> {
     say_in("fipa-contract-net", words)
 }
@@ -94,7 +94,7 @@ fn each_participant_has_a_state_of_its_own() {
     stage.right(say("propose ben>ann"));
     stage.right(say("refuse cid>ann"));
     stage.right(say("propose dan>ann"));
-    // One message to several is right when it is with all of them, and else moves nobody.
+    // A message to several agents must fit all of them. Otherwise it changes no state.
     let violation = stage.wrong(say("reject-proposal ann>ben,eve"));
     assert_eq!(violation.participant.as_deref(), Some("eve"));
     assert_eq!(violation.state.as_deref(), Some("called"));
@@ -116,7 +116,7 @@ fn each_participant_has_a_state_of_its_own() {
 }
 
 #[test]
-fn a_call_may_come_letter_by_letter_or_to_a_pattern() {
+fn a_call_may_be_sent_in_several_letters_or_to_a_pattern() {
     let mut stage = Stage::observer();
     stage.right(say("cfp ann>ben"));
     stage.right(say("cfp ann>cid"));
@@ -133,15 +133,15 @@ fn a_call_may_come_letter_by_letter_or_to_a_pattern() {
 }
 
 #[test]
-fn a_violation_says_all_about_it() {
+fn a_violation_describes_message_state_and_expected_messages() {
     let mut stage = Stage::observer();
     stage.right(say("cfp ann>ben"));
     let violation = stage.wrong(say("inform ben>ann"));
     assert_eq!(violation.kind, Kind::OutOfOrder);
     assert_eq!(
         violation.to_string(),
-        "inform from ben to ann breaks fipa-contract-net in conversation \"c\": too early, a step \
-         is missing; state \"called\" with ben; expected refuse, propose from ben to ann"
+        "inform from ben to ann breaks fipa-contract-net in conversation \"c\": the message is \
+         too early, a step is missing; state \"called\" with ben; expected refuse, propose from ben to ann"
     );
     assert_eq!(stage.wrong(say("propose ann>ben")).kind, Kind::WrongSender);
     assert_eq!(
@@ -169,7 +169,7 @@ fn a_violation_says_all_about_it() {
 }
 
 #[test]
-fn what_is_not_checked() {
+fn messages_without_conversation_protocol_or_agents_are_unchecked() {
     let mut stage = Stage::observer();
     for (header, why) in [
         (
@@ -207,7 +207,7 @@ fn what_is_not_checked() {
 }
 
 #[test]
-fn a_message_without_protocol_is_one_of_its_conversation() {
+fn a_message_without_protocol_belongs_to_its_conversation() {
     let mut stage = Stage::observer();
     stage.right(say_in("contractNet", "cfp ann>ben"));
     let header = Header::new(act("propose"))
@@ -219,7 +219,7 @@ fn a_message_without_protocol_is_one_of_its_conversation() {
 }
 
 #[test]
-fn messages_and_views_of_them_are_read_alike() {
+fn messages_and_their_views_have_the_same_verdicts() {
     let mut ours = Message::builder(Performative::Request)
         .sender(AgentId::new("ann").unwrap())
         .receiver(AgentId::new("ben").unwrap())
@@ -249,7 +249,7 @@ fn messages_and_views_of_them_are_read_alike() {
 }
 
 #[test]
-fn answers_name_what_they_answer() {
+fn in_reply_to_must_match_reply_with() {
     let mut stage = Stage::observer();
     stage.right(request("request ann>ben").reply_with("q1"));
     let wrong = stage.wrong(request("agree ben>ann").in_reply_to("q0"));
@@ -257,7 +257,7 @@ fn answers_name_what_they_answer() {
     stage.right(request("agree ben>ann").in_reply_to("q1").reply_with("a1"));
     let again = request("agree ben>ann").in_reply_to("q1").reply_with("a1");
     assert_eq!(stage.wrong(again).kind, Kind::Repeated);
-    // fipa_services does not write it.
+    // fipa_services does not write `in-reply-to`.
     stage.right(request("inform ben>ann"));
     let mut stage = Stage::observer();
     stage.right(request("request ann>ben").reply_with("q1"));
@@ -268,7 +268,7 @@ fn answers_name_what_they_answer() {
 }
 
 #[test]
-fn cancel_and_what_crosses_it() {
+fn messages_that_cross_a_cancel_are_accepted() {
     let subscribe = |words| say_in("fipa-subscribe", words);
     let mut stage = Stage::observer();
     stage.right(subscribe("subscribe ann>ben").reply_with("s"));
@@ -277,7 +277,7 @@ fn cancel_and_what_crosses_it() {
         stage.right(subscribe("cancel ann>ben").reply_with("x")),
         "cancelling"
     );
-    // On its way already: the answer to the subscription, not to the cancel.
+    // A crossing message: the answer to the subscription, not to the cancel.
     assert_eq!(
         stage.right(subscribe("inform ben>ann").in_reply_to("s")),
         "cancelling"
@@ -300,21 +300,21 @@ fn cancel_and_what_crosses_it() {
             .kind,
         Kind::Ended
     );
-    // Without in-reply-to nobody can tell which inform is which: one more may come.
+    // Without `in-reply-to`, either inform may be the answer to the cancel: a second one may come.
     let mut stage = Stage::observer();
     stage.right(request("request ann>ben"));
     stage.right(request("cancel ann>ben"));
     assert_eq!(stage.right(request("inform ben>ann")), "cancelled");
     assert_eq!(stage.right(request("inform ben>ann")), "cancelled");
     stage.wrong(request("inform ben>ann"));
-    // The participant does not cancel, by the standard.
+    // In the standard, a participant cannot cancel.
     let mut stage = Stage::observer();
     stage.right(request("request ann>ben"));
     stage.wrong(request("cancel ben>ann"));
 }
 
 #[test]
-fn who_knew_of_the_end_cannot_cancel() {
+fn an_agent_that_received_the_end_cannot_cancel() {
     let run = |monitor| {
         let mut stage = Stage::new(monitor);
         stage.right(request("request ann>ben"));
@@ -326,11 +326,14 @@ fn who_knew_of_the_end_cannot_cancel() {
         "it may have crossed the inform"
     );
     assert!(run(Monitor::agent(library(), "ben")), "likewise");
-    assert!(!run(Monitor::agent(library(), "ann")), "she had got it");
+    assert!(
+        !run(Monitor::agent(library(), "ann")),
+        "she had received it"
+    );
 }
 
 #[test]
-fn a_letter_that_was_not_delivered_can_be_sent_again() {
+fn an_undelivered_letter_can_be_sent_again() {
     let mut stage = Stage::observer();
     stage.right(request("request ann>ben").reply_with("1"));
     assert_eq!(
@@ -341,14 +344,14 @@ fn a_letter_that_was_not_delivered_can_be_sent_again() {
         stage.right(request("request ann>ben").reply_with("2")),
         "requested"
     );
-    // To what, is not said: it is about the last one.
+    // The report does not name a message: it concerns the last one.
     assert_eq!(stage.right(request("failure host-mts>ann")), "undelivered");
     assert_eq!(
         stage.right(request("agree ben>ann")),
         "agreed",
         "it had arrived after all"
     );
-    // Of several participants the content says whom it is about; nobody's state is touched.
+    // With several participants, only the content names the concerned one, so no state changes.
     let mut stage = Stage::observer();
     stage.right(say("cfp ann>ben,cid"));
     stage.right(say("failure host-mts>ann"));
@@ -361,7 +364,7 @@ fn a_letter_that_was_not_delivered_can_be_sent_again() {
 }
 
 #[test]
-fn an_agent_may_talk_to_itself() {
+fn an_agent_may_send_to_itself() {
     let mut stage = Stage::observer();
     for words in ["request ann>ann", "agree ann>ann", "inform ann>ann"] {
         stage.right(request(words));
@@ -370,7 +373,7 @@ fn an_agent_may_talk_to_itself() {
 }
 
 #[test]
-fn time_runs_out() {
+fn overdue_messages_are_reported_and_late_answers_are_marked() {
     let mut stage = Stage::observer();
     let by = |stage: &Stage| Time::from_system_time(stage.now + Duration::from_secs(5)).unwrap();
     let due = by(&stage);
@@ -394,7 +397,7 @@ fn time_runs_out() {
     stage.wrong(say("accept-proposal ann>cid"));
     stage.right(say("reject-proposal ann>cid"));
     stage.right(say("accept-proposal ann>ben"));
-    // Where the protocol has no state for it, an answer is just late.
+    // Without a timeout transition, an answer is only marked as late.
     let due = by(&stage);
     let ask = request("request ann>ben")
         .conversation_id("r")
@@ -410,7 +413,7 @@ fn time_runs_out() {
         panic!();
     };
     assert!(late.late && late.state == "agreed");
-    // Also without anybody calling handle_timeout.
+    // The same holds without a call of `handle_timeout`.
     let due = by(&stage);
     stage.right(say("cfp ann>ben").conversation_id("d").reply_by(due));
     stage.now += Duration::from_secs(9);
@@ -421,7 +424,7 @@ fn time_runs_out() {
 }
 
 #[test]
-fn states_have_time_outs_of_their_own() {
+fn states_have_timeouts_of_their_own() {
     let text = r#"<scxml initial="1" xmlns:f="urn:fipa-rs:protocol" f:scope="participant">
         <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
         <state id="2"><transition performative="inform" from="b" to="a" target="3"/>
@@ -447,7 +450,7 @@ fn states_have_time_outs_of_their_own() {
 }
 
 #[test]
-fn brokers_run_protocols_within() {
+fn brokers_run_embedded_protocols() {
     let broker = |words| say_in("fipa-brokering", words);
     let mut stage = Stage::observer();
     stage.right(broker("proxy ann>bro"));
@@ -458,7 +461,7 @@ fn brokers_run_protocols_within() {
     stage.right(broker("agree bro>ann"));
     stage.right(say_in("fipa-query", "query-ref bro>ben,cid"));
     stage.right(say_in("fipa-request", "request bro>dan"));
-    // What is wrong in the query that is there is no other one.
+    // A violation in the existing query does not begin another one.
     let own = stage.wrong(say_in("fipa-query", "inform bro>cid"));
     assert_eq!(own.kind, Kind::WrongSender);
     assert_eq!(
@@ -486,7 +489,10 @@ fn brokers_run_protocols_within() {
         "eve came into the query that was there"
     );
     stage.pass(100_000);
-    assert!(stage.monitor.is_empty(), "forgotten with all within");
+    assert!(
+        stage.monitor.is_empty(),
+        "removed with its embedded conversations"
+    );
 }
 
 #[test]
@@ -509,11 +515,11 @@ fn a_bid_that_crosses_the_next_call_is_late_and_no_violation() {
         };
         assert_eq!((accepted.state, accepted.late), ("called", true));
         assert!(accepted.void);
-        // It was void: there is nothing to accept, and the last call can be answered.
+        // The bid was void: it cannot be accepted, and the last call can still be answered.
         stage.wrong(auction("accept-proposal auc>ben"));
         assert_eq!(stage.right(bid("20")), "bidding");
     }
-    // Who bids knows the last call, or else the call comes when the bid has left.
+    // The bidder has received the last call, or the call arrives after the bid was sent.
     let mut stage = Stage::new(Monitor::agent(library(), "ben"));
     stage.right(auction("inform auc>ben"));
     stage.right(call("10"));
@@ -526,7 +532,7 @@ fn a_bid_that_crosses_the_next_call_is_late_and_no_violation() {
 }
 
 #[test]
-fn what_is_over_or_abandoned_is_forgotten() {
+fn ended_and_abandoned_conversations_are_removed() {
     let mut stage = Stage::observer();
     for id in ["done", "open", "won"] {
         stage.right(request("request ann>ben").conversation_id(id));
@@ -555,7 +561,7 @@ fn what_is_over_or_abandoned_is_forgotten() {
 }
 
 #[test]
-fn there_is_room_for_so_many() {
+fn the_limits_are_enforced() {
     let mut limits = Limits::default();
     (limits.conversations, limits.participants, limits.embedded) = (3, 4, 2);
     let mut stage = Stage::new(Monitor::observer(library()).with_limits(limits));
@@ -569,7 +575,7 @@ fn there_is_room_for_so_many() {
         (3, 0),
         "2 was over"
     );
-    // What begins nothing drives nothing out.
+    // A message that begins no conversation evicts none.
     stage.wrong(request("agree ann>ben").conversation_id("5"));
     assert_eq!(stage.monitor.forgotten(), 0);
     stage.right(request("request ann>ben").conversation_id("5"));
@@ -590,7 +596,7 @@ fn there_is_room_for_so_many() {
     let more = say("cfp ann>1,2,3,4,5").conversation_id("too many");
     let too_large = Verdict::Unchecked(Unchecked::TooLarge);
     assert_eq!(stage.check(&more), too_large);
-    // Conversations within.
+    // Embedded conversations.
     let mut stage = Stage::new(Monitor::observer(library()).with_limits({
         limits.conversations = 100;
         limits

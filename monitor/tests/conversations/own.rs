@@ -1,14 +1,14 @@
-//! Agents that watch their own conversations: what they cannot know is no violation.
+//! Monitors of one agent: a message that the monitor cannot check is no violation.
 
 use super::*;
 
 #[test]
-fn an_agent_knows_nothing_of_others_who_are_told_the_same() {
+fn an_agents_monitor_ignores_the_other_receivers_of_a_message() {
     let iterated = |words| say_in("fipa-iterated-contract-net", words);
     let mut stage = Stage::new(Monitor::agent(library(), "ben"));
     stage.right(iterated("cfp ann>ben,cid"));
     stage.right(iterated("propose ben>ann"));
-    // That cid has proposed, too, only ann can tell.
+    // Only ann knows whether cid has proposed too.
     assert_eq!(stage.right(iterated("cfp ann>cid,ben")), "called");
     assert_eq!(
         stage.wrong(iterated("cfp ann>ben,cid")).kind,
@@ -24,26 +24,26 @@ fn an_agent_knows_nothing_of_others_who_are_told_the_same() {
 }
 
 #[test]
-fn who_had_others_recruited_cannot_check_their_answers() {
+fn answers_of_recruited_agents_are_not_checked_for_the_initiator() {
     let recruit = |words| say_in("fipa-recruiting", words);
     let mut stage = Stage::new(Monitor::agent(library(), "ann"));
     stage.right(recruit("proxy ann>rec"));
     let answer = || say_in("fipa-query", "inform ben>ann");
-    // Nobody can have been asked yet.
+    // No agent can have been asked yet.
     assert_eq!(stage.wrong(answer()).kind, Kind::WrongProtocol);
     stage.right(recruit("agree rec>ann"));
     let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
     assert_eq!(stage.check(&answer()), elsewhere);
     stage.right(recruit("inform rec>ann"));
     assert_eq!(stage.check(&answer()), elsewhere);
-    // Those who take part in the recruiting itself are no strangers.
+    // A participant of the recruiting is no stranger.
     let known = stage.wrong(say_in("fipa-query", "inform rec>ann"));
     assert_eq!(known.kind, Kind::NotOpened);
     let own = stage.wrong(say_in("fipa-query", "query-ref ann>ben"));
     assert_eq!(own.kind, Kind::Ended);
     let own = stage.wrong(request("request ann>ben"));
     assert_eq!(own.kind, Kind::WrongProtocol);
-    // The recruiter has begun all there is itself.
+    // The recruiter itself has begun all embedded conversations.
     let mut stage = Stage::new(Monitor::agent(library(), "rec"));
     stage.right(recruit("proxy ann>rec"));
     stage.right(recruit("agree rec>ann"));
@@ -52,8 +52,8 @@ fn who_had_others_recruited_cannot_check_their_answers() {
 }
 
 #[test]
-fn who_is_named_in_reply_to_cannot_check_the_answers() {
-    // That dan gets them, only ann and ben know.
+fn answers_are_not_checked_for_an_agent_that_a_reply_to_names() {
+    // Only ann and ben know that dan receives the answers.
     let mut stage = Stage::new(Monitor::agent(library(), "dan"));
     let elsewhere = Verdict::Unchecked(Unchecked::BegunElsewhere);
     for words in ["agree ben>dan", "agree ben>dan", "not-understood cid>dan"] {
@@ -61,14 +61,14 @@ fn who_is_named_in_reply_to_cannot_check_the_answers() {
     }
     let answer = say_in("fipa-query", "inform ben>dan");
     let Verdict::Accepted(accepted) = stage.check(&answer) else {
-        panic!("it follows what ben has said before");
+        panic!("it follows the earlier message of ben");
     };
     assert_eq!((accepted.state, accepted.elsewhere), ("answered", true));
     let bid = say_in("fipa-contract-net", "propose ben>dan");
     assert_eq!(stage.check(&bid.conversation_id("d")), elsewhere);
     assert_eq!(stage.monitor.len(), 2);
     let mut stage = Stage::new(Monitor::agent(library(), "dan"));
-    // What is no answer, in no state; what only an initiator says; what dan says himself.
+    // Not an answer in any state, or only a message of the initiator, or a message of dan.
     for (protocol, words) in [
         ("fipa-query", "propose ben>dan"),
         ("fipa-query", "cancel ben>dan"),
@@ -79,11 +79,11 @@ fn who_is_named_in_reply_to_cannot_check_the_answers() {
         let wrong = stage.wrong(say_in(protocol, words));
         assert_eq!(wrong.kind, Kind::NotOpened, "{words}");
     }
-    // A conversation that does begin is one.
+    // A message that begins a conversation is checked.
     stage.right(say_in("fipa-query", "query-ref ben>dan"));
     let wrong = stage.wrong(say_in("fipa-query", "inform ben>dan"));
     assert_eq!(wrong.kind, Kind::WrongSender);
-    // An observer sees the beginning of everything.
+    // An observer sees the beginning of every conversation.
     let mut stage = Stage::observer();
     let wrong = stage.wrong(say_in("fipa-query", "inform ben>dan"));
     assert_eq!(wrong.kind, Kind::NotOpened);

@@ -1,4 +1,4 @@
-//! Protocols in the form of fipa_acl, which has one state for all.
+//! Protocols in the format of fipa_acl, with one state for all participants.
 
 use super::*;
 
@@ -26,7 +26,7 @@ const LIFT: &str = r#"<scxml initial="1">
     <state id="5" final="yes"/></scxml>"#;
 
 #[test]
-fn a_conversation_has_one_state_for_all() {
+fn a_conversation_has_one_state_for_all_participants() {
     let mut stage = stage(LIFT);
     stage.right(lift("request ann>ben,cid"));
     stage.right(lift("agree ben>ann"));
@@ -44,7 +44,7 @@ fn a_conversation_has_one_state_for_all() {
 }
 
 #[test]
-fn anybody_cancels_and_fails() {
+fn any_participant_may_cancel_and_fail() {
     for (words, state) in [
         ("not-understood ann>ben", "not-understood"),
         ("not-understood ben>ann", "not-understood"),
@@ -63,10 +63,10 @@ fn anybody_cancels_and_fails() {
     assert_eq!(stage.right(lift("inform ann>ben")), "cancelled");
 }
 
-/// Figure 6 of the paper about fipa_acl, but that a `failure` that answers a cancel lets the conversation
-/// go on, as in FIPA00026, and does not end it.
+/// Figure 6 of the paper about fipa_acl, with one difference: after a `failure` that answers a cancel,
+/// the conversation continues, as in FIPA00026.
 #[test]
-fn states_that_every_protocol_has() {
+fn every_protocol_has_the_common_states() {
     let after = |said: &[&'static str]| {
         let mut stage = stage(LIFT);
         stage.right(lift("request ann>ben"));
@@ -112,7 +112,7 @@ fn states_that_every_protocol_has() {
         ),
         (&["failure host-mts>ann"], "undelivered", false, true),
         (&["failure ben>ann"], "undelivered", false, true),
-        // What the file says comes first.
+        // The transitions of the file take precedence.
         (&["agree ben>ann", "failure ben>ann"], "5", true, true),
     ] {
         let (mut stage, last) = after(said);
@@ -120,13 +120,13 @@ fn states_that_every_protocol_has() {
         if ["not-understood", "cancelled"].contains(&state) {
             assert_eq!(stage.wrong(lift("agree ben>ann")).kind, Kind::Ended);
         }
-        // What failed may be tried again, and what was said before it may have come.
+        // An undelivered message may be sent again, and a message before it may have arrived.
         if state == "undelivered" {
             assert_eq!(stage.wrong(lift("inform ben>ann")).kind, Kind::OutOfOrder);
             assert_eq!(stage.right(lift("agree ben>ann")), "4", "{said:?}");
         }
     }
-    // Nothing of the kind behind the end.
+    // None of these is allowed after the end.
     for words in [
         "cancel ben>ann",
         "failure ben>ann",
@@ -138,7 +138,7 @@ fn states_that_every_protocol_has() {
 }
 
 #[test]
-fn roles_are_given_when_they_are_first_used() {
+fn roles_are_bound_at_their_first_use() {
     let mut stage = stage(
         r#"<scxml initial="1">
         <state id="1"><transition performative="request" from="a" to="b" target="2"/></state>
@@ -158,13 +158,13 @@ fn roles_are_given_when_they_are_first_used() {
 }
 
 #[test]
-fn sub_protocols_begin_where_the_file_allows_it() {
+fn subprotocols_begin_in_the_states_of_the_file() {
     let mut stage = stage(
         r#"<scxml initial="1">
         <state id="1"><transition performative="propagate" from="i" to="B" target="2"/></state>
         <state id="2" final="yes"><subprotocol name="fipa-.*" from="B"/></state></scxml>"#,
     );
-    // Who is named twice has his role once.
+    // An agent that is named twice has its role once.
     stage.right(lift("propagate ann>ben,ben"));
     stage.right(request("request ben>cid"));
     stage.right(request("agree cid>ben"));

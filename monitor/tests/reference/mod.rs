@@ -1,5 +1,5 @@
-//! A second reading of the rules, written for being right and not for being fast: it shares no code
-//! with the monitor but the file's own transitions, keeps all that was said, and decides from that.
+//! A reference implementation of the rules, written for correctness and not for speed. It shares only
+//! the transitions of the files with the monitor. It keeps all messages and decides from them.
 
 use std::collections::HashMap;
 
@@ -10,7 +10,7 @@ mod talk;
 use talk::{Spot, Step, Talk, View, is_answered, judge, state};
 pub(crate) use talk::{matches, options};
 
-/// A message, in plain words.
+/// The parameters of a message.
 #[derive(Debug, Clone)]
 pub(crate) struct Words {
     pub(crate) act: &'static str,
@@ -25,16 +25,16 @@ pub(crate) struct Words {
     pub(crate) reply_by: Option<u64>,
 }
 
-/// What the reference says: the new state with opened, ended, complete, late; or the violation.
+/// The verdict of the reference: the new state with opened, ended, complete, late; or the violation.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Says {
-    Right(String, [bool; 4]),
-    Wrong(&'static str),
-    Nothing,
+pub(crate) enum ReferenceVerdict {
+    Accepted(String, [bool; 4]),
+    Violation(&'static str),
+    Unchecked,
 }
 
-/// A conversation's machine, its initiator and who may go on instead, and the state of each
-/// participant.
+/// The machine of a conversation, its initiator and the agents that may continue in its place, and the
+/// state of each participant.
 pub(crate) type Overview<'l> = (&'l Machine, Vec<&'static str>, Vec<(&'static str, String)>);
 
 pub(crate) struct Reference<'l> {
@@ -46,17 +46,17 @@ pub(crate) struct Reference<'l> {
 struct Conversation<'l> {
     machine: &'l Machine,
     initiator: &'static str,
-    /// Who watches himself.
+    /// The monitored agent.
     agent: Option<&'static str>,
-    /// One per participant, or a single one without a name.
+    /// One for each participant, or a single one without a name.
     talks: Vec<(&'static str, Talk)>,
-    /// With the members of a multicast.
+    /// The state of the members of a multicast.
     multicast: Option<Talk>,
     roles: Vec<(String, &'static str)>,
     designated: Vec<&'static str>,
-    /// Whether it began between others, who answer the agent that watches himself.
+    /// Whether it began between other agents, which answer the monitored agent.
     joined: bool,
-    /// Conversations within, the latest first.
+    /// Embedded conversations, the latest first.
     inner: Vec<Self>,
 }
 
@@ -73,7 +73,7 @@ impl<'l> Reference<'l> {
         self.talks.remove(id);
     }
 
-    /// The states of a conversation, for whoever wants to say something fitting.
+    /// Returns the states of a conversation, to choose a message that fits.
     pub(crate) fn states(&self, id: &str) -> Option<Overview<'l>> {
         let conversation = self.talks.get(id)?;
         let talks = conversation.talks.iter();
@@ -83,25 +83,25 @@ impl<'l> Reference<'l> {
         Some((conversation.machine, initiators.collect(), states.collect()))
     }
 
-    pub(crate) fn hear(&mut self, words: &Words, now: u64) -> Says {
+    pub(crate) fn check(&mut self, words: &Words, now: u64) -> ReferenceVerdict {
         if let Some(conversation) = self.talks.get_mut(&words.id) {
             let library = self.library;
             return conversation
-                .hear_any(library, words, now)
-                .unwrap_or_else(Says::Wrong);
+                .check_any(library, words, now)
+                .unwrap_or_else(ReferenceVerdict::Violation);
         }
         let named = words
             .protocol
             .as_ref()
             .and_then(|name| self.library.find(name));
         let Some(machine) = named else {
-            return Says::Nothing;
+            return ReferenceVerdict::Unchecked;
         };
         let mut conversation = Conversation::new(machine, words.from, self.agent);
-        match conversation.hear(words, now) {
-            Ok(says) => {
+        match conversation.check(words, now) {
+            Ok(verdict) => {
                 self.talks.insert(words.id.clone(), conversation);
-                says
+                verdict
             }
             Err(_) => match self.agent {
                 Some(agent)
@@ -111,9 +111,9 @@ impl<'l> Reference<'l> {
                 {
                     let joined = Conversation::joined(machine, agent, words);
                     self.talks.insert(words.id.clone(), joined);
-                    Says::Nothing
+                    ReferenceVerdict::Unchecked
                 }
-                _ => Says::Wrong("not-opened"),
+                _ => ReferenceVerdict::Violation("not-opened"),
             },
         }
     }
@@ -124,7 +124,7 @@ fn begins(machine: &Machine, act: &str) -> bool {
     first.iter().any(|first| matches(first.performative(), act))
 }
 
-/// Whether somebody may answer so, in whatever state.
+/// Whether the performative is an answer in any state.
 fn is_answer(machine: &Machine, act: &str) -> bool {
     let mut all = machine
         .states()
@@ -171,15 +171,19 @@ impl<'l> Conversation<'l> {
         }
     }
 
-    /// Whether there may be more than the agent that watches himself hears.
-    fn goes_on_elsewhere(&self) -> bool {
+    /// Whether the conversation may have messages that the monitored agent does not receive.
+    fn may_continue_elsewhere(&self) -> bool {
         self.joined || !self.designated.is_empty() && self.agent == Some(self.initiator)
     }
 
-    /// Of what does not fit a conversation that began between others, some is not known to be wrong.
-    fn elsewhere(&mut self, words: &Words, wrong: &'static str) -> Result<Says, &'static str> {
+    /// Reconsiders a violation in a conversation that began between other agents.
+    fn elsewhere(
+        &mut self,
+        words: &Words,
+        wrong: &'static str,
+    ) -> Result<ReferenceVerdict, &'static str> {
         let machine = self.machine;
-        let asked = self.goes_on_elsewhere() && self.takes_part(words.from);
+        let asked = self.may_continue_elsewhere() && self.takes_part(words.from);
         let excused = if !self.joined && (!asked || ["repeated", "wrong-receiver"].contains(&wrong))
         {
             false
@@ -205,24 +209,24 @@ impl<'l> Conversation<'l> {
             self.joined && begins(machine, words.act)
         };
         if excused {
-            Ok(Says::Nothing)
+            Ok(ReferenceVerdict::Unchecked)
         } else {
             Err(wrong)
         }
     }
 
-    /// A message of this conversation, or of one within.
-    fn hear_any(
+    /// Checks a message of this conversation, or of an embedded one.
+    fn check_any(
         &mut self,
         library: &'l Library,
         words: &Words,
         now: u64,
-    ) -> Result<Says, &'static str> {
+    ) -> Result<ReferenceVerdict, &'static str> {
         let name = match &words.protocol {
             Some(name) if !self.machine.is_called(name) => name,
             _ => {
-                let says = self.hear(words, now);
-                return says.or_else(|wrong| self.elsewhere(words, wrong));
+                let verdict = self.check(words, now);
+                return verdict.or_else(|wrong| self.elsewhere(words, wrong));
             }
         };
         let may_begin = self.may_begin(library, name, words.from)
@@ -233,9 +237,9 @@ impl<'l> Conversation<'l> {
         let (mut first_wrong, mut open) = (None, None);
         for (at, inner) in self.inner.iter_mut().enumerate() {
             if inner.machine.is_called(name) {
-                match inner.hear(words, now) {
-                    Ok(says) => return Ok(says),
-                    Err(wrong) if inner.goes_on_elsewhere() => open = Some((at, wrong)),
+                match inner.check(words, now) {
+                    Ok(verdict) => return Ok(verdict),
+                    Err(wrong) if inner.may_continue_elsewhere() => open = Some((at, wrong)),
                     Err(wrong) => first_wrong = first_wrong.or(Some(wrong)),
                 }
             }
@@ -257,25 +261,25 @@ impl<'l> Conversation<'l> {
                     let joined = Conversation::joined(machine, agent, words);
                     self.inner.insert(0, joined);
                 }
-                return Ok(Says::Nothing);
+                return Ok(ReferenceVerdict::Unchecked);
             }
             if self.joined {
-                return Ok(Says::Nothing);
+                return Ok(ReferenceVerdict::Unchecked);
             }
             return Err("wrong-protocol");
         }
         let Some(machine) = library.find(name) else {
-            return Ok(Says::Nothing);
+            return Ok(ReferenceVerdict::Unchecked);
         };
         if self.inner.len() == 64 {
             return Err("too-many");
         }
         let mut inner = Conversation::new(machine, words.from, self.agent);
-        let says = inner
-            .hear(words, now)
+        let verdict = inner
+            .check(words, now)
             .map_err(|_| first_wrong.unwrap_or("not-opened"))?;
         self.inner.insert(0, inner);
-        Ok(says)
+        Ok(verdict)
     }
 
     fn may_begin(&self, library: &Library, name: &str, from: &str) -> bool {
@@ -290,7 +294,7 @@ impl<'l> Conversation<'l> {
         })
     }
 
-    /// Whether it can have begun behind the back of the agent that watches itself.
+    /// Whether it can have begun without a message to the monitored agent.
     fn others_may_begin(&self, library: &Library, name: &str, agent: &str) -> bool {
         let machine = self.machine;
         self.is_begun(library, name, |peer| match machine.scope() {
@@ -317,7 +321,7 @@ impl<'l> Conversation<'l> {
             || self.roles.iter().any(|(_, bound)| *bound == agent)
     }
 
-    /// Whether those who have these roles with somebody may begin such a conversation within.
+    /// Whether agents with these roles may begin such an embedded conversation.
     fn is_begun<'s>(
         &'s self,
         library: &Library,
@@ -350,13 +354,13 @@ fn place(talks: &[(&'static str, Talk)], name: &str) -> Option<usize> {
 }
 
 impl Conversation<'_> {
-    fn hear(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
+    fn check(&mut self, words: &Words, now: u64) -> Result<ReferenceVerdict, &'static str> {
         for (_, talk) in &mut self.talks {
             talk.expire(self.machine, now);
         }
         match self.machine.scope() {
-            Scope::Participant => self.hear_each(words, now),
-            _ => self.hear_all(words, now),
+            Scope::Participant => self.check_per_participant(words, now),
+            _ => self.check_per_conversation(words, now),
         }
     }
 
@@ -384,30 +388,38 @@ impl Conversation<'_> {
         }
     }
 
-    fn hear_each(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
+    fn check_per_participant(
+        &mut self,
+        words: &Words,
+        now: u64,
+    ) -> Result<ReferenceVerdict, &'static str> {
         let designated = self.designated.contains(&words.from);
         if words.from == self.initiator {
-            self.hear_initiator(words, now)
+            self.check_initiator(words, now)
         } else if self.multicast.is_some() || place(&self.talks, words.from).is_some() {
-            match self.hear_participant(words, now) {
-                // The other of his two parts may fit.
+            match self.check_participant(words, now) {
+                // The other of the two parts of the sender may fit.
                 Err(wrong) if designated => {
-                    self.hear_initiator(words, now)
+                    self.check_initiator(words, now)
                         .map_err(|other| match wrong {
                             "wrong-receiver" => other,
                             wrong => wrong,
                         })
                 }
-                says => says,
+                verdict => verdict,
             }
         } else if designated {
-            self.hear_initiator(words, now)
+            self.check_initiator(words, now)
         } else {
-            self.told_from_outside(words)
+            self.reported_from_outside(words)
         }
     }
 
-    fn hear_participant(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
+    fn check_participant(
+        &mut self,
+        words: &Words,
+        now: u64,
+    ) -> Result<ReferenceVerdict, &'static str> {
         let machine = self.machine;
         let known = place(&self.talks, words.from);
         let talk = match (known, &self.multicast) {
@@ -425,20 +437,25 @@ impl Conversation<'_> {
             self.talks.len() - 1
         });
         let (opened, late) = self.talks[at].1.go(machine, words, false, step, now);
-        Ok(self.says(Some(at), opened || known.is_none(), late))
+        Ok(self.verdict(Some(at), opened || known.is_none(), late))
     }
 
-    /// What the initiator says, or somebody in his place, who brings nobody new in.
-    fn hear_initiator(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
+    /// Checks a message of the initiator, or of an agent that continues in its place and cannot add
+    /// participants.
+    fn check_initiator(
+        &mut self,
+        words: &Words,
+        now: u64,
+    ) -> Result<ReferenceVerdict, &'static str> {
         let machine = self.machine;
         let brings_in = words.from == self.initiator && !self.joined;
-        // To everybody or to nobody.
+        // All receivers or none.
         let mut steps: Vec<(&'static str, bool, Step)> = Vec::new();
         let witness = self
             .agent
             .filter(|agent| words.to.contains(agent) && words.from != *agent);
         for name in &words.to {
-            // What the others know is unknown.
+            // The states with the other receivers are unknown.
             if witness.is_some_and(|agent| agent != *name && !name.contains('*')) {
                 continue;
             }
@@ -465,7 +482,7 @@ impl Conversation<'_> {
             }
         }
         let (mut opened, mut late, mut first) = (false, false, None);
-        // Who goes on may only have talked to himself, as a participant.
+        // A continuing agent may only have sent to itself, as a participant.
         let speaks = words.from == self.initiator || steps.iter().any(|(_, side, _)| *side);
         for (name, side, step) in steps {
             let known = place(&self.talks, name);
@@ -489,7 +506,7 @@ impl Conversation<'_> {
         if speaks {
             self.designate(words);
         }
-        Ok(self.says_state(first, opened, late))
+        Ok(self.verdict_in(first, opened, late))
     }
 
     fn designate(&mut self, words: &Words) {
@@ -500,8 +517,9 @@ impl Conversation<'_> {
         }
     }
 
-    /// Somebody who takes no part: a message transport service that tells of a failure, or wrong.
-    fn told_from_outside(&mut self, words: &Words) -> Result<Says, &'static str> {
+    /// Checks a message of an outside agent: a failure report of a message transport service, or a
+    /// violation.
+    fn reported_from_outside(&mut self, words: &Words) -> Result<ReferenceVerdict, &'static str> {
         let takes_part = |name: &str| {
             name == self.initiator
                 || self.designated.contains(&name)
@@ -533,7 +551,7 @@ impl Conversation<'_> {
                 })
                 .collect();
             if let [only] = concerned[..] {
-                // Whoever is named twice is told once.
+                // A receiver that is named twice gets the message once.
                 let talk = &mut self.talks[only].1;
                 if !failed.contains(&only) {
                     talk.fail();
@@ -542,10 +560,14 @@ impl Conversation<'_> {
                 first = first.or(Some(talk.name()));
             }
         }
-        Ok(self.says_state(first, false, false))
+        Ok(self.verdict_in(first, false, false))
     }
 
-    fn hear_all(&mut self, words: &Words, now: u64) -> Result<Says, &'static str> {
+    fn check_per_conversation(
+        &mut self,
+        words: &Words,
+        now: u64,
+    ) -> Result<ReferenceVerdict, &'static str> {
         let machine = self.machine;
         let free: Vec<String> = machine
             .roles()
@@ -570,7 +592,7 @@ impl Conversation<'_> {
         let goes_on = self.designated.contains(&words.from) && !has_part;
         let by_initiator = words.from == self.initiator || goes_on;
         let knows = |name: &str| !held(name).is_empty();
-        let nobody = |name: &str| may(name).is_empty();
+        let unknown = |name: &str| may(name).is_empty();
         let view = View {
             from: may(words.from),
             to: to_roles,
@@ -578,14 +600,14 @@ impl Conversation<'_> {
             compares: self.roles.len() == 2,
             ..self.view(words, by_initiator)
         };
-        let strange = words.to.iter().any(|name| nobody(name));
+        let strange = words.to.iter().any(|name| unknown(name));
         let step = match judge(machine, &self.talks[0].1, &view) {
             Ok(step) => step,
-            Err(_) if nobody(words.from) && words.act == "failure" && !strange => {
+            Err(_) if unknown(words.from) && words.act == "failure" && !strange => {
                 self.talks[0].1.fail();
-                return Ok(self.says(Some(0), false, false));
+                return Ok(self.verdict(Some(0), false, false));
             }
-            Err(_) if nobody(words.from) => return Err("stranger"),
+            Err(_) if unknown(words.from) => return Err("stranger"),
             Err("unexpected" | "out-of-order") if strange => return Err("wrong-receiver"),
             Err(wrong) => return Err(wrong),
         };
@@ -611,14 +633,14 @@ impl Conversation<'_> {
         if by_initiator {
             self.designate(words);
         }
-        Ok(self.says(Some(0), opened, late))
+        Ok(self.verdict(Some(0), opened, late))
     }
 
-    fn says(&self, at: Option<usize>, opened: bool, late: bool) -> Says {
-        self.says_state(at.map(|at| self.talks[at].1.name()), opened, late)
+    fn verdict(&self, at: Option<usize>, opened: bool, late: bool) -> ReferenceVerdict {
+        self.verdict_in(at.map(|at| self.talks[at].1.name()), opened, late)
     }
 
-    fn says_state(&self, name: Option<String>, opened: bool, late: bool) -> Says {
+    fn verdict_in(&self, name: Option<String>, opened: bool, late: bool) -> ReferenceVerdict {
         let machine = self.machine;
         let first = || self.talks.first().map(|(_, talk)| talk.name());
         let name = name
@@ -631,6 +653,6 @@ impl Conversation<'_> {
         };
         let complete =
             self.multicast.is_none() && self.talks.iter().all(|(_, talk)| talk.has_ended(machine));
-        Says::Right(name, [opened, ended, complete, late])
+        ReferenceVerdict::Accepted(name, [opened, ended, complete, late])
     }
 }

@@ -1,4 +1,4 @@
-//! One state machine as the reference runs it: what was said, and what a message means after that.
+//! One state machine of the reference: the messages so far, and the effect of the next one.
 
 use std::collections::HashMap;
 
@@ -16,7 +16,7 @@ pub(super) enum Spot {
         one_more: bool,
     },
     Undelivered(Box<Spot>),
-    /// Only others know.
+    /// The monitored agent does not know the state.
     Elsewhere,
 }
 
@@ -24,18 +24,18 @@ pub(super) enum Spot {
 pub(super) struct Talk {
     pub(super) spot: Spot,
     pub(super) previous: Spot,
-    pub(super) said: Vec<Said>,
+    pub(super) said: Vec<SentMessage>,
     pub(super) due: Option<u64>,
 }
 
 #[derive(Debug, Clone)]
-pub(super) struct Said {
+pub(super) struct SentMessage {
     pub(super) by_initiator: bool,
     pub(super) act: &'static str,
     pub(super) reply_with: Option<String>,
     /// A cancel that began cancelling.
     pub(super) cancels: bool,
-    /// Sent before the other side's cancel was known.
+    /// Sent before the cancel of the other side was received.
     pub(super) crossed: bool,
 }
 
@@ -43,7 +43,7 @@ pub(super) struct Step {
     pub(super) spot: Spot,
     pub(super) roles: Option<(String, String)>,
     pub(super) crossed: bool,
-    /// Answers what was said before the last thing.
+    /// Answers the message before the last one.
     pub(super) void: bool,
 }
 
@@ -73,7 +73,7 @@ pub(super) fn state<'m>(machine: &'m Machine, id: &str) -> &'m State {
     found.expect("a state of the machine")
 }
 
-/// Whether somebody else says this to the initiator so.
+/// Whether another agent sends this to the initiator in this transition.
 pub(super) fn is_answered(machine: &Machine, step: &Transition, act: &str) -> bool {
     let initiator = machine.initiator();
     let mut others = machine.roles().iter().filter(|role| *role != initiator);
@@ -82,7 +82,7 @@ pub(super) fn is_answered(machine: &Machine, step: &Transition, act: &str) -> bo
         && others.any(|role| matches(step.from(), role))
 }
 
-/// The state's transitions and those behind optional ones.
+/// Returns the transitions of a state and those behind optional ones.
 pub(crate) fn options<'m>(machine: &'m Machine, id: &str) -> Vec<&'m Transition> {
     let mut all = Vec::new();
     for transition in state(machine, id).transitions() {
@@ -110,24 +110,24 @@ impl Talk {
         }
     }
 
-    /// Who said the last thing that counts; before anything is said, the other side.
+    /// Whether the initiator sent the last message that counts. Without a message, it is the other side.
     pub(super) fn last_by_initiator(&self) -> bool {
         let last = self.said.iter().rev().find(|said| !said.crossed);
         last.is_some_and(|said| said.by_initiator)
     }
 
-    pub(super) fn last_of(&self, initiator: bool) -> Option<&Said> {
+    pub(super) fn last_of(&self, initiator: bool) -> Option<&SentMessage> {
         let mut said = self.said.iter().rev();
         said.find(|said| said.by_initiator == initiator && !said.cancels)
     }
 
-    pub(super) fn earlier_of(&self, initiator: bool) -> Option<&Said> {
+    pub(super) fn earlier_of(&self, initiator: bool) -> Option<&SentMessage> {
         let said = self.said.iter().rev();
-        let mut his = said.filter(|said| said.by_initiator == initiator && !said.cancels);
-        his.nth(1)
+        let mut own = said.filter(|said| said.by_initiator == initiator && !said.cancels);
+        own.nth(1)
     }
 
-    pub(super) fn cancel(&self) -> Option<&Said> {
+    pub(super) fn cancel(&self) -> Option<&SentMessage> {
         self.said.iter().rev().find(|said| said.cancels)
     }
 
@@ -137,7 +137,7 @@ impl Talk {
             && last.is_some_and(|said| said.act == words.act && said.reply_with == words.reply_with)
     }
 
-    /// Who came into the talk with an answer knows its state if only one can follow.
+    /// Creates the state of an agent that joined with an answer: known if only one state can follow.
     pub(super) fn joined(machine: &Machine, words: &Words) -> Self {
         let mut in_time = vec![machine.initial().id()];
         for at in 0.. {
@@ -162,7 +162,7 @@ impl Talk {
         Self {
             previous: spot.clone(),
             spot,
-            said: vec![Said {
+            said: vec![SentMessage {
                 by_initiator: false,
                 act: words.act,
                 reply_with: words.reply_with.clone(),
@@ -212,7 +212,7 @@ impl Talk {
     }
 }
 
-/// One message as one talk sees it: who may have which role, and who knows whom.
+/// One message with respect to one talk: the possible roles, and whether the agents are known.
 pub(super) struct View<'a> {
     pub(super) words: &'a Words,
     pub(super) by_initiator: bool,
@@ -252,7 +252,7 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
         Spot::Undelivered(before) => {
             let at = |spot: &Spot| match spot {
                 Spot::At(id) => judge_at(machine, talk, id, view),
-                // A protocol's own states only.
+                // Only the protocol's own states.
                 _ => Err("unexpected"),
             };
             at(before).or_else(|wrong| at(&talk.previous).map_err(|_| wrong))
@@ -260,14 +260,14 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
         Spot::Elsewhere => Err("unexpected"),
         Spot::NotUnderstood => Err(if repeated { "repeated" } else { "ended" }),
         Spot::Cancelled { one_more } => {
-            let canceller = talk.cancel().is_some_and(|cancel| cancel.by_initiator);
-            if *one_more && view.by_initiator != canceller && answers_cancel {
+            let canceling_side = talk.cancel().is_some_and(|cancel| cancel.by_initiator);
+            if *one_more && view.by_initiator != canceling_side && answers_cancel {
                 return Ok(to(Spot::Cancelled { one_more: false }));
             }
             Err(if repeated { "repeated" } else { "ended" })
         }
         Spot::Cancelling(back) => {
-            let cancel = talk.cancel().expect("somebody cancelled");
+            let cancel = talk.cancel().expect("a cancel was sent");
             if machine.scope() == Scope::Participant && view.by_initiator == cancel.by_initiator {
                 return match act {
                     "not-understood" => Ok(to(Spot::NotUnderstood)),
@@ -293,7 +293,7 @@ pub(super) fn judge(machine: &Machine, talk: &Talk, view: &View<'_>) -> Result<S
                     roles: step.roles,
                     void: step.void,
                 },
-                // While cancelling, a failure counts as under way, too.
+                // During a cancel, a failure counts as a crossing message too.
                 Spot::Undelivered(_) => Step {
                     crossed: true,
                     ..to(talk.spot.clone())
@@ -346,7 +346,7 @@ pub(super) fn judge_at(
         }
     }
     let over = is_over(machine, id);
-    let hears_last = talk.last_by_initiator() != view.by_initiator;
+    let received_last = talk.last_by_initiator() != view.by_initiator;
     if view.known && talk.said.iter().any(|said| !said.cancels) {
         let may_cancel = match machine.cancel() {
             Cancel::Initiator => view.by_initiator,
@@ -354,13 +354,13 @@ pub(super) fn judge_at(
             _ => false,
         };
         match words.act {
-            "not-understood" if !here.is_final() || hears_last => {
+            "not-understood" if !here.is_final() || received_last => {
                 return Ok(to(Spot::NotUnderstood));
             }
-            "cancel" if may_cancel && (!over || (hears_last && !view.own)) => {
+            "cancel" if may_cancel && (!over || (received_last && !view.own)) => {
                 return Ok(to(Spot::Cancelling(id.to_owned())));
             }
-            // In the form of fipa_acl, in which alone a conversation has one state here.
+            // In the format of fipa_acl. Only that format has one state per conversation here.
             "failure" if machine.scope() == Scope::Conversation && !here.is_final() => {
                 return Ok(to(Spot::Undelivered(Box::new(Spot::At(id.to_owned())))));
             }
@@ -404,14 +404,14 @@ impl Talk {
     pub(super) fn fail(&mut self) {
         self.spot = match self.spot.clone() {
             spot @ (Spot::At(_) | Spot::Elsewhere) => Spot::Undelivered(Box::new(spot)),
-            // The cancel was not heard.
+            // The cancel was not delivered.
             Spot::Cancelling(back) => Spot::At(back),
-            // What has ended, or failed already.
+            // An ended conversation, or an earlier failure.
             other => other,
         };
     }
 
-    /// Goes there; whether the talk began so, and whether it was late.
+    /// Applies a step. Returns whether the talk began with it, and whether it was late.
     pub(super) fn go(
         &mut self,
         machine: &Machine,
@@ -438,7 +438,7 @@ impl Talk {
         if !matches!(self.spot, Spot::Undelivered(_)) {
             self.previous = self.spot.clone();
         }
-        self.said.push(Said {
+        self.said.push(SentMessage {
             by_initiator,
             act: words.act,
             reply_with: words.reply_with.clone(),

@@ -1,28 +1,31 @@
-//! Writing XML 1.0: escaped text, nothing that a reader would change.
+//! Writer of XML 1.0. It escapes all text that a reader would otherwise change.
 
 use crate::Dialect;
 use crate::error::EncodeError;
 use crate::scan::{self, TOPS};
 use crate::word::is_token;
-use crate::xml::plain::{Around, is_plain};
+use crate::xml::plain::{TextContext, is_plain};
 
-/// A document in the making.
-pub(super) struct Out<'a> {
-    out: &'a mut dyn crate::bitefficient::write::Out,
-    /// White space is escaped wherever a reader that condenses it would change it. fipa_services
-    /// itself writes content in CDATA sections only, so outside of them nothing is promised.
+/// Writes a document.
+pub(super) struct XmlWriter<'a> {
+    out: &'a mut dyn crate::bitefficient::write::Output,
+    /// Whether to escape white space that a condensing reader would change. fipa_services writes
+    /// content in CDATA sections, and its reader may condense white space outside of them.
     guards_space: bool,
 }
 
-impl<'a> Out<'a> {
-    pub(super) fn new(out: &'a mut dyn crate::bitefficient::write::Out, dialect: Dialect) -> Self {
+impl<'a> XmlWriter<'a> {
+    pub(super) fn new(
+        out: &'a mut dyn crate::bitefficient::write::Output,
+        dialect: Dialect,
+    ) -> Self {
         Self {
             out,
             guards_space: dialect == Dialect::FipaServices,
         }
     }
 
-    /// Something that needs no escaping.
+    /// Writes text that needs no escaping.
     pub(super) fn raw(&mut self, text: &str) {
         self.out.slice(text.as_bytes());
     }
@@ -39,7 +42,7 @@ impl<'a> Out<'a> {
         self.raw(">");
     }
 
-    /// A value in an attribute of an element that is otherwise empty.
+    /// Writes an empty element with one attribute.
     pub(super) fn empty(
         &mut self,
         element: &str,
@@ -80,25 +83,26 @@ impl<'a> Out<'a> {
         Ok(())
     }
 
-    /// Text that keeps its line breaks and tabulators as they are where the reader lets it. It is
-    /// copied before it is checked, because shared memory may change meanwhile.
+    /// Writes content. Line breaks and tabs are escaped only if the reader would change them. The
+    /// content is copied before it is checked, because another process may change shared memory at
+    /// any time.
     pub(super) fn content(&mut self, content: &[u8]) -> Result<(), EncodeError> {
         let guards_space = self.guards_space;
-        let mut around = Around::NOTHING;
+        let mut context = TextContext::WHOLE;
         let mut rest = content;
         while !rest.is_empty() {
             let (step, later) = rest.split_at(rest.len().min(STEP));
-            around.is_last = later.is_empty();
-            let plain = |bytes: &[u8]| is_plain(bytes, guards_space, around);
+            context.is_last = later.is_empty();
+            let plain = |bytes: &[u8]| is_plain(bytes, guards_space, context);
             if self.out.slice_if(step, &plain) {
-                around.before = step.last().copied();
+                context.before = step.last().copied();
                 rest = later;
                 continue;
             }
             while rest.len() > later.len() {
-                let whole = self.piece(rest, around.before)?;
+                let whole = self.piece(rest, context.before)?;
                 let (written, unwritten) = rest.split_at(whole);
-                around.before = written.last().copied();
+                context.before = written.last().copied();
                 rest = unwritten;
             }
         }
@@ -112,8 +116,8 @@ impl<'a> Out<'a> {
         let (copy, _) = copy.split_at_mut(len);
         copy.copy_from_slice(content.split_at(len).0);
         let is_last = len == content.len();
-        let around = Around { before, is_last };
-        if is_plain(copy, self.guards_space, around) {
+        let context = TextContext { before, is_last };
+        if is_plain(copy, self.guards_space, context) {
             self.out.slice(copy);
             return Ok(len);
         }
@@ -131,19 +135,19 @@ impl<'a> Out<'a> {
                 });
             }
         };
-        let around = Around {
+        let context = TextContext {
             is_last: text.len() == content.len(),
-            ..around
+            ..context
         };
-        self.escaped("content", text, self.guards_space, around)?;
+        self.escaped("content", text, self.guards_space, context)?;
         Ok(text.len())
     }
 
     pub(super) fn text(&mut self, what: &'static str, text: &str) -> Result<(), EncodeError> {
-        self.escaped(what, text, true, Around::NOTHING)
+        self.escaped(what, text, true, TextContext::WHOLE)
     }
 
-    /// Text whose reader takes white space around it away: there it is escaped.
+    /// Writes text for a reader that removes the white space around it. That white space is escaped.
     pub(super) fn text_trimmed(
         &mut self,
         what: &'static str,
@@ -153,7 +157,7 @@ impl<'a> Out<'a> {
         let before = text.len() - inner.len();
         let core = inner.trim_end_matches(' ');
         self.spaces(before);
-        self.escaped(what, core, true, Around::NOTHING)?;
+        self.escaped(what, core, true, TextContext::WHOLE)?;
         self.spaces(inner.len() - core.len());
         Ok(())
     }
@@ -164,7 +168,7 @@ impl<'a> Out<'a> {
         }
     }
 
-    /// A user-defined parameter as the standards have it. Peers write a type too.
+    /// Writes a user-defined parameter in the form of the standards. Peers write a type too.
     pub(super) fn user_defined(
         &mut self,
         name: &str,
@@ -184,13 +188,13 @@ impl<'a> Out<'a> {
         Ok(())
     }
 
-    /// A user-defined parameter as an element of its own name.
+    /// Writes a user-defined parameter as an element with its name.
     pub(super) fn user_element(&mut self, name: &str, value: &str) -> Result<(), EncodeError> {
         check_element_name(name)?;
         self.element(&format!("X-{name}"), USER_DEFINED, value)
     }
 
-    /// A user-defined parameter as an element of its own name that repeats the name as `href`:
+    /// Writes a user-defined parameter as an element with its name, which `href` repeats:
     /// `<X-role href="X-role" type="string">lifts</X-role>`.
     pub(super) fn user_element_with_name(
         &mut self,
@@ -209,7 +213,7 @@ impl<'a> Out<'a> {
         Ok(())
     }
 
-    /// Refuses an empty user-defined parameter if its reader loses it.
+    /// Refuses an empty user-defined parameter if the reader would lose it.
     fn check_guarded(&self, value: &str) -> Result<(), EncodeError> {
         if self.guards_space && value.is_empty() {
             return Err(EncodeError::Unrepresentable {
@@ -225,7 +229,7 @@ impl<'a> Out<'a> {
         what: &'static str,
         text: &str,
         layout: bool,
-        around: Around,
+        context: TextContext,
     ) -> Result<(), EncodeError> {
         let looked_for = if self.guards_space {
             MARK | SPACE
@@ -238,13 +242,13 @@ impl<'a> Out<'a> {
         while let Some(found) = bytes.get(from..).and_then(|rest| marked(rest, looked_for)) {
             let at = from + found;
             from = at + 1;
-            // In front of the text there might as well be a space.
+            // A space may be in front of the text.
             let condensed = || {
                 let before = match at.checked_sub(1) {
                     Some(before) => bytes.get(before).copied(),
-                    None => around.before,
+                    None => context.before,
                 };
-                before.is_none_or(|byte| byte == b' ') || around.is_last && from == bytes.len()
+                before.is_none_or(|byte| byte == b' ') || context.is_last && from == bytes.len()
             };
             let escape = match bytes.get(at..).unwrap_or_default() {
                 [b' ', ..] if condensed() => "&#x20;",
@@ -260,7 +264,7 @@ impl<'a> Out<'a> {
                 [0..=0x1f, ..] | [0xef, 0xbf, 0xbe | 0xbf, ..] => {
                     return Err(EncodeError::Unrepresentable {
                         what,
-                        why: "XML has no way to write its control characters",
+                        why: "XML cannot represent its control characters",
                     });
                 }
                 _ => continue,
@@ -274,33 +278,33 @@ impl<'a> Out<'a> {
     }
 }
 
-/// How errors name a user-defined parameter.
+/// The name of a user-defined parameter in errors.
 const USER_DEFINED: &str = "user-defined parameter";
 
-/// Refuses a name of a user-defined parameter that no reader takes for that of an element.
+/// Refuses a name of a user-defined parameter that readers do not accept as an element name.
 fn check_element_name(name: &str) -> Result<(), EncodeError> {
     let allowed = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
     if name.is_empty() || !name.bytes().all(allowed) {
         return Err(EncodeError::Unrepresentable {
             what: USER_DEFINED,
-            why: "its reader needs a name of letters, digits, '-', '_' and '.'",
+            why: "its name must consist of letters, digits, '-', '_' and '.'",
         });
     }
     Ok(())
 }
 
-/// Bytes of content that are copied and checked at a time. A copy stays in the processor's cache until
-/// it has been checked.
+/// Number of bytes of content that are copied and checked at a time. They fit into the processor's
+/// cache.
 const STEP: usize = 16 << 10;
 
-/// Bytes of content that are escaped at a time.
+/// Number of bytes of content that are escaped at a time.
 const PIECE: usize = 4096;
 
-/// Where the first byte is that is looked for.
+/// Returns the position of the first byte of the classes `looked_for`.
 fn marked(bytes: &[u8], looked_for: u8) -> Option<usize> {
     let mut before = 0;
-    // Content may be long, and is looked at eight bytes at a time. '"' and '&', '<' and '>' differ in
-    // one bit each.
+    // Content may be long, so eight bytes are checked at a time. '"' and '&' differ in one bit, and
+    // so do '<' and '>'.
     let eights = |byte: u8| u64::from_le_bytes([byte; 8]);
     for eight in bytes.as_chunks::<8>().0 {
         let word = u64::from_le_bytes(*eight);
@@ -324,11 +328,12 @@ fn marked(bytes: &[u8], looked_for: u8) -> Option<usize> {
     Some(before + found)
 }
 
-/// Bytes that are escaped or refused, or might be.
+/// Class of bytes that may need an escape or be refused.
 const MARK: u8 = 1;
+/// Class of the space.
 const SPACE: u8 = 2;
 
-/// A table, because content may be long.
+/// The class of each byte. A lookup is fast for long content.
 static CLASS: [u8; 256] = {
     let mut class = [0; 256];
     let mut byte = 0;

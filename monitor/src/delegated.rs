@@ -1,14 +1,17 @@
-//! Conversations that began between others. The agent that watches itself comes into them because a
-//! `reply-to` names it, as the recruiter's does (FIPA00034), and may go on with those who answer it.
+//! Conversations that began between other agents.
 //!
-//! It does not know what was said before, nor what others say to each other meanwhile. So it takes
-//! the state from what it is told, where that can only lead to one; an answer that does not fit that
-//! state is no violation, but tells of another one. What the agent says itself must fit.
+//! The monitored agent joins such a conversation because a `reply-to` names it, for example that of a
+//! recruiter (FIPA00034). It may then continue with the agents that answer it.
 //!
-//! Likewise for who has named somebody else in a `reply-to` himself: what that one and the others say to
-//! each other, he does not hear.
+//! The monitor has not seen the earlier messages, and does not see messages between other agents. So
+//! it infers the state from a received answer, if the answer can lead to one state only. An answer
+//! that does not fit the inferred state is no violation: it implies another state. Messages of the
+//! monitored agent itself must fit.
 //!
-//! What must not live here: what conversations allow that are known from their beginning to their end.
+//! The same holds if the monitored agent has named another agent in a `reply-to`: the monitor does
+//! not see the messages between that agent and the others.
+//!
+//! The rules of conversations with a known beginning do not belong here.
 
 use std::sync::Arc;
 use std::time::SystemTime;
@@ -16,21 +19,21 @@ use std::time::SystemTime;
 use crate::act::Act;
 use crate::change::millis;
 use crate::conversation::{Conversation, ELSEWHERE, NONE, Party, Side, act_number, side_index};
-use crate::judge::Heard;
+use crate::judge::ObservedMessage;
 use crate::machine::{Machine, Scope, step};
 use crate::monitor::{Denied, Monitor};
 use crate::verdict::{Unchecked, ViolationKind as Kind};
 
 impl Monitor {
-    /// Whether the conversation began between others.
+    /// Whether the conversation began between other agents.
     pub(crate) fn is_joined(&self, at: u32) -> bool {
         let slot = self.table.slot(at);
         slot.is_some_and(|slot| slot.conversation.joined)
     }
 
-    /// Whether others may go on with the conversation where the agent that watches itself does not
-    /// hear it: it began between others, or the agent has named somebody else for the replies.
-    pub(crate) fn goes_on_elsewhere(&self, at: u32) -> bool {
+    /// Whether the conversation may continue without messages to the monitored agent: it began
+    /// between other agents, or the monitored agent has named another agent in `reply-to`.
+    pub(crate) fn may_continue_elsewhere(&self, at: u32) -> bool {
         let slot = self.table.slot(at);
         slot.zip(self.agent.as_deref())
             .is_some_and(|(slot, agent)| {
@@ -44,21 +47,21 @@ impl Monitor {
             })
     }
 
-    /// Comes into a conversation with what the agent is told in it, if that answers anything.
+    /// Joins a conversation with a message to the monitored agent, if the message is an answer.
     pub(crate) fn join(
         &mut self,
         id: &str,
         parent: u32,
         machine: u16,
-        heard: &Heard<'_>,
+        observed: &ObservedMessage<'_>,
         now: SystemTime,
     ) {
         let library = Arc::clone(&self.library);
         let protocol = library.machine(machine);
-        let Some(protocol) = protocol.filter(|protocol| protocol.is_answer(heard.act)) else {
+        let Some(protocol) = protocol.filter(|protocol| protocol.is_answer(observed.act)) else {
             return;
         };
-        self.make_room(parent);
+        self.evict(parent);
         let at = self.table.insert(id, parent, machine, millis(now));
         let agent = self.agent.as_deref().unwrap_or_default();
         let initiator = self.names.acquire(agent);
@@ -66,44 +69,50 @@ impl Monitor {
             slot.conversation.initiator = initiator;
             slot.conversation.joined = true;
         }
-        self.told(at, protocol, heard, now);
+        self.infer_state(at, protocol, observed, now);
     }
 
-    /// What to say of a message that does not fit a conversation with which others may go on.
-    pub(crate) fn elsewhere(
+    /// Reconsiders the refusal of a message in a conversation that may continue elsewhere.
+    pub(crate) fn recheck_delegated(
         &mut self,
         at: u32,
-        heard: &Heard<'_>,
+        observed: &ObservedMessage<'_>,
         denied: Denied,
         now: SystemTime,
     ) -> Denied {
         let library = Arc::clone(&self.library);
-        let slot = self.table.slot(at).filter(|_| self.goes_on_elsewhere(at));
+        let slot = self
+            .table
+            .slot(at)
+            .filter(|_| self.may_continue_elsewhere(at));
         let machine = slot.and_then(|slot| library.machine(slot.conversation.machine));
         let Some((slot, machine)) = slot.zip(machine) else {
             return denied;
         };
         let joined = slot.conversation.joined;
-        // Who has asked knows whom, and what came already.
-        let asked = !joined && slot.conversation.takes_part(&self.names, heard.sender);
+        // The agent that asked knows its participants, and the messages that it has received.
+        let asked = !joined && slot.conversation.takes_part(&self.names, observed.sender);
         let known = |kind| [Kind::Repeated, Kind::WrongReceiver].contains(&kind);
         let asked = asked && !matches!(&denied, Denied::Fault(fault, _) if known(fault.kind));
         let not_known = if !joined && !asked {
             false
-        } else if heard.own {
+        } else if observed.own {
             let unknown = |party: &Party| {
-                let mut receivers = heard.receivers.iter();
-                let mut told = || receivers.any(|receiver| self.names.is(party.peer, receiver));
-                // Where it goes on after what was not delivered is not known, either.
-                [party.state, party.resume].contains(&ELSEWHERE) && (party.peer == NONE || told())
+                let mut receivers = observed.receivers.iter();
+                let mut addressed =
+                    || receivers.any(|receiver| self.names.is(party.peer, receiver));
+                // The state after an undelivered message is unknown too.
+                [party.state, party.resume].contains(&ELSEWHERE)
+                    && (party.peer == NONE || addressed())
             };
-            slot.conversation.parties.iter().any(unknown) && machine.is_said_by_initiator(heard.act)
-        } else if machine.is_answer(heard.act) {
-            self.told(at, machine, heard, now);
+            slot.conversation.parties.iter().any(unknown)
+                && machine.is_sent_by_initiator(observed.act)
+        } else if machine.is_answer(observed.act) {
+            self.infer_state(at, machine, observed, now);
             true
         } else {
-            // Others may begin it with the agent as well.
-            joined && step(&machine.initial().steps, heard.act, u32::MAX, u32::MAX).is_some()
+            // Other agents may begin the protocol with the monitored agent too.
+            joined && step(&machine.initial().steps, observed.act, u32::MAX, u32::MAX).is_some()
         };
         if not_known {
             return Denied::Unchecked(Unchecked::BegunElsewhere);
@@ -111,8 +120,14 @@ impl Monitor {
         denied
     }
 
-    /// Takes the state from an answer.
-    fn told(&mut self, at: u32, machine: &Machine, heard: &Heard<'_>, now: SystemTime) {
+    /// Infers the state from an answer.
+    fn infer_state(
+        &mut self,
+        at: u32,
+        machine: &Machine,
+        observed: &ObservedMessage<'_>,
+        now: SystemTime,
+    ) {
         let Some(slot) = self.table.slot_mut(at) else {
             return;
         };
@@ -120,33 +135,32 @@ impl Monitor {
         let parties = &mut slot.conversation.parties;
         let (known, state) = match machine.scope {
             Scope::Participant => {
-                let by = |party: &Party| self.names.is(party.peer, heard.sender);
-                (parties.iter().position(by), after(machine, heard.act))
+                let by = |party: &Party| self.names.is(party.peer, observed.sender);
+                (parties.iter().position(by), after(machine, observed.act))
             }
-            // Who has which role in it is not known either.
+            // The roles of the agents are unknown too.
             Scope::Conversation => (parties.len().checked_sub(1), ELSEWHERE),
         };
         let peer = match known.and_then(|known| parties.get(known)) {
             Some(party) => party.peer,
             None if parties.len() == self.limits.participants => return,
             None if machine.scope == Scope::Conversation => NONE,
-            None => self.names.acquire(heard.sender),
+            None => self.names.acquire(observed.sender),
         };
         let index = side_index(Side::Other);
         let mut party = Party::new(peer, state);
-        party.acts[index] = act_number(heard.act);
-        party.asked[index] = heard.reply_with;
+        party.acts[index] = act_number(observed.act);
+        party.asked[index] = observed.reply_with;
         match known.and_then(|known| parties.get_mut(known)) {
-            Some(place) => *place = party,
+            Some(known) => *known = party,
             None => parties.push(party),
         }
         self.touch(main, millis(now));
     }
 }
 
-/// The state to which this answer leads, whatever was said before it; unknown, where there are
-/// several. What is said when time is up does not count: who does not know the question does not
-/// know its `reply-by`.
+/// Returns the state to which this answer leads from any reachable state, or [`ELSEWHERE`] if there
+/// are several. Timeouts do not count: the `reply-by` of the question is unknown.
 fn after(machine: &Machine, act: Act<'_>) -> u16 {
     let initiator = 1_u32 << machine.initiator;
     let mut reached = vec![machine.initial];
