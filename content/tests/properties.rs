@@ -1,0 +1,218 @@
+//! What must hold for every content, and for any bytes at all.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
+
+mod arbitrary;
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use fipa_content::{
+    Content, Dialect, PrintError, Printer, Profile, Set, Term, Wff, from_slice, from_slice_in,
+    to_vec, to_vec_in,
+};
+use proptest::collection::{btree_map, btree_set, vec};
+use proptest::option;
+use proptest::prelude::*;
+use serde::de::IgnoredAny;
+use serde::{Deserialize, Serialize};
+
+use arbitrary::{content, nested, text};
+
+const DIALECTS: [Dialect; 2] = [Dialect::Standard, Dialect::Jade];
+
+/// Bytes with a chance to be taken for something.
+fn nearly_sl() -> impl Strategy<Value = Vec<u8>> {
+    let pieces = prop::sample::select(
+        &[
+            "(", "(", "(", ")", ")", ")", " ", "a", ":a ", "?x ", "??m", "\"", "\\\"", "#2\"", "1",
+            "-1.5e3 ", "0x", "action ", "(action a b)", "iota ", "(p a)", "done ", "not ",
+            "sequence ", "set ", "20000508T042651481Z ", "true ", "é", "\n", "| ", "= ",
+        ][..],
+    );
+    let piece = prop_oneof![
+        9 => pieces.prop_map(|piece: &str| piece.as_bytes().to_vec()),
+        1 => vec(any::<u8>(), 1..3),
+    ];
+    vec(piece, 0..40).prop_map(|pieces| pieces.concat())
+}
+
+fn survives(content: &Content<'_>) {
+    for dialect in DIALECTS {
+        let printer = Printer::new().dialect(dialect);
+        let line = match printer.print(content) {
+            Ok(line) => line,
+            Err(PrintError::Unrepresentable { .. }) if dialect == Dialect::Jade => continue,
+            Err(error) => panic!("{dialect}: {error}"),
+        };
+        assert_eq!(Content::parse_in(dialect, &line).as_ref(), Ok(content));
+        let indented = printer.indented().print(content).unwrap();
+        assert_eq!(Content::parse_in(dialect, &indented).as_ref(), Ok(content));
+        let failure = printer.jade_failure().print(content);
+        if dialect == Dialect::Jade {
+            let failure = failure.unwrap();
+            assert_eq!(Content::parse_in(dialect, &failure).as_ref(), Ok(content));
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(256))]
+
+    #[test]
+    fn what_was_printed_reads_the_same(content in content()) {
+        survives(&content);
+        let owned = content.clone().into_owned();
+        prop_assert_eq!(&owned, &content);
+        let _ = content.to_string();
+        // Profiles contain each other.
+        if let Some(least) = Profile::of(&content) {
+            for profile in Profile::ALL {
+                prop_assert_eq!(profile.check(&content).is_ok(), profile >= least);
+            }
+        }
+    }
+
+    #[test]
+    fn terms_survive_serde(term in nested(2).0) {
+        let text = to_vec(&term).unwrap();
+        prop_assert_eq!(&text, &Printer::new().print(&term).unwrap());
+        prop_assert_eq!(&from_slice::<Term<'_>>(&text).unwrap(), &term);
+        if let Ok(text) = to_vec_in(Dialect::Jade, &term) {
+            prop_assert_eq!(&from_slice_in::<Term<'_>>(Dialect::Jade, &text).unwrap(), &term);
+        }
+        let json = serde_json::to_vec(&term).unwrap();
+        if std::str::from_utf8(&text).is_ok() {
+            prop_assert_eq!(&serde_json::from_slice::<Term<'_>>(&json).unwrap(), &term);
+        }
+    }
+
+    #[test]
+    fn any_bytes_are_read_or_refused(bytes in prop_oneof![vec(any::<u8>(), 0..80), nearly_sl()]) {
+        for dialect in DIALECTS {
+            match Content::parse_in(dialect, &bytes) {
+                Ok(content) if dialect == Dialect::Standard => survives(&content),
+                Ok(_) => {}
+                Err(error) => prop_assert!(error.offset() <= bytes.len()),
+            }
+            let _ = Wff::parse_in(dialect, &bytes);
+            let term = Term::parse_in(dialect, &bytes);
+            let read = from_slice_in::<Term<'_>>(dialect, &bytes);
+            prop_assert_eq!(term.is_ok(), read.is_ok());
+            let skipped = from_slice_in::<IgnoredAny>(dialect, &bytes);
+            if term.is_ok() {
+                prop_assert_eq!(read.unwrap(), term.unwrap());
+                prop_assert!(skipped.is_ok());
+            } else {
+                prop_assert!(read.unwrap_err().offset() <= bytes.len());
+            }
+            let _ = from_slice_in::<Everything>(dialect, &bytes);
+            let _ = from_slice_in::<serde_json::Value>(dialect, &bytes);
+        }
+    }
+
+    #[test]
+    fn values_survive(value in everything()) {
+        let text = to_vec(&value).unwrap();
+        prop_assert_eq!(&from_slice::<Everything>(&text).unwrap(), &value);
+        // The text is SL.
+        let term = Term::parse(&text).unwrap();
+        prop_assert_eq!(&term.read::<Everything>().unwrap(), &value);
+        prop_assert_eq!(Term::from_value(&value).unwrap(), term);
+        if let Ok(text) = to_vec_in(Dialect::Jade, &value) {
+            prop_assert_eq!(&from_slice_in::<Everything>(Dialect::Jade, &text).unwrap(), &value);
+        }
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+struct Everything {
+    small: i8,
+    large: u64,
+    huge: i128,
+    single: f32,
+    double: f64,
+    truth: bool,
+    letter: char,
+    text: String,
+    absent: Option<String>,
+    set: Set<BTreeSet<String>>,
+    list: Vec<Option1>,
+    map: BTreeMap<String, i32>,
+    pair: (u16, String),
+    kind: Kind,
+    unit: (),
+}
+
+/// An option in a slot of its own.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Option1 {
+    value: Option<i32>,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum Kind {
+    Unit,
+    True,
+    Newtype(String),
+    Absent(Option<u8>),
+    Tuple(i8, String),
+    Struct { inner: Option<Box<Kind>> },
+}
+
+fn kind() -> BoxedStrategy<Kind> {
+    let leaf = prop_oneof![
+        Just(Kind::Unit),
+        Just(Kind::True),
+        text().prop_map(Kind::Newtype),
+        any::<Option<u8>>().prop_map(Kind::Absent),
+        (any::<i8>(), text()).prop_map(|(one, other)| Kind::Tuple(one, other)),
+    ];
+    leaf.prop_recursive(3, 4, 1, |inner| {
+        option::of(inner.prop_map(Box::new)).prop_map(|inner| Kind::Struct { inner })
+    })
+    .boxed()
+}
+
+fn everything() -> impl Strategy<Value = Everything> {
+    let numbers = (
+        any::<i8>(),
+        any::<u64>(),
+        any::<i128>(),
+        any::<f32>().prop_filter("finite", |value| value.is_finite()),
+        any::<f64>().prop_filter("finite", |value| value.is_finite()),
+        any::<bool>(),
+        any::<char>(),
+    );
+    let others = (
+        text(),
+        option::of(text()),
+        btree_set(text(), 0..4),
+        vec(any::<Option<i32>>().prop_map(|value| Option1 { value }), 0..4),
+        btree_map(text(), any::<i32>(), 0..4),
+        (any::<u16>(), text()),
+        kind(),
+    );
+    (numbers, others).prop_map(|(numbers, others)| {
+        let (small, large, huge, single, double, truth, letter) = numbers;
+        let (text, absent, set, list, map, pair, kind) = others;
+        Everything {
+            small,
+            large,
+            huge,
+            single,
+            double,
+            truth,
+            letter,
+            text,
+            absent,
+            set: Set(set),
+            list,
+            map,
+            pair,
+            kind,
+            unit: (),
+        }
+    })
+}
