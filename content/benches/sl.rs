@@ -1,6 +1,6 @@
 //! SL beside JSON: the same values, written and read by this crate and by serde_json in one run.
 //!
-//! The last line of each group is the ratio that counts; absolute times depend on the machine.
+//! The ratio of both is what counts; absolute times depend on the machine.
 
 use std::collections::BTreeMap;
 use std::hint::black_box;
@@ -80,7 +80,6 @@ fn description(index: u32) -> Description {
 fn measure<T: Serialize + DeserializeOwned>(criterion: &mut Criterion, name: &str, value: &T) {
     let sl = to_vec(value).expect("SL");
     let json = serde_json::to_vec(value).expect("JSON");
-    println!("{name}: {} bytes of SL, {} bytes of JSON", sl.len(), json.len());
     let mut group = criterion.benchmark_group(name);
     group.bench_function(BenchmarkId::new("write value", "JSON"), |bench| {
         bench.iter(|| serde_json::to_vec(black_box(value)));

@@ -34,10 +34,7 @@ impl ActionExpression<'static> {
     ///
     /// # Errors
     /// When SL has no notation for a part of the act, or its `Serialize` fails.
-    pub fn new(
-        agent: &AgentId,
-        act: &(impl Serialize + ?Sized),
-    ) -> Result<Self, SerializeError> {
+    pub fn new(agent: &AgentId, act: &(impl Serialize + ?Sized)) -> Result<Self, SerializeError> {
         Ok(Self::Action {
             agent: agent.into(),
             act: Term::from_value(act)?,

@@ -2,8 +2,10 @@
 
 /// Ends a word: control characters, blanks and parentheses.
 const DELIMITER: u8 = 1;
-/// Needs care in quotation marks: a quotation mark or a backslash.
-const ESCAPE: u8 = 2;
+/// A quotation mark, which is escaped in quotation marks.
+const QUOTE: u8 = 2;
+/// A backslash, which a reader can take for the beginning of an escape.
+const BACKSLASH: u8 = 16;
 /// A byte of a character beyond ASCII.
 const NOT_ASCII: u8 = 4;
 /// White space between tokens.
@@ -18,7 +20,8 @@ const fn classes() -> [u8; 256] {
         classes[byte] = match byte as u8 {
             b' ' | b'\t' | b'\n' | b'\r' => DELIMITER | WHITE,
             0..=0x1f | b'(' | b')' => DELIMITER,
-            b'"' | b'\\' => ESCAPE,
+            b'"' => QUOTE,
+            b'\\' => BACKSLASH,
             0x80.. => NOT_ASCII,
             _ => 0,
         };
@@ -56,9 +59,7 @@ impl Shape {
     #[inline]
     pub(crate) fn of(text: &str) -> Self {
         let bytes = text.as_bytes();
-        let classes = bytes
-            .iter()
-            .fold(0, |classes, byte| classes | class(*byte));
+        let classes = bytes.iter().fold(0, |classes, byte| classes | class(*byte));
         Self {
             classes,
             begins: begins_word(bytes),
@@ -69,7 +70,7 @@ impl Shape {
     /// backslashes, and not the beginning of another token.
     #[inline]
     pub(crate) fn is_word(self) -> bool {
-        self.begins && self.classes & (DELIMITER | ESCAPE) == 0
+        self.begins && self.classes & (DELIMITER | QUOTE | BACKSLASH) == 0
     }
 
     #[inline]
@@ -77,10 +78,14 @@ impl Shape {
         self.classes & NOT_ASCII == 0
     }
 
-    /// Whether the text has neither quotation marks nor backslashes.
     #[inline]
-    pub(crate) fn is_plain(self) -> bool {
-        self.classes & ESCAPE == 0
+    pub(crate) fn has_quotes(self) -> bool {
+        self.classes & QUOTE != 0
+    }
+
+    #[inline]
+    pub(crate) fn has_backslashes(self) -> bool {
+        self.classes & BACKSLASH != 0
     }
 }
 
@@ -99,13 +104,12 @@ pub(crate) fn begins_word(bytes: &[u8]) -> bool {
 /// Whether a token that begins so is a number or a date-time.
 #[inline]
 pub(crate) fn begins_number(bytes: &[u8]) -> bool {
-    match bytes {
-        [b'0'..=b'9', ..] => true,
-        [b'+' | b'-', b'.', b'0'..=b'9', ..]
-        | [b'+' | b'-', b'0'..=b'9', ..]
-        | [b'.', b'0'..=b'9', ..] => true,
-        _ => false,
-    }
+    matches!(
+        bytes,
+        [b'0'..=b'9', ..]
+            | [b'+' | b'-' | b'.', b'0'..=b'9', ..]
+            | [b'+' | b'-', b'.', b'0'..=b'9', ..]
+    )
 }
 
 /// Whether the word is a truth value, in any case, as JADE reads it.
@@ -172,7 +176,19 @@ mod tests {
 
     #[test]
     fn words_follow_the_grammar() {
-        for word in ["a", "a:b?", "http://h:1/acc", "é", "+", "+x", "..5", ".x", "@a", "=", "|"] {
+        for word in [
+            "a",
+            "a:b?",
+            "http://h:1/acc",
+            "é",
+            "+",
+            "+x",
+            "..5",
+            ".x",
+            "@a",
+            "=",
+            "|",
+        ] {
             assert!(Shape::of(word).is_word(), "{word:?}");
         }
         for other in [

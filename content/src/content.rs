@@ -31,9 +31,7 @@ pub enum ContentExpression<'a> {
 impl<'a> Content<'a> {
     /// A content of these expressions.
     #[must_use]
-    pub fn new(
-        expressions: impl IntoIterator<Item = impl Into<ContentExpression<'a>>>,
-    ) -> Self {
+    pub fn new(expressions: impl IntoIterator<Item = impl Into<ContentExpression<'a>>>) -> Self {
         Self {
             expressions: expressions.into_iter().map(Into::into).collect(),
         }

@@ -181,10 +181,39 @@ impl<'a> Lexer<'a> {
         Err(ParseError::new(start, NUMBER, Problem::Number))
     }
 
+    /// The bytes that were not read yet.
+    #[inline]
+    pub(crate) fn rest(&self) -> &'a [u8] {
+        self.bytes.get(self.at..).unwrap_or_default()
+    }
+
+    /// Reads so many bytes, if a token ends behind them.
+    #[inline]
+    pub(crate) fn take(&mut self, len: usize) -> Option<&'a [u8]> {
+        let (taken, behind) = self.rest().split_at_checked(len)?;
+        if behind.first().is_some_and(|byte| !is_delimiter(*byte)) {
+            return None;
+        }
+        self.at += len;
+        Some(taken)
+    }
+
+    /// Reads a word that begins here, if there is one.
+    #[inline]
+    pub(crate) fn word(&mut self) -> Result<Option<&'a str>, ParseError> {
+        let start = self.at;
+        let bytes = self.run();
+        if !begins_word(bytes) {
+            self.at = start;
+            return Ok(None);
+        }
+        self.text_of(start, bytes, "word", WORD).map(Some)
+    }
+
     /// The bytes up to the next delimiter.
     #[inline]
     pub(crate) fn run(&mut self) -> &'a [u8] {
-        let rest = self.bytes.get(self.at..).unwrap_or_default();
+        let rest = self.rest();
         let len = rest
             .iter()
             .position(|byte| is_delimiter(*byte))
@@ -231,7 +260,11 @@ impl<'a> Lexer<'a> {
         loop {
             let behind = rest.get(end..).unwrap_or_default();
             let Some(found) = memchr::memchr(b'"', behind) else {
-                return Err(ParseError::new(start - 1, STRING, Problem::Truncated("string")));
+                return Err(ParseError::new(
+                    start - 1,
+                    STRING,
+                    Problem::Truncated("string"),
+                ));
             };
             let quote = end + found;
             end = quote + 1;
@@ -359,9 +392,16 @@ mod tests {
                 Word("-"),
             ]
         );
-        assert_eq!(tokens(b"#2\"\xff(").unwrap(), [Token::Bytes(b"\xff("[..].into())]);
+        assert_eq!(
+            tokens(b"#2\"\xff(").unwrap(),
+            [Token::Bytes(b"\xff("[..].into())]
+        );
         let numbers = tokens(b"-1 0x1F 1.5e3 .5").unwrap();
-        assert!(numbers.iter().all(|token| matches!(token, Token::Number(_))));
+        assert!(
+            numbers
+                .iter()
+                .all(|token| matches!(token, Token::Number(_)))
+        );
     }
 
     #[test]
@@ -386,11 +426,19 @@ mod tests {
         for (bytes, offset, problem) in [
             (&b" \"a"[..], 1, Problem::Truncated("string")),
             (b"\"a\\\"", 0, Problem::Truncated("string")),
-            (b"#3\"ab", 0, Problem::Truncated("byte-length encoded string")),
+            (
+                b"#3\"ab",
+                0,
+                Problem::Truncated("byte-length encoded string"),
+            ),
             (b"#3", 2, Problem::Truncated("byte-length encoded string")),
             (b"#x", 1, Problem::Byte(b'x')),
             (b"#\"x", 0, Problem::Number),
-            (b"#340282366920938463463374607431768211456\"", 0, Problem::Number),
+            (
+                b"#340282366920938463463374607431768211456\"",
+                0,
+                Problem::Number,
+            ),
             (b"a 1x", 2, Problem::Number),
             (b"-a", 0, Problem::Byte(b'-')),
             (b"20001308T042651481", 0, Problem::DateTime),
@@ -402,7 +450,11 @@ mod tests {
             (b"\"\xff\"", 1, Problem::NotUtf8("string")),
         ] {
             let error = tokens(bytes).unwrap_err();
-            assert_eq!((error.offset(), error.problem()), (offset, &problem), "{bytes:?}");
+            assert_eq!(
+                (error.offset(), error.problem()),
+                (offset, &problem),
+                "{bytes:?}"
+            );
         }
     }
 }

@@ -96,9 +96,11 @@ impl Number<'_> {
     /// notation in SL.
     #[must_use]
     pub fn from_f64(value: f64) -> Option<Self> {
-        value
-            .is_finite()
-            .then(|| Self(Cow::Owned(zmij::Buffer::new().format_finite(value).to_owned())))
+        value.is_finite().then(|| {
+            Self(Cow::Owned(
+                zmij::Buffer::new().format_finite(value).to_owned(),
+            ))
+        })
     }
 }
 
@@ -162,9 +164,113 @@ pub(crate) fn integer(bytes: &[u8]) -> Option<(bool, u128)> {
     }
     let magnitude = digits.iter().try_fold(0_u128, |value, digit| {
         let digit = char::from(*digit).to_digit(radix)?;
-        value.checked_mul(u128::from(radix))?.checked_add(digit.into())
+        value
+            .checked_mul(u128::from(radix))?
+            .checked_add(digit.into())
     })?;
     Some((negative, magnitude))
+}
+
+/// A number in decimal digits, read in one pass.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Decimal {
+    /// Bytes of the number.
+    pub(crate) len: usize,
+    pub(crate) negative: bool,
+    pub(crate) is_integer: bool,
+    /// All digits without the point, if they are few enough.
+    mantissa: Option<u64>,
+    /// The power of ten that the mantissa is multiplied with.
+    exponent: i32,
+}
+
+impl Decimal {
+    /// Reads the number that the bytes begin with. Hexadecimal ones end after their zero.
+    #[inline]
+    pub(crate) fn scan(bytes: &[u8]) -> Option<Self> {
+        /// So many digits always fit 64 bits.
+        const MAX_DIGITS: usize = 19;
+        let negative = bytes.first() == Some(&b'-');
+        let begin = bytes.len() - unsigned(bytes).len();
+        let mut at = begin;
+        let mut mantissa = 0_u64;
+        let mut digits = |at: &mut usize| {
+            let first = *at;
+            while let Some(digit) = bytes.get(*at).map(|byte| byte.wrapping_sub(b'0'))
+                && digit < 10
+            {
+                mantissa = mantissa.wrapping_mul(10).wrapping_add(u64::from(digit));
+                *at += 1;
+            }
+            *at - first
+        };
+        let mut total = digits(&mut at);
+        let mut exponent = 0;
+        let mut is_integer = true;
+        if bytes.get(at) == Some(&b'.') {
+            is_integer = false;
+            at += 1;
+            let fraction = digits(&mut at);
+            total += fraction;
+            exponent = i32::try_from(fraction).map_or(i32::MIN, |fraction| -fraction);
+        }
+        if total == 0 {
+            return None;
+        }
+        if let Some(b'e' | b'E') = bytes.get(at) {
+            is_integer = false;
+            let rest = bytes.get(at + 1..).unwrap_or_default();
+            let signed = rest.len() - unsigned(rest).len();
+            let (digits, _) = split_digits(unsigned(rest));
+            if digits.is_empty() {
+                return None;
+            }
+            // Beyond what fits, the digits are read in the other way.
+            let value = std::str::from_utf8(digits)
+                .ok()
+                .and_then(|text| text.parse().ok());
+            let value: i32 = value.unwrap_or(i32::MAX);
+            let value = if rest.first() == Some(&b'-') {
+                -value
+            } else {
+                value
+            };
+            exponent = exponent.saturating_add(value);
+            at += 1 + signed + digits.len();
+        }
+        Some(Self {
+            len: at,
+            negative,
+            is_integer,
+            mantissa: (total <= MAX_DIGITS).then_some(mantissa),
+            exponent,
+        })
+    }
+
+    /// The magnitude of an integer, if it has few digits.
+    #[inline]
+    pub(crate) fn magnitude(&self) -> Option<u64> {
+        self.mantissa.filter(|_| self.is_integer)
+    }
+
+    /// The value, if one multiplication or division of exact numbers gives it, which rounds once.
+    #[inline]
+    pub(crate) fn as_exact_f64(&self) -> Option<f64> {
+        const POWERS: [f64; 23] = [
+            1e0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8, 1e9, 1e10, 1e11, 1e12, 1e13, 1e14, 1e15,
+            1e16, 1e17, 1e18, 1e19, 1e20, 1e21, 1e22,
+        ];
+        let mantissa = self.mantissa.filter(|mantissa| *mantissa < 1 << 53)?;
+        let power = *POWERS.get(usize::try_from(self.exponent.unsigned_abs()).ok()?)?;
+        #[allow(clippy::cast_precision_loss, reason = "it has at most 53 bits")]
+        let value = mantissa as f64;
+        let value = if self.exponent < 0 {
+            value / power
+        } else {
+            value * power
+        };
+        Some(if self.negative { -value } else { value })
+    }
 }
 
 fn unsigned(bytes: &[u8]) -> &[u8] {
@@ -175,21 +281,55 @@ fn unsigned(bytes: &[u8]) -> &[u8] {
 }
 
 fn split_digits(bytes: &[u8]) -> (&[u8], &[u8]) {
-    let digits = bytes.iter().take_while(|byte| byte.is_ascii_digit()).count();
+    let digits = bytes
+        .iter()
+        .take_while(|byte| byte.is_ascii_digit())
+        .count();
     bytes.split_at_checked(digits).unwrap_or((bytes, &[]))
 }
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
 
     #[test]
     fn numbers_follow_the_grammar() {
-        for number in ["0", "-1", "+1", "0x1F", "-0Xa", "1.", ".5", "+.5e-3", "1e9", "1.5E+9"] {
+        for number in [
+            "0", "-1", "+1", "0x1F", "-0Xa", "1.", ".5", "+.5e-3", "1e9", "1.5E+9",
+        ] {
             assert!(Number::new(number).is_some(), "{number:?}");
         }
-        for other in ["", "-", "+", ".", "0x", "1a", "1e", "1e+", "1.5.", "0x1g", "--1", "inf", "NaN"] {
+        for other in [
+            "", "-", "+", ".", "0x", "1a", "1e", "1e+", "1.5.", "0x1g", "--1", "inf", "NaN",
+        ] {
             assert!(Number::new(other).is_none(), "{other:?}");
+        }
+    }
+
+    proptest! {
+        /// Against the numbers of the standard library.
+        #[test]
+        fn decimals_are_read_exactly(
+            text in "[+-]?([0-9]{1,22}(\\.[0-9]{0,22})?|\\.[0-9]{1,22})([eE][+-]?[0-9]{1,3})?"
+        ) {
+            let decimal = Decimal::scan(text.as_bytes()).unwrap();
+            prop_assert_eq!(decimal.len, text.len());
+            prop_assert_eq!(decimal.is_integer, is_integer(text.as_bytes()));
+            if let Some(value) = decimal.as_exact_f64() {
+                prop_assert_eq!(value.to_bits(), text.parse::<f64>().unwrap().to_bits());
+            }
+            if let Some(value) = decimal.magnitude() {
+                prop_assert_eq!(integer(text.as_bytes()), Some((decimal.negative, value.into())));
+            }
+        }
+
+        #[test]
+        fn what_is_scanned_is_a_number(text in "[+-]?[0-9.]{0,3}[eE]?[+-]?[0-9]{0,2}") {
+            let scanned = Decimal::scan(text.as_bytes());
+            let is_whole = scanned.is_some_and(|decimal| decimal.len == text.len());
+            prop_assert_eq!(is_whole, is_number(text.as_bytes()));
         }
     }
 

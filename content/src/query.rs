@@ -153,10 +153,7 @@ impl Query {
     /// # Errors
     /// When the content is no answer, is the answer to another query, or its value is no set or
     /// sequence of values of the type.
-    pub fn read_all<T: DeserializeOwned>(
-        &self,
-        answer: &Content<'_>,
-    ) -> Result<Vec<T>, ReadError> {
+    pub fn read_all<T: DeserializeOwned>(&self, answer: &Content<'_>) -> Result<Vec<T>, ReadError> {
         self.read_one(answer)
     }
 

@@ -128,35 +128,30 @@ fn is_word(shape: Shape, dialect: Dialect) -> bool {
 
 /// Appends the text in quotation marks, or as a byte-length encoded string where a reader could
 /// find another end of it.
-fn quoted(
-    out: &mut Vec<u8>,
-    dialect: Dialect,
-    text: &str,
-    shape: Shape,
-) -> Result<(), PrintError> {
-    out.reserve(text.len() + 2);
-    if shape.is_plain() {
-        out.push(b'"');
-        out.extend_from_slice(text.as_bytes());
-        out.push(b'"');
-        return Ok(());
-    }
-    match dialect {
-        Dialect::Standard if !is_quotable(text) => return counted(out, text.as_bytes()),
-        Dialect::Jade if text.ends_with('\\') => {
-            return Err(PrintError::Unrepresentable {
-                what: "string that ends with a backslash",
-                why: "JADE takes the backslash and the quotation mark behind it for an escape",
-            });
+fn quoted(out: &mut Vec<u8>, dialect: Dialect, text: &str, shape: Shape) -> Result<(), PrintError> {
+    if shape.has_backslashes() {
+        match dialect {
+            Dialect::Standard if !is_quotable(text) => return counted(out, text.as_bytes()),
+            Dialect::Jade if text.ends_with('\\') => {
+                return Err(PrintError::Unrepresentable {
+                    what: "string that ends with a backslash",
+                    why: "JADE takes the backslash and the quotation mark behind it for an escape",
+                });
+            }
+            _ => {}
         }
-        _ => {}
     }
+    out.reserve(text.len() + 2);
     out.push(b'"');
-    let mut pieces = text.split('"');
-    out.extend_from_slice(pieces.next().unwrap_or_default().as_bytes());
-    for piece in pieces {
-        out.extend_from_slice(b"\\\"");
-        out.extend_from_slice(piece.as_bytes());
+    if shape.has_quotes() {
+        let mut pieces = text.split('"');
+        out.extend_from_slice(pieces.next().unwrap_or_default().as_bytes());
+        for piece in pieces {
+            out.extend_from_slice(b"\\\"");
+            out.extend_from_slice(piece.as_bytes());
+        }
+    } else {
+        out.extend_from_slice(text.as_bytes());
     }
     out.push(b'"');
     Ok(())
@@ -168,7 +163,10 @@ fn is_quotable(text: &str) -> bool {
     !text.ends_with('\\') && !text.contains("\\\"")
 }
 
-#[allow(clippy::unnecessary_wraps, reason = "a last expression of functions that can fail")]
+#[allow(
+    clippy::unnecessary_wraps,
+    reason = "a last expression of functions that can fail"
+)]
 fn counted(out: &mut Vec<u8>, bytes: &[u8]) -> Result<(), PrintError> {
     out.reserve(bytes.len() + 8);
     out.push(b'#');

@@ -1,6 +1,6 @@
 //! The serializer: Rust values to SL text, without a tree in between.
 
-use std::mem;
+use std::{fmt, mem};
 
 use fipa_acl::TimeError;
 use serde::ser::{self, Serialize};
@@ -12,13 +12,32 @@ use crate::parse::Parser;
 use crate::print::Printer;
 use crate::{Dialect, MAX_DEPTH, write};
 
-type Result<T = ()> = std::result::Result<T, SerializeError>;
+type Result<T = ()> = std::result::Result<T, Boxed>;
+
+/// Boxed, so that successful results stay small.
+#[derive(Debug, thiserror::Error)]
+#[error(transparent)]
+struct Boxed(Box<SerializeError>);
+
+impl ser::Error for Boxed {
+    #[cold]
+    fn custom<T: fmt::Display>(message: T) -> Self {
+        <SerializeError as ser::Error>::custom(message).into()
+    }
+}
+
+impl<E: Into<SerializeError>> From<E> for Boxed {
+    #[cold]
+    fn from(error: E) -> Self {
+        Self(Box::new(error.into()))
+    }
+}
 
 /// Writes the value as a term in the standard dialect; the crate's documentation has the mapping.
 ///
 /// # Errors
 /// When SL has no notation for a part of the value, or `Serialize` of the value fails.
-pub fn to_vec(value: &(impl Serialize + ?Sized)) -> Result<Vec<u8>> {
+pub fn to_vec(value: &(impl Serialize + ?Sized)) -> std::result::Result<Vec<u8>, SerializeError> {
     to_vec_in(Dialect::Standard, value)
 }
 
@@ -26,7 +45,10 @@ pub fn to_vec(value: &(impl Serialize + ?Sized)) -> Result<Vec<u8>> {
 ///
 /// # Errors
 /// When the dialect has no notation for a part of the value, or `Serialize` of the value fails.
-pub fn to_vec_in(dialect: Dialect, value: &(impl Serialize + ?Sized)) -> Result<Vec<u8>> {
+pub fn to_vec_in(
+    dialect: Dialect,
+    value: &(impl Serialize + ?Sized),
+) -> std::result::Result<Vec<u8>, SerializeError> {
     let mut serializer = Serializer {
         out: Vec::with_capacity(128),
         dialect,
@@ -35,7 +57,9 @@ pub fn to_vec_in(dialect: Dialect, value: &(impl Serialize + ?Sized)) -> Result<
         absent: false,
         slots: Vec::new(),
     };
-    value.serialize(&mut serializer)?;
+    value
+        .serialize(&mut serializer)
+        .map_err(|Boxed(error)| *error)?;
     if serializer.absent {
         return Err(SerializeError::Absent);
     }
@@ -93,7 +117,7 @@ impl Serializer {
     fn present(&mut self, value: &(impl Serialize + ?Sized)) -> Result {
         value.serialize(&mut *self)?;
         if self.absent {
-            return Err(SerializeError::Absent);
+            return Err(SerializeError::Absent.into());
         }
         Ok(())
     }
@@ -121,7 +145,7 @@ impl Serializer {
 
     fn unsigned(&mut self, value: u64) -> Result {
         if self.dialect == Dialect::Jade && i64::try_from(value).is_err() {
-            return Err(too_large_for_jade());
+            return Err(too_large_for_jade().into());
         }
         self.put(itoa::Buffer::new().format(value));
         Ok(())
@@ -161,7 +185,7 @@ macro_rules! long_integers {
     ($($method:ident $integer:ty,)*) => {$(
         fn $method(self, value: $integer) -> Result {
             if self.dialect == Dialect::Jade && i64::try_from(value).is_err() {
-                return Err(too_large_for_jade());
+                return Err(too_large_for_jade().into());
             }
             self.put(itoa::Buffer::new().format(value));
             Ok(())
@@ -174,7 +198,7 @@ macro_rules! floats {
         #[inline]
         fn $method(self, value: $float) -> Result {
             if !value.is_finite() {
-                return Err(SerializeError::NotFinite);
+                return Err(SerializeError::NotFinite.into());
             }
             self.put(zmij::Buffer::new().format_finite(value));
             Ok(())
@@ -184,7 +208,7 @@ macro_rules! floats {
 
 impl<'s> ser::Serializer for &'s mut Serializer {
     type Ok = ();
-    type Error = SerializeError;
+    type Error = Boxed;
     type SerializeSeq = Compound<'s>;
     type SerializeTuple = Compound<'s>;
     type SerializeTupleStruct = Compound<'s>;
@@ -236,7 +260,9 @@ impl<'s> ser::Serializer for &'s mut Serializer {
                 Ok(())
             }
             Mode::DateTime => {
-                let time = text.parse().map_err(<SerializeError as ser::Error>::custom::<TimeError>)?;
+                let time = text
+                    .parse()
+                    .map_err(<Boxed as ser::Error>::custom::<TimeError>)?;
                 write::time(&mut self.out, self.dialect, time)?;
                 Ok(())
             }
@@ -387,7 +413,7 @@ impl Compound<'_> {
     fn field(&mut self, name: &'static str, value: &(impl Serialize + ?Sized)) -> Result {
         let slots = self.serializer.slots.get(self.first_slot..);
         if slots.unwrap_or_default().contains(&name) {
-            return Err(SerializeError::DuplicateSlot(name));
+            return Err(SerializeError::DuplicateSlot(name).into());
         }
         self.serializer.slots.push(name);
         self.serializer.slot(name, value)
@@ -404,7 +430,7 @@ macro_rules! elements {
     ($($trait:ident $method:ident,)*) => {$(
         impl ser::$trait for Compound<'_> {
             type Ok = ();
-            type Error = SerializeError;
+            type Error = Boxed;
 
             #[inline]
             fn $method<T: Serialize + ?Sized>(&mut self, value: &T) -> Result {
@@ -431,7 +457,7 @@ macro_rules! fields {
     ($($trait:ident,)*) => {$(
         impl ser::$trait for Compound<'_> {
             type Ok = ();
-            type Error = SerializeError;
+            type Error = Boxed;
 
             #[inline]
             fn serialize_field<T: Serialize + ?Sized>(
@@ -459,7 +485,7 @@ fields! {
 /// An entry of a map is a `property` (FIPA00023).
 impl ser::SerializeMap for Compound<'_> {
     type Ok = ();
-    type Error = SerializeError;
+    type Error = Boxed;
 
     fn serialize_key<T: Serialize + ?Sized>(&mut self, key: &T) -> Result {
         self.serializer.out.push(b' ');

@@ -119,6 +119,8 @@ impl Serialize for Agent {
 impl<'de> Deserialize<'de> for Agent {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let term = Term::deserialize(deserializer)?;
-        AgentId::try_from(&term).map(Self).map_err(de::Error::custom)
+        AgentId::try_from(&term)
+            .map(Self)
+            .map_err(de::Error::custom)
     }
 }

@@ -3,9 +3,8 @@
 use std::borrow::Cow;
 
 use fipa_content::{
-    ActionExpression, Arguments, Content, ContentExpression, FunctionalTerm,
-    IdentifyingExpression, LogicalOperator, ModalOperator, Number, Parameter, Quantifier,
-    ReferentialOperator, Term, Wff,
+    ActionExpression, Arguments, Content, ContentExpression, FunctionalTerm, IdentifyingExpression,
+    LogicalOperator, ModalOperator, Number, Parameter, Quantifier, ReferentialOperator, Term, Wff,
 };
 use proptest::collection::vec;
 use proptest::option;
@@ -15,9 +14,43 @@ use proptest::sample::select;
 /// Text that the notation has to be careful with.
 pub(crate) fn text() -> BoxedStrategy<String> {
     const SPECIAL: [&str; 37] = [
-        "", "true", "FALSE", "action", "sequence", "set", "all", "B", "b", "not", "=", "|", ";",
-        "+", "-", "1", "+1", ".5", "-x", "0x1f", "20000508T042651481Z", "?x", "??x", ":x", "#1\"a",
-        "a\\", "a\\\"b", "\\\"", "\"", "a\"b", "é", "a b", "(", "\n", "result", "done", "%",
+        "",
+        "true",
+        "FALSE",
+        "action",
+        "sequence",
+        "set",
+        "all",
+        "B",
+        "b",
+        "not",
+        "=",
+        "|",
+        ";",
+        "+",
+        "-",
+        "1",
+        "+1",
+        ".5",
+        "-x",
+        "0x1f",
+        "20000508T042651481Z",
+        "?x",
+        "??x",
+        ":x",
+        "#1\"a",
+        "a\\",
+        "a\\\"b",
+        "\\\"",
+        "\"",
+        "a\"b",
+        "é",
+        "a b",
+        "(",
+        "\n",
+        "result",
+        "done",
+        "%",
     ];
     prop_oneof![
         3 => "[a-z@:/.-]{0,8}",
@@ -134,11 +167,11 @@ pub(crate) fn nested(depth: usize) -> (BoxedStrategy<Term<'static>>, BoxedStrate
     );
     let quantifier = select(&[Quantifier::Forall, Quantifier::Exists][..]);
     let boxed = |wff: &BoxedStrategy<Wff<'static>>| wff.clone().prop_map(Box::new);
-    let two = (term.clone().prop_map(Box::new), term.clone().prop_map(Box::new));
-    let after = (
-        action.prop_map(Box::new),
-        option::of(boxed(&wff)),
+    let two = (
+        term.clone().prop_map(Box::new),
+        term.clone().prop_map(Box::new),
     );
+    let after = (action.prop_map(Box::new), option::of(boxed(&wff)));
     let wffs = prop_oneof![
         2 => atom,
         3 => (name(), vec(term.clone(), 1..4))
