@@ -65,7 +65,7 @@
 //! | enum | its variant: a word for a unit variant, `active` (`(active)` is read, too); otherwise a functional term, `(lift 3)`, `(plus 1 2)`, `(dock :speed 0.5)` |
 //! | `Vec`, slice, array, tuple, any set | `(sequence 1 2)`; sets are read, too |
 //! | the same in [`Set`] | `(set 1 2)`; sequences are read, too |
-//! | map | a set of properties: `(set (property :name speed :value 0.5))`. A functional term with parameters is read, too, its slots as keys |
+//! | map | a set of properties: `(set (property :name speed :value 0.5))`. A functional term with parameters is read, too, its slots as keys. Of a key that is there twice, the last value counts for most types of maps |
 //! | `Option` | the value, or a slot that is left out, argument of a newtype variant included. `None` anywhere else is an error |
 //! | `()` | `(sequence)` |
 //! | `bool` | the words `true` and `false`; as strings, they are in quotation marks |

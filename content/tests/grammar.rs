@@ -5,7 +5,7 @@
 use fipa_acl::AgentId;
 use fipa_content::{
     ActionExpression, AgentTermError, Content, ContentExpression, PrintError, Printer, Problem,
-    Profile, Query, ReadError, Term, Wff,
+    Profile, Query, ReadError, SerializeError, Term, Wff,
 };
 use serde::{Deserialize, Serialize};
 
@@ -218,6 +218,12 @@ enum Reason {
     MissingParameter(String, String),
 }
 
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum Operator {
+    Not(u8),
+}
+
 fn dock() -> (AgentId, Act) {
     (AgentId::new("crex").unwrap(), Act::Dock { speed: 0.5 })
 }
@@ -266,7 +272,14 @@ fn an_action_is_refused_with_a_reason() {
         assert_eq!((refused, why.read::<Reason>().unwrap()), (&action, reason));
     }
     // What has parameters by name is no predicate.
-    assert!(Wff::from_value(&act).is_err());
+    assert_eq!(Wff::from_value(&act), Err(SerializeError::Predicate));
+    // A predicate symbol is never taken for an operator.
+    let not = Wff::from_value(&("not", 1)).unwrap_err();
+    assert_eq!(not, SerializeError::Predicate);
+    let not = Wff::from_value(&Operator::Not(1)).unwrap();
+    assert_eq!(not.to_string(), "(\"not\" 1)");
+    assert_eq!(not.read::<Operator>().unwrap(), Operator::Not(1));
+    assert!(Wff::parse("(not p)").unwrap().read::<Operator>().is_err());
 }
 
 #[test]

@@ -178,7 +178,7 @@ fn damaged_text_is_refused_where_it_is_damaged() {
     let mut changed = text.as_bytes().to_vec();
     for at in 0..changed.len() {
         let byte = changed[at];
-        for other in 0..=u8::MAX {
+        for other in *b"\0 \"#()+-.0:?Z\\e|\x80\xc3\xff" {
             changed[at] = other;
             if let Err(error) = Content::parse(&changed) {
                 assert!(error.offset() <= changed.len());

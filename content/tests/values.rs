@@ -117,6 +117,16 @@ fn enums_are_function_symbols() {
         Act::Dock { speed: Some(0.5) }
     );
 
+    // An operator of SL is no function symbol.
+    assert!(matches!(
+        refused::<Act>("(action a b)").kind(),
+        DeserializeErrorKind::Type { .. }
+    ));
+    assert!(matches!(
+        refused::<Pose>("(set 1)").kind(),
+        DeserializeErrorKind::Symbol { .. }
+    ));
+
     let error = refused::<Act>("(fly 3)");
     let found = "fly".to_owned();
     assert!(matches!(
@@ -155,6 +165,12 @@ fn collections_are_sequences_sets_and_properties() {
     same((), "(sequence)");
     same(Set(BTreeSet::from([1, 2])), "(set 1 2)");
     same(Some(Set(vec![vec![1]])), "(set (sequence 1))");
+    // Only the collection itself is a set, nothing further inside.
+    assert_eq!(
+        text(&Set(Lists { list: vec![1] })),
+        "(Lists :list (sequence 1))"
+    );
+    assert_eq!(text(&Set(vec![vec![1]])), "(set (sequence 1))");
     assert_eq!(from_slice::<Vec<u8>>("(set 1 2)").unwrap(), [1, 2]);
     assert_eq!(from_slice::<Set<Vec<u8>>>("(sequence 1)").unwrap().0, [1]);
     let map = BTreeMap::from([("a".to_owned(), Some(1)), ("b".to_owned(), None)]);
@@ -167,6 +183,11 @@ fn collections_are_sequences_sets_and_properties() {
     assert_eq!(slots["x"], 1.5);
     let error = refused::<BTreeMap<String, i32>>("(set (property :value 1 :name a))");
     assert_eq!(error.kind(), &DeserializeErrorKind::MissingSlot("name"));
+}
+
+#[derive(Serialize)]
+struct Lists {
+    list: Vec<u8>,
 }
 
 #[test]

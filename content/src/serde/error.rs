@@ -27,11 +27,15 @@ pub enum SerializeError {
     /// A value that the dialect has no notation for.
     #[error(transparent)]
     Print(#[from] PrintError),
+    /// A value that is no predicate and no proposition: neither a function symbol with arguments by
+    /// position nor a word.
+    #[error("the value is no predicate and no proposition; arguments of predicates have no names")]
+    Predicate,
     /// A [`Term`](crate::Term) inside that is none.
     #[error("the term inside is malformed")]
     Term(#[from] ParseError),
     /// An error of the value's own `Serialize`.
-    #[error("{0}")]
+    #[error("{}", escape(.0))]
     Custom(String),
 }
 
@@ -68,7 +72,7 @@ pub enum DeserializeErrorKind {
     #[error(transparent)]
     Syntax(#[from] ParseError),
     /// A term of another type.
-    #[error("found {found} where {expected} should be")]
+    #[error("found {} where {expected} should be", escape(.found))]
     Type {
         /// The term.
         found: String,
@@ -76,7 +80,7 @@ pub enum DeserializeErrorKind {
         expected: String,
     },
     /// A term of the right type whose value is not allowed, for example out of range.
-    #[error("found {found} where {expected} should be")]
+    #[error("found {} where {expected} should be", escape(.found))]
     Value {
         /// The value.
         found: String,
@@ -92,7 +96,7 @@ pub enum DeserializeErrorKind {
         expected: String,
     },
     /// Another function symbol than that of the type.
-    #[error("found the function symbol {:?} where {expected:?} should be", escape(.found))]
+    #[error("found the function symbol \"{}\" where {expected:?} should be", escape(.found))]
     Symbol {
         /// The symbol.
         found: String,
@@ -100,7 +104,7 @@ pub enum DeserializeErrorKind {
         expected: &'static str,
     },
     /// A function symbol, or a word, that no variant of the enum has.
-    #[error("found {:?} where one of {expected:?} should be", escape(.found))]
+    #[error("found \"{}\" where one of {expected:?} should be", escape(.found))]
     Variant {
         /// The symbol.
         found: String,
@@ -125,7 +129,7 @@ pub enum DeserializeErrorKind {
     #[error(transparent)]
     Print(#[from] PrintError),
     /// An error of the type's own `Deserialize`.
-    #[error("{0}")]
+    #[error("{}", escape(.0))]
     Custom(String),
 }
 
@@ -290,7 +294,7 @@ pub(super) fn quoted(text: &str) -> String {
 fn described(found: de::Unexpected<'_>) -> String {
     match found {
         de::Unexpected::Map | de::Unexpected::StructVariant => "a functional term".to_owned(),
-        de::Unexpected::Str(text) => format!("the string {:?}", escape(&quoted(text))),
+        de::Unexpected::Str(text) => format!("the string \"{}\"", quoted(text)),
         other => quoted(&other.to_string()),
     }
 }

@@ -93,6 +93,8 @@ impl Serializer {
     }
 
     fn open(&mut self) -> Result {
+        // A mode is for a collection or a text, not for what is inside of another term.
+        self.mode = Mode::Plain;
         self.depth += 1;
         if self.depth > MAX_DEPTH {
             return Err(PrintError::TooDeep.into());
@@ -143,14 +145,6 @@ impl Serializer {
         }
     }
 
-    fn unsigned(&mut self, value: u64) -> Result {
-        if self.dialect == Dialect::Jade && i64::try_from(value).is_err() {
-            return Err(too_large_for_jade().into());
-        }
-        self.put(itoa::Buffer::new().format(value));
-        Ok(())
-    }
-
     /// Appends the text of a term, at any depth that is left.
     fn term(&mut self, text: &[u8]) -> Result {
         let term = Parser::whole_at(self.depth, Dialect::Standard, text, Parser::term)?;
@@ -183,6 +177,7 @@ macro_rules! integers {
 
 macro_rules! long_integers {
     ($($method:ident $integer:ty,)*) => {$(
+        #[inline]
         fn $method(self, value: $integer) -> Result {
             if self.dialect == Dialect::Jade && i64::try_from(value).is_err() {
                 return Err(too_large_for_jade().into());
@@ -228,6 +223,7 @@ impl<'s> ser::Serializer for &'s mut Serializer {
     }
 
     long_integers! {
+        serialize_u64 u64,
         serialize_i128 i128,
         serialize_u128 u128,
     }
@@ -235,11 +231,6 @@ impl<'s> ser::Serializer for &'s mut Serializer {
     floats! {
         serialize_f32 f32,
         serialize_f64 f64,
-    }
-
-    #[inline]
-    fn serialize_u64(self, value: u64) -> Result {
-        self.unsigned(value)
     }
 
     #[inline]
@@ -347,8 +338,8 @@ impl<'s> ser::Serializer for &'s mut Serializer {
     }
 
     fn serialize_seq(self, _len: Option<usize>) -> Result<Compound<'s>> {
+        let is_set = matches!(self.mode, Mode::Set);
         self.open()?;
-        let is_set = matches!(mem::take(&mut self.mode), Mode::Set);
         self.put(if is_set { "set" } else { "sequence" });
         Ok(self.compound())
     }

@@ -8,7 +8,7 @@ use serde::ser::{self, Serialize, Serializer};
 use super::error::{DeserializeError, SerializeError};
 use super::{de::from_slice, names, ser::to_vec};
 use crate::print::Printer;
-use crate::term::Term;
+use crate::term::{Arguments, FunctionalTerm, Term};
 use crate::wff::Wff;
 
 impl Term<'static> {
@@ -35,16 +35,22 @@ impl Term<'_> {
 }
 
 impl Wff<'static> {
-    /// The formula that the value is written as: a predicate for a functional term with arguments by
-    /// position, a proposition for a word. So an enum can hold the reasons of a refusal:
+    /// The formula of a value: a predicate for a function symbol with arguments by position, a
+    /// proposition for a word. So an enum can hold the reasons of a refusal:
     /// `(missing-parameter dock target)`, `unauthorised`.
     ///
     /// # Errors
-    /// When SL has no notation for a part of the value, when the value is no such term, or
-    /// `Serialize` of the value fails.
+    /// When the value is written as another term, SL has no notation for a part of it, or its
+    /// `Serialize` fails.
     pub fn from_value(value: &(impl Serialize + ?Sized)) -> Result<Self, SerializeError> {
-        let text = to_vec(value)?;
-        Ok(Wff::parse(&text)?.into_owned())
+        match Term::from_value(value)? {
+            Term::String(symbol) => Ok(Self::Proposition(symbol)),
+            Term::Functional(FunctionalTerm {
+                symbol,
+                arguments: Arguments::Terms(arguments),
+            }) => Ok(Self::predicate(symbol, arguments)),
+            _ => Err(SerializeError::Predicate),
+        }
     }
 }
 
@@ -52,16 +58,25 @@ impl Wff<'_> {
     /// Reads a predicate or proposition as a value: see [`from_value`](Self::from_value).
     ///
     /// # Errors
-    /// When the formula is not a value of the type. Offsets count from the start of the formula in
-    /// its standard notation on one line.
+    /// When it is another formula, or not a value of the type. Offsets count from the start of the
+    /// formula in its standard notation on one line.
     pub fn read<T: DeserializeOwned>(&self) -> Result<T, DeserializeError> {
-        let text = Printer::new().print(self)?;
-        from_slice(&text)
+        match self {
+            Self::Proposition(symbol) => Term::String(symbol.clone()).read(),
+            Self::Predicate { symbol, arguments } => {
+                Term::functional(symbol.clone(), arguments.iter().cloned()).read()
+            }
+            _ => {
+                let found = de::Unexpected::Other("another formula");
+                let expected = &"a predicate or proposition";
+                Err(de::Error::invalid_type(found, expected))
+            }
+        }
     }
 }
 
 /// Writes the term as it is; in other formats than SL, as text in the standard notation, or bytes
-/// where it has byte strings.
+/// where it has byte strings. As in that notation, a byte string that is UTF-8 becomes a string.
 impl Serialize for Term<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let text = Printer::new().print(self).map_err(ser::Error::custom)?;

@@ -22,8 +22,23 @@ pub(super) struct Deserializer<'de> {
 
 /// The beginning of a term in parentheses.
 pub(super) enum Head<'de> {
+    /// A sequence or set.
     Sequence,
+    /// An action expression or identifying expression.
+    Operator,
+    /// A functional term.
     Symbol(Cow<'de, str>),
+}
+
+impl Head<'_> {
+    /// The kind of term, for errors.
+    pub(super) fn kind(&self) -> Unexpected<'static> {
+        Unexpected::Other(match self {
+            Self::Sequence => "a sequence or set",
+            Self::Operator => "an action expression or identifying expression",
+            Self::Symbol(_) => "a functional term",
+        })
+    }
 }
 
 impl<'de> Deserializer<'de> {
@@ -62,6 +77,7 @@ impl<'de> Deserializer<'de> {
         let start = self.start();
         Ok(match self.lexer.next()? {
             Token::Word("sequence" | "set") => Head::Sequence,
+            Token::Word(word) if is_term_keyword(word) => Head::Operator,
             Token::Word(word) => Head::Symbol(Cow::Borrowed(word)),
             Token::Literal(symbol) => Head::Symbol(symbol),
             other => return Err(unexpected(start, &other, "symbol")),
@@ -141,14 +157,17 @@ impl<'de> Deserializer<'de> {
             return Err(self.mistaken(&symbol));
         }
         self.open()?;
-        // The symbol is mostly written without blanks and quotation marks.
+        self.lexer.peek();
+        // The symbol is mostly written without quotation marks.
         let found = match self.lexer.word()? {
             Some(word) if word == symbol && !is_term_keyword(word) => return Ok(()),
             Some(word) => quoted(word),
             None => match self.head()? {
                 Head::Symbol(found) if found == symbol => return Ok(()),
                 Head::Symbol(found) => quoted(&found),
-                Head::Sequence => "sequence".to_owned(),
+                other => {
+                    return Err(DeserializeError::invalid_type(other.kind(), &symbol).at(start));
+                }
             },
         };
         let expected = symbol;
@@ -181,11 +200,10 @@ impl<'de> Deserializer<'de> {
                     Unexpected::Other(&number)
                 }
             },
-            Token::Open => Unexpected::Other(match self.head() {
-                Ok(Head::Sequence) => "a sequence or set",
-                Ok(Head::Symbol(_)) => "a functional term",
+            Token::Open => match self.head() {
+                Ok(head) => head.kind(),
                 Err(error) => return error,
-            }),
+            },
             other => return unexpected(start, other, "term"),
         };
         DeserializeError::invalid_type(found, expected).at(start)

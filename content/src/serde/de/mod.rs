@@ -6,7 +6,7 @@ mod cursor;
 use std::borrow::Cow;
 
 use serde::de::value::CowStrDeserializer;
-use serde::de::{self, Deserialize, Error as _, IntoDeserializer, Unexpected, Visitor};
+use serde::de::{self, Deserialize, Error as _, IntoDeserializer, Visitor};
 
 use self::access::{Function, Properties};
 use self::cursor::{Deserializer, Head, out_of_range, unexpected, visit_byte_string, visit_text};
@@ -67,9 +67,8 @@ impl<'de> de::Deserializer<'de> for &mut Deserializer<'de> {
         if self.lexer.peek() == Some(b'(') {
             self.open()?;
             return match (self.head()?, self.lexer.peek()) {
-                (Head::Sequence, _) => self.visit_elements(visitor),
                 (Head::Symbol(_), Some(b':')) => self.visit_slots(visitor),
-                (Head::Symbol(_), _) => self.visit_elements(visitor),
+                _ => self.visit_elements(visitor),
             };
         }
         let before = self.lexer.clone();
@@ -176,9 +175,9 @@ impl<'de> de::Deserializer<'de> for &mut Deserializer<'de> {
             return Err(self.mistaken(&visitor));
         }
         self.open()?;
-        if let Head::Symbol(_) = self.head()? {
-            let found = Unexpected::Other("a functional term");
-            return Err(DeserializeError::invalid_type(found, &"(sequence)").at(start));
+        let head = self.head()?;
+        if !matches!(head, Head::Sequence) {
+            return Err(DeserializeError::invalid_type(head.kind(), &"(sequence)").at(start));
         }
         self.close("none")?;
         visitor.visit_unit()
@@ -212,9 +211,9 @@ impl<'de> de::Deserializer<'de> for &mut Deserializer<'de> {
             return Err(self.mistaken(&visitor));
         }
         self.open()?;
-        if let Head::Symbol(_) = self.head()? {
-            let found = Unexpected::Other("a functional term");
-            return Err(DeserializeError::invalid_type(found, &visitor).at(start));
+        let head = self.head()?;
+        if !matches!(head, Head::Sequence) {
+            return Err(DeserializeError::invalid_type(head.kind(), &visitor).at(start));
         }
         let visited = self.visit_elements(visitor);
         visited.map_err(|error| error.at(start))
@@ -244,6 +243,7 @@ impl<'de> de::Deserializer<'de> for &mut Deserializer<'de> {
         self.open()?;
         let visited = match self.head()? {
             Head::Symbol(_) => self.visit_slots(visitor),
+            head @ Head::Operator => Err(DeserializeError::invalid_type(head.kind(), &visitor)),
             Head::Sequence => {
                 let value = visitor.visit_map(Properties { deserializer: self })?;
                 self.close("as many as the type has")?;
@@ -282,9 +282,9 @@ impl<'de> de::Deserializer<'de> for &mut Deserializer<'de> {
             return visited.map_err(|error| error.at(start));
         }
         self.open()?;
-        let Head::Symbol(symbol) = self.head()? else {
-            let found = Unexpected::Other("a sequence or set");
-            return Err(DeserializeError::invalid_type(found, &visitor).at(start));
+        let symbol = match self.head()? {
+            Head::Symbol(symbol) => symbol,
+            other => return Err(DeserializeError::invalid_type(other.kind(), &visitor).at(start)),
         };
         let visited = visitor.visit_enum(Function {
             deserializer: self,
