@@ -1,5 +1,5 @@
-//! What conversations ask for and answer: actions, and that they are done, have a result, or are
-//! refused.
+//! The forms of requests and their answers: an action; the statement that it is done, or has a
+//! result; a refusal with a reason.
 
 use fipa_acl::AgentId;
 use serde::Serialize;

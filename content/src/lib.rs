@@ -1,8 +1,8 @@
 //! The content of FIPA messages: FIPA-SL (FIPA00008), and Rust values in it by serde.
 //!
-//! What lives here: the values of the content language, the code that turns them into text and
-//! back, and the forms that conversations need. What must not: input and output, clocks, threads,
-//! `unsafe`; messages around the content are in `fipa-acl`.
+//! This crate has the values of the content language, the code that turns them into text and back,
+//! and the forms that conversations need. It has no input and output, no clocks, no threads and no
+//! `unsafe`. Messages around the content are in `fipa-acl`.
 //!
 //! * [`Content`], [`Wff`] and [`Term`] are parsed text. They borrow from the message, or own their
 //!   text after `into_owned()`. [`Printer`] writes them, on one line or indented, for readers of the

@@ -16,9 +16,9 @@ use crate::{Dialect, MAX_DEPTH, write};
 
 /// Writes contents, formulas and terms.
 ///
-/// What was printed reads as the same value, in the same dialect. The exceptions: a byte string that
-/// is UTF-8 reads as a string in the standard dialect, and a predicate without arguments as a
-/// proposition.
+/// Printed text reads as the same value in the same dialect, with two exceptions: in the standard
+/// dialect a byte string that is UTF-8 reads as a string, and a predicate without arguments reads as
+/// a proposition.
 ///
 /// ```
 /// use fipa_content::{Content, Dialect, Printer};

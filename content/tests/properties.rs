@@ -1,4 +1,4 @@
-//! What must hold for every content, and for any bytes at all.
+//! Properties of every content, and of any bytes at all.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 

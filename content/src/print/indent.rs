@@ -7,6 +7,8 @@ use crate::lex::{Lexer, Token};
 const WIDTH: usize = 80;
 /// Columns of one level.
 const STEP: usize = 2;
+/// Deepest indentation, which bounds the blanks that deep text takes.
+const MAX_INDENT: usize = 60;
 
 /// A token of the text on one line.
 struct Span {
@@ -24,7 +26,7 @@ enum Kind {
     Other,
 }
 
-/// The text of the printer with long lists on several lines.
+/// Returns the printer's text with long lists on several lines.
 pub(super) fn indented(line: &[u8]) -> Vec<u8> {
     let spans = spans(line);
     let mut out = Vec::with_capacity(line.len() * 2);
@@ -48,12 +50,12 @@ pub(super) fn indented(line: &[u8]) -> Vec<u8> {
             out.push(b' ');
         } else if !first_of_list && !out.is_empty() {
             out.push(b'\n');
-            out.resize(out.len() + depth * STEP, b' ');
+            out.resize(out.len() + columns(depth), b' ');
         }
         after_name = matches!(span.kind, Kind::Name);
         first_of_list = false;
         match span.kind {
-            Kind::Open(end) if depth * STEP + (end - span.start) > WIDTH => {
+            Kind::Open(end) if columns(depth) + (end - span.start) > WIDTH => {
                 depth += 1;
                 first_of_list = true;
                 out.push(b'(');
@@ -66,6 +68,10 @@ pub(super) fn indented(line: &[u8]) -> Vec<u8> {
         }
     }
     out
+}
+
+fn columns(depth: usize) -> usize {
+    (depth * STEP).min(MAX_INDENT)
 }
 
 /// The tokens, and where the list of each opening parenthesis ends.

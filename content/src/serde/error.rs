@@ -290,7 +290,7 @@ pub(super) fn quoted(text: &str) -> String {
     text.chars().take(MAX_QUOTED).collect()
 }
 
-/// What was found, in the terms of SL.
+/// Describes a found value in the terms of SL.
 fn described(found: de::Unexpected<'_>) -> String {
     match found {
         de::Unexpected::Map | de::Unexpected::StructVariant => "a functional term".to_owned(),

@@ -77,7 +77,7 @@ struct Serializer {
     slots: Vec<&'static str>,
 }
 
-/// How the next value is written: see [`names`].
+/// The notation of the next value: see [`names`].
 #[derive(Default)]
 enum Mode {
     #[default]
@@ -389,7 +389,7 @@ impl<'s> ser::Serializer for &'s mut Serializer {
 /// A term in parentheses that is being written.
 struct Compound<'s> {
     serializer: &'s mut Serializer,
-    /// Where its slots begin among those of all structs.
+    /// Index of its first slot among those of all open structs.
     first_slot: usize,
 }
 

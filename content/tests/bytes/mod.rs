@@ -1,5 +1,5 @@
-//! What must hold for any bytes: they are read or refused, in every way alike. The fuzz target
-//! `content` has the same body.
+//! Properties of any bytes: they are read or refused, in every way alike. The fuzz target `content`
+//! has the same body.
 
 use std::collections::BTreeMap;
 

@@ -43,7 +43,7 @@ pub(super) struct Slots<'d, 'de> {
     pub(super) deserializer: &'d mut Deserializer<'de>,
     /// The slot whose value is next.
     pub(super) name: Cow<'de, str>,
-    /// Where it begins.
+    /// Its offset.
     pub(super) start: usize,
 }
 
