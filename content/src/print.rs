@@ -177,8 +177,11 @@ impl Writer {
     }
 
     fn functional(&mut self, term: &FunctionalTerm<'_>) -> Result<(), PrintError> {
-        if self.is_jade_failure() && term.symbol == "agent-identifier" {
-            return self.jade_agent(term.parameters());
+        if self.is_jade_failure()
+            && term.symbol == "agent-identifier"
+            && let Arguments::Parameters(parameters) = &term.arguments
+        {
+            return self.jade_agent(parameters);
         }
         self.open()?;
         let is_binary = term.terms().len() == 2;

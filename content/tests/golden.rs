@@ -113,6 +113,14 @@ fn a_failure_of_the_message_transport_is_read_and_written_as_jade_does() {
     assert!(cause.starts_with("Agent not found: "), "{cause}");
 }
 
+/// An agent identifier without names of slots is malformed, and keeps its arguments.
+#[test]
+fn arguments_by_position_survive_the_layout_of_failures() {
+    let content = Content::parse("((p (agent-identifier crex)))").unwrap();
+    let text = Printer::new().jade_failure().print(&content).unwrap();
+    assert_eq!(text, b"( (p (agent-identifier crex)) )");
+}
+
 /// The contents of the other recordings.
 #[test]
 fn content_that_is_no_sl_is_refused() {
