@@ -1,0 +1,111 @@
+//! Contents of messages (FIPA00008 clause 3.1).
+
+use crate::Dialect;
+use crate::error::ParseError;
+use crate::parse::Parser;
+use crate::term::{ActionExpression, IdentifyingExpression};
+use crate::wff::Wff;
+
+/// The content of a message: content expressions in one pair of parentheses.
+///
+/// `Content<'a>` borrows its text from the parsed bytes, `Content<'static>` owns it: see
+/// [`into_owned`](Self::into_owned).
+#[derive(Debug, Clone, PartialEq)]
+pub struct Content<'a> {
+    /// The expressions. The standard asks for at least one.
+    pub expressions: Vec<ContentExpression<'a>>,
+}
+
+/// An expression that can be the content of a message.
+#[derive(Debug, Clone, PartialEq)]
+#[allow(clippy::exhaustive_enums, reason = "the standard is final")]
+pub enum ContentExpression<'a> {
+    /// An action, as in a `request`.
+    Action(ActionExpression<'a>),
+    /// A reference to objects, as in a `query-ref`.
+    Identifying(IdentifyingExpression<'a>),
+    /// A formula, as in an `inform`.
+    Wff(Wff<'a>),
+}
+
+impl<'a> Content<'a> {
+    /// A content of these expressions.
+    #[must_use]
+    pub fn new(expressions: impl IntoIterator<Item = impl Into<ContentExpression<'a>>>) -> Self {
+        Self {
+            expressions: expressions.into_iter().map(Into::into).collect(),
+        }
+    }
+
+    /// Parses a content in the standard notation.
+    ///
+    /// # Errors
+    /// When the bytes are not one content, are nested deeper than [`MAX_DEPTH`](crate::MAX_DEPTH),
+    /// or have more than [`MAX_NODES`](crate::MAX_NODES) terms and formulas.
+    pub fn parse(bytes: &'a (impl AsRef<[u8]> + ?Sized)) -> Result<Self, ParseError> {
+        Self::parse_in(Dialect::Standard, bytes)
+    }
+
+    /// Parses a content that comes from a writer of this dialect.
+    ///
+    /// # Errors
+    /// See [`parse`](Self::parse).
+    pub fn parse_in(
+        dialect: Dialect,
+        bytes: &'a (impl AsRef<[u8]> + ?Sized),
+    ) -> Result<Self, ParseError> {
+        Parser::whole(dialect, bytes.as_ref(), Parser::content)
+    }
+
+    /// The same content with all text in memory of its own.
+    #[must_use]
+    pub fn into_owned(self) -> Content<'static> {
+        let expressions = self.expressions.into_iter();
+        Content {
+            expressions: expressions.map(ContentExpression::into_owned).collect(),
+        }
+    }
+}
+
+impl ContentExpression<'_> {
+    /// The same expression with all text in memory of its own.
+    #[must_use]
+    pub fn into_owned(self) -> ContentExpression<'static> {
+        match self {
+            Self::Action(action) => ContentExpression::Action(action.into_owned()),
+            Self::Identifying(expression) => {
+                ContentExpression::Identifying(expression.into_owned())
+            }
+            Self::Wff(wff) => ContentExpression::Wff(wff.into_owned()),
+        }
+    }
+}
+
+/// The expression. A meta-symbol alone is [`Wff::Meta`], as it is when it is parsed.
+impl<'a> From<ActionExpression<'a>> for ContentExpression<'a> {
+    fn from(action: ActionExpression<'a>) -> Self {
+        match action {
+            ActionExpression::Meta(name) => Self::Wff(Wff::Meta(name)),
+            action => Self::Action(action),
+        }
+    }
+}
+
+impl<'a> From<IdentifyingExpression<'a>> for ContentExpression<'a> {
+    fn from(expression: IdentifyingExpression<'a>) -> Self {
+        Self::Identifying(expression)
+    }
+}
+
+impl<'a> From<Wff<'a>> for ContentExpression<'a> {
+    fn from(wff: Wff<'a>) -> Self {
+        Self::Wff(wff)
+    }
+}
+
+/// A content of one expression.
+impl<'a, T: Into<ContentExpression<'a>>> From<T> for Content<'a> {
+    fn from(expression: T) -> Self {
+        Self::new([expression])
+    }
+}

@@ -1,0 +1,1 @@
+((result (action (agent-identifier :name df@jadetest) (search (df-agent-description) (search-constraints :max-results -1))) (sequence)))

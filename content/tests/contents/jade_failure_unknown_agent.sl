@@ -1,0 +1,1 @@
+( (action ( agent-identifier :name rusty@rustap  :addresses (sequence http://127.0.0.1:9904/acc )) (ACLMessage) ) (MTS-error ( agent-identifier :name nobody@jadetest  :addresses (sequence http://127.0.0.1:7778/acc )) (internal-error "Agent not found: getContainerID() failed to find agent nobody@jadetest")) )

@@ -1,0 +1,1 @@
+((all (sequence ?name ?duration) (offers crex ?name ?duration)))

@@ -1,0 +1,1 @@
+((action (agent-identifier :name crex) (dock :target (pose 1.5 0.2) :speed 0.5)))
