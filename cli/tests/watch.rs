@@ -300,7 +300,7 @@ fn people_see_lines_and_a_summary() {
 /// An agent that does what it is told on standard input, as in the demo.
 fn part(host: &Host, name: &str) -> (std::process::Child, BufReader<std::process::ChildStdout>) {
     let mut child = host
-        .command(&["demo", "--part", "agent", "--name", name])
+        .command(&["demo", "--role", "agent", "--name", name])
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .spawn()

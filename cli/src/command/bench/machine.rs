@@ -44,7 +44,7 @@ impl fmt::Display for Machine {
         if self.optimised {
             Ok(())
         } else {
-            f.write_str(" without optimisation")
+            f.write_str(" without optimization")
         }
     }
 }
@@ -76,21 +76,21 @@ impl Machine {
         let mut warnings = Vec::new();
         if self.busy > BUSY {
             warnings.push(format!(
-                "the machine is busy: others use {:.0} % of its processors. Times will be too \
-                 long and scattered; ratios suffer less",
+                "other processes use {:.0} % of the CPU time: times will be too long and scattered; \
+                 ratios are less affected",
                 self.busy * 100.0
             ));
         }
         if !self.optimised {
             warnings.push(
-                "this command was built without optimisation: cargo run --release -- bench"
+                "this command was built without optimization; run: cargo run --release -- bench"
                     .to_owned(),
             );
         }
         if self.cores < 2 {
             warnings.push(
-                "with one processor, both ends of a way take turns on it, and whoever spins \
-                 keeps the other from working"
+                "this machine has one CPU: sender and receiver share it, and a spinning process delays \
+                 the other one"
                     .to_owned(),
             );
         }
@@ -112,7 +112,7 @@ pub(super) fn keep_to(core: usize) -> Result<(), String> {
     let mut only = CpuSet::new();
     only.set(core);
     rustix::thread::sched_setaffinity(None, &only)
-        .map_err(|error| format!("cannot keep to processor {core}: {error}"))
+        .map_err(|error| format!("cannot pin the process to CPU {core}: {error}"))
 }
 
 fn processor() -> String {

@@ -113,6 +113,6 @@ async fn turn(
     }
     match sent {
         Event::Sent { began, ended, .. } => Ok(median(&times(&began, &ended))),
-        other => Err(format!("instead of times there was {other:?}")),
+        other => Err(format!("expected times, not {other:?}")),
     }
 }

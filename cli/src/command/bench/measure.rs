@@ -154,7 +154,9 @@ pub(super) async fn all(
             for (index, why) in failed.into_iter().rev() {
                 let way = ways.remove(index);
                 let name = way.sort.name();
-                measured.notes.push(format!("{name}: given up: {why}"));
+                measured
+                    .notes
+                    .push(format!("{name}: measurement stopped: {why}"));
                 able.retain(|other| *other != index);
                 for other in &mut able {
                     *other -= usize::from(*other > index);

@@ -40,17 +40,18 @@ use crate::options::Global;
 use crate::report::{Failure, warn};
 use crate::{membership, output};
 
-/// Measure how fast letters go on this machine, beside what the bare mechanisms can do
+/// Measure latency and throughput on this machine, compared with the raw mechanisms
 ///
-/// Compares every configured transport: latency one way and round trip, throughput and processor
-/// time, for content from 100 bytes to 4 MB, each beside its limit (bare iceoryx2, Unix
-/// domain socket, a bare relay) measured in the same rounds, with the ratio. Gateways also speak TCP with
-/// TLS, and QUIC, with keys made for the measurement, beside TCP without. All traffic stays on this
-/// machine, and nothing is left behind.
+/// Measures one-way latency, round trip, throughput and CPU time of every configured transport, for
+/// content from 100 bytes to 4 MB. Each transport is compared with its limit, which is measured in the
+/// same rounds: raw iceoryx2, a raw Unix domain socket, or a raw relay. Gateways are also measured
+/// with TCP over TLS and with QUIC, with temporary keys. All traffic stays on this machine, and no
+/// files are left.
 ///
-/// Times are worth little on a busy machine; ratios more.
+/// On a busy machine the times are unreliable; the ratios are less affected.
 #[derive(Debug, Args)]
-#[command(after_help = "Examples:
+#[command(after_help = "\
+Examples:
   fipa bench
   fipa bench shm --quick
   fipa bench net --json | jq '.rows[] | {path, size, p50: .one_way_us.p50, ratio}'
@@ -58,19 +59,19 @@ use crate::{membership, output};
   fipa bench --zenoh comparison/zenoh/target/release/fipa-comparison-zenoh
   fipa bench paper --dir docs")]
 pub(crate) struct Arguments {
-    /// What to compare; everything unless given
+    /// Part to measure [default: shm and net]
     #[arg(value_enum)]
     what: Option<What>,
     /// Print JSON instead of a table
     #[arg(long)]
     json: bool,
-    /// Draw latency over size into this file too
+    /// Also draw latency over content size to this file
     #[arg(long, value_name = "FILE")]
     svg: Option<PathBuf>,
-    /// Measure less, in a few seconds: figures scatter more
+    /// Take fewer samples: a few seconds, with a larger spread
     #[arg(long)]
     quick: bool,
-    /// Sizes of content; `paper` has its own
+    /// Content sizes; not used by `paper`
     #[arg(
         long,
         value_delimiter = ',',
@@ -79,27 +80,27 @@ pub(crate) struct Arguments {
         default_value = "100B,1KiB,64KiB,1MiB,4MiB"
     )]
     sizes: Vec<ByteSize>,
-    /// Where `paper` writes its tables and pictures [default: docs]
+    /// Directory for the tables and drawings of `paper` [default: docs]
     #[arg(long, value_name = "DIRECTORY")]
     dir: Option<PathBuf>,
-    /// Measure zenoh in the same rounds, through this program (see comparison/zenoh)
+    /// Also measure zenoh in the same rounds, with this program (see comparison/zenoh)
     #[arg(long, value_name = "PROGRAM")]
     zenoh: Option<PathBuf>,
-    /// Play a part in somebody else's measurement
+    /// Run as a process of a measurement
     #[arg(long, hide = true)]
     part: Option<String>,
-    /// Play it on this processor
+    /// Run on this CPU
     #[arg(long, hide = true, requires = "part")]
     core: Option<usize>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum What {
-    /// Two agents on one host, through shared memory
+    /// Shared memory between two agents on one host
     Shm,
-    /// Through sockets: two agents directly, and through a gateway on either side
+    /// Sockets between two agents, directly and through two gateways
     Net,
-    /// Encodings, as in the evaluation of the C++ libraries; writes tables and pictures
+    /// Encodings, as in the paper about the C++ libraries; writes tables and drawings
     Paper,
 }
 
@@ -112,17 +113,17 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         let kept = arguments.core.map_or(Ok(()), machine::keep_to);
         let part = serde_json::from_str::<Part>(part).map_err(|error| error.to_string());
         let played = kept.and(part).and_then(|part| part::play(part, &config));
-        let advice = "see what the measurement itself reports";
-        return played.map_err(|error| Failure::failed(error, "a part of fipa bench", advice));
+        let advice = "see the report of the measurement";
+        return played.map_err(|error| Failure::failed(error, "a process of fipa bench", advice));
     }
     if arguments.what == Some(What::Paper) {
         return again(&arguments);
     }
     if arguments.dir.is_some() {
         return Err(Failure::wrong_usage(
-            "only `fipa bench paper` writes into a directory",
+            "--dir is only for `fipa bench paper`",
             "--dir",
-            "leave it out, or use --svg FILE for a picture",
+            "omit --dir, or use --svg FILE for a drawing",
         ));
     }
     let effort = effort(&arguments)?;
@@ -132,9 +133,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     }
     if measured.rows.is_empty() {
         return Err(Failure::failed(
-            format!("nothing could be measured: {}", measured.notes.join("; ")),
+            format!("every measurement failed: {}", measured.notes.join("; ")),
             "fipa bench",
-            "see `fipa config show` for mts.transports, and run it with -v for the logs",
+            "check mts.transports (`fipa config show`), and run the command with -v for the logs",
         ));
     }
     if let Some(file) = &arguments.svg {
@@ -150,24 +151,24 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 fn again(arguments: &Arguments) -> Result<(), Failure> {
     if arguments.svg.is_some() {
         return Err(Failure::wrong_usage(
-            "`fipa bench paper` draws pictures of its own",
+            "`fipa bench paper` has no --svg: it always writes its drawings",
             "--svg",
-            "leave it out, and name with --dir where the pictures go",
+            "omit --svg, and give the directory of the drawings with --dir",
         ));
     }
     if arguments.zenoh.is_some() {
         return Err(Failure::wrong_usage(
-            "`fipa bench paper` is about encodings, which zenoh has none of",
+            "`fipa bench paper` measures encodings, and zenoh has none",
             "--zenoh",
-            "leave it out, or leave out `paper`",
+            "omit --zenoh or `paper`",
         ));
     }
     let directory = arguments.dir.as_deref().unwrap_or(Path::new("docs"));
     if !directory.is_dir() {
         return Err(Failure::wrong_usage(
-            format!("{} is no directory", directory.display()),
+            format!("{} is not a directory", directory.display()),
             "--dir",
-            "run it where the sources are, or name the directory to write into",
+            "give an existing directory, or run the command in the source directory",
         ));
     }
     let paper = membership::run(async {
@@ -188,13 +189,13 @@ fn again(arguments: &Arguments) -> Result<(), Failure> {
         let paper = paper::measure(machine, cycles, &told).await;
         progress.finish_and_clear();
         paper.map_err(|error| {
-            let advice = "report it: these messages are the same everywhere";
+            let advice = "report this bug: the messages do not depend on the machine";
             Failure::failed(error, "fipa bench paper", advice)
         })
     })?;
     paper.write(directory).map_err(|error| {
         let place = directory.display().to_string();
-        Failure::failed(error, place, "see whether this user can write there")
+        Failure::failed(error, place, "check whether this user can write there")
     })?;
     if arguments.json {
         return output::json(&paper);
@@ -204,7 +205,7 @@ fn again(arguments: &Arguments) -> Result<(), Failure> {
 
 fn size(text: &str) -> Result<ByteSize, String> {
     let size = text.parse();
-    size.map_err(|_| "use a size such as 100B, 64KiB or 1MiB".to_owned())
+    size.map_err(|_| "expected a size such as 100B, 64KiB or 1MiB".to_owned())
 }
 
 fn effort(arguments: &Arguments) -> Result<Effort, Failure> {
@@ -213,7 +214,7 @@ fn effort(arguments: &Arguments) -> Result<Effort, Failure> {
         let bytes = usize::try_from(size.as_u64()).unwrap_or(usize::MAX);
         if !(1..=MOST).contains(&size.as_u64()) {
             return Err(Failure::wrong_usage(
-                format!("content of {size} cannot be measured"),
+                format!("cannot measure content of {size}"),
                 "--sizes",
                 format!("use 1 byte to {}", ByteSize(MOST)),
             ));
@@ -243,7 +244,7 @@ async fn measure(
         Failure::failed(
             error,
             "fipa bench",
-            "see whether this user can write to $TMPDIR",
+            "check whether this user can write to $TMPDIR",
         )
     })?;
     let mut wanted = wanted(arguments.what, &config.mts.transports);
@@ -262,18 +263,18 @@ async fn measure(
         told(&format!("starting {}", sort.name()));
         match Way::open(&mut stage, sort, wait).await {
             Ok(way) => ways.push(way),
-            Err(why) => notes.push(format!("{}: cannot be measured: {why}", sort.name())),
+            Err(why) => notes.push(format!("cannot measure {}: {why}", sort.name())),
         }
     }
     let mut measured = measure::all(&mut stage, &mut ways, effort, &told).await;
     if many {
-        told("content for many");
+        told("multicast");
         match many::measure(&mut stage, effort).await {
             Ok(many) => measured.many = Some(many),
-            Err(why) => notes.push(format!("content for many: cannot be measured: {why}")),
+            Err(why) => notes.push(format!("cannot measure multicast: {why}")),
         }
     }
-    progress.set_message("ending");
+    progress.set_message("stopping");
     drop(stage);
     progress.finish_and_clear();
     notes.append(&mut measured.notes);
@@ -330,9 +331,9 @@ fn wanted(what: Option<What>, transports: &[Kind]) -> Vec<(Sort, Wait)> {
 fn program(given: &Path) -> Result<PathBuf, Failure> {
     given.canonicalize().map_err(|error| {
         Failure::wrong_usage(
-            format!("{}: {error}", given.display()),
+            format!("cannot find {}: {error}", given.display()),
             "--zenoh",
-            "build it: cargo build --release --manifest-path comparison/zenoh/Cargo.toml",
+            "build the program: cargo build --release --manifest-path comparison/zenoh/Cargo.toml",
         )
     })
 }
@@ -348,7 +349,7 @@ fn zenoh(what: Option<What>) -> Vec<(Sort, Wait)> {
 
 fn draw(file: &PathBuf, machine: &Machine, measured: &Measured) -> Result<(), Failure> {
     let subtitle = format!(
-        "{}, {} cores, {}; others used {:.0} % of it",
+        "{}, {} cores, {}; {:.0} % of the CPU time used by other processes",
         machine.processor,
         machine.cores,
         machine.system,
@@ -356,9 +357,9 @@ fn draw(file: &PathBuf, machine: &Machine, measured: &Measured) -> Result<(), Fa
     );
     let failed = |error: String| {
         Failure::failed(
-            format!("cannot draw the picture: {error}"),
+            format!("cannot write the drawing: {error}"),
             file.display().to_string(),
-            "see whether this user can write there",
+            "check whether this user can write there",
         )
     };
     let picture = plot::svg(&measured.rows, &subtitle).map_err(failed)?;

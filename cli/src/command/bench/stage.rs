@@ -48,7 +48,7 @@ impl Stage {
         let mut private = std::fs::DirBuilder::new();
         std::os::unix::fs::DirBuilderExt::mode(&mut private, 0o700);
         let made = private.create(&place);
-        made.map_err(|error| format!("cannot make {}: {error}", place.display()))?;
+        made.map_err(|error| format!("cannot create {}: {error}", place.display()))?;
         Ok(Self {
             program,
             zenoh,
@@ -123,7 +123,7 @@ impl Stage {
         end: End,
         shared_memory: bool,
     ) -> Result<(Who, String), String> {
-        let program = self.zenoh.as_ref().ok_or("there is no program for it")?;
+        let program = self.zenoh.as_ref().ok_or("no zenoh program is given")?;
         let mut command = Command::new(program);
         command.args(match end {
             End::Sender => ["--end", "sender"],
@@ -132,7 +132,7 @@ impl Stage {
         if shared_memory {
             command.arg("--shared-memory");
         }
-        self.spawn(command, format!("the {end:?} of zenoh")).await
+        self.spawn(command, format!("zenoh {end:?}")).await
     }
 
     async fn spawn(&mut self, mut command: Command, name: String) -> Result<(Who, String), String> {
@@ -151,7 +151,7 @@ impl Stage {
             .map_err(|error| format!("cannot start {}: {error}", program.display()))?;
         let orders = child.stdin.take();
         let stdout = child.stdout.take();
-        let stdout = stdout.ok_or("a process without standard output")?;
+        let stdout = stdout.ok_or("the process has no standard output")?;
         let who = Who(self.processes.len());
         self.processes.push(Process {
             name,
@@ -161,7 +161,7 @@ impl Stage {
         });
         match self.event(who).await? {
             Event::Ready { address } => Ok((who, address)),
-            other => Err(format!("a process began with {other:?}")),
+            other => Err(format!("expected `ready` from a process, not {other:?}")),
         }
     }
 
@@ -179,7 +179,7 @@ impl Stage {
         let process = self.process(who)?;
         let mut line = serde_json::to_string(order).map_err(|error| error.to_string())?;
         line.push('\n');
-        let orders = process.orders.as_mut().ok_or("it was told to end")?;
+        let orders = process.orders.as_mut().ok_or("the process is ending")?;
         let written = orders.write_all(line.as_bytes()).await;
         written.map_err(|error| format!("{}: {error}", process.name))
     }
@@ -189,19 +189,19 @@ impl Stage {
         let process = self.process(who)?;
         let name = &process.name;
         let line = tokio::time::timeout(PATIENCE, process.events.next_line()).await;
-        let line = line.map_err(|_| format!("{name} said nothing for {PATIENCE:?}"))?;
+        let line = line.map_err(|_| format!("no event from {name} within {PATIENCE:?}"))?;
         let line = line.map_err(|error| format!("{name}: {error}"))?;
         let line = line.ok_or_else(|| format!("{name} ended unexpectedly"))?;
         match serde_json::from_str(&line) {
             Ok(Event::Failed { what }) => Err(what),
             Ok(event) => Ok(event),
-            Err(error) => Err(format!("{name} said {line:?}: {error}")),
+            Err(error) => Err(format!("invalid event {line:?} from {name}: {error}")),
         }
     }
 
     fn process(&mut self, who: Who) -> Result<&mut Process, String> {
         let process = self.processes.get_mut(who.0);
-        process.ok_or_else(|| "nobody of this number is on stage".to_owned())
+        process.ok_or_else(|| "no process has this number".to_owned())
     }
 
     /// The measurement's shared memory.
@@ -242,6 +242,6 @@ impl Drop for Stage {
 
 fn remove(place: &Path) {
     if let Err(error) = std::fs::remove_dir_all(place) {
-        tracing::warn!(%error, place = %place.display(), "left behind");
+        tracing::warn!(%error, place = %place.display(), "cannot remove the directory of the measurement");
     }
 }

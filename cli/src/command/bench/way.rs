@@ -243,7 +243,7 @@ impl Way {
         let before = self.cpu(stage).await?;
         stage.tell(self.receiver, &Order::Receive(letters)).await?;
         let Event::Receiving = stage.event(self.receiver).await? else {
-            return Err("the receiver does something else".to_owned());
+            return Err("the receiver has another order".to_owned());
         };
         stage.tell(self.sender, &Order::Send(letters)).await?;
         let sent = stage.event(self.sender).await?;
@@ -261,11 +261,11 @@ impl Way {
             },
         ) = (sent, received)
         else {
-            return Err("the two ends did something else".to_owned());
+            return Err("the two ends have run another order".to_owned());
         };
         let all = [began.len(), ended.len(), arrived.len()];
         if all != [letters.count; 3] {
-            return Err(format!("of {} letters there were {all:?}", letters.count));
+            return Err(format!("expected {} letters, not {all:?}", letters.count));
         }
         Ok(Turn {
             began,
@@ -282,7 +282,7 @@ impl Way {
             stage.tell(*who, &Order::Cpu).await?;
             match stage.event(*who).await? {
                 Event::Cpu { ns } => all += ns,
-                other => return Err(format!("instead of a time there was {other:?}")),
+                other => return Err(format!("expected a time, not {other:?}")),
             }
         }
         Ok(all)
@@ -293,7 +293,7 @@ async fn find(stage: &mut Stage, who: Who, to: String) -> Result<(), String> {
     stage.tell(who, &Order::Find { to }).await?;
     match stage.event(who).await? {
         Event::Found => Ok(()),
-        other => Err(format!("instead of an end there was {other:?}")),
+        other => Err(format!("expected an end, not {other:?}")),
     }
 }
 

@@ -43,7 +43,7 @@ impl Agent {
         let domain = runtime.block_on(Domain::open(config)).map_err(told)?;
         let agents = names.iter().map(|name| domain.register(name));
         let mut agents = agents.collect::<Result<Vec<_>, _>>().map_err(told)?;
-        let agent = agents.pop().ok_or("nobody to play")?;
+        let agent = agents.pop().ok_or("no agent is given")?;
         let orders = runtime.block_on(async { orders() });
         let agent = Self {
             agent,
@@ -122,7 +122,7 @@ impl Agent {
                     delivered(one.await)?;
                 }
             } else {
-                let message = self.message.clone().ok_or("nobody to send to")?;
+                let message = self.message.clone().ok_or("no receiver is set")?;
                 let message = message.build().map_err(told)?;
                 sent.began.push(now_ns());
                 let mut loan = self.agent.loan(message, letters.size).map_err(told)?;
@@ -161,7 +161,7 @@ impl Agent {
         number: usize,
         sent: &mut Sent,
     ) -> Result<Sending, String> {
-        let message = self.message.clone().ok_or("nobody to send to")?;
+        let message = self.message.clone().ok_or("no receiver is set")?;
         let byte = byte_of(number);
         if letters.fill == Fill::Copied {
             let content = self.content(letters.size, byte);
@@ -206,7 +206,7 @@ impl Running {
     where
         F: Future<Output = (Agent, T)> + Send + 'static,
     {
-        let agent = self.agent.take().ok_or("the agent is gone")?;
+        let agent = self.agent.take().ok_or("the agent is not available")?;
         let task = self.runtime.spawn(async move { work(agent).await });
         let (agent, done) = self.runtime.block_on(task).map_err(told)?;
         self.agent = Some(agent);
@@ -285,7 +285,7 @@ pub(super) fn gateway(config: &Config) -> Result<(), String> {
 
 fn runtime() -> Result<Runtime, String> {
     let runtime = Builder::new_current_thread().enable_all().build();
-    runtime.map_err(|error| format!("no runtime: {error}"))
+    runtime.map_err(|error| format!("cannot start the runtime: {error}"))
 }
 
 fn orders() -> Lines<BufReader<Stdin>> {

@@ -95,7 +95,7 @@ struct Both {
 impl Both {
     /// Dispatches one, and says when it was begun.
     fn begin(&mut self, letters: &Letters, number: usize) -> Result<(AttemptId, u64), String> {
-        let to = self.to.as_ref().ok_or("no other end was found")?;
+        let to = self.to.as_ref().ok_or("no receiver is set")?;
         let byte = byte_of(number);
         let ready = (letters.fill == Fill::Copied).then(|| {
             make_ready(&mut self.ready, letters.size, byte);
@@ -107,7 +107,7 @@ impl Both {
             None => {
                 let front = NAME.len() + ENVELOPE.len() + HEAD.len();
                 let loan = self.endpoint.loan(to, front, letters.size, TAIL.len());
-                let mut loan = loan.map_err(told)?.ok_or("no memory is loaned")?;
+                let mut loan = loan.map_err(told)?.ok_or("the transport loans no memory")?;
                 if letters.fill == Fill::Filled {
                     loan.content_mut().fill(byte);
                 }

@@ -118,19 +118,19 @@ pub(crate) trait Peer {
     }
 
     fn find(&mut self, _to: &str) -> Result<(), String> {
-        Err("this part looks for nobody".to_owned())
+        Err("this process finds no receivers".to_owned())
     }
 
     fn receive(&mut self, _letters: &Letters) -> Result<Vec<u64>, String> {
-        Err("this part receives nothing".to_owned())
+        Err("this process does not receive".to_owned())
     }
 
     fn send(&mut self, _letters: &Letters) -> Result<Sent, String> {
-        Err("this part sends nothing".to_owned())
+        Err("this process does not send".to_owned())
     }
 
     fn spread(&mut self, _what: Spread, _letters: &Letters) -> Result<Sent, String> {
-        Err("this part sends to one only".to_owned())
+        Err("this process sends to one receiver only".to_owned())
     }
 }
 

@@ -109,7 +109,7 @@ fn far(node: &RawNode) -> Result<(), String> {
                 Err(error) => ended(Err(told(error))),
             }
         });
-        let nobody = |_| Err("this half is connected to".to_owned());
+        let nobody = |_| Err("this half of the relay does not connect".to_owned());
         obey(&mut Half { start: nobody }, address);
         std::process::exit(0)
     })
