@@ -241,7 +241,7 @@ fn is_next(file: &Path) -> bool {
 
 fn described(certificate: &Certificate) -> String {
     format!(
-        "  fingerprint {}\n  agents {}\n  valid until {}\n",
+        "  fingerprint: {}\n  agents: {}\n  valid until: {}\n",
         certificate.fingerprint(),
         agents(certificate),
         valid_until(certificate)
@@ -260,7 +260,7 @@ fn valid_until(certificate: &Certificate) -> String {
 /// The agents for which the host of the certificate may send.
 fn agents(certificate: &Certificate) -> String {
     match certificate.certified().agents() {
-        [] => "every agent".to_owned(),
+        [] => "all".to_owned(),
         agents => {
             let escaped: Vec<_> = agents.iter().map(|agent| escape(agent)).collect();
             escaped.join(", ")

@@ -514,7 +514,7 @@ impl Demo {
             error.contains("not sent: inform from arm_6") && error.contains("expected"),
             "the error of arm_6: {error}"
         );
-        self.say(&format!("  rejected before sending, {error}"));
+        self.say(&format!("  {error}"));
         one_delivery(&self.send("arm_6", converse("propose", "rover")).await?)?;
         // This is the next message from arm_6: the inform was not sent.
         let seen = self.received_by("rover").await?;
