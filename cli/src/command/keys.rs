@@ -93,6 +93,7 @@ Examples:
   fipa keys revoke 5d41402abc4b")]
     Revoke {
         /// Name of its gateway, or the first 8 or more digits of the fingerprint
+        #[arg(value_name = "NAME|FINGERPRINT")]
         which: String,
     },
 
@@ -217,7 +218,7 @@ fn failed(error: &KeysError, keys: &Keys) -> Failure {
             "give next.pem to the owners of other hosts, then run `fipa keys renew --use`"
         }
         KeysError::Exists(_) => "to replace this host's keys, run `fipa keys renew`",
-        KeysError::Validity(_) => "give a validity above 0 that ends before the year 10000",
+        KeysError::Validity(_) => "give a validity above 0 that ends by the year 9999",
         KeysError::Certificate(_) => "change the names (mts.name, --agent)",
         KeysError::Contents { .. } => "replace the file with a valid one, or remove it",
         KeysError::Which { .. } => {

@@ -103,7 +103,7 @@ Examples:
         /// Output format
         #[arg(long, value_enum, default_value_t = Format::Svg)]
         format: Format,
-        /// Write it to this file instead of standard output
+        /// Write the drawing to this file instead of standard output
         #[arg(short, long, value_name = "FILE")]
         output: Option<PathBuf>,
     },
