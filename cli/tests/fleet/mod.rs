@@ -147,7 +147,7 @@ impl Fleet {
         for account in self.accounts.pairs.lock().values_mut() {
             (account.in_a_row, account.failed_since) = (0, 0);
         }
-        self.wait("traffic resumes", || {
+        self.wait("traffic resumes and enough letters are sent", || {
             let all = self.accounts.pairs.lock();
             let resumed = all.values().all(|account| account.in_a_row >= IN_A_ROW);
             resumed && all.values().map(|account| account.sent).sum::<u64>() >= letters
