@@ -51,7 +51,7 @@ content     loaned: in loaned memory, not written; filled: in loaned memory, wri
             measured time; copied: in the memory of the application
 encoded     letters encoded before, through the transport alone, not decoded
 n           number of samples
-p50 to p99.9  percentiles of the one-way time: from the call of send until the receiver has the
+p50-p99.9   percentiles of the one-way time: from the call of send until the receiver has the
             decoded message
 round trip  from the call of send until the sender has the acknowledgment
 rate/s      letters per second with 16 letters in flight (8 if loaned or filled)
