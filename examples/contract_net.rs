@@ -10,7 +10,8 @@ use fipa::config::Sources;
 use fipa::protocol::{DialogueError, Reply};
 use fipa::{Agent, AgentId, Config, Domain, Performative};
 
-const PATIENCE: Duration = Duration::from_secs(10);
+/// Maximum wait for the answers of a step.
+const TIMEOUT: Duration = Duration::from_secs(10);
 
 #[tokio::main]
 async fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -27,36 +28,36 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
     Ok(())
 }
 
-/// The initiator.
+/// Runs the initiator.
 async fn call(rover: &Agent, arms: &[AgentId]) -> Result<(), DialogueError> {
     let call = rover.message(Performative::Cfp).content("(carry crate)");
-    let mut net = rover.contract_net(call, arms, PATIENCE).await?;
+    let mut net = rover.contract_net(call, arms, TIMEOUT).await?;
     let price = |bid: &fipa::Message| {
         let text = String::from_utf8_lossy(bid.content()?).into_owned();
         text.parse::<u32>().ok()
     };
     let best = net.bids().proposals.iter().min_by_key(|bid| price(bid));
     let best: Vec<_> = best.into_iter().cloned().collect();
-    for awarded in net.award(&best, "", PATIENCE).await? {
+    for awarded in net.award(&best, "", TIMEOUT).await? {
         match awarded.result {
-            Ok(done) => say(&format!("{}: {done}", awarded.agent)),
-            Err(error) => say(&format!("{}: {error}", awarded.agent)),
+            Ok(done) => print(&format!("{}: {done}", awarded.agent)),
+            Err(error) => print(&format!("{}: {error}", awarded.agent)),
         }
     }
     Ok(())
 }
 
-/// A participant.
+/// Runs a participant.
 async fn work(arm: &Agent, price: u32) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
     let call = arm.receive().await?.message;
     let mut task = arm.take_part(&call)?;
-    if task.propose(price.to_string(), PATIENCE).await? {
+    if task.propose(price.to_string(), TIMEOUT).await? {
         task.reply(Reply::Inform("carried".into())).await?;
     }
     Ok(())
 }
 
-#[expect(clippy::print_stdout, reason = "an example shows what happens")]
-fn say(text: &str) {
+#[expect(clippy::print_stdout, reason = "an example prints its results")]
+fn print(text: &str) {
     println!("{text}");
 }

@@ -342,11 +342,11 @@ impl Paper {
     /// The tables, in Markdown.
     pub fn to_text(&self) -> String {
         let mut text = format!(
-            "# The paper's evaluation again\n\n\
-             Written by `fipa bench paper` on {}; other processes used {:.0} % of the processors before.\n\
-             The columns *C++* are `fipa_acl` and `fipa_services`, **measured elsewhere** (two shared \
-             cores, -O3,\nanother machine at another time); they are for orientation, and no ratio is \
-             claimed.\n\n\
+            "# Repetition of the paper's evaluation\n\n\
+             Written by `fipa bench paper` on {}; {:.0} % of the CPU time used by other processes before.\n\
+             The columns *C++* have `fipa_acl` and `fipa_services`, **measured elsewhere** (two shared \
+             cores, -O3,\nanother machine at another time). They are for orientation; do not compute \
+             ratios from them.\n\n\
              ## Encoded length (figure 7)\n\n\
              1 byte of content and {HEADER} bytes in ten other fields, in the standard's dialect.\n\n\
              ![lengths](paper-sizes.svg)\n\n\
@@ -367,11 +367,11 @@ impl Paper {
         }
         text.push_str(&format!(
             "\n## Time of encoding and decoding (figure 9)\n\n\
-             {} cycles, mean ± standard deviation in microseconds. Encoding yields one piece of \
-             memory with a\ncopy of the content; decoding yields owned values, of which the content \
-             shares the memory that was\nread where the encoding allows it. A letter is encoded \
-             and decoded with its envelope and its\nmessage; the figures of C++ for letters are the \
-             sums of those of the message and of the envelope.\n\n\
+             {} cycles, mean ± standard deviation in microseconds. Encoding returns one buffer with a \
+             copy of the\ncontent. Decoding returns owned values; where the encoding allows it, the \
+             content shares the input buffer.\nA letter is encoded and decoded with its envelope and \
+             its message. The C++ figures of a letter are the\nsums of those of the message and of the \
+             envelope.\n\n\
              ![times](paper-times.svg)\n\n\
              | envelope | message | content | encode | decode | C++ encode | C++ decode |\n\
              |---|---|---|---|---|---|---|\n",

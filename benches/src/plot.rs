@@ -30,7 +30,7 @@ struct Line {
 pub(super) fn svg(rows: &[Row], subtitle: &str) -> Result<String, String> {
     let lines = lines(rows);
     if lines.is_empty() {
-        return Err("nothing was measured".to_owned());
+        return Err("there are no measurements".to_owned());
     }
     let mut text = String::new();
     draw(&lines, subtitle, &mut text).map_err(|error| error.to_string())?;
@@ -108,7 +108,7 @@ fn draw(
     area.fill(&WHITE)?;
     let style = |size: u32, colour: &RGBColor| ("sans-serif", size).into_font().color(colour);
     area.draw_text(
-        "One way, from sending to the decoded message (median)",
+        "One-way time from send to the decoded message (median)",
         &style(20, &INK),
         (24, 18),
     )?;

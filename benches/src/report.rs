@@ -25,12 +25,12 @@ pub(super) fn json(machine: &Machine, effort: &Effort, measured: &Measured) -> V
 /// All results as a table with a legend.
 pub(super) fn text(machine: &Machine, effort: &Effort, measured: &Measured) -> String {
     let mut text = format!(
-        "{machine}; other processes used {:.0} % of the processors before\n",
+        "{machine}; {:.0} % of the CPU time used by other processes before the start\n",
         machine.busy * 100.0,
     );
     text.push_str(&format!(
-        "{} rounds, in each of which all paths take turns; sender and receiver on different \
-         processors where there are two; times in microseconds\n\n",
+        "{} rounds; each round measures every route in turn; sender and receiver on separate CPUs if \
+         there are two; times in microseconds\n\n",
         effort.rounds
     ));
     text.push_str(&table(&measured.rows).to_string());
@@ -46,15 +46,18 @@ pub(super) fn text(machine: &Machine, effort: &Effort, measured: &Measured) -> S
 }
 
 const LEGEND: &str = "
-wait     spin: a waiting process polls; block: it sleeps until it is woken
-content  loaned: memory loaned and not written; filled: loaned and written by the application, which
-         is part of the time; copied: from the application's own memory
-encoded  encoded letters through the transport alone, not decoded
-one way  from before sending until the receiver has the decoded message; round trip: until the
-         sender has the acknowledgment; rate: letters per second with 16 under way (8 when loaned)
-cpu      of all processes of the path together, one letter at a time
-x limit  ratio of the one-way time to that of the same bytes through the bare mechanism in the same
-         rounds (middle half of the rounds); then the ratios of round trip, rate and cpu
+wait        spin: the waiting process polls; block: it sleeps until it is woken
+content     loaned: in loaned memory, not written; filled: in loaned memory, written within the
+            measured time; copied: in the memory of the application
+encoded     letters encoded before, through the transport alone, not decoded
+n           number of samples
+p50-p99.9   percentiles of the one-way time: from the call of send until the receiver has the
+            decoded message
+round trip  from the call of send until the sender has the acknowledgment
+rate/s      letters per second with 16 letters in flight (8 if loaned or filled)
+cpu         CPU time of all processes of the route per letter, one letter at a time
+x limit     ratio of the one-way time to that of the same bytes through the raw mechanism in the same
+            rounds (spread: the middle half of the rounds); trip, rate and cpu are the other ratios
 ";
 
 /// Cost of encryption, one line per path and content.
@@ -65,7 +68,7 @@ fn encrypted(rows: &[Row]) -> String {
         let [low, high] = plain.round_trip_ratio_spread;
         let rate = plain.rate_ratio.map(|ratio| format!(", rate {ratio:.2}"));
         text.push_str(&format!(
-            "{} with {} {}, in units of {}: round trip {:.2} ({low:.2}-{high:.2}), one way {:.2}{}, \
+            "{} with {} {}, ratio to {}: round trip {:.2} ({low:.2}-{high:.2}), one way {:.2}{}, \
              cpu {:.2}\n",
             row.path,
             size(row.size),
@@ -86,9 +89,9 @@ fn encrypted(rows: &[Row]) -> String {
 fn of_many(many: &Many) -> String {
     let [low, high] = many.ratio_spread;
     format!(
-        "\n{} filled, to {} receivers: {} until all have it; writing it {}, a small message to all \
-         {}, so {:.2} ({low:.2}-{high:.2}) of their sum; {} with a copy for each, {:.1} times as \
-         long\n",
+        "\nmulticast of {} filled to {} receivers: {} until all receivers have it; writing the content \
+         takes {}, a small message to all {}: ratio to their sum {:.2} ({low:.2}-{high:.2}); with one \
+         copy per receiver {}, {:.1} times as long\n",
         size(many.size),
         many.receivers,
         micro(many.together_us),
@@ -105,7 +108,7 @@ fn table(rows: &[Row]) -> Table {
     table.load_style(presets::NOTHING);
     let head = [
         "content",
-        "path",
+        "route",
         "wait",
         "n",
         "p50",

@@ -47,7 +47,7 @@ impl Stage {
         let mut private = std::fs::DirBuilder::new();
         std::os::unix::fs::DirBuilderExt::mode(&mut private, 0o700);
         let made = private.create(&place);
-        made.map_err(|error| format!("cannot make {}: {error}", place.display()))?;
+        made.map_err(|error| format!("cannot create {}: {error}", place.display()))?;
         Ok(Self {
             program,
             zenoh,
@@ -136,7 +136,7 @@ impl Stage {
         if shared_memory {
             command.arg("--shared-memory");
         }
-        self.spawn(command, format!("the {end:?} of zenoh")).await
+        self.spawn(command, format!("zenoh {end:?}")).await
     }
 
     async fn spawn(

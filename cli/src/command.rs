@@ -1,4 +1,4 @@
-//! The commands, one per file: its arguments, with the help that documents it, and `run`.
+//! The commands, one file each: its arguments with their help, and `run`.
 
 mod agents;
 #[cfg(feature = "bench")]
@@ -22,7 +22,7 @@ use clap::Subcommand;
 use crate::options::Global;
 use crate::report::Failure;
 
-/// What `fipa` can be told to do.
+/// The commands of `fipa`.
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
     Up(up::Arguments),
@@ -43,7 +43,7 @@ pub(crate) enum Command {
     Config(config::Arguments),
 }
 
-/// Does what was asked for.
+/// Runs a command.
 pub(crate) fn run(command: Command, global: &Global) -> Result<(), Failure> {
     match command {
         Command::Up(arguments) => up::run(arguments, global),

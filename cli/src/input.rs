@@ -1,4 +1,4 @@
-//! Reads what a command is given as a file or on standard input.
+//! Reads the input of a command from a file or from standard input.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -8,7 +8,7 @@ use fipa_acl::escape;
 
 use crate::report::Failure;
 
-/// All bytes of a file, or of standard input when it is named `-`; at most `limit`.
+/// Reads a whole file, or standard input for the path `-`. More than `limit` bytes are an error.
 pub(crate) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, Failure> {
     let mut bytes = Vec::new();
     let read = if path == Path::new("-") {
@@ -19,19 +19,19 @@ pub(crate) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, Failure> {
     match read {
         Ok(true) => Ok(bytes),
         Ok(false) => Err(Failure::failed(
-            format!("there are more than {limit} bytes"),
+            format!("the input has more than {limit} bytes"),
             name(path),
-            "use a smaller file",
+            "use a smaller input",
         )),
         Err(error) => Err(Failure::failed(
             format!("cannot read: {error}"),
             name(path),
-            "name a file that this user can read, or - for standard input",
+            "give a file that this user can read, or - for standard input",
         )),
     }
 }
 
-/// What to call it when something is wrong with it.
+/// The name of an input in error messages.
 pub(crate) fn name(path: &Path) -> String {
     if path == Path::new("-") {
         "standard input".to_owned()
@@ -40,7 +40,7 @@ pub(crate) fn name(path: &Path) -> String {
     }
 }
 
-/// Whether that was all.
+/// Whether the source had at most `limit` bytes.
 fn read_all(source: &mut dyn Read, limit: u64, bytes: &mut Vec<u8>) -> io::Result<bool> {
     let read = source.take(limit.saturating_add(1)).read_to_end(bytes)?;
     Ok(read as u64 <= limit)

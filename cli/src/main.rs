@@ -1,13 +1,14 @@
 //! The `fipa` command.
 //!
-//! What lives here: the command line, what is printed, log output, exit codes. What a command
-//! does with agents and letters is the business of the crate `fipa`.
+//! This crate has the command line, the printed output, the log output and the exit codes. The work
+//! with agents and letters is in the crate `fipa`.
 //!
 //! * [`options`] has the command line and the options all commands share.
 //! * [`command`] has one file per command. A new one is a file there and a line in its enum.
-//! * [`membership`] has what the commands share that take part in a domain.
-//! * [`report`] says what went wrong; [`output`] prints what was asked for; [`input`] reads what is
-//!   given as a file or on standard input.
+//! * [`membership`] has the code shared by the commands that join a domain: joining, registering,
+//!   errors and signals.
+//! * [`report`] prints errors and warnings; [`output`] prints results; [`input`] reads files and
+//!   standard input.
 
 mod command;
 mod input;
@@ -35,18 +36,18 @@ fn main() -> ExitCode {
     }
 }
 
-/// Logs go to standard error: standard output is for what was asked for.
+/// Starts logging to standard error. Standard output carries only the results of a command.
 fn log_to_stderr(global: &options::Global) {
-    let usual = || EnvFilter::new(global.log_level());
+    let default_filter = || EnvFilter::new(global.log_level());
     let filter = if std::env::var_os("RUST_LOG").is_some_and(|value| !value.is_empty()) {
         EnvFilter::try_from_default_env().unwrap_or_else(|error| {
             report::warn(&format!(
-                "$RUST_LOG is not understood ({error}); logging as usual"
+                "ignoring $RUST_LOG, which is not a valid log filter: {error}"
             ));
-            usual()
+            default_filter()
         })
     } else {
-        usual()
+        default_filter()
     };
     tracing_subscriber::fmt()
         .with_env_filter(filter)
@@ -56,8 +57,8 @@ fn log_to_stderr(global: &options::Global) {
         .init();
 }
 
-/// Writes one field of an event. Names and texts of peers are among the values, so a value with
-/// unprintable characters is escaped; others stay, because they may have been escaped already.
+/// Writes one field of an event. A value can contain names and texts of peers, so a value with
+/// unprintable characters is escaped. Other values stay as they are: they may be escaped already.
 fn log_field(writer: &mut Writer<'_>, field: &Field, value: &dyn Debug) -> fmt::Result {
     let mut text = format!("{value:?}");
     if text.contains(is_unprintable) {
@@ -65,7 +66,7 @@ fn log_field(writer: &mut Writer<'_>, field: &Field, value: &dyn Debug) -> fmt::
     }
     match field.name() {
         "message" => writer.write_str(&text),
-        // Where in a crate that logs with `log` the event came from.
+        // The source location of an event from a crate that logs with `log`.
         name if name.starts_with("log.") => Ok(()),
         name if writer.has_ansi_escapes() => {
             let (italic, dimmed) = (Style::new().italic(), Style::new().dimmed());

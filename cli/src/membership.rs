@@ -1,5 +1,5 @@
-//! What the commands share that take part in a domain: they join it, say why they cannot, and end
-//! in order when they are told to.
+//! Shared code of the commands that join a domain: joining, registering, error reports, and an
+//! orderly end on a signal.
 
 use std::io::{self, IsTerminal};
 use std::pin::pin;
@@ -11,35 +11,37 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 use crate::options;
 use crate::report::Failure;
 
-/// Within this time signals to end are one.
-const AT_ONCE: Duration = Duration::from_millis(500);
+/// Signals within this time after the first one count as the same request to end.
+const SIGNAL_GRACE: Duration = Duration::from_millis(500);
 
-/// The signals that tell a command to end: Ctrl-C, `kill`, and a terminal that closes.
+/// The signals that end a command: SIGINT (Ctrl-C), SIGTERM (`kill`) and SIGHUP (a closed terminal).
 pub(crate) struct Stop {
     interrupt: Signal,
     terminate: Signal,
     hang_up: Signal,
-    /// Whether it was started from a terminal.
+    /// Whether the command was started from a terminal.
     from_terminal: bool,
 }
 
-/// What a signal wants of a service.
-pub(crate) enum Wish {
-    /// It is to end.
+/// The request that a signal makes of a service.
+pub(crate) enum SignalRequest {
+    /// End the service.
     End,
-    /// It is to read its configuration again.
+    /// Read the configuration again.
     Reload,
 }
 
 impl Stop {
-    /// From now on they end nothing by themselves. Must be called within a tokio runtime.
+    /// Starts listening. From now on the signals do not end the process by themselves.
+    ///
+    /// Must be called within a tokio runtime.
     pub(crate) fn listen() -> Result<Self, Failure> {
         let listen = |kind| {
             signal(kind).map_err(|error: io::Error| {
                 Failure::failed(
-                    format!("cannot wait for signals: {error}"),
+                    format!("cannot listen for signals: {error}"),
                     "this process",
-                    "see `ulimit -n` for how many files it may open",
+                    "check the limit on open files: `ulimit -n`",
                 )
             })
         };
@@ -51,23 +53,23 @@ impl Stop {
         })
     }
 
-    /// What a service is told: a hang-up means that its configuration has changed, unless the
-    /// terminal that it was started from has really been closed.
-    pub(crate) async fn wish(&mut self) -> Wish {
+    /// Waits for the next signal to a service. SIGHUP requests a reload, unless the terminal from which
+    /// the service was started has been closed.
+    pub(crate) async fn next_request(&mut self) -> SignalRequest {
         tokio::select! {
-            _ = self.interrupt.recv() => Wish::End,
-            _ = self.terminate.recv() => Wish::End,
+            _ = self.interrupt.recv() => SignalRequest::End,
+            _ = self.terminate.recv() => SignalRequest::End,
             _ = self.hang_up.recv() => {
                 if self.from_terminal && !io::stdin().is_terminal() {
-                    Wish::End
+                    SignalRequest::End
                 } else {
-                    Wish::Reload
+                    SignalRequest::Reload
                 }
             }
         }
     }
 
-    /// Returns when one of them has come.
+    /// Waits for a signal.
     pub(crate) async fn requested(&mut self) {
         tokio::select! {
             _ = self.interrupt.recv() => {}
@@ -76,28 +78,28 @@ impl Stop {
         }
     }
 
-    /// From now on the command ends, which takes a while when another process holds it up. Whoever
-    /// says once more that it is to end does not wait for that: what is left behind then is removed by
-    /// the next process of the domain.
+    /// Marks the start of the orderly end, which can take a while when another process delays it. A
+    /// second signal ends the process at once; the next process of the domain removes the files that
+    /// it leaves behind.
     pub(crate) fn ending() {
-        // On a thread and a runtime of its own: those of the command may all be held up.
+        // A thread and a runtime of its own: all threads of the command may be blocked.
         std::thread::spawn(|| {
-            // Some say it twice at once, as `timeout` does.
-            std::thread::sleep(AT_ONCE);
-            let told = options::block_on(async {
+            // Some programs, for example `timeout`, send the signal twice.
+            std::thread::sleep(SIGNAL_GRACE);
+            let signaled = options::block_on(async {
                 let mut again = Self::listen()?;
                 again.requested().await;
                 Ok::<_, Failure>(())
             });
-            if matches!(told, Ok(Ok(()))) {
+            if matches!(signaled, Ok(Ok(()))) {
                 std::process::exit(1);
             }
         });
     }
 }
 
-/// Does some work that ends by itself. A signal ends it before; dropping the work leaves the
-/// domain in order.
+/// Runs work that ends by itself. A signal cancels it; dropping the future leaves the domain in
+/// order.
 pub(crate) fn run<T>(work: impl Future<Output = Result<T, Failure>>) -> Result<T, Failure> {
     options::block_on(async {
         let mut stop = Stop::listen()?;
@@ -105,39 +107,39 @@ pub(crate) fn run<T>(work: impl Future<Output = Result<T, Failure>>) -> Result<T
         tokio::select! {
             done = &mut work => done,
             () = stop.requested() => Err(Failure::failed(
-                "told to end before it was done",
-                "this process got a signal",
-                "run it again when you want the rest",
+                "canceled by a signal before the command was done",
+                "this process",
+                "run the command again",
             )),
         }
     })?
 }
 
-/// Joins the domain that the configuration names.
+/// Joins the domain of the configuration.
 pub(crate) async fn join(config: &Config) -> Result<Domain, Failure> {
     let joined = Domain::open(config).await;
     joined.map_err(|error| not_joined(error, config))
 }
 
-/// Why a domain could not be joined, or its gateway not be started.
+/// The error report for a domain that cannot be joined or a gateway that cannot be started.
 pub(crate) fn not_joined(error: OpenError, config: &Config) -> Failure {
     let domain = format!("domain {:?}", config.domain);
     match error {
         OpenError::Config(error) => error.into(),
         OpenError::GatewayRunning(name) => Failure::failed(
-            format!("the domain has a gateway already, {name:?}"),
+            format!("the domain already has a gateway, {name:?}"),
             domain,
-            "use that one, end it, or start this one for another domain: --set domain=NAME",
+            "use that gateway, stop it, or start this one in another domain (--set domain=NAME)",
         ),
         OpenError::Name(error) => not_registered(error, &config.mts.name, config),
         OpenError::Listen { kind, source } => {
             let used = matches!(&source, ListenError::Bind { source, .. }
                 if source.kind() == io::ErrorKind::AddrInUse);
             let advice = if used {
-                "end the process that uses the port (`ss -lntp` lists them), or choose another; \
+                "stop the process that uses the port (`ss -lntup` lists it), or choose another port; \
                  with port 0 the system chooses a free one"
             } else {
-                "give it addresses of this machine with ports that this user may use"
+                "use an address of this machine and a port that this user may open"
             };
             Failure::failed(
                 source.to_string(),
@@ -148,24 +150,24 @@ pub(crate) fn not_joined(error: OpenError, config: &Config) -> Failure {
         OpenError::Keys(_) => Failure::failed(
             error.to_string(),
             format!("mts.name {:?}", config.mts.name),
-            "`fipa doctor` says what is wrong; keys are of one gateway: use its name (--set \
-             mts.name=NAME), or make new ones in an empty directory (`fipa keys init --dir`)",
+            "run `fipa doctor`; keys belong to one gateway: use its name (--set mts.name=NAME), or make \
+             new keys in an empty directory (`fipa keys init --dir DIRECTORY`)",
         ),
         OpenError::NoTransport(_) => Failure::failed(
             error.to_string(),
             domain,
-            "see `fipa config show` for mts.transports, and the reasons above for each of them",
+            "check mts.transports (`fipa config show`); the message above has the reason for each",
         ),
         other => Failure::failed(
             other.to_string(),
             domain,
-            "processes of a domain meet in $FIPA_RUNTIME_DIR, else in /tmp/fipa-<user id>: see \
-             whether this user can write there",
+            "check whether this user can write to $FIPA_RUNTIME_DIR, or to /tmp/fipa-<user id> when it is \
+             not set: the processes of a domain meet there",
         ),
     }
 }
 
-/// Registers an agent of this process.
+/// Registers an agent.
 pub(crate) fn register(
     domain: &Domain,
     name: &str,
@@ -176,27 +178,27 @@ pub(crate) fn register(
     registered.map_err(|error| not_registered(error, name, config))
 }
 
-/// Why a name could not be registered.
+/// The error report for a name that cannot be registered.
 pub(crate) fn not_registered(error: RegisterError, name: &str, config: &Config) -> Failure {
     let domain = format!("domain {:?}", config.domain);
     match error {
         RegisterError::AlreadyRegistered { holder } => Failure::failed(
             format!(
-                "the name {name:?} is taken by an agent at {:?}",
+                "the name {name:?} is already registered by an agent at {:?}",
                 holder.mts.name
             ),
             domain,
-            "choose another name, or end that agent (`fipa agents` shows where it is)",
+            "choose another name, or stop that agent (`fipa agents` shows its locations)",
         ),
         RegisterError::Invalid(error) => Failure::wrong_usage(
-            format!("{name:?} cannot be registered: {error}"),
+            format!("cannot register the name {name:?}: {error}"),
             "the command line",
-            "keep to these limits",
+            "use a name within these limits",
         ),
         other => Failure::failed(
             other.to_string(),
             domain,
-            "see `fipa agents` for who is there; end what is not needed",
+            "`fipa agents` lists the registered agents; stop those that are not needed",
         ),
     }
 }

@@ -11,11 +11,11 @@ use tokio::runtime::Runtime;
 use crate::command::Command;
 use crate::report::Failure;
 
-/// Agents that exchange letters, to the FIPA standards: through shared memory on one host, through
-/// a gateway between hosts.
+/// Agent communication to the FIPA standards: through shared memory or Unix domain sockets on one
+/// host, through gateways between hosts.
 ///
-/// Every command finds its configuration by itself: the file given with --config, else the one
-/// named by $FIPA_CONFIG, else ./fipa.toml, else ~/.config/fipa/fipa.toml, else the defaults.
+/// Every command reads one configuration file: the file given with --config, else the file named by
+/// $FIPA_CONFIG, else ./fipa.toml, else ~/.config/fipa/fipa.toml. Without a file the defaults apply.
 #[derive(Debug, Parser)]
 #[command(
     name = "fipa",
@@ -32,11 +32,11 @@ pub(crate) struct CommandLine {
 }
 
 impl CommandLine {
-    /// What this process was told; ends it when that is wrong, or help was asked for.
+    /// Parses the command line of this process. Ends the process after printing an error or the help.
     ///
-    /// The global options may stand before and behind the command. They are defined at every
-    /// level and put together here, because those that clap calls global forget what stood
-    /// before the command when they are given behind it too.
+    /// The global options are accepted before and after the command. They are defined at every level
+    /// and merged here, because clap's own global options lose the value given before the command
+    /// when the option is also given after it.
     pub(crate) fn read() -> Self {
         let matches = with_global_options(Self::command()).get_matches();
         let read = || {
@@ -54,52 +54,59 @@ fn with_global_options(command: Clap) -> Clap {
 
 const EXIT_CODES: &str = "\
 Exit codes:
-  0  done
-  1  failed, as reported on standard error
-  2  wrong usage: of the command line, or mistakes in the configuration
+  0  success
+  1  failure; standard error has the reason
+  2  usage error: invalid command line or invalid configuration
 
 Environment:
-  FIPA_CONFIG  the configuration file, unless --config is given
-  RUST_LOG     what is logged to standard error, for example fipa_mts=debug; goes before -v and -q";
+  FIPA_CONFIG       configuration file, unless --config is given
+  FIPA_RUNTIME_DIR  directory in which the processes of a domain meet; default: /tmp/fipa-<user id>
+  RUST_LOG          log filter, for example fipa_mts=debug; overrides -v and -q
+  NO_COLOR          when set, the output has no colors
 
-// Options that every command takes. A documentation comment would be taken for the help of every
-// command.
+Examples:
+  fipa demo                                 shows the main functions with real processes
+  fipa echo arm_1                           runs an agent that answers
+  fipa send --to arm_1 --content hello --wait
+  fipa doctor                               checks this machine";
+
+// Options of every command. Not a doc comment: clap would print it as the help of every command.
 #[derive(Debug, Args)]
 pub(crate) struct Global {
-    /// Read this configuration file, and no other
+    /// Read this configuration file and no other
     #[arg(long, value_name = "FILE", help_heading = "Global options")]
     config: Option<PathBuf>,
 
-    /// Override a key of the configuration, for example mts.deadline=9s; may be repeated
+    /// Override one configuration key, for example mts.deadline=9s; repeatable
     #[arg(long, value_name = "KEY=VALUE", help_heading = "Global options")]
     set: Vec<String>,
 
-    /// Log more: once for what happens, twice for why, three times for every step
+    /// Log more: -v logs events, -vv debug details, -vvv every step
     #[arg(short, long, action = ArgAction::Count, conflicts_with = "quiet",
           help_heading = "Global options")]
     verbose: u8,
 
-    /// Log errors only
+    /// Log only errors
     #[arg(short, long, help_heading = "Global options")]
     quiet: bool,
 }
 
 impl Global {
-    /// Those of a command and of the commands within it: what can be given again adds up, of
-    /// several files the last counts.
+    /// Merges the options of a command with those of its subcommands: repeatable options add up; of
+    /// several configuration files the last one is used.
     fn of(matches: &ArgMatches) -> Result<Self, clap::Error> {
         let mut all = Self::from_arg_matches(matches)?;
         if let Some((_, matches)) = matches.subcommand() {
-            let within = Self::of(matches)?;
-            all.config = within.config.or(all.config);
-            all.set.extend(within.set);
-            all.verbose = all.verbose.saturating_add(within.verbose);
-            all.quiet |= within.quiet;
+            let inner = Self::of(matches)?;
+            all.config = inner.config.or(all.config);
+            all.set.extend(inner.set);
+            all.verbose = all.verbose.saturating_add(inner.verbose);
+            all.quiet |= inner.quiet;
         }
         Ok(all)
     }
 
-    /// What is logged unless `$RUST_LOG` says otherwise.
+    /// Default log level; `$RUST_LOG` overrides it.
     pub(crate) fn log_level(&self) -> &'static str {
         match (self.quiet, self.verbose) {
             (true, _) => "error",
@@ -110,12 +117,12 @@ impl Global {
         }
     }
 
-    /// The configuration.
+    /// Loads the configuration.
     pub(crate) fn config(&self) -> Result<Config, Failure> {
         Ok(self.effective()?.into_config())
     }
 
-    /// The configuration, with the origin of every value.
+    /// Loads the configuration with the origin of every value.
     pub(crate) fn effective(&self) -> Result<Effective, ConfigError> {
         Effective::load(&Sources {
             file: self.config.clone(),
@@ -125,27 +132,27 @@ impl Global {
     }
 }
 
-/// A time such as 10s.
+/// Parses a duration such as 10s.
 pub(crate) fn duration(text: &str) -> Result<Duration, String> {
     let duration = humantime::parse_duration(text);
-    duration.map_err(|_| "use a time such as 10s, 500ms or 2h".to_owned())
+    duration.map_err(|_| "expected a duration such as 10s, 500ms or 2h".to_owned())
 }
 
-/// How long threads have to end that are still blocked when everything else has been done.
-const BLOCKED: Duration = Duration::from_secs(3);
+/// Maximum wait for blocked threads after the work has ended.
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(3);
 
-/// Runs what waits, to its end. A thread that is blocked all the same, in looking up a name that
-/// nobody answers for, or in reading standard input, ends with the process.
+/// Runs a future to completion on a new runtime. A thread that is still blocked afterwards, for
+/// example in a name lookup without an answer or in a read of standard input, ends with the process.
 pub(crate) fn block_on<T>(work: impl Future<Output = T>) -> Result<T, Failure> {
     let runtime = Runtime::new().map_err(|error| {
         Failure::failed(
-            format!("cannot start the threads that do the work: {error}"),
+            format!("cannot start the worker threads: {error}"),
             "this process",
-            "see `ulimit -u` and `ulimit -n`",
+            "check the limits on threads and open files: `ulimit -u`, `ulimit -n`",
         )
     })?;
     let done = runtime.block_on(work);
-    runtime.shutdown_timeout(BLOCKED);
+    runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
     Ok(done)
 }
 

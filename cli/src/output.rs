@@ -1,6 +1,6 @@
-//! Prints to standard output what was asked for.
+//! Prints the results of a command on standard output.
 //!
-//! Commands [escape](fipa_acl::escape) texts from outside where they put them into lines.
+//! Commands [escape](fipa_acl::escape) texts from outside before they put them into lines.
 
 use std::borrow::Cow;
 use std::fmt::Write as _;
@@ -16,13 +16,13 @@ use tokio::sync::oneshot;
 
 use crate::report::Failure;
 
-/// Prints a text that ends its last line itself.
+/// Prints a text. The text has its own final newline.
 pub(crate) fn text(text: &str) -> Result<(), Failure> {
     bytes(printable(text).as_bytes())
 }
 
-/// The text with those of its lines escaped that still have unprintable characters, such as errors
-/// of the operating system that name a file. A line without them stays: it may have been escaped.
+/// Escapes the lines that still have unprintable characters, for example an error of the operating
+/// system with a file name. Other lines stay as they are: they may be escaped already.
 pub(crate) fn printable(text: &str) -> Cow<'_, str> {
     if !text.contains(|c| c != '\n' && is_unprintable(c)) {
         return Cow::Borrowed(text);
@@ -36,39 +36,39 @@ pub(crate) fn printable(text: &str) -> Cow<'_, str> {
     Cow::Owned(lines.collect::<Vec<_>>().join("\n"))
 }
 
-/// Prints bytes as they are.
+/// Prints bytes unchanged.
 pub(crate) fn bytes(bytes: &[u8]) -> Result<(), Failure> {
     bytes_if_read(bytes).map(drop)
 }
 
-/// Prints a text that ends its last line itself, and says whether anybody still reads: who prints
-/// for as long as somebody does ends with the reader.
+/// Prints a text with its own final newline. Returns whether the output still has a reader, so that
+/// a command that prints continuously can end together with its reader.
 pub(crate) fn text_if_read(text: &str) -> Result<bool, Failure> {
     bytes_if_read(text.as_bytes())
 }
 
-/// Says when nobody will read what is printed any more, as after `| head`; never where that cannot
-/// be known.
+/// Watches standard output for the loss of its reader, as after `| head`. Where the kernel cannot
+/// report that, it is never detected.
 pub(crate) struct Reader(oneshot::Receiver<()>);
 
 impl Reader {
-    /// From now on.
+    /// Starts watching standard output.
     pub(crate) fn of_output() -> Self {
         let (gone, reader) = oneshot::channel();
-        // It ends with the process: nothing but the reader's end ends the wait.
+        // This thread ends with the process at the latest: only the loss of the reader ends `poll`.
         std::thread::spawn(move || {
             let stdout = io::stdout();
             let mut watched = [PollFd::new(&stdout, PollFlags::empty())];
             while let Err(Errno::INTR) = poll(&mut watched, None) {}
             if watched[0].revents().contains(PollFlags::ERR) {
-                // Who waited may have ended.
+                // The `Reader` may have been dropped.
                 let _ = gone.send(());
             }
         });
         Self(reader)
     }
 
-    /// Returns then. Cancelling the future loses nothing.
+    /// Returns when the output has no reader any more. Safe to cancel.
     pub(crate) async fn gone(&mut self) {
         if (&mut self.0).await.is_err() {
             std::future::pending().await
@@ -80,12 +80,12 @@ fn bytes_if_read(bytes: &[u8]) -> Result<bool, Failure> {
     let mut stdout = io::stdout().lock();
     let written = stdout.write_all(bytes).and_then(|()| stdout.flush());
     match written {
-        // Whoever reads has seen enough, as `head` does.
+        // The reader has closed the pipe, as `head` does.
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
         Err(error) => Err(Failure::failed(
             format!("cannot write the output: {error}"),
             "standard output",
-            "see whether the disk is full, or print to somewhere else",
+            "check whether the disk is full, or redirect the output to another file",
         )),
         Ok(()) => Ok(true),
     }
@@ -104,24 +104,24 @@ pub(crate) fn json_line(value: &impl Serialize) -> Result<(), Failure> {
 fn document(document: serde_json::Result<String>) -> Result<(), Failure> {
     let document = document.map_err(|error| {
         Failure::failed(
-            format!("the output cannot be written as JSON: {error}"),
+            format!("cannot write the output as JSON: {error}"),
             "standard output",
-            "leave out --json",
+            "run the command without --json",
         )
     })?;
     text(&format!("{}\n", visible_in_json(&document)))
 }
 
-/// The JSON document with the characters escaped that serde_json leaves as they are. They stand in
-/// texts only, where JSON has `\u` for them (RFC 8259 clause 7).
+/// Escapes the unprintable characters that serde_json leaves unescaped. They occur only within
+/// strings, where JSON has `\u` for them (RFC 8259 clause 7).
 pub(crate) fn visible_in_json(document: &str) -> Cow<'_, str> {
-    let is_left = |c: char| c != '\n' && is_unprintable(c);
-    if !document.contains(is_left) {
+    let is_unescaped = |c: char| c != '\n' && is_unprintable(c);
+    if !document.contains(is_unescaped) {
         return Cow::Borrowed(document);
     }
     let mut out = String::with_capacity(document.len() + 16);
     for c in document.chars() {
-        if is_left(c) {
+        if is_unescaped(c) {
             for unit in c.encode_utf16(&mut [0; 2]) {
                 // Writing to a string cannot fail.
                 let _ = write!(out, "\\u{unit:04x}");
@@ -133,8 +133,8 @@ pub(crate) fn visible_in_json(document: &str) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
-/// What became of a message, one object per receiver: `receiver`, `outcome`, `via` or `reason`,
-/// and the `attempts` that did not work.
+/// The outcomes of a message, one object per receiver: `receiver`, `outcome`, `via` or `reason`, and
+/// the failed `attempts`.
 pub(crate) fn deliveries(deliveries: &Deliveries) -> Value {
     let one = |delivery: &fipa::Delivery| {
         let attempts = delivery.outcome.attempts().iter().map(|attempt| {
@@ -172,7 +172,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn json_means_the_same_when_it_is_visible() {
+    fn escaping_a_json_document_keeps_its_meaning() {
         let value = json!({ "a\u{9b}b": "\u{7f}\u{202e}\u{e0001}\n\\u{1b}", "c": [1, "é"] });
         for document in [value.to_string(), format!("{value:#}")] {
             let visible = visible_in_json(&document);
@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_escaped_already_is_not_escaped_again() {
+    fn a_line_that_is_escaped_already_is_not_escaped_again() {
         assert_eq!(printable("a\\u{1b}\nb\u{9b}\n"), "a\\u{1b}\nb\\u{9b}\n");
     }
 }

@@ -1,4 +1,4 @@
-//! Says on standard error what went wrong: what, where, and what to do about it.
+//! Prints errors on standard error: the problem, its place and the remedy.
 
 use std::fmt::Write as _;
 use std::io::{self, Write as _};
@@ -8,102 +8,102 @@ use fipa::config::{ConfigError, Mistake};
 
 use crate::output;
 
-/// Why a command ended without having done what it was told, and the exit code for that.
+/// The errors that ended a command, and its exit code.
 ///
-/// Displayed, for each trouble, as
+/// Each error is printed as
 /// ```text
 /// error: unknown key `mts.deadlin`
 /// where: fipa.toml:3
-///    do: did you mean `mts.deadline`?
+///  help: did you mean `mts.deadline`?
 /// ```
 #[derive(Debug)]
 pub(crate) struct Failure {
     code: u8,
-    troubles: Vec<Trouble>,
+    errors: Vec<ErrorReport>,
 }
 
 #[derive(Debug)]
-struct Trouble {
-    what: String,
+struct ErrorReport {
+    problem: String,
     place: Option<String>,
-    advice: String,
+    help: String,
 }
 
-/// Exit code: it did not work.
+/// Exit code of a failed operation.
 const FAILED: u8 = 1;
-/// Exit code: it was told the wrong thing, on the command line or in the configuration.
+/// Exit code for an invalid command line or an invalid configuration.
 const WRONG_USAGE: u8 = 2;
 
 impl Failure {
-    /// It did not work.
+    /// A failed operation.
     pub(crate) fn failed(
-        what: impl Into<String>,
+        problem: impl Into<String>,
         place: impl Into<String>,
-        advice: impl Into<String>,
+        help: impl Into<String>,
     ) -> Self {
         Self {
             code: FAILED,
-            troubles: vec![Trouble {
-                what: what.into(),
+            errors: vec![ErrorReport {
+                problem: problem.into(),
                 place: Some(place.into()),
-                advice: advice.into(),
+                help: help.into(),
             }],
         }
     }
 
-    /// It was told the wrong thing.
+    /// An invalid command line or configuration.
     pub(crate) fn wrong_usage(
-        what: impl Into<String>,
+        problem: impl Into<String>,
         place: impl Into<String>,
-        advice: impl Into<String>,
+        help: impl Into<String>,
     ) -> Self {
         Self {
             code: WRONG_USAGE,
-            ..Self::failed(what, place, advice)
+            ..Self::failed(problem, place, help)
         }
     }
 
-    /// Several things did not work, if any.
+    /// Joins several failures into one. Returns `Ok` when there is none.
     pub(crate) fn all(failures: impl IntoIterator<Item = Self>) -> Result<(), Self> {
         let joined = failures.into_iter().reduce(|mut all, one| {
             all.code = all.code.max(one.code);
-            all.troubles.extend(one.troubles);
+            all.errors.extend(one.errors);
             all
         });
         joined.map_or(Ok(()), Err)
     }
 
-    /// It was told the wrong thing, and the output says so already.
-    pub(crate) fn wrong_usage_already_told() -> Self {
+    /// Exit code 2 without an error report: the output of the command has the errors already.
+    pub(crate) fn wrong_usage_already_reported() -> Self {
         Self {
             code: WRONG_USAGE,
-            troubles: Vec::new(),
+            errors: Vec::new(),
         }
     }
 
-    /// It did not work, and the output says so already.
-    pub(crate) fn already_told() -> Self {
+    /// Exit code 1 without an error report: the output of the command has the errors already.
+    pub(crate) fn already_reported() -> Self {
         Self {
             code: FAILED,
-            troubles: Vec::new(),
+            errors: Vec::new(),
         }
     }
 
-    /// Prints it.
+    /// Prints the errors and returns the exit code.
     pub(crate) fn report(&self) -> ExitCode {
         let mut text = String::new();
-        for Trouble {
-            what,
+        for ErrorReport {
+            problem,
             place,
-            advice,
-        } in &self.troubles
+            help,
+        } in &self.errors
         {
             // Writing to a string cannot fail.
-            let _ = writeln!(text, "error: {}", indented(what));
+            let _ = writeln!(text, "error: {}", indented(problem));
             if let Some(place) = place {
                 let _ = writeln!(text, "where: {}", indented(place));
             }
-            let _ = writeln!(text, "   do: {}", indented(advice));
+            let _ = writeln!(text, " help: {}", indented(help));
         }
         to_stderr(&text);
         ExitCode::from(self.code)
@@ -112,43 +112,44 @@ impl Failure {
 
 impl From<ConfigError> for Failure {
     fn from(error: ConfigError) -> Self {
-        let troubles = match error {
-            ConfigError::Mistakes(mistakes) => mistakes.into_iter().map(Trouble::from).collect(),
-            other => vec![Trouble {
-                what: other.to_string(),
+        let errors = match error {
+            ConfigError::Mistakes(mistakes) => {
+                mistakes.into_iter().map(ErrorReport::from).collect()
+            }
+            other => vec![ErrorReport {
+                problem: other.to_string(),
                 place: None,
-                advice: "name another file with --config or $FIPA_CONFIG, or leave both out"
-                    .to_owned(),
+                help: "give another file with --config or $FIPA_CONFIG, or use neither".to_owned(),
             }],
         };
         Self {
             code: WRONG_USAGE,
-            troubles,
+            errors,
         }
     }
 }
 
-impl From<Mistake> for Trouble {
+impl From<Mistake> for ErrorReport {
     fn from(mistake: Mistake) -> Self {
         Self {
             place: mistake.place.map(|place| place.to_string()),
-            what: mistake.what,
-            advice: mistake.help,
+            problem: mistake.what,
+            help: mistake.help,
         }
     }
 }
 
-/// Says something that stops nothing.
-pub(crate) fn warn(what: &str) {
-    to_stderr(&format!("warning: {}\n", indented(what)));
+/// Prints a warning; the command continues.
+pub(crate) fn warn(text: &str) {
+    to_stderr(&format!("warning: {}\n", indented(text)));
 }
 
-/// The text with all lines but the first indented: none of them looks like one of this module.
+/// Indents all lines but the first, so that none of them looks like a line of this module.
 fn indented(text: &str) -> String {
     output::printable(text).replace('\n', "\n       ")
 }
 
-/// When standard error is closed there is nobody left to tell.
+/// Ignores a closed standard error: there is no other place to report it.
 fn to_stderr(text: &str) {
     let _ = io::stderr().lock().write_all(text.as_bytes());
 }

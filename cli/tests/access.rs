@@ -1,31 +1,27 @@
-//! The rules of `[access]`: what a gateway and an agent's own process do not let through, and what
-//! is told of it.
+//! The rules of `[access]`: the letters that a gateway and the process of an agent reject, and the
+//! reports about them.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 mod common;
 
 use std::time::{Duration, Instant};
 
 use common::Host;
-use serde_json::Value;
 
-/// Starts a gateway with these settings; says where it is.
+/// Starts a gateway with these settings. Returns it with its TCP location.
 fn gateway(host: &Host, settings: &[String]) -> (common::Running, String) {
     let mut arguments = vec!["up", "--json", "-v"];
     for setting in settings {
         arguments.extend(["--set", setting]);
     }
     let gateway = host.start(&arguments);
-    let ready: Value = serde_json::from_str(&gateway.ready).unwrap();
-    let location = ready["locations"].as_array().unwrap().iter();
-    let mut tcp = location.map(|one| one.as_str().unwrap());
-    let tcp = tcp.find(|one| one.starts_with("tcp://")).unwrap();
-    (gateway, tcp.split('#').next().unwrap().to_owned())
+    let location = format!("tcp://{}", gateway.tcp_address());
+    (gateway, location)
 }
 
 #[test]
-fn what_a_rule_denies_is_refused_and_audited() {
+fn a_letter_that_a_rule_denies_is_refused_and_audited() {
     let (rover, crex) = (Host::new(), Host::new());
     let (arm, brake) = (
         format!("arm-{}", crex.domain),
@@ -59,7 +55,7 @@ fn what_a_rule_denies_is_refused_and_audited() {
     while send(&arm, "inform").code != Some(0) {
         assert!(
             begun.elapsed() < Duration::from_secs(60),
-            "no letter passes"
+            "no letter is delivered"
         );
         std::thread::sleep(Duration::from_millis(20));
     }
@@ -70,21 +66,25 @@ fn what_a_rule_denies_is_refused_and_audited() {
     ] {
         let sent = send(to, performative);
         assert_eq!(sent.code, Some(1), "{to} {performative}");
-        let told = format!("{}{}", String::from_utf8_lossy(&sent.stdout), sent.stderr);
-        assert!(told.contains("refused") && told.contains(why), "{told}");
-        theirs.tells(&["fipa::audit", "letter refused", why]);
+        let output = format!("{}{}", String::from_utf8_lossy(&sent.stdout), sent.stderr);
+        assert!(
+            output.contains("refused") && output.contains(why),
+            "{output}"
+        );
+        theirs.wait_for_log(&["fipa::audit", "letter refused", why]);
     }
     assert_eq!(send(&arm, "inform").code, Some(0));
 }
 
 #[test]
-fn agents_of_one_host_are_held_to_the_rules_by_who_gets_their_letters() {
+fn the_receiving_process_enforces_its_rules_within_a_host() {
     let host = Host::new();
     let deny = "access.deny={ \".*\" = [\"arm performative=request\"] }";
     let mut arm = host.start(&["echo", "arm", "-v", "--set", deny]);
-    // Who sends has no rules. The gateway, which is not on the way, answers what it is asked.
-    let everything = "access.allow={ nobody = [\"nothing\"] }";
-    let _gateway = host.start(&["up", "--set", everything]);
+    // The sender has no rules. The gateway, which does not forward these letters, answers requests for
+    // its routes in spite of its rules.
+    let deny_all = "access.allow={ unknown = [\"nothing\"] }";
+    let _gateway = host.start(&["up", "--set", deny_all]);
     let send = |performative: &str| {
         let content = ["--content", "hello", "--performative", performative];
         host.run(&[&["send", "--to", "arm"], &content[..]].concat())
@@ -92,10 +92,10 @@ fn agents_of_one_host_are_held_to_the_rules_by_who_gets_their_letters() {
     assert_eq!(send("inform").code, Some(0));
     let sent = send("request");
     assert_eq!(sent.code, Some(1), "{sent:?}");
-    let told = format!("{}{}", String::from_utf8_lossy(&sent.stdout), sent.stderr);
-    assert!(told.contains("a rule denies it"), "{told}");
-    arm.tells(&["fipa::audit", "letter refused", "a rule denies it"]);
-    // Whoever lets in nobody else still hears the gateway.
-    let routes = host.run(&["routes", "--json", "--set", everything]);
+    let output = format!("{}{}", String::from_utf8_lossy(&sent.stdout), sent.stderr);
+    assert!(output.contains("a rule denies it"), "{output}");
+    arm.wait_for_log(&["fipa::audit", "letter refused", "a rule denies it"]);
+    // A process that denies all other senders still accepts the answer of the gateway.
+    let routes = host.run(&["routes", "--json", "--set", deny_all]);
     assert_eq!(routes.code, Some(0), "{routes:?}");
 }

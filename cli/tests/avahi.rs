@@ -1,10 +1,10 @@
-//! With the real Avahi, on another host of a network of its own: `avahi-browse` lists the agents of a
-//! gateway with the keys of the peers, for as long as they are there.
+//! Tests with the real Avahi on another host of a test network: `avahi-browse` lists the agents of a
+//! gateway with the TXT keys of legacy peers, as long as the agents are registered.
 //!
-//! Needs root, and of Debian the packages avahi-daemon, avahi-utils, dbus, iproute2 and
-//! util-linux. Where they are missing the test says so and is skipped; in CI it fails.
+//! The tests need root and the Debian packages avahi-daemon, avahi-utils, dbus, iproute2 and
+//! util-linux. If one is missing, the test prints a note and is skipped; in CI it fails.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 mod common;
 
@@ -19,17 +19,17 @@ use serde_json::Value;
 
 #[test]
 fn avahi_lists_the_agents() {
-    isolated("in_the_namespace", &Avahi::TOOLS);
+    isolated("inside_avahi_lists_the_agents", &Avahi::TOOLS);
 }
 
 const FIRST: &str = "arm.left@robot.local";
-/// A dot is a question mark to the peers; the rest are `avahi-browse`'s decimal escapes.
+/// Legacy peers replace a dot by a question mark; `avahi-browse` prints it as a decimal escape.
 const FIRST_LABEL: &str = r"arm\063left\064robot\063local";
 const SECOND: &str = "camera";
 
 #[test]
 #[ignore = "is run by the other test in a network namespace"]
-fn in_the_namespace() {
+fn inside_avahi_lists_the_agents() {
     enter();
     fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     let network = Network::new(2);
@@ -59,36 +59,36 @@ fn agents_come_and_go(avahi: &Avahi<'_>) {
     let arm = &shown[FIRST];
     assert_eq!(arm.label, FIRST_LABEL);
     assert_eq!(
-        arm.of_the_peers(),
+        arm.legacy_values(),
         ["arm", &locator, "left; front", &timestamp(&agents, FIRST)]
     );
     let camera = &shown[SECOND];
     assert_eq!(camera.label, SECOND);
     assert_eq!(
-        camera.of_the_peers(),
+        camera.legacy_values(),
         ["", &locator, "", &timestamp(&agents, SECOND)]
     );
 
-    // One of them stays each time, so what is seen to go has gone by itself.
+    // One agent stays each time, so the other one disappears by its own goodbye.
     ends(first);
     wait_for(&[SECOND]);
     let _first = start_first(&host);
     wait_for(&[FIRST, SECOND]);
     ends(second);
     wait_for(&[FIRST]);
-    // The agent is there still, but nobody on the network could reach it.
+    // The agent is still registered, but without a gateway no other host can reach it.
     ends(gateway);
     wait_for(&[]);
 }
 
 #[test]
-fn a_letter_to_a_legacy_peer_waits_for_its_sender_to_be_found() {
-    isolated("in_the_namespace_with_a_legacy_peer", &Avahi::TOOLS);
+fn a_letter_to_a_legacy_peer_waits_until_the_peer_can_find_its_sender() {
+    isolated("inside_a_letter_to_a_legacy_peer_waits", &Avahi::TOOLS);
 }
 
 #[test]
 #[ignore = "is run by the other test in a network namespace"]
-fn in_the_namespace_with_a_legacy_peer() {
+fn inside_a_letter_to_a_legacy_peer_waits() {
     enter();
     fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     let network = Network::new(2);
@@ -121,7 +121,10 @@ fn a_letter_waits(peer: &TcpListener) {
     ]);
     let begun = Instant::now();
     while !host.run(&["agents"]).done().contains("cpp") {
-        assert!(begun.elapsed() < WATCHDOG, "the legacy peer is not found");
+        assert!(
+            begun.elapsed() < WATCHDOG,
+            "the legacy peer is not discovered"
+        );
     }
     let before = Instant::now();
     let mut command = host.command(&["send", "--to", "cpp", "--content", "hello"]);
@@ -134,7 +137,7 @@ fn a_letter_waits(peer: &TcpListener) {
     assert!(sending.wait().unwrap().success());
     assert!(letter.windows(5).any(|bytes| bytes == b"hello"));
     assert!(waited >= Duration::from_millis(1500), "{waited:?}");
-    gateway.tells(&[
+    gateway.wait_for_log(&[
         "letters wait until the legacy peer has found their sender",
         "cpp",
     ]);
@@ -151,7 +154,7 @@ fn ends(running: Running) {
     assert_eq!(running.signal("-INT"), (Some(0), String::new()));
 }
 
-/// What the peers have to read about where the gateway listens.
+/// The expected value of the key `LOCATOR`.
 fn locator(gateway: &Running) -> String {
     let ready: Value = serde_json::from_str(&gateway.ready).unwrap();
     let locations = ready["locations"].as_array().unwrap();
@@ -161,7 +164,7 @@ fn locator(gateway: &Running) -> String {
     format!("{address} fipa::services::transports::MessageTransport;")
 }
 
-/// When the agent was registered, as the peers write it.
+/// The registration time of an agent in the format of legacy peers.
 fn timestamp(agents: &Value, name: &str) -> String {
     let agents = agents["agents"].as_array().unwrap();
     let agent = agents.iter().find(|agent| agent["name"] == name).unwrap();
@@ -179,9 +182,9 @@ struct Shown {
 }
 
 impl Shown {
-    /// The values of the keys that the peers know, all of which have to be there.
+    /// The values of the keys of legacy peers. All keys are required.
     #[track_caller]
-    fn of_the_peers(&self) -> [&str; 4] {
+    fn legacy_values(&self) -> [&str; 4] {
         ["TYPE", "LOCATOR", "DESCRIPTION", "TIMESTAMP"].map(|key| {
             let value = self.value(key);
             value.unwrap_or_else(|| panic!("no {key} in {self:?}"))
@@ -205,15 +208,15 @@ fn wait_for(avahi: &Avahi<'_>, names: &[&str]) -> BTreeMap<String, Shown> {
         }
         assert!(
             start.elapsed() < WATCHDOG,
-            "never just {names:?}: {shown:?}"
+            "expected exactly {names:?}: {shown:?}"
         );
     }
 }
 
-/// Ends a test that hangs; nothing is expected to take this long.
+/// Timeout for hanging tests. No step is expected to take this long.
 const WATCHDOG: Duration = Duration::from_secs(60);
 
-/// What `avahi-browse` shows, by the exact name.
+/// The agents that `avahi-browse` shows, by their exact names.
 fn browse(avahi: &Avahi<'_>) -> BTreeMap<String, Shown> {
     let mut agents = BTreeMap::new();
     for line in avahi.browse("_fipa_service_directory._udp") {
@@ -228,7 +231,10 @@ fn browse(avahi: &Avahi<'_>) -> BTreeMap<String, Shown> {
             txt: txt.map(str::to_owned).collect(),
         };
         let name = shown.value("fipa-name").unwrap().to_owned();
-        assert!(agents.insert(name, shown).is_none(), "twice: {line}");
+        assert!(
+            agents.insert(name, shown).is_none(),
+            "duplicate name: {line}"
+        );
     }
     agents
 }

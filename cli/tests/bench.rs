@@ -1,6 +1,6 @@
-//! The measurement, as a stranger runs it, and interrupted. Nothing here is about times.
+//! `fipa bench`, complete and interrupted. The tests assert no times.
 
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+#![expect(clippy::unwrap_used, reason = "a panic fails the test")]
 
 use std::process::{Command, Stdio};
 use std::time::Duration;
@@ -18,23 +18,23 @@ fn bench(arguments: &[&str]) -> Command {
     command
 }
 
-/// What a measurement has in the file system, by the number of its process.
-fn traces(pid: u32) -> Vec<String> {
-    let places = ["/dev/shm".into(), std::env::temp_dir()];
-    let names = places.iter().flat_map(|place| {
-        let files = std::fs::read_dir(place).unwrap();
-        files.map(|file| file.unwrap().file_name().to_string_lossy().into_owned())
+/// The files of the measurement with this process identifier.
+fn files(pid: u32) -> Vec<String> {
+    let directories = ["/dev/shm".into(), std::env::temp_dir()];
+    let names = directories.iter().flat_map(|directory| {
+        let entries = std::fs::read_dir(directory).unwrap();
+        entries.map(|file| file.unwrap().file_name().to_string_lossy().into_owned())
     });
     names
         .filter(|name| name.contains(&format!("bench-{pid}")))
         .collect()
 }
 
-/// The processes that a measurement has started.
-fn parts(pid: u32) -> usize {
+/// The number of processes that the measurement has started.
+fn processes(pid: u32) -> usize {
     let mark = format!("domain=bench-{pid}-");
-    let processes = std::fs::read_dir("/proc").unwrap().flatten();
-    let lines = processes.map(|process| std::fs::read(process.path().join("cmdline")));
+    let entries = std::fs::read_dir("/proc").unwrap().flatten();
+    let lines = entries.map(|process| std::fs::read(process.path().join("cmdline")));
     let lines = lines.flatten();
     lines
         .filter(|line| String::from_utf8_lossy(line).contains(&mark))
@@ -44,11 +44,11 @@ fn parts(pid: u32) -> usize {
 fn number(value: &Value) -> f64 {
     value
         .as_f64()
-        .unwrap_or_else(|| panic!("{value} is no number"))
+        .unwrap_or_else(|| panic!("{value} is not a number"))
 }
 
 #[test]
-fn every_way_is_measured_beside_its_limit() {
+fn every_route_is_measured_with_its_limit() {
     let picture = tempfile::tempdir().unwrap();
     let picture = picture.path().join("latency.svg");
     let child = bench(&["--quick", "--json", "--sizes", "100B,20KiB", "--svg"])
@@ -59,8 +59,8 @@ fn every_way_is_measured_beside_its_limit() {
         .unwrap();
     let pid = child.id();
     let output = child.wait_with_output().unwrap();
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{said}");
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{errors}");
     let report: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert!(number(&report["machine"]["cores"]) >= 1.0);
     let rows = report["rows"].as_array().unwrap();
@@ -109,21 +109,24 @@ fn every_way_is_measured_beside_its_limit() {
     }
     let drawn = std::fs::read_to_string(&picture).unwrap();
     assert!(drawn.starts_with("<svg") && drawn.contains("raw iceoryx2"));
-    assert_eq!(traces(pid), Vec::<String>::new());
-    assert_eq!(parts(pid), 0);
+    assert_eq!(files(pid), Vec::<String>::new());
+    assert_eq!(processes(pid), 0);
 }
 
 #[test]
-fn an_interrupted_measurement_leaves_nothing_behind() {
+fn an_interrupted_measurement_leaves_no_files_and_processes() {
     let mut child = bench(&["shm"])
         .stdout(Stdio::null())
         .stderr(Stdio::null())
         .spawn()
         .unwrap();
     let pid = child.id();
-    // Bare iceoryx2 is among the last that are started.
-    while parts(pid) < 6 {
-        assert!(child.try_wait().unwrap().is_none(), "it ended early");
+    // The processes of raw iceoryx2 start late.
+    while processes(pid) < 6 {
+        assert!(
+            child.try_wait().unwrap().is_none(),
+            "the command ended early"
+        );
         std::thread::sleep(Duration::from_millis(5));
     }
     let interrupted = Command::new("kill")
@@ -132,8 +135,8 @@ fn an_interrupted_measurement_leaves_nothing_behind() {
         .unwrap();
     assert!(interrupted.success());
     assert_eq!(child.wait().unwrap().code(), Some(1));
-    assert_eq!(traces(pid), Vec::<String>::new());
-    assert_eq!(parts(pid), 0);
+    assert_eq!(files(pid), Vec::<String>::new());
+    assert_eq!(processes(pid), 0);
 }
 
 #[test]
@@ -143,8 +146,8 @@ fn the_evaluation_of_the_paper_is_repeated() {
         .arg(directory.path())
         .output()
         .unwrap();
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{said}");
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{errors}");
     let report: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert!(number(&report["machine"]["cores"]) >= 1.0);
     assert!(number(&report["cycles"]) >= 1.0);
@@ -196,7 +199,7 @@ fn the_evaluation_of_the_paper_is_repeated() {
 }
 
 #[test]
-fn what_cannot_be_measured_is_wrong_usage() {
+fn invalid_options_have_exit_code_2() {
     let cases: [(&[&str], &str); 4] = [
         (&["shm", "--sizes", "1GiB"], "--sizes"),
         (&["shm", "--dir", "/tmp"], "--dir"),
@@ -206,7 +209,7 @@ fn what_cannot_be_measured_is_wrong_usage() {
     for (arguments, wrong) in cases {
         let output = bench(arguments).output().unwrap();
         assert_eq!(output.status.code(), Some(2), "{arguments:?}");
-        let said = String::from_utf8_lossy(&output.stderr);
-        assert!(said.contains(wrong), "{said}");
+        let errors = String::from_utf8_lossy(&output.stderr);
+        assert!(errors.contains(wrong), "{errors}");
     }
 }

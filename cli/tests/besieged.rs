@@ -1,17 +1,17 @@
-//! Fifty hostile peers beside two honest gateways: every honest letter arrives.
+//! Fifty hostile peers attack one of two honest gateways: every honest letter is delivered.
 //!
-//! How long they take is printed: while it is quiet, while the hostile peers are at the gateway, and
-//! while they are at somebody who takes whatever comes and does nothing about it. The last says what
-//! their own work costs on the processors that all share. `FIPA_SIEGE_SECONDS` is how long each of
-//! these goes on, three times; without it, one second, once. Only in a release build and on a machine
-//! that does nothing else do the figures mean something:
+//! The test prints the delivery times in three states: without an attack, during an attack on the
+//! gateway, and during an attack on a sink that accepts and ignores everything. The third state shows
+//! the cost of the hostile peers themselves on the shared CPUs. `FIPA_SIEGE_SECONDS` is the duration of
+//! each state, in seconds, repeated three times; without it each state takes one second, once. The
+//! figures are meaningful only in a release build on an otherwise idle machine:
 //!
 //! ```console
 //! $ FIPA_SIEGE_SECONDS=10 cargo test --release -p fipa-cli --test besieged -- --nocapture --test-threads=1
 //! ```
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
-#![allow(clippy::print_stdout, reason = "what it came to is worth knowing")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
+#![allow(clippy::print_stdout, reason = "the test prints its figures")]
 
 mod fuzzing;
 mod siege;
@@ -30,17 +30,19 @@ use fuzzing::{Writer, datagram, stream};
 use siege::hostile::{self, AT_KEYS, IN_THE_CLEAR, Means};
 use siege::{percentiles, usage};
 
-/// Where the hostile peers are to go: two addresses; whether there are keys.
-const GO: &str = "FIPA_SIEGE_AT";
+/// Environment variable with the orders of the hostile peers: whether there are keys, the directory, and
+/// two addresses or `sink`.
+const ORDERS: &str = "FIPA_SIEGE_AT";
 
-/// First datagrams of connections, each of which may be used again when its connection is over.
+/// Number of prepared first datagrams of connections. A datagram is reused after its connection has
+/// ended.
 const INITIALS: usize = 300;
 
-/// The hostile peers in a process of their own, so that what they need can be told apart.
+/// The hostile peers, in a separate process so that their CPU time is measured separately.
 struct Hostile(Child);
 
 impl Hostile {
-    fn set_off(to: Option<(SocketAddr, SocketAddr)>, secured: bool, place: &Path) -> Self {
+    fn start(to: Option<(SocketAddr, SocketAddr)>, secured: bool, place: &Path) -> Self {
         let at = to.map_or("sink".to_owned(), |(tcp, datagrams)| {
             format!("{tcp} {datagrams}")
         });
@@ -52,16 +54,16 @@ impl Hostile {
                 "--ignored",
                 "--nocapture",
             ])
-            .env(GO, format!("{secured} {} {at}", place.display()))
+            .env(ORDERS, format!("{secured} {} {at}", place.display()))
             .stdout(Stdio::piped());
         let mut child = command.spawn().unwrap();
         let lines = BufReader::new(child.stdout.take().unwrap()).lines();
         let mut lines = lines.map_while(Result::ok);
         assert!(
             lines.any(|line| line.contains("READY")),
-            "they did not set off"
+            "the hostile peers did not start"
         );
-        // It goes on saying how much it did.
+        // Reads further output, so that the process does not block.
         std::thread::spawn(move || lines.for_each(drop));
         Self(child)
     }
@@ -69,7 +71,7 @@ impl Hostile {
 
 impl Drop for Hostile {
     fn drop(&mut self) {
-        // It may have ended already, which is as good.
+        // The process may have ended already.
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
@@ -78,8 +80,8 @@ impl Drop for Hostile {
 #[test]
 #[ignore = "is run by the other tests in a process of its own"]
 fn inside_hostile_peers() {
-    let go = std::env::var(GO).unwrap();
-    let mut words = go.split(' ');
+    let orders = std::env::var(ORDERS).unwrap();
+    let mut words = orders.split(' ');
     let secured: bool = words.next().unwrap().parse().unwrap();
     let place = Path::new(words.next().unwrap()).to_owned();
     let runtime = tokio::runtime::Builder::new_current_thread()
@@ -100,7 +102,7 @@ fn inside_hostile_peers() {
 
 async fn means(secured: bool, place: &Path, (tcp, datagrams): (SocketAddr, SocketAddr)) -> Means {
     let mut random = fastrand::Rng::with_seed(1);
-    let receivers = ["nobody".to_owned()];
+    let receivers = ["unknown".to_owned()];
     let mut writer = Writer {
         random: &mut random,
         name: "rogue",
@@ -131,7 +133,7 @@ async fn means(secured: bool, place: &Path, (tcp, datagrams): (SocketAddr, Socke
     means
 }
 
-/// How it went in one of the states.
+/// The figures of one state.
 #[derive(Debug, Default)]
 struct Account {
     took: Vec<Duration>,
@@ -144,7 +146,7 @@ fn besieged(secured: bool) {
     let (seconds, rounds) = asked.map_or((1, 1), |seconds| (seconds, 3));
     let place = tempfile::Builder::new().prefix("siege-").tempdir().unwrap();
     if secured {
-        // Nobody trusts him.
+        // No gateway trusts this key.
         siege::keys(place.path().join("stranger"), "stranger");
     }
     let pair = siege::Pair::new(place.path(), secured, "besieged");
@@ -160,14 +162,14 @@ fn besieged(secured: bool) {
         for (state, account) in accounts.iter_mut().enumerate() {
             let hostile = match state {
                 0 => None,
-                1 => Some(Hostile::set_off(Some(to), secured, place.path())),
-                _ => Some(Hostile::set_off(None, secured, place.path())),
+                1 => Some(Hostile::start(Some(to), secured, place.path())),
+                _ => Some(Hostile::start(None, secured, place.path())),
             };
             let used = |of: Option<&Hostile>| of.map(|it| usage(it.0.id()).processor);
             let before = (pair.gateway.usage(), used(hostile.as_ref()));
             talk.take();
             std::thread::sleep(Duration::from_secs(seconds));
-            // However slow they have become.
+            // Also when the letters are slow.
             talk.goes_on(20);
             account.took.extend(talk.take());
             account.gateway += pair.gateway.usage().processor - before.0.processor;
@@ -177,9 +179,9 @@ fn besieged(secured: bool) {
         }
     }
     talk.end();
-    println!("{}:", if secured { "with keys" } else { "in the clear" });
+    println!("{}:", if secured { "with keys" } else { "without keys" });
     let quiet = percentiles(accounts[0].took.clone());
-    for (what, account) in ["quiet", "at the gateway", "at a sink"]
+    for (state, account) in ["no attack", "attack on gateway", "attack on sink"]
         .iter()
         .zip(accounts)
     {
@@ -187,8 +189,8 @@ fn besieged(secured: bool) {
         let (median, last) = percentiles(account.took);
         let ratio = |one: Duration, other: Duration| one.as_secs_f64() / other.as_secs_f64();
         println!(
-            "  {what:14} {letters:6} letters: median {median:.1?} ({:.2}), 99 % {last:.1?} ({:.2}); \
-             processor: gateway {:.1?}, hostile peers {:.1?}",
+            "  {state:17} {letters:6} letters: median {median:.1?} ({:.2}), 99 % {last:.1?} ({:.2}); \
+             CPU time: gateway {:.1?}, hostile peers {:.1?}",
             ratio(median, quiet.0),
             ratio(last, quiet.1),
             account.gateway,
@@ -199,11 +201,11 @@ fn besieged(secured: bool) {
 }
 
 #[test]
-fn honest_letters_arrive_at_a_gateway_with_keys() {
+fn honest_letters_are_delivered_by_an_attacked_gateway_with_keys() {
     besieged(true);
 }
 
 #[test]
-fn honest_letters_arrive_at_a_gateway_in_the_clear() {
+fn honest_letters_are_delivered_by_an_attacked_gateway_without_keys() {
     besieged(false);
 }

@@ -1,6 +1,6 @@
-//! `fipa coalition`, and who watches agents, as a shell runs them.
+//! `fipa coalition` and `fipa agents --watch` in processes of their own.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 mod common;
 
@@ -10,13 +10,13 @@ use std::process::Stdio;
 use common::Host;
 
 #[test]
-fn a_coalition_is_shown_and_written_to() {
+fn a_coalition_is_listed_and_receives_letters() {
     let host = Host::new();
     let (parrot, owl) = (host.echo("parrot"), host.echo("owl"));
     let members = ["coalition", "birds", "parrot", "owl", "--leader", "owl"];
     let birds = host.start(&members);
     assert!(
-        birds.ready.starts_with("birds of the domain"),
+        birds.ready.starts_with("coalition birds of domain "),
         "{}",
         birds.ready
     );
@@ -26,7 +26,7 @@ fn a_coalition_is_shown_and_written_to() {
     assert_eq!(listed["members"], serde_json::json!(["parrot", "owl"]));
     assert_eq!(listed["leader"], "owl");
     let table = host.run(&["agents", "birds"]).done();
-    assert!(table.contains("owl (leads)"), "{table}");
+    assert!(table.contains("owl (leader)"), "{table}");
     let sent = host.run(&["send", "--to", "birds", "--content", "hello", "--json"]);
     let sent = sent.done_json().to_string();
     assert!(sent.contains("\"receiver\":\"owl\""), "{sent}");
@@ -39,14 +39,14 @@ fn a_coalition_is_shown_and_written_to() {
     assert_eq!(birds.signal("-INT"), (Some(0), String::new()));
     let gone = host.run(&["agents", "birds"]).done();
     assert!(
-        gone.contains("nobody") && gone.contains("by that description"),
+        gone.contains("no agent") && gone.contains("that matches the filters"),
         "{gone}"
     );
     drop((parrot, owl));
 }
 
 #[test]
-fn who_watches_ends_when_nobody_reads_any_more() {
+fn agents_watch_ends_when_its_output_has_no_reader() {
     let host = Host::new();
     let _parrot = host.echo("parrot");
     let mut watching = host
@@ -59,9 +59,9 @@ fn who_watches_ends_when_nobody_reads_any_more() {
     output.read_line(&mut line).unwrap();
     output.read_line(&mut line).unwrap();
     let (first, second) = line.split_once('\n').unwrap();
-    assert!(first.starts_with("watching the domain"), "{line}");
+    assert!(first.starts_with("watching domain "), "{line}");
     assert!(second.contains("present  parrot"), "{line}");
-    // As `head` does. Nothing else happens that would be told; a watchdog ends a test that hangs.
+    // Closes the pipe, as `head` does. No further change would make the command print.
     drop(output);
     assert!(watching.wait().unwrap().success());
 }

@@ -1,6 +1,6 @@
-//! `fipa config show` and `fipa config check`, as a shell runs them.
+//! `fipa config show` and `fipa config check` in processes of their own.
 
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![expect(clippy::unwrap_used, reason = "a panic fails the test")]
 
 use std::fs::{self, File};
 use std::io;
@@ -10,15 +10,15 @@ use std::process::{Command, Output};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-/// A place with a home and a working directory of its own, and nothing from the outside.
-struct Place(TempDir);
+/// A home directory, a working directory and a clean environment.
+struct Environment(TempDir);
 
-impl Place {
+impl Environment {
     fn new() -> Self {
-        let place = Self(tempfile::tempdir().unwrap());
-        fs::create_dir_all(place.path("home/.config/fipa")).unwrap();
-        fs::create_dir(place.path("work")).unwrap();
-        place
+        let env = Self(tempfile::tempdir().unwrap());
+        fs::create_dir_all(env.path("home/.config/fipa")).unwrap();
+        fs::create_dir(env.path("work")).unwrap();
+        env
     }
 
     fn path(&self, name: &str) -> PathBuf {
@@ -77,13 +77,13 @@ fn ran(code: i32, stdout: &str, stderr: &str) -> Ran {
 }
 
 #[test]
-fn show_prints_a_file_that_says_the_same() {
-    let place = Place::new();
-    place.write(
+fn show_prints_an_equivalent_configuration_file() {
+    let env = Environment::new();
+    env.write(
         "work/fipa.toml",
         "domain = \"lab\"\n[mts]\nname = \"sherpa\"\n[routes]\n\"arm_.*\" = [\"tcp\"]\n",
     );
-    let shown = place.run(&["config", "show", "--set", "mts.deadline=9s"]);
+    let shown = env.run(&["config", "show", "--set", "mts.deadline=9s"]);
     let expected = "\
 domain = \"lab\"                       # fipa.toml:1
 
@@ -135,8 +135,8 @@ protocols = []                       # default
 ";
     assert_eq!(shown, ran(0, expected, ""));
 
-    place.write("work/shown.toml", expected);
-    let again = place.run(&["--config", "shown.toml", "config", "show"]);
+    env.write("work/shown.toml", expected);
+    let again = env.run(&["--config", "shown.toml", "config", "show"]);
     let without_origins = |text: &str| -> Vec<String> {
         let lines = text
             .lines()
@@ -147,10 +147,10 @@ protocols = []                       # default
 }
 
 #[test]
-fn show_as_json_tells_the_origin_of_every_value() {
-    let place = Place::new();
-    place.write("work/fipa.toml", "mts.name = \"sherpa\"\nmts.queue = 8\n");
-    let shown = place.run(&["config", "show", "--json", "--set", "discovery.mdns=false"]);
+fn show_as_json_has_the_origin_of_every_value() {
+    let env = Environment::new();
+    env.write("work/fipa.toml", "mts.name = \"sherpa\"\nmts.queue = 8\n");
+    let shown = env.run(&["config", "show", "--json", "--set", "discovery.mdns=false"]);
     assert_eq!((shown.code, shown.stderr.as_str()), (Some(0), ""));
     let shown = shown.json();
     assert_eq!(shown["file"], "fipa.toml");
@@ -167,16 +167,16 @@ fn show_as_json_tells_the_origin_of_every_value() {
         assert!(settings.contains(&expected), "{expected} in {settings:#?}");
     }
     assert_eq!(
-        Place::new().run(&["config", "show", "--json"]).json()["file"],
+        Environment::new().run(&["config", "show", "--json"]).json()["file"],
         Value::Null
     );
 }
 
 #[test]
-fn options_before_and_behind_the_command_add_up() {
-    let place = Place::new();
+fn global_options_before_and_after_the_command_are_merged() {
+    let env = Environment::new();
     let before = ["--set", "mts.queue=7", "--set", "domain=a"];
-    let behind = [
+    let after = [
         "config",
         "--set",
         "mts.name=m",
@@ -185,7 +185,7 @@ fn options_before_and_behind_the_command_add_up() {
         "--set",
         "domain=b",
     ];
-    let shown = place.run(&[&before[..], &behind].concat()).json();
+    let shown = env.run(&[&before[..], &after].concat()).json();
     for (path, value) in [
         (json!(["mts", "queue"]), json!(7)),
         (json!(["mts", "name"]), json!("m")),
@@ -198,16 +198,23 @@ fn options_before_and_behind_the_command_add_up() {
 }
 
 #[test]
-fn check_has_nothing_to_say_about_a_good_file() {
-    let place = Place::new();
-    let nothing = place.run(&["config", "check"]);
-    assert_eq!(nothing, ran(0, "no mistakes: no file, only defaults\n", ""));
-    place.write("work/fipa.toml", "domain = \"lab\"\n");
+fn check_reports_no_errors_for_a_valid_file() {
+    let env = Environment::new();
+    let nothing = env.run(&["config", "check"]);
     assert_eq!(
-        place.run(&["config", "check"]),
-        ran(0, "no mistakes: fipa.toml\n", "")
+        nothing,
+        ran(
+            0,
+            "no errors: no configuration file, all keys have their defaults\n",
+            ""
+        )
     );
-    let as_json = place.run(&["config", "check", "--json"]);
+    env.write("work/fipa.toml", "domain = \"lab\"\n");
+    assert_eq!(
+        env.run(&["config", "check"]),
+        ran(0, "no errors: fipa.toml\n", "")
+    );
+    let as_json = env.run(&["config", "check", "--json"]);
     assert_eq!(
         (as_json.code, as_json.json()),
         (Some(0), json!({ "ok": true, "mistakes": [] }))
@@ -215,21 +222,21 @@ fn check_has_nothing_to_say_about_a_good_file() {
 }
 
 #[test]
-fn mistakes_are_told_with_place_and_advice() {
-    let place = Place::new();
-    place.write("work/fipa.toml", "[mts]\ndeadlin = \"5s\"\nqueue = \"x\"\n");
-    let told = "\
+fn errors_are_reported_with_place_and_help() {
+    let env = Environment::new();
+    env.write("work/fipa.toml", "[mts]\ndeadlin = \"5s\"\nqueue = \"x\"\n");
+    let errors = "\
 error: unknown key `mts.deadlin`
 where: fipa.toml:2
-   do: did you mean `mts.deadline`? (known in [mts]: name, transports, deadline, queue, queue_bytes)
+ help: did you mean `mts.deadline`? (known in [mts]: name, transports, deadline, queue, queue_bytes)
 error: `mts.queue` is wrong: \"x\": a string cannot stand here
 where: fipa.toml:3
-   do: expected a number of letters such as 256
+ help: expected a number of letters such as 256
 ";
     for action in ["show", "check"] {
-        assert_eq!(place.run(&["config", action]), ran(2, "", told));
+        assert_eq!(env.run(&["config", action]), ran(2, "", errors));
     }
-    let as_json = place.run(&["config", "check", "--json"]);
+    let as_json = env.run(&["config", "check", "--json"]);
     assert_eq!((as_json.code, as_json.stderr.as_str()), (Some(2), ""));
     assert_eq!(
         as_json.json(),
@@ -243,7 +250,7 @@ where: fipa.toml:3
               "place": { "from": "file", "path": "fipa.toml", "line": 3 } },
         ] })
     );
-    let set = place.run(&[
+    let set = env.run(&[
         "config",
         "check",
         "--config",
@@ -251,29 +258,29 @@ where: fipa.toml:3
         "--set",
         "mts.queue=0",
     ]);
-    let told = "\
+    let errors = "\
 error: `mts.queue` cannot be 0
 where: --set mts.queue=0
-   do: use 1 to 65536 letters
+ help: use 1 to 65536 letters
 ";
-    assert_eq!(set, ran(2, "", told));
+    assert_eq!(set, ran(2, "", errors));
 }
 
 #[test]
-fn a_missing_file_is_told() {
-    let place = Place::new();
-    let told = "\
+fn a_missing_file_is_reported() {
+    let env = Environment::new();
+    let errors = "\
 error: cannot read the configuration none.toml (named by --config): \
 No such file or directory (os error 2)
-   do: name another file with --config or $FIPA_CONFIG, or leave both out
+ help: give another file with --config or $FIPA_CONFIG, or use neither
 ";
     assert_eq!(
-        place.run(&["config", "show", "--config", "none.toml"]),
-        ran(2, "", told)
+        env.run(&["config", "show", "--config", "none.toml"]),
+        ran(2, "", errors)
     );
-    let json = place.run(&["config", "check", "--json", "--config", "none.toml"]);
-    assert_eq!(json, ran(2, "", told));
-    let mut by_variable = place.command(&["config", "check"]);
+    let json = env.run(&["config", "check", "--json", "--config", "none.toml"]);
+    assert_eq!(json, ran(2, "", errors));
+    let mut by_variable = env.command(&["config", "check"]);
     let by_variable = Ran::from(
         by_variable
             .env("FIPA_CONFIG", "none.toml")
@@ -282,15 +289,15 @@ No such file or directory (os error 2)
     );
     assert_eq!(
         by_variable,
-        ran(2, "", &told.replace("--config):", "$FIPA_CONFIG):"))
+        ran(2, "", &errors.replace("--config):", "$FIPA_CONFIG):"))
     );
 }
 
 #[test]
-fn the_first_file_counts() {
-    let place = Place::new();
+fn the_first_existing_file_is_used() {
+    let env = Environment::new();
     let checked = |arguments: &[&str], variable: Option<&Path>| {
-        let mut command = place.command(&["config", "check"]);
+        let mut command = env.command(&["config", "check"]);
         command
             .args(arguments)
             .envs(variable.map(|file| ("FIPA_CONFIG", file)));
@@ -298,30 +305,30 @@ fn the_first_file_counts() {
         assert_eq!((checked.code, checked.stderr.as_str()), (Some(0), ""));
         checked
             .stdout
-            .trim_start_matches("no mistakes: ")
+            .trim_start_matches("no errors: ")
             .trim_end()
             .to_owned()
     };
-    let of_user = place.path("home/.config/fipa/fipa.toml");
-    place.write("home/.config/fipa/fipa.toml", "");
+    let of_user = env.path("home/.config/fipa/fipa.toml");
+    env.write("home/.config/fipa/fipa.toml", "");
     assert_eq!(checked(&[], None), of_user.display().to_string());
-    place.write("work/fipa.toml", "");
+    env.write("work/fipa.toml", "");
     assert_eq!(checked(&[], None), "fipa.toml");
-    place.write("variable.toml", "").write("asked.toml", "");
-    let variable = place.path("variable.toml");
+    env.write("variable.toml", "").write("option.toml", "");
+    let variable = env.path("variable.toml");
     assert_eq!(
         checked(&[], Some(&variable)),
         variable.display().to_string()
     );
     assert_eq!(
-        checked(&["--config", "../asked.toml"], Some(&variable)),
-        "../asked.toml"
+        checked(&["--config", "../option.toml"], Some(&variable)),
+        "../option.toml"
     );
 }
 
 #[test]
-fn wrong_usage_is_told_apart() {
-    let place = Place::new();
+fn an_invalid_command_line_has_exit_code_2() {
+    let env = Environment::new();
     for arguments in [
         &[][..],
         &["config"],
@@ -329,7 +336,7 @@ fn wrong_usage_is_told_apart() {
         &["config", "show", "--nonsense"],
         &["config", "show", "-v", "-q"],
     ] {
-        let ran = place.run(arguments);
+        let ran = env.run(arguments);
         assert_eq!(
             (ran.code, ran.stdout.as_str()),
             (Some(2), ""),
@@ -345,37 +352,37 @@ fn wrong_usage_is_told_apart() {
 
 #[test]
 fn every_command_has_help_with_examples() {
-    let place = Place::new();
-    let help = place.run(&["--help"]);
+    let env = Environment::new();
+    let help = env.run(&["--help"]);
     assert_eq!((help.code, help.stderr.as_str()), (Some(0), ""));
     assert!(help.stdout.contains("Exit codes:"), "{}", help.stdout);
     for (command, first_line) in [
         (
             &["config"][..],
-            "Show the configuration that counts, or check it for mistakes",
+            "Show the effective configuration, or check it for errors",
         ),
         (
             &["config", "show"],
-            "Print the configuration that counts, with the origin of every value",
+            "Print the effective configuration with the origin of every value",
         ),
-        (
-            &["config", "check"],
-            "Say whether the configuration has mistakes, and where",
-        ),
+        (&["config", "check"], "Check the configuration for errors"),
         (
             &["up"],
-            "Run the gateway, which connects the agents of this host with those of other hosts",
+            "Run the gateway, which connects the agents of this host with agents on other hosts",
         ),
-        (&["agents"], "Show who is there, and where"),
-        (&["send"], "Send one message, and say what became of it"),
+        (&["agents"], "List the agents of the domain"),
+        (&["send"], "Send one message and print its outcome"),
         (
             &["echo"],
-            "Run an agent that answers every message with an inform of the same content",
+            "Run an agent that answers each message with an inform of the same content",
         ),
         (&["decode"], "Print a recorded message or letter as JSON"),
-        (&["demo"], "Show what this is about"),
+        (
+            &["demo"],
+            "Demonstrate the main functions with two simulated hosts and several agents",
+        ),
     ] {
-        let help = place.run(&[command, &["--help"]].concat());
+        let help = env.run(&[command, &["--help"]].concat());
         assert_eq!((help.code, help.stderr.as_str()), (Some(0), ""));
         assert!(help.stdout.starts_with(first_line), "{}", help.stdout);
         let example = format!("Examples:\n  fipa {}", command[0]);
@@ -384,14 +391,14 @@ fn every_command_has_help_with_examples() {
 }
 
 #[test]
-fn a_log_filter_that_is_not_understood_stops_nothing() {
-    let place = Place::new();
-    let mut command = place.command(&["config", "check"]);
+fn an_invalid_log_filter_is_only_a_warning() {
+    let env = Environment::new();
+    let mut command = env.command(&["config", "check"]);
     let ran = Ran::from(command.env("RUST_LOG", "fipa=loudly").output().unwrap());
     assert_eq!(ran.code, Some(0));
     assert!(
         ran.stderr
-            .starts_with("warning: $RUST_LOG is not understood ("),
+            .starts_with("warning: ignoring $RUST_LOG, which is not a valid log filter: "),
         "{}",
         ran.stderr
     );
@@ -399,23 +406,23 @@ fn a_log_filter_that_is_not_understood_stops_nothing() {
 
 #[test]
 fn output_that_cannot_be_written_is_a_failure() {
-    let place = Place::new();
-    let mut command = place.command(&["config", "show"]);
+    let env = Environment::new();
+    let mut command = env.command(&["config", "show"]);
     command.stdout(File::options().write(true).open("/dev/full").unwrap());
-    let told = "\
+    let errors = "\
 error: cannot write the output: No space left on device (os error 28)
 where: standard output
-   do: see whether the disk is full, or print to somewhere else
+ help: check whether the disk is full, or redirect the output to another file
 ";
-    assert_eq!(Ran::from(command.output().unwrap()), ran(1, "", told));
+    assert_eq!(Ran::from(command.output().unwrap()), ran(1, "", errors));
 }
 
 #[test]
-fn a_reader_that_has_seen_enough_is_no_failure() {
-    let place = Place::new();
+fn a_closed_pipe_is_not_a_failure() {
+    let env = Environment::new();
     let (reader, writer) = io::pipe().unwrap();
     drop(reader);
-    let mut command = place.command(&["config", "show"]);
+    let mut command = env.command(&["config", "show"]);
     command.stdout(writer);
     assert_eq!(Ran::from(command.output().unwrap()), ran(0, "", ""));
 }

@@ -1,6 +1,6 @@
-//! `fipa decode`: recorded bytes of real peers as JSON.
+//! `fipa decode`: decodes recorded bytes of real peers.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 mod common;
 
@@ -13,14 +13,14 @@ use common::Host;
 use serde_json::{Value, json};
 
 #[test]
-fn recorded_messages_mean_what_is_written_beside_them() {
+fn recorded_messages_decode_to_their_descriptions() {
     let host = Host::new();
     let recorded = vectors('m');
     assert!(recorded.len() >= 35, "only {} found", recorded.len());
     for path in recorded {
-        let mut expected = beside(&path);
+        let mut expected = description(&path);
         if name(&path) == "m28_resolver_depth2" {
-            // The library that wrote it goes one level deep.
+            // The recording library encodes only one level of resolvers.
             let resolver = &mut expected["message"]["sender"]["resolvers"][0];
             resolver.as_object_mut().unwrap().remove("resolvers");
         }
@@ -32,15 +32,15 @@ fn recorded_messages_mean_what_is_written_beside_them() {
 }
 
 #[test]
-fn recorded_letters_mean_what_is_written_beside_them() {
+fn recorded_letters_decode_to_their_descriptions() {
     let host = Host::new();
     let recorded = vectors('e');
     assert!(recorded.len() >= 11, "only {} found", recorded.len());
     let mut messages = 0;
     for path in recorded {
-        let mut expected = beside(&path);
+        let mut expected = description(&path);
         if name(&path) == "e12_extra_override" {
-            // The format has no date in extensions.
+            // The encoding has no date in extensions.
             let extension = &mut expected["envelope"]["extensions"][0];
             extension.as_object_mut().unwrap().remove("date");
         }
@@ -59,7 +59,7 @@ fn recorded_letters_mean_what_is_written_beside_them() {
             assert_eq!(ran.stderr.is_empty(), payload == "", "{}", ran.stderr);
             continue;
         }
-        // The message is the one that its bytes make on their own.
+        // The message equals the result of decoding the payload alone.
         assert_eq!(ran.stderr, "");
         let payload = BASE64
             .decode(expected["payload_base64"].as_str().unwrap())
@@ -74,12 +74,12 @@ fn recorded_letters_mean_what_is_written_beside_them() {
     }
     assert!(
         messages >= 5,
-        "only {messages} letters had a message that was read"
+        "only {messages} letters had a decoded message"
     );
 }
 
 #[test]
-fn hexadecimal_text() {
+fn hexadecimal_input_is_decoded() {
     let host = Host::new();
     let bytes = fs::read(vector("m19_perf_request.be")).unwrap();
     let plain = host
@@ -89,15 +89,16 @@ fn hexadecimal_text() {
     let hex: String = bytes.iter().map(|byte| format!("{byte:02X} ")).collect();
     let decoded = host.run_with_input(&["decode", "--hex", "--compact"], hex.as_bytes());
     assert_eq!(decoded.done(), plain);
-    let told = host
+    let output = host
         .run_with_input(&["decode", "--hex"], b"fa 1g")
         .failed(1);
-    let expected = "error: 'g' is no hexadecimal digit here\nwhere: standard input, character 5\n";
-    assert!(told.starts_with(expected), "{told}");
+    let expected =
+        "error: expected a hexadecimal digit, not 'g'\nwhere: standard input, character 5\n";
+    assert!(output.starts_with(expected), "{output}");
 }
 
 #[test]
-fn what_the_help_shows_works() {
+fn the_example_of_the_help_works() {
     let decoded = Host::new()
         .run_with_input(&["decode", "--hex"], b"fa 10 13 01\n")
         .done_json();
@@ -105,31 +106,31 @@ fn what_the_help_shows_works() {
 }
 
 #[test]
-fn malformed_bytes_are_told_with_place_and_clause() {
+fn malformed_bytes_are_reported_with_offset_and_clause() {
     let host = Host::new();
     let message = fs::read(vector("m19_perf_request.be")).unwrap();
     let cut = message.len() - 1;
     fs::write(host.path("cut.be"), &message[..cut]).unwrap();
-    let told = host.run(&["decode", "cut.be"]).failed(1);
+    let output = host.run(&["decode", "cut.be"]).failed(1);
     assert!(
-        told.contains(&format!("where: cut.be, byte {cut}\n")),
-        "{told}"
+        output.contains(&format!("where: cut.be, byte {cut}\n")),
+        "{output}"
     );
-    assert!(told.contains("(FIPA00069"), "{told}");
+    assert!(output.contains("(FIPA00069"), "{output}");
     let letter = fs::read(vector("e01_simple.be")).unwrap();
     for (input, clause) in [
         (&letter[..9], "(FIPA00069"),
         (b"", "FIPA"),
         (b"hello", "FIPA"),
     ] {
-        let told = host.run_with_input(&["decode"], input).failed(1);
+        let output = host.run_with_input(&["decode"], input).failed(1);
         assert!(
-            told.contains(clause) && told.contains("where: standard input, byte "),
-            "{told}"
+            output.contains(clause) && output.contains("where: standard input, byte "),
+            "{output}"
         );
     }
-    let told = host.run(&["decode", "nothing.be"]).failed(1);
-    assert!(told.contains("where: nothing.be\n"), "{told}");
+    let output = host.run(&["decode", "nothing.be"]).failed(1);
+    assert!(output.contains("where: nothing.be\n"), "{output}");
 }
 
 fn to_base64(message: &mut Value) {
@@ -140,7 +141,7 @@ fn to_base64(message: &mut Value) {
     }
 }
 
-fn beside(path: &Path) -> Value {
+fn description(path: &Path) -> Value {
     serde_json::from_slice(&fs::read(path.with_extension("json")).unwrap()).unwrap()
 }
 

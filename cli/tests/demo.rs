@@ -1,6 +1,6 @@
-//! The demo, as a stranger runs it, and interrupted.
+//! `fipa demo`, complete and interrupted.
 
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+#![expect(clippy::unwrap_used, reason = "a panic fails the test")]
 
 use std::io::{BufRead, BufReader, Read};
 use std::process::{Child, Command, Stdio};
@@ -8,8 +8,8 @@ use std::sync::{Mutex, PoisonError};
 
 use serde_json::Value;
 
-/// Demos find their hosts by mDNS on loopback, where they would hear of each other, and their
-/// agents have the same names.
+/// Demos use mDNS on loopback and the same agent names, so two demos at a time would find each other's
+/// agents.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
 fn demo(arguments: &[&str]) -> Command {
@@ -18,22 +18,22 @@ fn demo(arguments: &[&str]) -> Command {
     command
 }
 
-/// What a demo has in the file system, by the number of its process.
-fn traces(pid: u32) -> Vec<String> {
+/// The files of the demo with this process identifier.
+fn files(pid: u32) -> Vec<String> {
     let names = |directory| {
-        let files = std::fs::read_dir(directory).unwrap();
-        files.map(|file| file.unwrap().file_name().to_string_lossy().into_owned())
+        let entries = std::fs::read_dir(directory).unwrap();
+        entries.map(|file| file.unwrap().file_name().to_string_lossy().into_owned())
     };
     let all = names("/dev/shm").chain(names("/tmp"));
     all.filter(|name| name.contains(&format!("demo-{pid}")))
         .collect()
 }
 
-/// The processes that a demo has started.
-fn parts(pid: u32) -> usize {
+/// The number of processes that the demo has started.
+fn processes(pid: u32) -> usize {
     let mark = format!("domain=demo-{pid}-");
-    let processes = std::fs::read_dir("/proc").unwrap().flatten();
-    let lines = processes.map(|process| std::fs::read(process.path().join("cmdline")));
+    let entries = std::fs::read_dir("/proc").unwrap().flatten();
+    let lines = entries.map(|process| std::fs::read(process.path().join("cmdline")));
     let lines = lines
         .flatten()
         .map(|line| String::from_utf8_lossy(&line).into_owned());
@@ -41,7 +41,7 @@ fn parts(pid: u32) -> usize {
 }
 
 #[test]
-fn every_step_does_what_it_says() {
+fn every_step_passes() {
     let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
     let child = demo(&["--json"]).stdout(Stdio::piped()).spawn().unwrap();
     let pid = child.id();
@@ -62,12 +62,12 @@ fn every_step_does_what_it_says() {
     assert_eq!(steps[8]["sender"], "arm_3");
     let itself = steps[8]["caught_itself"].as_str().unwrap();
     assert!(itself.contains("from arm_6"), "{itself}");
-    assert_eq!(traces(pid), Vec::<String>::new());
-    assert_eq!(parts(pid), 0);
+    assert_eq!(files(pid), Vec::<String>::new());
+    assert_eq!(processes(pid), 0);
 }
 
 #[test]
-fn an_interrupted_demo_leaves_nothing_behind() {
+fn an_interrupted_demo_leaves_no_files_and_processes() {
     let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
     let mut child: Child = demo(&[])
         .stdout(Stdio::piped())
@@ -75,16 +75,16 @@ fn an_interrupted_demo_leaves_nothing_behind() {
         .spawn()
         .unwrap();
     let pid = child.id();
-    let mut story = BufReader::new(child.stdout.take().unwrap());
+    let mut output = BufReader::new(child.stdout.take().unwrap());
     let mut line = String::new();
     while !line.contains("arm_2") {
         line.clear();
         assert!(
-            story.read_line(&mut line).unwrap() > 0,
-            "the story ended early"
+            output.read_line(&mut line).unwrap() > 0,
+            "the output ended early"
         );
     }
-    assert!(parts(pid) > 2);
+    assert!(processes(pid) > 2);
     let interrupted = Command::new("kill")
         .args(["-INT", &pid.to_string()])
         .status()
@@ -92,14 +92,14 @@ fn an_interrupted_demo_leaves_nothing_behind() {
     assert!(interrupted.success());
     let status = child.wait().unwrap();
     assert_eq!(status.code(), Some(1));
-    let mut told = String::new();
+    let mut errors = String::new();
     child
         .stderr
         .take()
         .unwrap()
-        .read_to_string(&mut told)
+        .read_to_string(&mut errors)
         .unwrap();
-    assert!(told.contains("interrupted"), "{told}");
-    assert_eq!(traces(pid), Vec::<String>::new());
-    assert_eq!(parts(pid), 0);
+    assert!(errors.contains("interrupted"), "{errors}");
+    assert_eq!(files(pid), Vec::<String>::new());
+    assert_eq!(processes(pid), 0);
 }

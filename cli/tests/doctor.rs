@@ -1,7 +1,7 @@
-//! `fipa doctor`, as a shell runs it.
+//! `fipa doctor` in processes of its own.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
-#![allow(clippy::print_stderr, reason = "a skipped test says so")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
+#![allow(clippy::print_stderr, reason = "a skipped test prints a note")]
 
 mod common;
 
@@ -23,7 +23,7 @@ fn check<'a>(report: &'a Value, name: &str) -> (&'a str, &'a str) {
 }
 
 #[test]
-fn a_machine_in_order_is_found_so_and_left_so() {
+fn a_machine_without_problems_is_fine_and_is_not_changed() {
     let host = Host::new();
     let small = [
         "doctor",
@@ -54,19 +54,19 @@ fn a_machine_in_order_is_found_so_and_left_so() {
 }
 
 #[test]
-fn what_a_killed_process_left_is_found_until_somebody_comes() {
+fn files_of_a_killed_process_are_reported_until_the_next_process_removes_them() {
     let host = Host::new();
     let parrot = host.echo("parrot");
-    let living = host.run(&["doctor", "--json"]).done_json();
+    let running = host.run(&["doctor", "--json"]).done_json();
     assert!(
-        check(&living, "traces of the dead")
+        check(&running, "traces of the dead")
             .1
             .starts_with("1 processes are there, 0 have")
     );
     assert_eq!(
-        check(&living, "permissions in /dev/shm").0,
+        check(&running, "permissions in /dev/shm").0,
         "fine",
-        "{living}"
+        "{running}"
     );
     parrot.signal("-KILL");
     let dead = host.run(&["doctor", "--json"]).done_json();
@@ -94,8 +94,8 @@ fn a_directory_that_others_may_enter_is_bad() {
     set_permissions(&domain, Permissions::from_mode(0o700)).unwrap();
 }
 
-/// Makes the command that is run in a user namespace without inotify instances. None where this
-/// user may not make one; fails then if `CI=true`.
+/// Wraps a command in a user namespace without inotify instances. Returns `None` if this user cannot
+/// create one; panics in that case if `CI=true`.
 fn without_inotify(command: &Command) -> Option<Command> {
     let unshare = || {
         let mut unshare = Command::new("unshare");
@@ -123,7 +123,7 @@ fn without_inotify(command: &Command) -> Option<Command> {
 }
 
 #[test]
-fn without_inotify_agents_are_reached_and_the_doctor_names_the_sysctl() {
+fn without_inotify_letters_are_delivered_and_the_doctor_names_the_sysctl() {
     let host = Host::new();
     let Some(echo) = without_inotify(&host.command(&["echo", "parrot"])) else {
         return;
@@ -139,8 +139,8 @@ fn without_inotify_agents_are_reached_and_the_doctor_names_the_sysctl() {
     assert_eq!(verdict, "doubtful", "{found}");
     assert!(found.contains("poll the directory"), "{found}");
     assert!(report.to_string().contains("fs.inotify.max_user_instances"));
-    let (code, told) = parrot.signal("-INT");
-    assert_eq!(code, Some(0), "{told}");
-    let times = told.matches("fs.inotify.max_user_instances").count();
-    assert_eq!(times, 1, "{told}");
+    let (code, log) = parrot.signal("-INT");
+    assert_eq!(code, Some(0), "{log}");
+    let times = log.matches("fs.inotify.max_user_instances").count();
+    assert_eq!(times, 1, "{log}");
 }

@@ -1,6 +1,6 @@
-//! `fipa encode`: JSON as bytes, which `fipa decode` takes back; and bytes explained.
+//! `fipa encode`: encodes JSON that `fipa decode` decodes again; and `fipa decode --explain`.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 mod common;
 
@@ -13,7 +13,7 @@ use common::Host;
 use serde_json::{Value, json};
 
 #[test]
-fn every_recorded_message_survives() {
+fn every_recorded_message_is_unchanged_after_encode_and_decode() {
     let host = Host::new();
     let recorded = recorded('m');
     assert!(recorded.len() >= 35, "only {} found", recorded.len());
@@ -27,7 +27,7 @@ fn every_recorded_message_survives() {
 }
 
 #[test]
-fn every_recorded_letter_survives() {
+fn every_recorded_letter_is_unchanged_after_encode_and_decode() {
     let host = Host::new();
     let recorded = recorded('e');
     assert!(recorded.len() >= 11, "only {} found", recorded.len());
@@ -39,12 +39,12 @@ fn every_recorded_letter_survives() {
             .unwrap()
             .iter();
         if extensions.any(|extension| extension.get("received").is_none()) {
-            // Only XML has a place for an extension without a stamp.
-            let told = host.run_with_input(&["encode"], expected.to_string().as_bytes());
-            let told = told.failed(1);
+            // Only XML can encode an extension without a stamp.
+            let output = host.run_with_input(&["encode"], expected.to_string().as_bytes());
+            let output = output.failed(1);
             assert!(
-                told.starts_with("error: ") && told.contains("an extension envelope"),
-                "{told}"
+                output.starts_with("error: ") && output.contains("an extension envelope"),
+                "{output}"
             );
             how = &["--envelope", "xml"];
         }
@@ -59,7 +59,7 @@ fn every_recorded_letter_survives() {
 }
 
 #[test]
-fn every_encoding_for_every_reader() {
+fn every_dialect_of_every_encoding_is_decoded() {
     let host = Host::new();
     let message = json!({ "message": {
         "performative": "request",
@@ -81,13 +81,13 @@ fn every_encoding_for_every_reader() {
             seen.push(encoded);
         }
     }
-    // Each has its own hand.
+    // No two dialects have the same bytes.
     seen.dedup();
     assert_eq!(seen.len(), 9);
 }
 
 #[test]
-fn the_envelope_says_what_the_message_is() {
+fn the_envelope_sets_the_encoding_of_the_message() {
     let host = Host::new();
     let date = "2026-11-20T11:26:44.998Z";
     let letter = |params: Value| {
@@ -106,79 +106,80 @@ fn the_envelope_says_what_the_message_is() {
     };
     let string = json!("fipa.acl.rep.string.std");
 
-    let (bytes, said) = decoded(&letter(json!({ "payload_length": 99 })), &[]);
+    let (bytes, json) = decoded(&letter(json!({ "payload_length": 99 })), &[]);
     assert!(bytes.ends_with(b"\xfa\x10\x08\x01"));
-    let base = &said["envelope"]["base"];
+    let base = &json["envelope"]["base"];
     assert_eq!(base["acl_representation"], "fipa.acl.rep.bitefficient.std");
     assert_eq!(base["payload_length"], 4);
 
-    let (bytes, said) = decoded(&letter(json!({})), &["--representation", "string"]);
+    let (bytes, json) = decoded(&letter(json!({})), &["--representation", "string"]);
     assert!(bytes.ends_with(b"(inform)"));
-    assert_eq!(said["envelope"]["base"]["acl_representation"], string);
+    assert_eq!(json["envelope"]["base"]["acl_representation"], string);
 
-    let said_string = letter(json!({ "acl_representation": string }));
-    let (bytes, said) = decoded(&said_string, &["--envelope", "xml", "--dialect", "jade"]);
+    let string_letter = letter(json!({ "acl_representation": string }));
+    let (bytes, json) = decoded(&string_letter, &["--envelope", "xml", "--dialect", "jade"]);
     assert!(
         bytes.starts_with(b"<?xml") && bytes.ends_with(b")"),
         "{bytes:?}"
     );
-    assert_eq!(said["envelope"], said_string["envelope"]);
-    assert_eq!(said["message"], said_string["message"]);
+    assert_eq!(json["envelope"], string_letter["envelope"]);
+    assert_eq!(json["message"], string_letter["message"]);
 
-    let input = said_string.to_string();
-    let told = host.run_with_input(&["encode", "--representation", "xml"], input.as_bytes());
-    let start = "error: the envelope says that the message is fipa.acl.rep.string.std, which is \
-        not XML\nwhere: standard input, envelope: acl_representation\n";
-    assert!(told.failed(2).starts_with(start));
+    let input = string_letter.to_string();
+    let output = host.run_with_input(&["encode", "--representation", "xml"], input.as_bytes());
+    let start = "error: the envelope has acl_representation fipa.acl.rep.string.std, but \
+        --representation is XML\nwhere: standard input, envelope: acl_representation\n";
+    assert!(output.failed(2).starts_with(start));
     let unknown = letter(json!({ "acl_representation": "x" })).to_string();
-    let told = host
+    let output = host
         .run_with_input(&["encode"], unknown.as_bytes())
         .failed(1);
     assert!(
-        told.starts_with("error: messages cannot be encoded as x\n"),
-        "{told}"
+        output.starts_with("error: cannot encode a message as x: not a supported encoding\n"),
+        "{output}"
     );
     let mut alone = letter(json!({}));
     alone.as_object_mut().unwrap().remove("message");
     let input = alone.to_string();
-    let told = host.run_with_input(&["encode", "--representation", "xml"], input.as_bytes());
-    assert!(
-        told.failed(2)
-            .starts_with("error: there is no message to encode")
-    );
+    let output = host.run_with_input(&["encode", "--representation", "xml"], input.as_bytes());
+    assert!(output.failed(2).starts_with(
+        "error: --representation has no effect: the letter has no `message` to encode\n"
+    ));
 }
 
 #[test]
-fn mistakes_are_told_with_their_place() {
+fn errors_are_reported_with_their_place() {
     let host = Host::new();
     let failed = |input: &str| host.run_with_input(&["encode"], input.as_bytes()).failed(1);
-    let told = failed("{\n \"performative\" }");
-    let start = "error: not JSON: expected `:`\nwhere: standard input, line 2, column 17\n   do: ";
-    assert!(told.starts_with(start), "{told}");
-    let told =
+    let output = failed("{\n \"performative\" }");
+    let start =
+        "error: invalid JSON: expected `:`\nwhere: standard input, line 2, column 17\n help: ";
+    assert!(output.starts_with(start), "{output}");
+    let output =
         failed(r#"{ "message": { "performative": "inform", "receivers": [{ "name": 7 }] } }"#);
     let place = "where: standard input, message.receivers[0].name\n";
-    assert!(told.contains(place), "{told}");
-    let told = failed(r#"{ "performative": "inform", "recievers": [] }"#);
+    assert!(output.contains(place), "{output}");
+    let output = failed(r#"{ "performative": "inform", "recievers": [] }"#);
     assert!(
-        told.starts_with("error: unknown field `recievers`"),
-        "{told}"
+        output.starts_with("error: unknown field `recievers`"),
+        "{output}"
     );
     assert!(
-        told.contains("where: standard input, recievers\n"),
-        "{told}"
+        output.contains("where: standard input, recievers\n"),
+        "{output}"
     );
-    let told = failed(r#"{ "envelope": { "base": {} }, "message": { "performative": "inform" } }"#);
+    let output =
+        failed(r#"{ "envelope": { "base": {} }, "message": { "performative": "inform" } }"#);
     assert!(
-        told.starts_with("error: the date of a base envelope is missing\n"),
-        "{told}"
+        output.starts_with("error: the date of a base envelope is missing\n"),
+        "{output}"
     );
     host.run(&["encode", "nothing.json"]).failed(1);
     host.run(&["encode", "--representation", "morse"]).failed(2);
 }
 
 #[test]
-fn what_the_help_shows_works() {
+fn the_examples_of_the_help_work() {
     let host = Host::new();
     let input = br#"{ "performative": "request", "content": "lift" }"#;
     let hex = host.run_with_input(&["encode", "--hex"], input).done();
@@ -188,13 +189,13 @@ fn what_the_help_shows_works() {
         .done_json();
     let expected = json!({ "message": { "performative": "request", "content": "lift" } });
     assert_eq!(decoded, expected);
-    // A letter that was printed, with what counts of its envelope, is a letter again.
+    // A decoded letter can be encoded again, also with `effective`.
     let mut printed = host
         .run(&["decode", letter().to_str().unwrap()])
         .done_json();
     let again = encoded(&host, &printed, &["--envelope", "xml"]);
     let mut again = host.run_with_input(&["decode"], &again).done_json();
-    // fipa_services wrote more bytes for the same message.
+    // fipa_services encodes the same message in more bytes.
     for (letter, len) in [(&mut again, 78), (&mut printed, 85)] {
         letter["effective"]["payload_length"].take();
         assert_eq!(letter["envelope"]["base"]["payload_length"].take(), len);
@@ -203,7 +204,7 @@ fn what_the_help_shows_works() {
 }
 
 #[test]
-fn a_letter_explained() {
+fn a_letter_is_explained_without_gaps() {
     let host = Host::new();
     let letter = letter();
     let letter = letter.to_str().unwrap();
@@ -223,7 +224,7 @@ fn a_letter_explained() {
 }
 
 #[test]
-fn long_content_explained_is_cut() {
+fn explained_content_is_shortened() {
     let host = Host::new();
     let message = json!({ "performative": "inform", "content": "x".repeat(1000) });
     let encoded = encoded(&host, &message, &[]);
@@ -233,7 +234,7 @@ fn long_content_explained_is_cut() {
     assert_eq!(explained.lines().count(), 9, "{explained}");
     assert!(explained.contains("       3  04 17 03 e8  "), "{explained}");
     assert!(
-        explained.contains("\n      55  … 952 bytes more\n    1007  01  "),
+        explained.contains("\n      55  … 952 more bytes\n    1007  01  "),
         "{explained}"
     );
 }
@@ -247,7 +248,7 @@ fn malformed_bytes_are_explained_up_to_the_error() {
     let printed = String::from_utf8(ran.stdout).unwrap();
     let last: Vec<&str> = printed.lines().rev().take(2).collect();
     assert!(
-        last[0].starts_with("       9  05 01  ") && last[0].ends_with("not read: see the error")
+        last[0].starts_with("       9  05 01  ") && last[0].ends_with("not decoded: see the error")
     );
     assert!(last[1].starts_with("       8  03  ") && last[1].ends_with("    resolvers"));
     assert!(
@@ -261,9 +262,9 @@ fn malformed_bytes_are_explained_up_to_the_error() {
     assert_eq!(json["error"]["clause"], "FIPA00069 2.2 AgentIdentifier");
 
     let ran = host.run_with_input(&["decode", "--explain"], b"(inform)");
-    let told = ran.failed(1);
-    let start = "error: only what is bit-efficient is explained, and this is string\n";
-    assert!(told.starts_with(start), "{told}");
+    let output = ran.failed(1);
+    let start = "error: cannot explain string: --explain supports only bit-efficient encodings\n";
+    assert!(output.starts_with(start), "{output}");
     host.run(&["decode", "--explain", "--compact"]).failed(2);
 }
 
@@ -289,7 +290,7 @@ fn vectors() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../acl/tests/vectors")
 }
 
-/// The JSON beside the recordings whose names begin so.
+/// The JSON descriptions of the recordings whose names begin with this letter.
 fn recorded(initial: char) -> Vec<(String, Value)> {
     let entries = fs::read_dir(vectors()).unwrap();
     let paths = entries.map(|entry| entry.unwrap().path());

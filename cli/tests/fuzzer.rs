@@ -1,12 +1,12 @@
-//! A protocol fuzzer against running gateways, over every transport that they listen on, while an
-//! honest pair talks through each: no crash, no stall, no leak.
+//! A protocol fuzzer for running gateways, over every transport on which they listen, while an honest
+//! pair of agents exchanges letters through each gateway: no crash, no stall, no leak.
 //!
-//! `FIPA_FUZZ_SECONDS` is how long each of the two gateways, one in the clear and one with keys, is
-//! shot at (3 by default); `FIPA_FUZZ_SEED` repeats the decisions of an earlier run, though not the
-//! machine's.
+//! There are two gateways, one without and one with keys. `FIPA_FUZZ_SECONDS` is the duration of the
+//! attack on each, in seconds (default: 3). `FIPA_FUZZ_SEED` repeats the random decisions of a run, but
+//! not the timing.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
-#![allow(clippy::print_stdout, reason = "what it came to is worth knowing")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
+#![allow(clippy::print_stdout, reason = "the test prints its figures")]
 
 mod fuzzing;
 mod siege;
@@ -24,99 +24,100 @@ use fuzzing::{Writer, datagram, stream};
 use siege::{Gateway, Pair, Usage, percentiles, until};
 use tempfile::TempDir;
 
-/// Conversations at a time.
+/// Concurrent conversations.
 const AT_ONCE: usize = 12;
 
-/// Descriptors that may be open afterwards and were not before: connections of the gateway's own
-/// that come and go.
+/// Allowed increase of open descriptors: connections that the gateway opens and closes by itself.
 const DESCRIPTORS: usize = 8;
 
-/// Memory that may be taken afterwards beside a quarter more than before, in KiB: what the allocator
-/// keeps of the largest conversations. Gateways have about 36 MiB and grew by 1 MiB in three seconds
-/// and by 5 MiB in ten minutes with 220,000 conversations; so what leaves 64 KiB behind for each is
-/// found within a minute, and what leaves a few hundred bytes within ten.
+/// Allowed increase of memory in addition to a quarter of the memory before, in KiB: the allocator keeps
+/// memory of the largest conversations. A gateway has about 36 MiB and grows by 1 MiB in three seconds
+/// and by 5 MiB in ten minutes with 220,000 conversations. So a leak of 64 KiB per conversation is
+/// detected within a minute, and a leak of a few hundred bytes within ten minutes.
 const RESIDENT: u64 = 12 << 10;
 
-/// Ways to talk to a gateway.
+/// Attacks on a gateway.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Way {
+enum Attack {
     /// Frames over TCP.
     Frames,
-    /// A letter of an old peer.
+    /// A letter of a legacy peer.
     OldPeer,
-    /// Datagrams that begin a UDP connection, or none.
+    /// Datagrams that may begin a UDP connection.
     Datagrams,
     /// A UDP connection.
     Udp,
-    /// The beginning of a TLS handshake.
+    /// The start of a TLS handshake.
     Handshake,
     /// Frames over TLS, as a trusted peer.
     Tls,
-    /// Datagrams that begin a QUIC connection, or none.
+    /// Datagrams that may begin a QUIC connection.
     QuicDatagrams,
     /// A QUIC connection as a trusted peer.
     Quic,
-    /// The same with datagrams that are spoilt on the way.
-    SpoiltQuic,
+    /// A QUIC connection as a trusted peer, whose datagrams are corrupted.
+    CorruptQuic,
 }
 
-use Way::*;
-const CLEAR: [Way; 4] = [Frames, OldPeer, Datagrams, Udp];
-const SECURED: [Way; 7] = [
+use Attack::*;
+const CLEAR: [Attack; 4] = [Frames, OldPeer, Datagrams, Udp];
+const SECURED: [Attack; 7] = [
     Frames,
     OldPeer,
     Handshake,
     Tls,
     QuicDatagrams,
     Quic,
-    SpoiltQuic,
+    CorruptQuic,
 ];
 
-/// What was done by one way.
+/// Counters of one attack.
 #[derive(Debug, Default)]
 struct Tally {
     conversations: AtomicU64,
-    /// Conversations in which the gateway let the other side in.
-    let_in: AtomicU64,
+    /// Conversations that the gateway accepted.
+    accepted: AtomicU64,
     bytes: AtomicU64,
 }
 
-/// Two gateways, one of which is shot at.
-struct Range {
+/// Two gateways, one of which is attacked.
+struct Setup {
     pair: Pair,
     target: Arc<Target>,
-    /// Until everything has ended.
-    _place: TempDir,
+    /// Removed after all processes have ended.
+    _directory: TempDir,
 }
 
-/// Where to shoot, and how.
+/// The attacked gateway, and the attacks.
 struct Target {
-    ways: &'static [Way],
+    attacks: &'static [Attack],
     tcp: SocketAddr,
     datagrams: SocketAddr,
     tls: Option<Arc<rustls::ClientConfig>>,
     quic: Option<quinn::ClientConfig>,
     receivers: Vec<String>,
+    /// Registrations of real agents and gateways, by name.
     known: Vec<(String, Incarnation)>,
+    /// Registrations that the attacker claims.
     claimed: Vec<Incarnation>,
-    /// What a peer of ours begins a handshake with, over TCP and in a datagram.
-    begun: [Vec<u8>; 2],
+    /// The first bytes of a valid handshake, over TCP and in a datagram.
+    handshakes: [Vec<u8>; 2],
 }
 
-impl Range {
+impl Setup {
     fn new(secured: bool) -> Self {
-        let place = tempfile::Builder::new()
+        let directory = tempfile::Builder::new()
             .prefix("fuzzer-")
             .tempdir()
             .unwrap();
-        let pair = Pair::new(place.path(), secured, "fuzzed");
+        let pair = Pair::new(directory.path(), secured, "fuzzed");
         let tls = secured.then(|| {
-            let rogue = siege::keys(place.path().join("rogue"), "rogue");
-            siege::befriend(&Keys::at(place.path().join("target")), &rogue);
+            let rogue = siege::keys(directory.path().join("rogue"), "rogue");
+            siege::befriend(&Keys::at(directory.path().join("target")), &rogue);
             client(&rogue, "rogue")
         });
         let quic = tls.as_ref().map(quic);
-        let begun = |tls, quic| {
+        let handshakes = |tls, quic| {
             let runtime = tokio::runtime::Builder::new_current_thread()
                 .enable_all()
                 .build();
@@ -129,40 +130,45 @@ impl Range {
             .iter()
             .filter(|(name, _)| secured || name == "arm" || name == "target");
         let target = Target {
-            claimed: claimed.map(|(_, life)| *life).collect(),
+            claimed: claimed.map(|(_, incarnation)| *incarnation).collect(),
             known,
-            ways: if secured { &SECURED } else { &CLEAR },
+            attacks: if secured { &SECURED } else { &CLEAR },
             tcp: pair.gateway.at("tcp"),
             datagrams: pair.gateway.at(if secured { "quic" } else { "udp" }),
-            begun: match (&tls, &quic) {
-                (Some(tls), Some(quic)) => begun(tls, quic),
+            handshakes: match (&tls, &quic) {
+                (Some(tls), Some(quic)) => handshakes(tls, quic),
                 _ => Default::default(),
             },
             tls,
             quic,
-            receivers: ["arm", "target", "rover", "nobody", "ar[lm]"]
+            receivers: ["arm", "target", "rover", "unknown", "ar[lm]"]
                 .map(str::to_owned)
                 .into(),
         };
         Self {
             pair,
             target: Arc::new(target),
-            _place: place,
+            _directory: directory,
         }
     }
 
-    /// Shoots for so long, and waits until the gateway has got over it.
-    fn shoot(&self, seconds: u64, seed: u64) -> Vec<Tally> {
+    /// Attacks the gateway for this number of seconds. Returns the counters of each attack.
+    fn attack(&self, seconds: u64, seed: u64) -> Vec<Tally> {
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(2)
             .enable_all()
             .build()
             .unwrap();
-        let tallies: Arc<Vec<Tally>> =
-            Arc::new(self.target.ways.iter().map(|_| Tally::default()).collect());
+        let tallies: Arc<Vec<Tally>> = Arc::new(
+            self.target
+                .attacks
+                .iter()
+                .map(|_| Tally::default())
+                .collect(),
+        );
         let until = Instant::now() + Duration::from_secs(seconds);
         let next = Arc::new(AtomicU64::new(0));
-        let shooting = (0..AT_ONCE).map(|_| {
+        let attackers = (0..AT_ONCE).map(|_| {
             let (target, tallies, next) = (self.target.clone(), tallies.clone(), next.clone());
             runtime.spawn(async move {
                 while Instant::now() < until {
@@ -171,7 +177,7 @@ impl Range {
                 }
             })
         });
-        for one in shooting.collect::<Vec<_>>() {
+        for one in attackers.collect::<Vec<_>>() {
             runtime.block_on(one).unwrap();
         }
         runtime.shutdown_timeout(Duration::from_secs(5));
@@ -180,11 +186,11 @@ impl Range {
 }
 
 impl Target {
-    /// One conversation, as the seed has it.
+    /// Runs the conversation of this seed.
     async fn converse(&self, seed: u64, tallies: &[Tally]) {
         let mut random = Rng::with_seed(seed);
-        let at = random.usize(..self.ways.len());
-        let way = self.ways[at];
+        let at = random.usize(..self.attacks.len());
+        let attack = self.attacks[at];
         let mut choices = random.fork();
         let mut writer = Writer {
             random: &mut random,
@@ -193,7 +199,7 @@ impl Target {
             known: &self.known,
             claimed: &self.claimed,
         };
-        let bytes = match way {
+        let bytes = match attack {
             Frames => {
                 let script = writer.frames();
                 Some(stream::plain(self.tcp, script).await)
@@ -203,8 +209,8 @@ impl Target {
                 Some(stream::plain(self.tcp, script).await)
             }
             Datagrams | QuicDatagrams => {
-                let pieces = match way {
-                    QuicDatagrams => self.begun[1].clone(),
+                let pieces = match attack {
+                    QuicDatagrams => self.handshakes[1].clone(),
                     _ => writer.parcel(),
                 };
                 let script = writer.recorded(&vec![pieces; 8]);
@@ -212,84 +218,88 @@ impl Target {
             }
             Udp => datagram::udp(self.datagrams, &mut writer).await,
             Handshake => {
-                let script = writer.recorded(&self.begun[..1]);
+                let script = writer.recorded(&self.handshakes[..1]);
                 Some(stream::plain(self.tcp, script).await)
             }
             Tls => {
                 let script = writer.frames();
                 stream::secured(self.tcp, self.tls.clone().unwrap(), script).await
             }
-            Quic | SpoiltQuic => {
+            Quic | CorruptQuic => {
                 let script = writer.frames();
-                let (config, spoilt) = (self.quic.clone().unwrap(), way == SpoiltQuic);
-                datagram::quic(self.datagrams, config, script, &mut choices, spoilt).await
+                let (config, corrupt) = (self.quic.clone().unwrap(), attack == CorruptQuic);
+                datagram::quic(self.datagrams, config, script, &mut choices, corrupt).await
             }
         };
         let tally = &tallies[at];
         tally.conversations.fetch_add(1, Ordering::Relaxed);
         if let Some(bytes) = bytes {
-            tally.let_in.fetch_add(1, Ordering::Relaxed);
+            tally.accepted.fetch_add(1, Ordering::Relaxed);
             tally.bytes.fetch_add(bytes, Ordering::Relaxed);
         }
     }
 }
 
-/// A gateway that has got over what was done to it.
+/// Waits until the usage of the gateway meets the condition, and returns it.
 fn settled(gateway: &Gateway, is: impl Fn(&Usage) -> bool) -> Usage {
-    until("the gateway lets go of what it took", || {
-        is(&gateway.usage())
-    });
+    until(
+        "the gateway releases its resources",
+        || is(&gateway.usage()),
+    );
     gateway.usage()
 }
 
 fn fuzz(secured: bool) {
     let seconds = siege::number("FIPA_FUZZ_SECONDS").unwrap_or(3);
     let seed = siege::number("FIPA_FUZZ_SEED").unwrap_or_else(|| fastrand::u64(..));
-    let what = if secured { "with keys" } else { "in the clear" };
-    println!("{what}: FIPA_FUZZ_SEED={seed}, {seconds} s");
-    let range = Range::new(secured);
-    let talk = range.pair.rover.talk("arm");
+    let mode = if secured { "with keys" } else { "without keys" };
+    println!("{mode}: FIPA_FUZZ_SEED={seed}, {seconds} s");
+    let setup = Setup::new(secured);
+    let talk = setup.pair.rover.talk("arm");
     talk.goes_on(100);
-    let at_first = range.pair.gateway.usage();
+    let at_first = setup.pair.gateway.usage();
     let calm = move |usage: &Usage| usage.descriptors <= at_first.descriptors + DESCRIPTORS;
 
-    // What a gateway takes once and keeps, it takes in the warm-up.
-    range.shoot(seconds.div_ceil(10), seed.rotate_left(32));
-    let before = settled(&range.pair.gateway, calm);
-    let tallies = range.shoot(seconds, seed);
-    let after = settled(&range.pair.gateway, |usage| {
+    // The gateway allocates in the warm-up what it keeps permanently.
+    setup.attack(seconds.div_ceil(10), seed.rotate_left(32));
+    let before = settled(&setup.pair.gateway, calm);
+    let tallies = setup.attack(seconds, seed);
+    let after = settled(&setup.pair.gateway, |usage| {
         calm(usage) && usage.resident <= before.resident * 5 / 4 + RESIDENT
     });
     talk.goes_on(100);
     let took = talk.take();
     talk.end();
 
-    for (way, tally) in range.target.ways.iter().zip(&tallies) {
+    for (attack, tally) in setup.target.attacks.iter().zip(&tallies) {
         let of = |count: &AtomicU64| count.load(Ordering::Relaxed);
-        let (all, let_in) = (of(&tally.conversations), of(&tally.let_in));
+        let (all, accepted) = (of(&tally.conversations), of(&tally.accepted));
         println!(
-            "  {way:?}: {all} conversations, {let_in} of them let in, {} bytes",
+            "  {attack:?}: {all} conversations, {accepted} of them accepted, {} bytes",
             of(&tally.bytes)
         );
-        assert!(let_in > 0, "{way:?} was never tried in earnest");
+        assert!(
+            accepted > 0,
+            "the gateway accepted no conversation of {attack:?}"
+        );
     }
-    println!("  at first {at_first:?}\n  warm     {before:?}\n  after    {after:?}");
-    let strange = range.pair.strange();
-    println!("  {strange} letters of the fuzzer came to the honest agent");
-    assert!(strange > 0, "nothing got past admission");
+    println!("  at first      {at_first:?}\n  after warm-up {before:?}\n  at the end    {after:?}");
+    let foreign = setup.pair.strange();
+    println!("  {foreign} letters of the attacker arrived at the honest agent");
+    assert!(foreign > 0, "no letter of the attacker passed admission");
     let letters = took.len();
-    assert!(letters > 0, "the honest pair said nothing");
+    assert!(letters > 0, "the honest pair exchanged no letter");
     let (median, last) = percentiles(took);
-    println!("  {letters} honest letters and answers: median {median:.1?}, 99 % {last:.1?}");
-    range.pair.end();
+    println!("  {letters} honest letters with answers: median {median:.1?}, 99 % {last:.1?}");
+    setup.pair.end();
 }
 
 #[test]
-fn a_gateway_in_the_clear_bears_nonsense() {
+fn a_gateway_without_keys_survives_malformed_input() {
     fuzz(false);
 }
 
 #[test]
-fn a_gateway_with_keys_bears_nonsense_also_from_those_it_trusts() {
+fn a_gateway_with_keys_survives_malformed_input_also_of_trusted_peers() {
     fuzz(true);
 }

@@ -1,29 +1,29 @@
-//! Three hosts, each with a gateway process, whose links are cut and healed in random order, seeded:
-//! after every healing the processes of all hosts see the same agents again, though announcements
-//! and goodbyes were missed meanwhile. And a gateway that vanished without a goodbye is noticed by
-//! those who write to its agents.
+//! Three hosts with a gateway process each, whose links are cut and restored in a seeded random order.
+//! After every repair the processes of all hosts list the same agents again, although announcements
+//! and goodbyes were lost in between. The failure of a gateway that sent no goodbye is detected by the
+//! hosts that send letters to its agents.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
-#![allow(clippy::print_stdout, reason = "how long it took is worth knowing")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
+#![allow(clippy::print_stdout, reason = "the test prints its times")]
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use fipa::config::Sources;
 use fipa::{Agent, AgentId, Config, Domain, Incarnation, Performative, Role};
-use fipa_testbed::{Ghost, Host, Network, Running, enter, isolated};
+use fipa_testbed::{Host, Network, PacketRepeater, Running, enter, isolated};
 use tokio::runtime::{Builder, Runtime};
 
 const WATCHDOG: Duration = Duration::from_secs(90);
 
 #[test]
-fn processes_agree_after_every_healing() {
-    isolated("inside_processes_agree_after_every_healing", &[]);
+fn processes_agree_after_every_link_repair() {
+    isolated("inside_processes_agree_after_every_link_repair", &[]);
 }
 
 #[test]
 #[ignore = "is run by the other test in namespaces of its own"]
-fn inside_processes_agree_after_every_healing() {
+fn inside_processes_agree_after_every_link_repair() {
     enter();
     fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     let seed = std::env::var("FIPA_LINKS_SEED").ok();
@@ -33,7 +33,7 @@ fn inside_processes_agree_after_every_healing() {
     let network = Network::new(3);
     let mut robots: Vec<Robot> = network.hosts().iter().map(Robot::start).collect();
     for robot in &mut robots {
-        robot.change(0);
+        robot.toggle(0);
     }
     agree(&robots);
     for round in 0..3 {
@@ -46,48 +46,50 @@ fn inside_processes_agree_after_every_healing() {
                     cut.insert(at);
                     network.host(at).unplug();
                 }
-                _ => robots[at].change(random.usize(0..4)),
+                _ => robots[at].toggle(random.usize(0..4)),
             }
             std::thread::sleep(Duration::from_millis(random.u64(0..600)));
         }
         for at in cut {
             network.host(at).plug();
         }
-        let healed = Instant::now();
+        let repaired = Instant::now();
         agree(&robots);
         println!(
-            "round {round}: all agree {:.1?} after healing",
-            healed.elapsed()
+            "round {round}: all agree {:.1?} after the repair",
+            repaired.elapsed()
         );
     }
 
-    // Killed: no goodbye. Its beacons go on, so that who only listens believes in it. Who writes
-    // to an agent behind it is told, and does not believe in it any more.
-    robots[2].change_to(0, true);
+    // A killed gateway sends no goodbye. Its beacons are repeated, so hosts that only listen keep its
+    // entries. A host that sends a letter to one of its agents detects the failure and removes them.
+    robots[2].set_registered(0, true);
     agree(&robots);
     let gone = robots[2].agents.keys().next().unwrap().clone();
     let gateway = robots[0].gateway_of(&gone);
-    let mut ghost = network.host(2).enter(|| {
+    let mut repeater = network.host(2).enter(|| {
         let beacon = format!("{gateway}\x0d_fipa_gateway");
-        Ghost::of(&beacon, network.host(2).ipv4(), 5353)
+        PacketRepeater::capture(&beacon, network.host(2).ipv4(), 5353)
     });
     robots[2].gateway = None;
-    ghost.speak();
+    repeater.start();
     let killed = Instant::now();
     robots[0].fails_to_reach(&gone);
-    until("it is noticed by use", || !robots[0].view().contains(&gone));
-    println!("noticed {:.1?} after it was killed", killed.elapsed());
+    until("the sender detects the failure", || {
+        !robots[0].view().contains(&gone)
+    });
+    println!("detected {:.1?} after the kill", killed.elapsed());
 
-    // Who has not written notices when the beacons end.
-    drop(ghost);
+    // A host that sent no letter detects the failure when the beacons end.
+    drop(repeater);
     let silent = Instant::now();
-    until("it is noticed by its silence", || {
+    until("the missing beacons are detected", || {
         !robots[1].view().contains(&gone)
     });
-    println!("noticed {:.1?} after its last beacon", silent.elapsed());
+    println!("detected {:.1?} after the last beacon", silent.elapsed());
 }
 
-/// A host with its gateway, a process of its own, and agents that come and go.
+/// A host with a gateway process and agents that are registered and deregistered.
 struct Robot {
     name: String,
     gateway: Option<Running>,
@@ -133,17 +135,17 @@ impl Robot {
         }
     }
 
-    /// An agent comes or goes.
-    fn change(&mut self, number: usize) {
+    /// Registers the agent of this number, or deregisters it if it is registered.
+    fn toggle(&mut self, number: usize) {
         let name = self.name_of(number);
-        self.change_to(number, !self.agents.contains_key(&name));
+        self.set_registered(number, !self.agents.contains_key(&name));
     }
 
-    fn change_to(&mut self, number: usize, here: bool) {
+    fn set_registered(&mut self, number: usize, registered: bool) {
         let name = self.name_of(number);
         match self.agents.remove(&name) {
-            Some(agent) if here => drop(self.agents.insert(name, agent)),
-            None if here => {
+            Some(agent) if registered => drop(self.agents.insert(name, agent)),
+            None if registered => {
                 let agent = self.domain.register(&name).unwrap();
                 self.agents.insert(name, agent);
             }
@@ -155,7 +157,7 @@ impl Robot {
         format!("{}.agent {number}", self.name)
     }
 
-    /// The agents on all hosts, as a process of this one sees them.
+    /// The agents of all hosts in the directory of a process of this host.
     fn view(&self) -> BTreeSet<String> {
         let directory = self.domain.directory();
         directory.refresh();
@@ -164,7 +166,7 @@ impl Robot {
         agents.map(|entry| entry.name.to_string()).collect()
     }
 
-    /// The gateway behind which this agent is.
+    /// The gateway of this agent.
     fn gateway_of(&self, name: &str) -> Incarnation {
         let entry = self.domain.directory().known(name).unwrap();
         entry.mts.incarnation
@@ -182,7 +184,7 @@ impl Robot {
     }
 }
 
-/// Waits until all see the same: everybody that is there.
+/// Waits until every host lists exactly the registered agents.
 fn agree(robots: &[Robot]) {
     let all: BTreeSet<String> = robots
         .iter()
@@ -191,7 +193,7 @@ fn agree(robots: &[Robot]) {
             agents.chain([robot.writer.name().to_owned()])
         })
         .collect();
-    until("they agree", || {
+    until("all hosts agree", || {
         robots.iter().all(|robot| robot.view() == all)
     });
 }
@@ -199,7 +201,7 @@ fn agree(robots: &[Robot]) {
 fn until(what: &str, condition: impl Fn() -> bool) {
     let started = Instant::now();
     while !condition() {
-        assert!(started.elapsed() < WATCHDOG, "never: {what}");
+        assert!(started.elapsed() < WATCHDOG, "timed out: {what}");
         std::thread::sleep(Duration::from_millis(20));
     }
 }

@@ -1,6 +1,6 @@
-//! Every command that prints text from outside gets text that is made to deceive a terminal.
+//! Every command that prints text from outside escapes text that would control the terminal.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 mod common;
 
@@ -9,18 +9,17 @@ use std::io::Write;
 use std::net::TcpStream;
 use std::thread;
 
-use common::{Host, Ran, Running};
+use common::{Host, Ran};
 use fipa::{AgentId, Envelope, EnvelopeParams, Letter, Message, Performative};
 use fipa_acl::{AclRepresentation, is_unprintable};
-use serde_json::Value;
 
-/// The title of the window, a colour by a C1 control, the order of writing, the direction of a line,
-/// an invisible space, separators of lines, and a line like one of the program.
+/// A window title, a color set by a C1 control, two changes of the writing direction, an invisible
+/// space, line separators, and a line that looks like an error of the program.
 const HOSTILE: &str = "x\u{1b}]0;t\u{7}\u{9b}31m\u{202e}\u{2066}\u{200b}\u{2028}\r\nerror: forged";
-/// What of it a word can have.
+/// The characters of [`HOSTILE`] that a word can contain.
 const WORD: &str = "x\u{9b}31m\u{202e}\u{2066}\u{200b}";
 
-/// Nothing that a terminal obeys was printed, and no line of a peer's.
+/// Asserts that the text has no control characters and no forged line.
 #[track_caller]
 fn harmless(text: &str) {
     let found = text.chars().find(|&c| c != '\n' && is_unprintable(c));
@@ -35,15 +34,6 @@ fn all_harmless(ran: &Ran) -> String {
     harmless(&printed);
     harmless(&ran.stderr);
     printed
-}
-
-/// The address at which the gateway takes letters of legacy peers.
-fn address(gateway: &Running) -> String {
-    let ready: Value = serde_json::from_str(&gateway.ready).unwrap();
-    let locations = ready["locations"].as_array().unwrap();
-    let mut locations = locations.iter().filter_map(Value::as_str);
-    let tcp = locations.find_map(|it| it.strip_prefix("tcp://")).unwrap();
-    tcp.split('#').next().unwrap().to_owned()
 }
 
 #[test]
@@ -69,7 +59,10 @@ fn decode_prints_json_and_notes_without_unprintable_characters() {
         all_harmless(&ran);
     }
     let json = host.run_with_input(&["decode"], &bytes).done_json();
-    assert_eq!(json["message"]["content"], HOSTILE, "the text is the same");
+    assert_eq!(
+        json["message"]["content"], HOSTILE,
+        "the decoded text is unchanged"
+    );
 }
 
 #[test]
@@ -130,7 +123,7 @@ fn messages_and_entries_are_shown_without_unprintable_characters() {
     all_harmless(&ran);
     harmless(&arm.line());
 
-    // A failure message, after a message that is no reply. The echo does not answer a reply.
+    // A failure message, after a message that is not a reply. The echo agent does not answer a reply.
     let mut asked = hostile("arm", "crane");
     asked.extend([
         "--in-reply-to",
@@ -141,7 +134,7 @@ fn messages_and_entries_are_shown_without_unprintable_characters() {
         "c",
     ]);
     asked.extend(["--wait", "--timeout", "30s"]);
-    let told = thread::scope(|scope| {
+    let output = thread::scope(|scope| {
         let (host, asked) = (&host, &asked);
         let waiting = scope.spawn(move || host.run(asked));
         harmless(&arm.line());
@@ -150,7 +143,7 @@ fn messages_and_entries_are_shown_without_unprintable_characters() {
             "((action (agent-identifier :name crane) (ACLMessage)) (MTS-error \
              (agent-identifier :name \"{HOSTILE}\") (internal-error \"{HOSTILE}\")))"
         );
-        let told = host.run(&[
+        let output = host.run(&[
             "send",
             "--to",
             "crane",
@@ -165,15 +158,18 @@ fn messages_and_entries_are_shown_without_unprintable_characters() {
             "--content",
             &failure,
         ]);
-        assert_eq!(told.code, Some(0), "{told:?}");
+        assert_eq!(output.code, Some(0), "{output:?}");
         waiting.join().unwrap()
     });
-    assert_eq!(told.code, Some(1), "{told:?}");
-    all_harmless(&told);
-    assert!(told.stderr.contains("warning: not a reply"), "{told:?}");
+    assert_eq!(output.code, Some(1), "{output:?}");
+    all_harmless(&output);
     assert!(
-        told.stderr.contains("error: not delivered: x\\u{1b}]0;t"),
-        "{told:?}"
+        output.stderr.contains("warning: ignored, not a reply"),
+        "{output:?}"
+    );
+    assert!(
+        output.stderr.contains("error: not delivered: x\\u{1b}]0;t"),
+        "{output:?}"
     );
 
     for watching in [&mut watching, &mut drawing, &mut machine] {
@@ -188,7 +184,7 @@ fn messages_and_entries_are_shown_without_unprintable_characters() {
     }
     harmless(&fs::read_to_string(host.path("all.mmd")).unwrap());
 
-    // Names that nobody could tell from others.
+    // Names that look like other names are rejected.
     for arguments in [
         &["echo", direction][..],
         &["coalition", direction, "arm"],
@@ -227,13 +223,13 @@ fn the_gateway_logs_letters_of_legacy_peers_without_unprintable_characters() {
         extensions: Vec::new(),
     };
     let letter = Letter::new(envelope.encode_standard().unwrap(), message.to_payload());
-    let mut stream = TcpStream::connect(address(&gateway)).unwrap();
+    let mut stream = TcpStream::connect(gateway.tcp_address()).unwrap();
     stream.write_all(&letter.to_bytes()).unwrap();
     drop(stream);
-    gateway.tells(&["nobody to send a failure message to"]);
-    let (_, told) = gateway.signal("-INT");
-    harmless(&told);
-    assert!(told.contains("31m"), "{told}");
+    gateway.wait_for_log(&["nobody to send a failure message to"]);
+    let (_, output) = gateway.signal("-INT");
+    harmless(&output);
+    assert!(output.contains("31m"), "{output}");
 }
 
 #[test]

@@ -1,6 +1,6 @@
-//! `fipa keys`: two hosts are secured as the README says, and let nobody else in.
+//! `fipa keys`: two hosts trust each other as in the README, and reject other hosts.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 mod common;
 
@@ -10,13 +10,13 @@ use std::time::{Duration, Instant};
 use common::{Host, Running};
 use serde_json::{Value, json};
 
-/// A host with keys of its own.
-struct Keyed {
+/// A host with keys.
+struct KeyedHost {
     host: Host,
     name: String,
 }
 
-impl Keyed {
+impl KeyedHost {
     fn new(name: &str, init: &[&str]) -> Self {
         let host = Host::new();
         let name = format!("{name}-{}", host.domain);
@@ -45,7 +45,7 @@ impl Keyed {
         serde_json::from_str(&self.keys(&["list", "--json"])).unwrap()
     }
 
-    /// Starts the gateway, which knows these others.
+    /// Starts the gateway with these static peers. Returns it with its TCP location.
     fn gateway(&self, peers: &[(&str, &str)]) -> (Running, String) {
         let peers: Vec<String> = peers
             .iter()
@@ -59,21 +59,17 @@ impl Keyed {
             &format!("mts.name={}", self.name),
             "--set",
             &format!("security.keys={}", self.dir()),
-            // Two hosts on one machine.
+            // The hosts are on one machine, so peers on loopback need keys too.
             "--set",
             "security.loopback=true",
             "--set",
             &format!("discovery.static={{ {} }}", peers.join(", ")),
         ]);
-        let ready: Value = serde_json::from_str(&gateway.ready).unwrap();
-        let locations = ready["locations"].as_array().unwrap();
-        let mut tcp = locations.iter().map(|one| one.as_str().unwrap());
-        let tcp = tcp.find(|one| one.starts_with("tcp://")).unwrap();
-        let address = tcp.split('#').next().unwrap().to_owned();
-        (gateway, address)
+        let location = format!("tcp://{}", gateway.tcp_address());
+        (gateway, location)
     }
 
-    /// Whether a letter from this host comes to an agent on the other.
+    /// Whether a letter from this host to an agent is delivered.
     fn reaches(&self, agent: &str) -> bool {
         let sent = self
             .host
@@ -91,10 +87,10 @@ fn until(what: &str, condition: impl Fn() -> bool) {
 }
 
 #[test]
-fn two_hosts_that_trust_each_other_and_nobody_else() {
-    let rover = Keyed::new("rover", &[]);
-    let crex = Keyed::new("crex", &[]);
-    let stranger = Keyed::new("stranger", &[]);
+fn only_hosts_that_trust_each_other_exchange_letters() {
+    let rover = KeyedHost::new("rover", &[]);
+    let crex = KeyedHost::new("crex", &[]);
+    let stranger = KeyedHost::new("stranger", &[]);
     rover.keys(&["trust", &crex.certificate()]);
     crex.keys(&["trust", &rover.certificate()]);
     stranger.keys(&["trust", &crex.certificate()]);
@@ -105,34 +101,37 @@ fn two_hosts_that_trust_each_other_and_nobody_else() {
     let peers = [(crex.name.as_str(), address.as_str())];
     let (_ours, _) = rover.gateway(&peers);
     let (_strange, _) = stranger.gateway(&peers);
-    until("a letter passes", || rover.reaches(&arm));
-    assert!(!stranger.reaches(&arm), "a stranger got in");
-    theirs.tells(&["connection refused"]);
+    until("a letter is delivered", || rover.reaches(&arm));
+    assert!(
+        !stranger.reaches(&arm),
+        "a letter of an untrusted host was delivered"
+    );
+    theirs.wait_for_log(&["connection refused"]);
 
-    // Trust that is withdrawn ends what it was given for, without a new start.
+    // Revoking the trust closes the connection without a restart.
     crex.keys(&["revoke", &rover.name]);
-    theirs.tells(&["the keys were read again", "trusted=0"]);
+    theirs.wait_for_log(&["the keys were read again", "trusted=0"]);
     until("the connection has ended", || !rover.reaches(&arm));
-    let told = rover
+    let output = rover
         .host
         .run(&["keys", "list", "--dir", &crex.dir()])
         .done();
     assert!(
-        told.contains("revoked") && told.contains(&rover.name),
-        "{told}"
+        output.contains("revoked") && output.contains(&rover.name),
+        "{output}"
     );
 
-    // A new key, which the other host was given in time, lets in again.
+    // A renewed key that the other host trusts is accepted.
     rover.keys(&["renew"]);
     let next = rover.host.path("keys/next.pem").display().to_string();
     crex.keys(&["trust", &next]);
     rover.keys(&["renew", "--use"]);
-    until("a letter passes again", || rover.reaches(&arm));
+    until("a letter is delivered again", || rover.reaches(&arm));
 }
 
 #[test]
-fn what_there_is_is_listed_and_not_overwritten() {
-    let host = Keyed::new(
+fn keys_are_listed_and_never_overwritten() {
+    let host = KeyedHost::new(
         "rover",
         &["--agent", "rover", "--agent", "arm_*", "--valid", "90days"],
     );
@@ -148,7 +147,7 @@ fn what_there_is_is_listed_and_not_overwritten() {
     assert_eq!(days, 91, "a day before now, and 90 from now");
     let dir = host.dir();
     let (own, own_key) = (host.certificate(), format!("{dir}/own.key"));
-    for (wrong, told) in [
+    for (arguments, expected) in [
         (vec!["keys", "init", "--dir", &dir], "nothing was changed"),
         (
             vec!["keys", "trust", "/dev/null", "--dir", &dir],
@@ -167,7 +166,7 @@ fn what_there_is_is_listed_and_not_overwritten() {
             "cannot read",
         ),
         (
-            vec!["keys", "revoke", "nobody", "--dir", &dir],
+            vec!["keys", "revoke", "unknown", "--dir", &dir],
             "0 of the trusted certificates",
         ),
         (
@@ -179,90 +178,95 @@ fn what_there_is_is_listed_and_not_overwritten() {
             "the year 9999",
         ),
     ] {
-        let said = host.host.run(&wrong).failed(1);
-        assert!(said.contains(told), "{wrong:?}: {said}");
+        let errors = host.host.run(&arguments).failed(1);
+        assert!(errors.contains(expected), "{arguments:?}: {errors}");
     }
     assert_eq!(host.list(), listed);
 
-    // The next ones are seen too, and made once.
+    // The next keys are listed too, and are created only once.
     assert_eq!(listed["next"], Value::Null);
     host.keys(&["renew"]);
     assert_eq!(host.list()["next"]["mts"], json!(host.name));
-    let said = host.host.run(&["keys", "renew", "--dir", &dir]).failed(1);
-    assert!(said.contains("`fipa keys renew --use`"), "{said}");
+    let errors = host.host.run(&["keys", "renew", "--dir", &dir]).failed(1);
+    assert!(errors.contains("`fipa keys renew --use`"), "{errors}");
 }
 
 #[test]
-fn who_has_no_keys_is_told_how_to_make_them() {
+fn without_keys_the_output_names_the_command_that_creates_them() {
     let host = Host::new();
-    let told = host.run(&["keys", "list"]).done();
-    assert!(told.contains("make them with `fipa keys init`"), "{told}");
-    let told = host.run(&["keys", "init", "--dir", "some"]).done();
-    // Wherever the gateway is started from.
+    let output = host.run(&["keys", "list"]).done();
+    assert!(
+        output.contains("create them with `fipa keys init`"),
+        "{output}"
+    );
+    let output = host.run(&["keys", "init", "--dir", "some"]).done();
+    // The path is absolute, so it does not depend on the working directory of the gateway.
     let dir = host.path("some").canonicalize().unwrap();
-    assert!(told.contains(&format!("keys = {dir:?}")), "{told}");
+    assert!(output.contains(&format!("keys = {dir:?}")), "{output}");
 }
 
 #[test]
 fn a_gateway_does_not_start_with_keys_that_cannot_be_used() {
-    let host = Keyed::new("rover", &[]);
+    let host = KeyedHost::new("rover", &[]);
     let keys = format!("security.keys={}", host.dir());
-    let told = host
+    let output = host
         .host
         .run(&["up", "--set", &keys, "--set", "mts.name=another"]);
-    let told = told.failed(1);
+    let output = output.failed(1);
     assert!(
-        told.contains("another") && told.contains(&host.name) && told.contains("mts.name=NAME"),
-        "{told}"
+        output.contains("another")
+            && output.contains(&host.name)
+            && output.contains("mts.name=NAME"),
+        "{output}"
     );
-    let told = host
+    let output = host
         .host
         .run(&["up", "--set", "security.keys=/nowhere"])
         .failed(1);
-    assert!(told.contains("fipa keys init"), "{told}");
-    let told = host
+    assert!(output.contains("fipa keys init"), "{output}");
+    let output = host
         .host
         .run(&["up", "--set", "transport.tcp.listen=0.0.0.0:0"]);
-    let told = told.failed(2);
+    let output = output.failed(2);
     assert!(
-        told.contains("fipa keys init") && told.contains("security.insecure"),
-        "{told}"
+        output.contains("fipa keys init") && output.contains("security.insecure"),
+        "{output}"
     );
 }
 
 #[test]
-fn a_certificate_that_has_ended_is_told_wherever_it_is_seen() {
+fn an_expired_certificate_is_reported_in_every_output() {
     let (rover, crex) = (
-        Keyed::new("rover", &["--valid", "1ms"]),
-        Keyed::new("crex", &[]),
+        KeyedHost::new("rover", &["--valid", "1ms"]),
+        KeyedHost::new("crex", &[]),
     );
-    // A second is what its times are told in.
-    until("it has ended", || {
+    // The times of a certificate have a resolution of one second.
+    until("the certificate has expired", || {
         rover.keys(&["list"]).contains("(has ended)")
     });
-    let told = crex.keys(&["trust", &rover.certificate()]);
-    assert!(told.contains("(has ended)"), "{told}");
+    let output = crex.keys(&["trust", &rover.certificate()]);
+    assert!(output.contains("(has ended)"), "{output}");
     let (mut theirs, address) = crex.gateway(&[]);
-    theirs.tells(&["the certificate of rover", "has ended"]);
+    theirs.wait_for_log(&["the certificate of rover", "has ended"]);
     rover.keys(&["trust", &crex.certificate()]);
     let (mut ours, _) = rover.gateway(&[(&crex.name, &address)]);
-    ours.tells(&["the certificate of this host has ended"]);
-    theirs.tells(&["connection refused", "Expired", "`fipa keys renew` there"]);
+    ours.wait_for_log(&["the certificate of this host has ended"]);
+    theirs.wait_for_log(&["connection refused", "Expired", "`fipa keys renew` there"]);
 }
 
 #[test]
-fn a_pipe_among_the_certificates_is_waited_for_by_nobody() {
-    let rover = Keyed::new("rover", &[]);
+fn a_named_pipe_among_the_certificates_does_not_block() {
+    let rover = KeyedHost::new("rover", &[]);
     let trusted = rover.host.path("keys/trusted");
     std::fs::create_dir_all(&trusted).unwrap();
     let pipe = trusted.join("other.pem").display().to_string();
     let made = Command::new("mkfifo").args(["-m", "600", &pipe]).status();
     assert!(made.unwrap().success());
     let listed = rover.host.run(&["keys", "list", "--dir", &rover.dir()]);
-    let told = format!(
+    let output = format!(
         "{}{}",
         String::from_utf8_lossy(&listed.stdout),
         listed.stderr
     );
-    assert!(told.contains("no file"), "{told}");
+    assert!(output.contains("no file"), "{output}");
 }

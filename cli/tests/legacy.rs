@@ -1,6 +1,6 @@
-//! The commands with agents of legacy peers, in processes of their own.
+//! The commands with agents of legacy peers.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 mod common;
 
@@ -8,7 +8,7 @@ use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::thread;
 
-use common::{Host, Running};
+use common::Host;
 use fipa::{AgentId, Envelope, EnvelopeParams, Message, Performative};
 use serde_json::{Value, json};
 
@@ -17,28 +17,19 @@ const LETTER: &[u8] = include_bytes!("../../acl/tests/vectors/tcp_letter.bin");
 /// The failure message that the message transport service of fipa_services sent to `cpp-sender`.
 const FAILURE: &[u8] = include_bytes!("../../acl/tests/vectors/failure_letter.bin");
 
-/// The address at which the gateway takes letters of legacy peers.
-fn address(gateway: &Running) -> String {
-    let ready: Value = serde_json::from_str(&gateway.ready).unwrap();
-    let locations = ready["locations"].as_array().unwrap();
-    let mut locations = locations.iter().filter_map(Value::as_str);
-    let tcp = locations.find_map(|it| it.strip_prefix("tcp://")).unwrap();
-    tcp.split('#').next().unwrap().to_owned()
-}
-
-/// A legacy peer that takes one letter, then sends this one on a connection of its own.
+/// A legacy peer that receives one letter and then sends this one on a new connection.
 fn answers_with(listener: &TcpListener, letter: Vec<u8>, to: String) {
     let listener = listener.try_clone().unwrap();
     thread::spawn(move || {
         let (mut stream, _) = listener.accept().unwrap();
-        let mut asked = Vec::new();
-        stream.read_to_end(&mut asked).unwrap();
+        let mut received = Vec::new();
+        stream.read_to_end(&mut received).unwrap();
         drop(stream);
         TcpStream::connect(to).unwrap().write_all(&letter).unwrap();
     });
 }
 
-/// Waits until the processes of the host are told of the agent, and returns what `fipa agents` says.
+/// Waits until the processes of the host know the agent, and returns its entry in `fipa agents`.
 #[track_caller]
 fn known(host: &Host, name: &str) -> Value {
     let until = std::time::Instant::now() + std::time::Duration::from_secs(60);
@@ -52,7 +43,7 @@ fn known(host: &Host, name: &str) -> Value {
 }
 
 #[test]
-fn an_agent_that_has_udt_only_is_shown_as_unsupported_and_letters_to_it_fail_at_once() {
+fn letters_to_an_agent_with_only_udt_locations_fail_at_once() {
     let host = Host::new();
     let peer = "discovery.static={ cpp = [\"udt://127.0.0.1:9\"] }";
     let _gateway = host.start(&["up", "--set", peer]);
@@ -71,18 +62,18 @@ fn an_agent_that_has_udt_only_is_shown_as_unsupported_and_letters_to_it_fail_at_
 
     // The watchdog ends the command long before this deadline.
     let send = ["send", "--to", "cpp", "--deadline", "30m", "--json"];
-    let (json, told) = host.run(&send).failed_json();
+    let (json, output) = host.run(&send).failed_json();
     let delivery = &json["deliveries"][0];
     assert_eq!(delivery["reason"], "unsupported transport");
     assert_eq!(delivery["attempts"][0]["via"], "udt");
     assert!(
-        told.starts_with("error: not delivered: unsupported transport\nwhere: \"cpp\"\n"),
-        "{told}"
+        output.starts_with("error: not delivered: unsupported transport\nwhere: \"cpp\"\n"),
+        "{output}"
     );
 }
 
 #[test]
-fn a_failure_message_about_the_letter_is_no_reply() {
+fn a_failure_message_about_the_letter_is_not_a_reply() {
     let host = Host::new();
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let at = listener.local_addr().unwrap();
@@ -104,18 +95,17 @@ fn a_failure_message_about_the_letter_is_no_reply() {
         "30s",
         "--json",
     ];
-    answers_with(&listener, FAILURE.to_vec(), address(&gateway));
-    let (json, told) = host.run(&send).failed_json();
+    answers_with(&listener, FAILURE.to_vec(), gateway.tcp_address());
+    let (json, output) = host.run(&send).failed_json();
     assert_eq!(json["deliveries"][0]["outcome"], "sent");
     assert_eq!(json.get("reply"), None, "{json}");
     let failure = json!({ "from": "echo-mts", "receiver": "nobo",
                           "reason": "message delivery failed" });
     assert_eq!(json["failures"], json!([failure]));
-    let expected =
-        "error: not delivered: message delivery failed\nwhere: \"nobo\", as \"echo-mts\" ";
-    assert!(told.starts_with(expected), "{told}");
+    let expected = "error: not delivered: message delivery failed\nwhere: \"nobo\", in a failure message from \"echo-mts\"\n";
+    assert!(output.starts_with(expected), "{output}");
 
-    // A failure that the receiver itself tells, of something else, is a reply.
+    // A failure message of the receiver about something else is a reply.
     let to = AgentId::new("cpp-sender").unwrap();
     let reply = Message::builder(Performative::Failure)
         .sender(AgentId::new("cpp").unwrap())
@@ -137,45 +127,45 @@ fn a_failure_message_about_the_letter_is_no_reply() {
     };
     let mut letter = envelope.encode_standard().unwrap().to_vec();
     letter.extend_from_slice(&reply.to_payload().to_bytes());
-    answers_with(&listener, letter, address(&gateway));
+    answers_with(&listener, letter, gateway.tcp_address());
     let json = host.run(&send).done_json();
     assert_eq!(json["reply"]["performative"], "failure");
     assert_eq!(json.get("failures"), None, "{json}");
 }
 
 #[test]
-fn failure_messages_that_are_left_out_are_counted_in_the_log() {
+fn omitted_failure_messages_are_counted_in_the_log() {
     let host = Host::new();
     let mut gateway = host.start(&["up", "--json"]);
-    let to = address(&gateway);
+    let to = gateway.tcp_address();
     for _ in 0..200 {
         TcpStream::connect(&to).unwrap().write_all(LETTER).unwrap();
     }
-    gateway.tells(&["left out failure messages", "count="]);
+    gateway.wait_for_log(&["left out failure messages", "count="]);
 }
 
 #[test]
-fn a_name_that_legacy_peers_cannot_read_is_warned_of_once() {
+fn a_name_that_legacy_peers_cannot_read_causes_one_warning() {
     let host = Host::new();
     for name in ["arm.left", "béla@home:1099/JADE"] {
-        let (code, told) = host.echo(name).signal("-INT");
-        assert_eq!((code, told.as_str()), (Some(0), ""), "{name}");
+        let (code, output) = host.echo(name).signal("-INT");
+        assert_eq!((code, output.as_str()), (Some(0), ""), "{name}");
     }
     for arguments in [&["echo", "a b"][..], &["coalition", "a b", "arm"]] {
-        let (code, told) = host.start(arguments).signal("-INT");
+        let (code, output) = host.start(arguments).signal("-INT");
         assert_eq!(code, Some(0));
         let warned = "can neither get letters from \"a b\" nor name it";
-        assert_eq!(told.matches(warned).count(), 1, "{told}");
+        assert_eq!(output.matches(warned).count(), 1, "{output}");
     }
 }
 
 #[test]
-fn no_agent_takes_the_letters_to_a_pattern() {
+fn an_agent_cannot_have_a_pattern_as_its_name() {
     let host = Host::new();
     let mut arms = [host.echo("arm_1"), host.echo("arm_2")];
     for arguments in [&["echo", "arm_.*"][..], &["coalition", "arm_.*", "arm_1"]] {
-        let told = host.run(arguments).failed(2);
-        assert!(told.contains("is a pattern"), "{told}");
+        let output = host.run(arguments).failed(2);
+        assert!(output.contains("is a pattern"), "{output}");
     }
     host.run(&["send", "--to", "arm_.*", "--content", "stop"])
         .done();

@@ -1,7 +1,7 @@
-//! `fipa doctor` on networks that carry multicast, filter it, or have nobody on them: hosts in
-//! namespaces of the test's own.
+//! `fipa doctor` on networks that forward multicast, filter it, or have no other host. The hosts are
+//! network namespaces.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 use std::process::Command;
 use std::time::{Duration, Instant};
@@ -10,13 +10,16 @@ use fipa_testbed::{Host, Network, Running, enter, isolated};
 use serde_json::Value;
 
 #[test]
-fn the_doctor_says_what_the_network_does() {
-    isolated("inside_the_doctor_says_what_the_network_does", &[]);
+fn the_doctor_reports_multicast_faults_of_the_network() {
+    isolated(
+        "inside_the_doctor_reports_multicast_faults_of_the_network",
+        &[],
+    );
 }
 
 #[test]
 #[ignore = "is run by the other test in namespaces of its own"]
-fn inside_the_doctor_says_what_the_network_does() {
+fn inside_the_doctor_reports_multicast_faults_of_the_network() {
     enter();
     fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
     let network = Network::new(2);
@@ -28,7 +31,7 @@ fn inside_the_doctor_says_what_the_network_does() {
 
     let mut up = fipa(there, "there");
     let _gateway = Running::until_ready(up.arg("up"));
-    // Who has nothing to announce has nothing to answer.
+    // A gateway without agents has no records with which it could answer.
     let mut echo = fipa(there, "there");
     let _agent = Running::until_ready(echo.args(["echo", "parrot"]));
     let deadline = Instant::now() + Duration::from_secs(60);
@@ -41,19 +44,19 @@ fn inside_the_doctor_says_what_the_network_does() {
     };
     assert!(found.contains("goes both ways, with 10.99.0.2"), "{found}");
 
-    // The switch keeps multicast from this host, which others hear.
-    here.hears_multicast(false);
+    // The switch does not forward multicast to this host; the other host receives it.
+    here.forward_multicast(false);
     let (verdict, found) = multicast(here);
     assert_eq!(verdict, "doubtful", "{found}");
     assert!(found.contains("does not come in: 10.99.0.2"), "{found}");
-    here.hears_multicast(true);
+    here.forward_multicast(true);
 
-    // The other way round.
-    there.hears_multicast(false);
+    // The switch does not forward multicast to the other host.
+    there.forward_multicast(false);
     let (verdict, found) = multicast(here);
     assert_eq!(verdict, "doubtful", "{found}");
     assert!(found.contains("may not get out: 10.99.0.2"), "{found}");
-    there.hears_multicast(true);
+    there.forward_multicast(true);
 
     here.ip("link set eth0 down");
     let (verdict, found) = multicast(here);
@@ -64,13 +67,13 @@ fn inside_the_doctor_says_what_the_network_does() {
 fn fipa(host: &Host, domain: &str) -> Command {
     let mut command = host.command(env!("CARGO_BIN_EXE_fipa"));
     command.args(["--set", &format!("domain={domain}")]);
-    // A gateway that listens on loopback announces nothing.
+    // A gateway that listens only on loopback announces no agents.
     let open = ["security.insecure=true", "transport.tcp.listen=0.0.0.0:0"];
     command.args(open.iter().flat_map(|setting| ["--set", setting]));
     command
 }
 
-/// What the doctor says about multicast over IPv4.
+/// The verdict and the finding of the doctor about multicast over IPv4.
 fn multicast(host: &Host) -> (String, String) {
     let output = fipa(host, "here").args(["doctor", "--json"]).output();
     let output = output.unwrap();

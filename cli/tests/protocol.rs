@@ -1,6 +1,6 @@
-//! `fipa protocol`: what is known, what is in a file, what is wrong with one, and how it looks.
+//! `fipa protocol`: lists, shows, checks and draws protocols.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 mod common;
 
@@ -9,7 +9,7 @@ use std::fs;
 use common::Host;
 use serde_json::Value;
 
-/// In the form of fipa_acl.
+/// A protocol in the format of fipa_acl.
 const LIFT: &str = r#"<scxml version="1.0" initial="1">
 <state id="1">
   <transition performative="request" from="initiator" to="B" target="2"/>
@@ -39,7 +39,7 @@ fn protocols_are_listed_and_shown() {
     let shown = host.run(&["protocol", "show", "contractNet"]).done();
     for line in [
         "fipa-contract-net: Calling for proposals and accepting some",
-        "each participant has a state of its own",
+        "scope: one state per participant",
         "start (initial)",
         "  cfp from initiator to participant -> called",
         "  after reply-by -> expired",
@@ -54,13 +54,13 @@ fn protocols_are_listed_and_shown() {
     assert_eq!(json["states"][1]["transitions"][1]["optional"], true);
     let unknown = host.run(&["protocol", "show", "fipa-dance"]).failed(1);
     assert!(
-        unknown.contains("no protocol is called \"fipa-dance\""),
+        unknown.contains("no protocol and no file has the name \"fipa-dance\""),
         "{unknown}"
     );
 }
 
 #[test]
-fn files_are_checked() {
+fn errors_in_files_are_reported_with_their_lines() {
     let host = Host::new();
     let (good, bad) = (host.path("lift"), host.path("bad.scxml"));
     fs::write(&good, LIFT).unwrap();
@@ -68,17 +68,17 @@ fn files_are_checked() {
     let (good, bad) = (good.to_str().unwrap(), bad.to_str().unwrap());
     let fine = host.run(&["protocol", "check", good]).done();
     assert!(
-        fine.ends_with("lift: lift, states: 3, no mistakes\n"),
+        fine.ends_with("lift: lift, states: 3, no errors\n"),
         "{fine}"
     );
     let wrong = host.run(&["protocol", "check", bad]).failed(1);
     assert!(wrong.contains("error: there is no state \"4\""), "{wrong}");
     assert!(wrong.contains("bad.scxml:6"), "{wrong}");
-    let (json, told) = host
+    let (json, output) = host
         .run(&["protocol", "check", "--json", good, bad])
         .failed_json();
     assert_eq!(
-        (&json[0]["name"], told.as_str()),
+        (&json[0]["name"], output.as_str()),
         (&Value::from("lift"), "")
     );
     assert_eq!(json[1]["mistakes"][0]["line"], 6);
@@ -86,7 +86,7 @@ fn files_are_checked() {
 }
 
 #[test]
-fn protocols_are_drawn() {
+fn protocols_are_drawn_as_svg_and_mermaid() {
     let host = Host::new();
     let good = host.path("lift.scxml");
     fs::write(&good, LIFT).unwrap();
@@ -101,7 +101,7 @@ fn protocols_are_drawn() {
     let svg = host.run(&["protocol", "draw", good]).done();
     for text in [
         "inform|failure",
-        "begins protocol fipa-.*, answers to initiator",
+        "starts protocol fipa-.*, answers to initiator",
     ] {
         assert!(svg.contains(text), "{text}: {svg}");
     }
@@ -130,7 +130,7 @@ fn protocols_are_drawn() {
 }
 
 #[test]
-fn the_configuration_brings_protocols_of_its_own() {
+fn protocols_of_the_configuration_are_listed_first() {
     let host = Host::new();
     let file = host.path("lift.scxml");
     fs::write(&file, LIFT).unwrap();

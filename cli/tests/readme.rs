@@ -1,6 +1,6 @@
-//! What the README tells a new user to type, typed.
+//! Runs the commands that the README gives to a new user.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use fipa_testbed::{Host, Network, Running, enter, isolated};
 
 const README: &str = include_str!("../../README.md");
 
-/// The commands that the README shows under the paragraph that begins so, without its comments.
+/// The commands below the README paragraph that begins with this text, without their comments.
 fn commands(below: &str) -> Vec<&'static str> {
     let (_, text) = README.split_once(below).unwrap();
     let (_, block) = text.split_once("```console\n").unwrap();
@@ -22,7 +22,7 @@ fn commands(below: &str) -> Vec<&'static str> {
         .collect()
 }
 
-/// A user on a host of that name.
+/// A user on the host of the same name.
 struct User<'a> {
     name: &'a str,
     host: &'a Host,
@@ -33,7 +33,7 @@ impl User<'_> {
         fipa_testbed::directory().join(self.name)
     }
 
-    /// A shell on that host, in the user's home, about to run this line.
+    /// The command that runs this line in a shell on the host, in the home of the user.
     fn shell(&self, line: &str) -> Command {
         let programs = Path::new(env!("CARGO_BIN_EXE_fipa")).parent().unwrap();
         let path = format!(
@@ -55,7 +55,7 @@ impl User<'_> {
         command
     }
 
-    fn types(&self, line: &str) {
+    fn run(&self, line: &str) {
         let done = self.shell(line).stdout(Stdio::null()).status().unwrap();
         assert!(done.success(), "{}: {line}", self.name);
     }
@@ -71,7 +71,7 @@ fn two_hosts_are_secured_in_under_ten_commands() {
 fn inside_two_hosts_are_secured() {
     enter();
     fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
-    // What would copy to another host copies to the other user's home.
+    // `scp` copies to the home of the other user.
     let homes = fipa_testbed::directory();
     let bin = homes.join("bin");
     fs::create_dir(&bin).unwrap();
@@ -89,9 +89,9 @@ fn inside_two_hosts_are_secured() {
         User { name, host }
     });
     let [rover, crex] = &users;
-    let typed = commands("Two hosts trust each other");
-    // The other way round.
-    let also: Vec<String> = typed
+    let lines = commands("Two hosts trust each other");
+    // The same lines for the other host.
+    let swapped: Vec<String> = lines
         .iter()
         .map(|line| {
             line.replace("crex", "X")
@@ -99,16 +99,16 @@ fn inside_two_hosts_are_secured() {
                 .replace('X', "rover")
         })
         .collect();
-    assert!(typed.len() + also.len() < 10, "{typed:?}");
+    assert!(lines.len() + swapped.len() < 10, "{lines:?}");
     for user in &users {
         fs::create_dir(user.home()).unwrap();
     }
-    let (last, before) = typed.split_last().unwrap();
-    for (ours, theirs) in before.iter().zip(&also) {
-        rover.types(ours);
-        crex.types(theirs);
+    let (last, before) = lines.split_last().unwrap();
+    for (ours, theirs) in before.iter().zip(&swapped) {
+        rover.run(ours);
+        crex.run(theirs);
     }
-    let gateways = [(rover, *last), (crex, also[before.len()].as_str())];
+    let gateways = [(rover, *last), (crex, swapped[before.len()].as_str())];
     let _gateways =
         gateways.map(|(user, line)| Running::until_ready(&mut user.shell(&format!("exec {line}"))));
     let _arm = Running::until_ready(&mut crex.shell("exec fipa echo arm_1"));
@@ -118,12 +118,15 @@ fn inside_two_hosts_are_secured() {
             .shell("fipa send --to arm_1 --content hello")
             .output()
             .unwrap();
-        let told = String::from_utf8_lossy(&sent.stdout).into_owned();
+        let stdout = String::from_utf8_lossy(&sent.stdout).into_owned();
         if sent.status.success() {
-            assert!(told.contains("delivered via tcp"), "{told}");
+            assert!(stdout.contains("delivered via tcp"), "{stdout}");
             return;
         }
-        assert!(begun.elapsed() < Duration::from_secs(60), "never: {sent:?}");
+        assert!(
+            begun.elapsed() < Duration::from_secs(60),
+            "not delivered: {sent:?}"
+        );
         std::thread::sleep(Duration::from_millis(50));
     }
 }

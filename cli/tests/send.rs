@@ -1,6 +1,6 @@
-//! `fipa send` and `fipa echo`, in processes of their own.
+//! `fipa send` and `fipa echo` in processes of their own.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 mod common;
 
@@ -12,7 +12,7 @@ use common::Host;
 use serde_json::{Value, json};
 
 #[test]
-fn a_message_and_its_reply_with_and_without_a_gateway() {
+fn a_message_is_answered_with_and_without_a_gateway() {
     let host = Host::new();
     let _echo = host.echo("arm_1");
     let asked = [
@@ -40,16 +40,16 @@ fn a_message_and_its_reply_with_and_without_a_gateway() {
     let gateway = host.start(&["up"]);
     assert!(gateway.ready.contains(&host.domain), "{}", gateway.ready);
     converse();
-    // A gateway that crashes takes nobody else with it.
+    // A crash of the gateway does not affect the agents of the host.
     drop(gateway);
     converse();
 }
 
 #[test]
-fn what_people_read() {
+fn the_text_output_has_the_outcome_and_the_reply() {
     let host = Host::new();
     let mut echo = host.echo("arm_1");
-    let told = host.run(&[
+    let output = host.run(&[
         "send",
         "--to",
         "arm_1",
@@ -59,8 +59,8 @@ fn what_people_read() {
         "hi",
         "--wait",
     ]);
-    let told = told.done();
-    let (outcome, reply) = told.split_once('\n').unwrap();
+    let output = output.done();
+    let (outcome, reply) = output.split_once('\n').unwrap();
     assert_eq!(outcome, "arm_1: delivered via shm");
     assert!(
         reply.starts_with("reply: (inform :sender arm_1 :receiver (set me)"),
@@ -75,7 +75,7 @@ fn what_people_read() {
 }
 
 #[test]
-fn all_parameters_arrive() {
+fn all_parameters_are_delivered() {
     let host = Host::new();
     let mut echo = host.echo("arm_1");
     let sent = [
@@ -129,7 +129,7 @@ fn all_parameters_arrive() {
 }
 
 #[test]
-fn binary_content_from_a_file_and_from_standard_input() {
+fn binary_content_is_read_from_a_file_and_from_standard_input() {
     let host = Host::new();
     let _echo = host.echo("camera");
     let every_byte: Vec<u8> = (0..=255).cycle().take(100_000).collect();
@@ -155,13 +155,13 @@ fn binary_content_from_a_file_and_from_standard_input() {
 }
 
 #[test]
-fn a_receiver_that_nobody_knows() {
+fn a_letter_to_an_unknown_receiver_fails() {
     let host = Host::new();
-    let (json, told) = host
+    let (json, output) = host
         .run(&[
             "send",
             "--to",
-            "nobody",
+            "unknown",
             "--content",
             "x",
             "--wait",
@@ -170,42 +170,42 @@ fn a_receiver_that_nobody_knows() {
         .failed_json();
     assert_eq!(
         json,
-        json!({ "deliveries": [{ "receiver": "nobody", "outcome": "failed",
+        json!({ "deliveries": [{ "receiver": "unknown", "outcome": "failed",
                                  "reason": "no such agent", "attempts": [] }] })
     );
     assert!(
-        told.contains("error: not delivered: no such agent\nwhere: \"nobody\"\n"),
-        "{told}"
+        output.contains("error: not delivered: no such agent\nwhere: \"unknown\"\n"),
+        "{output}"
     );
-    assert!(told.contains("start one with `fipa up`"), "{told}");
+    assert!(output.contains("start one with `fipa up`"), "{output}");
     let _gateway = host.start(&["up"]);
-    let (_, told) = host
-        .run(&["send", "--to", "nobody", "--json"])
+    let (_, output) = host
+        .run(&["send", "--to", "unknown", "--json"])
         .failed_json();
-    assert!(told.contains("that the gateway"), "{told}");
+    assert!(output.contains("that gateway "), "{output}");
 }
 
 #[test]
-fn one_of_two_receivers() {
+fn a_failure_for_one_of_two_receivers_does_not_affect_the_other() {
     let host = Host::new();
     let _echo = host.echo("arm_1");
-    let (json, told) = host
+    let (json, output) = host
         .run(&["send", "--to", "arm_1", "--to", "arm_2", "--wait", "--json"])
         .failed_json();
     let mut outcomes: Vec<_> = json["deliveries"].as_array().unwrap().iter().collect();
     outcomes.sort_by_key(|one| one["receiver"].to_string());
     assert_eq!(outcomes[0]["outcome"], "delivered");
     assert_eq!(outcomes[1]["reason"], "no such agent");
-    // The failure about arm_2 is no reply.
+    // The failure message about arm_2 is not a reply.
     assert_eq!(json["reply"]["sender"]["name"], "arm_1");
     assert!(
-        told.contains("where: \"arm_2\"\n") && !told.contains("no reply"),
-        "{told}"
+        output.contains("where: \"arm_2\"\n") && !output.contains("no reply"),
+        "{output}"
     );
 }
 
 #[test]
-fn a_pattern_reaches_all_that_match() {
+fn a_pattern_reaches_all_matching_agents_except_the_sender() {
     let host = Host::new();
     let mut echoes = [host.echo("arm_1"), host.echo("arm_2")];
     let _other = host.echo("camera");
@@ -235,12 +235,12 @@ fn a_pattern_reaches_all_that_match() {
             "{seen}"
         );
     }
-    let (_, told) = host.run(&["send", "--to", "arm_[", "--json"]).failed_json();
-    assert!(told.contains("unclosed character class"), "{told}");
+    let (_, output) = host.run(&["send", "--to", "arm_[", "--json"]).failed_json();
+    assert!(output.contains("unclosed character class"), "{output}");
 }
 
 #[test]
-fn no_reply_in_time() {
+fn a_missing_reply_is_reported_after_the_timeout() {
     let host = Host::new();
     let _echo = host.echo("arm_1");
     let not_answered = [
@@ -254,20 +254,20 @@ fn no_reply_in_time() {
         "50ms",
         "--json",
     ];
-    let (json, told) = host.run(&not_answered).failed_json();
+    let (json, output) = host.run(&not_answered).failed_json();
     assert_eq!(json["deliveries"][0]["outcome"], "delivered");
     assert_eq!(json.get("reply"), None);
     assert!(
-        told.starts_with("error: no reply within 50ms\nwhere: \"arm_1\"\n"),
-        "{told}"
+        output.starts_with("error: no reply within 50ms\nwhere: \"arm_1\"\n"),
+        "{output}"
     );
 }
 
 #[test]
-fn echo_agents_do_not_talk_to_each_other_forever() {
+fn echo_agents_do_not_answer_each_other_endlessly() {
     let host = Host::new();
     let (mut arm_1, mut arm_2) = (host.echo("arm_1"), host.echo("arm_2"));
-    // The answer goes to the other one, and has no in-reply-to to know it by.
+    // The answer goes to arm_2 and has no in-reply-to that would mark it as a reply.
     let begin = [
         "--performative",
         "request",
@@ -281,7 +281,7 @@ fn echo_agents_do_not_talk_to_each_other_forever() {
     assert!(arm_1.line().contains("\"begin\""));
     let answer = arm_2.line();
     assert!(answer.contains("(inform :sender arm_1"), "{answer}");
-    // It takes one message after the other: when it has answered this one, it is done with that.
+    // arm_2 handles messages in order: after this answer it has handled the previous message.
     host.run(&["send", "--to", "arm_2", "--content", "between", "--wait"])
         .done();
     host.run(&["send", "--to", "arm_1", "--content", "end"])
@@ -291,7 +291,7 @@ fn echo_agents_do_not_talk_to_each_other_forever() {
 }
 
 #[test]
-fn an_echo_that_has_answered_enough_ends() {
+fn echo_ends_after_its_count_of_messages() {
     let host = Host::new();
     let mut echo = host.start(&["echo", "arm_1", "--count", "2"]);
     for _ in 0..2 {
@@ -301,24 +301,24 @@ fn an_echo_that_has_answered_enough_ends() {
 }
 
 #[test]
-fn a_second_agent_of_the_same_name() {
+fn a_second_agent_of_the_same_name_is_rejected() {
     let host = Host::new();
     let _echo = host.echo("arm_1");
     for second in [
         &["echo", "arm_1"][..],
         &["send", "--to", "x", "--from", "arm_1"],
     ] {
-        let told = host.run(second).failed(1);
+        let output = host.run(second).failed(1);
         assert!(
-            told.starts_with("error: the name \"arm_1\" is taken by an agent at "),
-            "{told}"
+            output.starts_with("error: the name \"arm_1\" is already registered by an agent at "),
+            "{output}"
         );
-        assert!(told.contains("\n   do: choose another name"), "{told}");
+        assert!(output.contains("\n help: choose another name"), "{output}");
     }
 }
 
 #[test]
-fn content_that_is_too_large() {
+fn too_large_content_fails_on_every_route() {
     let host = Host::new();
     let _echo = host.echo("camera");
     std::fs::write(host.path("large.raw"), vec![0; 2 << 20]).unwrap();
@@ -332,26 +332,26 @@ fn content_that_is_too_large() {
         "large.raw",
         "--json",
     ];
-    let (json, told) = host.run(&send).failed_json();
+    let (json, output) = host.run(&send).failed_json();
     let delivery = &json["deliveries"][0];
     assert_eq!(
         (&delivery["outcome"], &delivery["reason"]),
         (&json!("failed"), &json!("too large"))
     );
-    let ways: Vec<_> = delivery["attempts"].as_array().unwrap().iter().collect();
-    assert_eq!(ways.len(), 2, "{delivery}");
+    let attempts: Vec<_> = delivery["attempts"].as_array().unwrap().iter().collect();
+    assert_eq!(attempts.len(), 2, "{delivery}");
     assert!(
-        told.starts_with("error: not delivered: too large\nwhere: \"camera\"\n"),
-        "{told}"
+        output.starts_with("error: not delivered: too large\nwhere: \"camera\"\n"),
+        "{output}"
     );
     assert!(
-        told.contains("transport.shm.max_letter (here 1048576 bytes)"),
-        "{told}"
+        output.contains("transport.shm.max_letter (now 1048576 bytes here)"),
+        "{output}"
     );
 }
 
 #[test]
-fn wrong_usage() {
+fn an_invalid_command_line_has_exit_code_2() {
     let host = Host::new();
     for wrong in [
         &["send"][..],
@@ -368,14 +368,14 @@ fn wrong_usage() {
         &["echo", "arm\n1"],
         &["echo", "arm_1", "--set", "mts.queue=0"],
     ] {
-        let told = host.run(wrong).failed(2);
-        assert!(told.starts_with("error: "), "{wrong:?}: {told}");
+        let output = host.run(wrong).failed(2);
+        assert!(output.starts_with("error: "), "{wrong:?}: {output}");
     }
     assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
 }
 
 #[test]
-fn nothing_is_left_behind() {
+fn no_files_are_left_behind() {
     let host = Host::new();
     let echo = host.echo("arm_1");
     assert!(!host.left_behind().is_empty());
@@ -388,10 +388,10 @@ fn nothing_is_left_behind() {
 }
 
 #[test]
-fn a_signal_ends_waiting_in_order() {
+fn a_signal_during_the_wait_for_a_reply_leaves_no_files() {
     let host = Host::new();
     let echo = host.echo("arm_1");
-    // Prints its outcome and waits for a reply that never comes.
+    // Prints its outcome and waits for a reply that is never sent.
     let waiting = host.start(&[
         "send",
         "--to",
@@ -403,11 +403,11 @@ fn a_signal_ends_waiting_in_order() {
         "1h",
     ]);
     assert_eq!(waiting.ready, "arm_1: delivered via shm");
-    let (code, told) = waiting.signal("-TERM");
+    let (code, output) = waiting.signal("-TERM");
     assert_eq!(code, Some(1));
     assert!(
-        told.starts_with("error: told to end before it was done\n"),
-        "{told}"
+        output.starts_with("error: canceled by a signal before the command was done\n"),
+        "{output}"
     );
     assert_eq!(echo.signal("-HUP"), (Some(0), String::new()));
     assert_eq!(host.left_behind(), Vec::<PathBuf>::new());

@@ -1,6 +1,6 @@
-//! `fipa up` and `fipa agents`, in processes of their own.
+//! `fipa up` and `fipa agents` in processes of their own.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 mod common;
 
@@ -12,7 +12,7 @@ use common::Host;
 use serde_json::{Value, json};
 
 #[test]
-fn the_gateway_says_what_it_is() {
+fn the_gateway_prints_its_name_and_locations() {
     let host = Host::new();
     let gateway = host.start(&["up", "--json", "--set", "mts.name=sherpa"]);
     let ready: Value = serde_json::from_str(&gateway.ready).unwrap();
@@ -41,15 +41,15 @@ fn the_gateway_says_what_it_is() {
 }
 
 #[test]
-fn who_joins_and_leaves_is_logged() {
+fn agents_that_join_and_leave_are_logged() {
     let host = Host::new();
     let _before = host.echo("arm_1");
     let mut gateway = host.start(&["up", "-v", "--json"]);
-    gateway.tells(&["INFO", "is there", "arm_1"]);
+    gateway.wait_for_log(&["INFO", "present", "arm_1"]);
     let echo = host.echo("arm_2");
-    gateway.tells(&["INFO", "joined", "arm_2"]);
+    gateway.wait_for_log(&["INFO", "joined", "arm_2"]);
     assert_eq!(echo.signal("-INT"), (Some(0), String::new()));
-    gateway.tells(&["INFO", "left", "arm_2"]);
+    gateway.wait_for_log(&["INFO", "left", "arm_2"]);
     let (code, log) = gateway.signal("-INT");
     assert_eq!(code, Some(0), "{log}");
 }
@@ -59,10 +59,10 @@ fn a_removed_runtime_directory_is_logged_once_and_joined_again() {
     let host = Host::new();
     let mut gateway = host.start(&["up", "--json", "--set", "mts.name=sherpa"]);
     let mut parrot = host.echo("parrot");
-    // An error is that the processes are back before all is removed.
+    // An error means that the processes have created files again before all were removed.
     let _ = std::fs::remove_dir_all(host.path("run"));
     for process in [&mut gateway, &mut parrot] {
-        process.tells(&["WARN", "were removed", "joining the domain again"]);
+        process.wait_for_log(&["WARN", "were removed", "joining the domain again"]);
     }
     let watchdog = Instant::now() + Duration::from_secs(60);
     loop {
@@ -72,7 +72,7 @@ fn a_removed_runtime_directory_is_logged_once_and_joined_again() {
         if names.contains(&"parrot") && names.contains(&"sherpa") {
             break;
         }
-        assert!(Instant::now() < watchdog, "never: {listed}");
+        assert!(Instant::now() < watchdog, "not listed again: {listed}");
     }
     loop {
         let letter = ["send", "--to", "parrot", "--content", "hello"];
@@ -80,7 +80,7 @@ fn a_removed_runtime_directory_is_logged_once_and_joined_again() {
         if sent.code == Some(0) {
             break;
         }
-        assert!(Instant::now() < watchdog, "never: {sent:?}");
+        assert!(Instant::now() < watchdog, "not delivered: {sent:?}");
     }
     for process in [gateway, parrot] {
         let (code, log) = process.signal("-INT");
@@ -92,36 +92,36 @@ fn a_removed_runtime_directory_is_logged_once_and_joined_again() {
 }
 
 #[test]
-fn a_port_in_use() {
+fn a_port_in_use_is_reported() {
     let host = Host::new();
     let holder = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = holder.local_addr().unwrap();
     let listen = format!("transport.tcp.listen=[\"{address}\"]");
-    let told = host.run(&["up", "--set", &listen]).failed(1);
+    let output = host.run(&["up", "--set", &listen]).failed(1);
     let expected = format!("error: cannot listen on {address}: Address already in use");
-    assert!(told.starts_with(&expected), "{told}");
+    assert!(output.starts_with(&expected), "{output}");
     assert!(
-        told.contains("where: transport.tcp.listen of the configuration\n"),
-        "{told}"
+        output.contains("where: transport.tcp.listen of the configuration\n"),
+        "{output}"
     );
     assert!(
-        told.contains("end the process that uses the port"),
-        "{told}"
+        output.contains("stop the process that uses the port"),
+        "{output}"
     );
     assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
 }
 
 #[test]
-fn a_second_gateway_of_the_domain() {
+fn a_second_gateway_of_the_domain_is_rejected() {
     let host = Host::new();
     let _gateway = host.start(&["up", "--set", "mts.name=first"]);
-    let told = host.run(&["up", "--set", "mts.name=second"]).failed(1);
-    let expected = "error: the domain has a gateway already, \"first\"\n";
-    assert!(told.starts_with(expected), "{told}");
+    let output = host.run(&["up", "--set", "mts.name=second"]).failed(1);
+    let expected = "error: the domain already has a gateway, \"first\"\n";
+    assert!(output.starts_with(expected), "{output}");
 }
 
 #[test]
-fn a_configuration_with_mistakes() {
+fn an_invalid_configuration_stops_every_command() {
     let host = Host::new();
     std::fs::write(host.path("robot.toml"), "[mts]\nqueue = 0\n").unwrap();
     for command in [
@@ -131,17 +131,17 @@ fn a_configuration_with_mistakes() {
         &["send", "--to", "x"],
     ] {
         let arguments = [command, &["--config", "robot.toml"]].concat();
-        let told = host.run(&arguments).failed(2);
-        assert!(told.contains("where: robot.toml:2\n"), "{told}");
+        let output = host.run(&arguments).failed(2);
+        assert!(output.contains("where: robot.toml:2\n"), "{output}");
     }
     assert_eq!(host.left_behind(), Vec::<PathBuf>::new());
 }
 
 #[test]
-fn who_is_there() {
+fn agents_are_listed_and_filtered() {
     let host = Host::new();
-    let nobody = host.run(&["agents"]).done();
-    assert!(nobody.starts_with("nobody in the domain "), "{nobody}");
+    let empty = host.run(&["agents"]).done();
+    assert!(empty.starts_with("no agent is known in domain "), "{empty}");
     let _arm = host.start(&[
         "echo",
         "arm_1",
@@ -208,38 +208,38 @@ fn who_is_there() {
         let names: Vec<&Value> = names.map(|agent| &agent["name"]).collect();
         assert_eq!(json!(names), found, "{search:?}");
     }
-    let told = host.run(&["agents", "arm_["]).failed(2);
-    assert!(told.contains("unclosed character class"), "{told}");
+    let output = host.run(&["agents", "arm_["]).failed(2);
+    assert!(output.contains("unclosed character class"), "{output}");
 }
 
 #[test]
-fn who_joins_and_leaves_is_watched() {
+fn agents_that_join_and_leave_are_watched() {
     let host = Host::new();
     let _arm = host.start(&["echo", "arm", "--type", "arm"]);
     let mut watching = host.start(&["agents", "--watch", "--json", "arm.*"]);
-    let told = |line: &str| {
+    let change = |line: &str| {
         let line: Value = serde_json::from_str(line).unwrap();
         assert!(line["time"].as_str().unwrap().ends_with('Z'), "{line}");
         let name = line["agent"]["name"].as_str().unwrap();
         format!("{} {name}", line["change"].as_str().unwrap())
     };
-    assert_eq!(told(&watching.ready), "present arm");
+    assert_eq!(change(&watching.ready), "present arm");
     let _other = host.echo("leg");
     let newcomer = host.echo("arm_2");
-    assert_eq!(told(&watching.line()), "joined arm_2");
+    assert_eq!(change(&watching.line()), "joined arm_2");
     assert_eq!(newcomer.signal("-INT"), (Some(0), String::new()));
-    assert_eq!(told(&watching.line()), "left arm_2");
+    assert_eq!(change(&watching.line()), "left arm_2");
     assert_eq!(watching.signal("-INT"), (Some(0), String::new()));
 
     let mut watching = host.start(&["agents", "-w"]);
-    assert!(watching.ready.starts_with("watching the domain cli-"));
+    assert!(watching.ready.starts_with("watching domain cli-"));
     let present = watching.line();
     assert!(present.contains("  present  arm (arm)  this host  shm://"));
     assert_eq!(watching.signal("-TERM"), (Some(0), String::new()));
 }
 
 #[test]
-fn an_agent_of_another_host() {
+fn an_agent_on_another_host_is_listed_and_reached() {
     let (here, there) = (Host::new(), Host::new());
     let name = format!("arm-{}", there.domain);
     let mdns = [
@@ -254,9 +254,9 @@ fn an_agent_of_another_host() {
     };
     let (mut gateway, _other) = (up(&here), up(&there));
     let echo = there.echo(&name);
-    gateway.tells(&["INFO", "joined", &name]);
+    gateway.wait_for_log(&["INFO", "joined", &name]);
 
-    // The gateway tells the processes of this host a moment later.
+    // The processes of this host learn of the agent shortly after the gateway.
     let mut listed = Value::Null;
     for _ in 0..600 {
         listed = here.run(&["agents", &name, "--json"]).done_json()["agents"][0].take();
@@ -296,11 +296,11 @@ fn an_agent_of_another_host() {
     assert_eq!(json["reply"]["content"], "hello", "{json}");
 
     assert_eq!(echo.signal("-INT"), (Some(0), String::new()));
-    gateway.tells(&["INFO", "left", &name]);
+    gateway.wait_for_log(&["INFO", "left", &name]);
 }
 
 #[test]
-fn a_hang_up_reads_the_configuration_again() {
+fn sighup_reloads_the_configuration() {
     let host = Host::new();
     let file = host.path("robot.toml");
     let port = |number| format!("[transport.tcp]\nlisten = [\"127.0.0.1:{number}\"]\n");
@@ -315,31 +315,31 @@ fn a_hang_up_reads_the_configuration_again() {
     gateway.send_signal("-HUP");
     let started = Instant::now();
     while peers()[0]["name"] != "crex" {
-        assert!(started.elapsed().as_secs() < 60, "never: the new peer");
+        assert!(started.elapsed().as_secs() < 60, "the new peer is not used");
     }
-    gateway.tells(&["warning", "transport.tcp.listen", "started again"]);
-    // A mistake changes nothing.
+    gateway.wait_for_log(&["warning", "transport.tcp.listen", "restarted"]);
+    // An invalid configuration changes nothing.
     std::fs::write(&file, "[mts]\nqueue = 0\n").unwrap();
     gateway.send_signal("-HUP");
-    gateway.tells(&["robot.toml:2"]);
+    gateway.wait_for_log(&["robot.toml:2"]);
     assert_eq!(peers()[0]["name"], "crex");
     std::fs::write(&file, port(0)).unwrap();
     gateway.send_signal("-HUP");
     while peers() != json!([]) {
-        assert!(started.elapsed().as_secs() < 60, "never: no peer");
+        assert!(started.elapsed().as_secs() < 60, "the peer is still used");
     }
     let (code, log) = gateway.signal("-TERM");
     assert_eq!(code, Some(0), "{log}");
 }
 
-/// What a process does when it joins, registers or leaves; but this one does not go on.
+/// The test holds the directory lock, as a process does that stops while it joins, registers or leaves.
 #[test]
-fn who_is_told_twice_to_end_does_not_wait_for_who_was_stopped() {
+fn a_second_signal_ends_a_command_that_waits_for_the_directory_lock() {
     let host = Host::new();
     let mut echo = host.echo("arm");
     let lock = host.path("run").join(&host.domain).join("directory/lock");
-    let stopped = std::fs::File::open(lock).unwrap();
-    stopped.lock().unwrap();
+    let lock = std::fs::File::open(lock).unwrap();
+    lock.lock().unwrap();
     while !echo.has_ended() {
         echo.send_signal("-INT");
     }

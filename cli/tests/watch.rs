@@ -1,6 +1,6 @@
-//! `fipa watch`: real processes, and somebody who looks on.
+//! `fipa watch` with real processes.
 
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+#![expect(clippy::unwrap_used, reason = "a panic fails the test")]
 
 mod common;
 
@@ -11,7 +11,7 @@ use std::process::{Command, Stdio};
 use common::{Host, Running};
 use serde_json::Value;
 
-/// Watches as a program does, once all processes that are there can be seen.
+/// Starts `fipa watch --json` and waits until it watches all running processes.
 fn watch(host: &Host, arguments: &[&str]) -> Running {
     let running = host.start(&[&["watch", "--json"], arguments].concat());
     let ready: Value = serde_json::from_str(&running.ready).unwrap();
@@ -39,7 +39,7 @@ fn send(host: &Host, arguments: &[&str]) {
 }
 
 #[test]
-fn a_letter_and_its_answer_are_seen() {
+fn a_letter_and_its_answer_are_shown() {
     let host = Host::new();
     let _arm = host.echo("arm_1");
     let mut watching = watch(&host, &["--conversation", "c1", "--content"]);
@@ -78,7 +78,7 @@ fn a_letter_and_its_answer_are_seen() {
     assert_eq!(request["letter"]["effective"]["from"]["name"], "rover");
     assert_eq!(request["content_length"], 13);
     assert_eq!(request["verdict"]["verdict"], "accepted");
-    // The echo answers at once, without agreeing.
+    // The echo agent answers at once, without an agree.
     let answer = next(&mut watching);
     assert_eq!(
         (&answer["sender"], &answer["receiver"]),
@@ -89,7 +89,7 @@ fn a_letter_and_its_answer_are_seen() {
 }
 
 #[test]
-fn filters_leave_out_what_was_not_asked_for() {
+fn letters_that_do_not_match_the_filters_are_not_shown() {
     let host = Host::new();
     let _arms = [host.echo("arm_1"), host.echo("arm_2")];
     let mut watching = watch(&host, &["--agent", "arm_2", "--performative", "query-ref"]);
@@ -134,19 +134,19 @@ fn filters_leave_out_what_was_not_asked_for() {
     assert_eq!(
         seen["letter"]["message"].get("content"),
         None,
-        "content was not asked for"
+        "content without --content"
     );
 }
 
 #[test]
-fn a_letter_that_fails_is_seen_with_its_reason() {
+fn a_failed_letter_is_shown_with_its_reason() {
     let host = Host::new();
     let _arm = host.echo("arm_1");
     let mut watching = watch(&host, &["--performative", "request"]);
     let ran = host.run(&[
         "send",
         "--to",
-        "nobody",
+        "unknown",
         "--performative",
         "request",
         "--content",
@@ -162,11 +162,11 @@ fn a_letter_that_fails_is_seen_with_its_reason() {
 }
 
 #[test]
-fn a_violation_stands_out() {
+fn a_violation_is_shown_with_its_protocol() {
     let host = Host::new();
     let _arm = host.echo("arm_1");
     let mut watching = watch(&host, &["--violations"]);
-    // A conversation that begins with an agreement to nothing.
+    // An agree as the first message of a conversation.
     send(
         &host,
         &[
@@ -195,19 +195,19 @@ fn a_violation_stands_out() {
 }
 
 #[test]
-fn protocols_of_ones_own_are_read_and_mistakes_in_them_told() {
+fn errors_in_protocol_files_are_reported() {
     let host = Host::new();
     let protocols = host.path("protocols");
     fs::create_dir(&protocols).unwrap();
     let file = protocols.join("broken.scxml");
     fs::write(&file, "<scxml><state/></scxml>").unwrap();
     let directory = protocols.to_str().unwrap();
-    let told = host.run(&["watch", "--protocols", directory]).failed(2);
-    assert!(told.contains("broken.scxml"), "{told}");
-    let told = host
+    let output = host.run(&["watch", "--protocols", directory]).failed(2);
+    assert!(output.contains("broken.scxml"), "{output}");
+    let output = host
         .run(&["watch", "--protocols", "/no/such/directory"])
         .failed(2);
-    assert!(told.contains("/no/such/directory"), "{told}");
+    assert!(output.contains("/no/such/directory"), "{output}");
 }
 
 #[test]
@@ -263,7 +263,7 @@ fn a_conversation_is_drawn_in_the_terminal_and_for_documents() {
 }
 
 #[test]
-fn people_see_lines_and_a_summary() {
+fn the_text_output_has_lines_and_a_summary() {
     let host = Host::new();
     let _arm = host.echo("arm_1");
     let mut watching = host.start(&["watch", "--agent", "rover"]);
@@ -276,10 +276,7 @@ fn people_see_lines_and_a_summary() {
     for part in ["rover → arm_1", "inform", "shm", "delivered"] {
         assert!(line.contains(part), "{line}");
     }
-    assert!(
-        !line.contains('\u{1b}'),
-        "no colour where there is no terminal"
-    );
+    assert!(!line.contains('\u{1b}'), "no color without a terminal");
     let pid = watching.pid();
     assert!(
         Command::new("kill")
@@ -297,10 +294,13 @@ fn people_see_lines_and_a_summary() {
     assert_eq!(watching.end().0, Some(0));
 }
 
-/// An agent that does what it is told on standard input, as in the demo.
-fn part(host: &Host, name: &str) -> (std::process::Child, BufReader<std::process::ChildStdout>) {
+/// Starts an agent that executes orders from standard input, as in the demo.
+fn ordered_agent(
+    host: &Host,
+    name: &str,
+) -> (std::process::Child, BufReader<std::process::ChildStdout>) {
     let mut child = host
-        .command(&["demo", "--part", "agent", "--name", name])
+        .command(&["demo", "--role", "agent", "--name", name])
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .spawn()
@@ -312,12 +312,13 @@ fn part(host: &Host, name: &str) -> (std::process::Child, BufReader<std::process
     (child, events)
 }
 
-/// A watcher that is stopped takes nothing from anybody, and is told what it missed.
+/// A stopped watcher does not delay any letter, and reports the lost records later.
 #[test]
-fn a_stopped_watcher_slows_nobody() {
+fn a_stopped_watcher_does_not_delay_letters() {
     const LETTERS: usize = 4000;
     let host = Host::new();
-    let ((mut rover, mut events), (mut arm, _)) = (part(&host, "rover"), part(&host, "arm"));
+    let ((mut rover, mut events), (mut arm, _)) =
+        (ordered_agent(&host, "rover"), ordered_agent(&host, "arm"));
     let mut watching = watch(&host, &[]);
     let pid = watching.pid();
     let signal = |signal: &str| {
@@ -332,23 +333,23 @@ fn a_stopped_watcher_slows_nobody() {
         .unwrap()
         .write_all(order.as_bytes())
         .unwrap();
-    let mut told = String::new();
-    events.read_line(&mut told).unwrap();
+    let mut output = String::new();
+    events.read_line(&mut output).unwrap();
     assert!(
-        told.contains("\"measured\""),
-        "every letter must arrive: {told}"
+        output.contains("\"measured\""),
+        "not every letter was delivered: {output}"
     );
     signal("-CONT");
     let lost = next_of(&mut watching, "lost");
     assert!(lost["records"].as_u64().unwrap() > 0, "{lost}");
-    for part in [&mut rover, &mut arm] {
-        drop(part.stdin.take());
-        assert!(part.wait().unwrap().success());
+    for agent in [&mut rover, &mut arm] {
+        drop(agent.stdin.take());
+        assert!(agent.wait().unwrap().success());
     }
 }
 
 #[test]
-fn a_killed_watcher_leaves_nothing_behind() {
+fn the_files_of_a_killed_watcher_are_removed() {
     let host = Host::new();
     let arm = host.echo("arm_1");
     let watching = watch(&host, &[]);
@@ -362,10 +363,10 @@ fn a_killed_watcher_leaves_nothing_behind() {
     watching.signal("-KILL");
     let began = std::time::Instant::now();
     while sockets() > 0 {
-        assert!(began.elapsed().as_secs() < 60, "the socket is still there");
+        assert!(began.elapsed().as_secs() < 60, "the socket was not removed");
         std::thread::sleep(std::time::Duration::from_millis(5));
     }
-    send(&host, &["--to", "arm_1", "--content", "alone again"]);
+    send(&host, &["--to", "arm_1", "--content", "unwatched"]);
     arm.signal("-INT");
     assert_eq!(host.left_behind(), Vec::<std::path::PathBuf>::new());
 }

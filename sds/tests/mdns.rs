@@ -13,7 +13,7 @@ use common::{conforms, eventually, next, registration};
 use fipa_sds::{
     Change, Directory, MdnsConfig, MdnsDirectory, Members, Mts, Reach, RegisterError, Role, Source,
 };
-use fipa_testbed::{Ghost, Running};
+use fipa_testbed::{PacketRepeater, Running};
 use fipa_transport::{Incarnation, Location};
 
 /// A port that nobody else uses, so that tests do not see each other.
@@ -225,9 +225,9 @@ async fn a_gateway_that_vanished_is_noticed_by_verification() {
     let two = open(port, "two");
     let (peer, gateway) = announcing(port, &two).await;
     // Its beacons go on, so that they cannot be what is noticed.
-    let mut ghost = Ghost::of(&gateway, Ipv4Addr::LOCALHOST, port);
+    let mut repeater = PacketRepeater::capture(&gateway, Ipv4Addr::LOCALHOST, port);
     drop(peer);
-    ghost.speak();
+    repeater.start();
     assert!(two.lookup("Arm").is_some());
     two.verify("Arm");
     eventually("gone", || two.lookup("Arm").is_none().then_some(())).await;

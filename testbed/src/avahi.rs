@@ -1,4 +1,4 @@
-//! The real Avahi, on one host.
+//! The real Avahi on a host.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 
 use crate::{Host, Running};
 
-/// How long `avahi-browse` has, in seconds: it takes one, or never ends.
-const PATIENCE: &str = "10";
-/// How often it is asked.
-const TRIES: usize = 6;
+/// Timeout of `avahi-browse`, in seconds: it takes one second, or never ends.
+const BROWSE_TIMEOUT: &str = "10";
+/// Maximum number of attempts.
+const MAX_ATTEMPTS: usize = 6;
 
 const BUS: &str = "/run/fipa-testbed-bus";
 
@@ -20,7 +20,7 @@ const BUS_CONFIG: &str = r#"<!DOCTYPE busconfig PUBLIC
 <auth>EXTERNAL</auth><policy context="default"><allow user="*"/><allow own="*"/>
 <allow send_destination="*"/><allow receive_sender="*"/></policy></busconfig>"#;
 
-/// A running avahi-daemon with a bus of its own. One process can have one.
+/// A running avahi-daemon with its own bus. A process can have only one.
 #[derive(Debug)]
 pub struct Avahi<'a> {
     host: &'a Host,
@@ -29,7 +29,7 @@ pub struct Avahi<'a> {
 }
 
 impl<'a> Avahi<'a> {
-    /// What has to be there: to be named to [`isolated`](crate::isolated).
+    /// The required tools, for [`isolated`](crate::isolated).
     pub const TOOLS: [&'static str; 4] = [
         "avahi-daemon",
         "avahi-browse",
@@ -37,10 +37,10 @@ impl<'a> Avahi<'a> {
         "dbus-daemon",
     ];
 
-    /// Starts it on this host, for its interface `eth0`, and waits until it answers.
+    /// Starts Avahi on this host for its interface `eth0`, and waits until it is ready.
     ///
     /// # Panics
-    /// When it does not.
+    /// If it does not start.
     #[must_use]
     pub fn start(host: &'a Host) -> Self {
         std::fs::write("/run/bus.conf", BUS_CONFIG).unwrap();
@@ -66,10 +66,10 @@ impl<'a> Avahi<'a> {
         }
     }
 
-    /// Announces a service with these TXT strings, until the result is dropped.
+    /// Announces a service with these TXT strings until the returned process is dropped.
     ///
     /// # Panics
-    /// When `avahi-publish` cannot be run.
+    /// If `avahi-publish` cannot be run.
     #[must_use]
     pub fn publish(&self, label: &str, service_type: &str, port: u16, txt: &[&str]) -> Running {
         let mut command = with_bus(self.host.command("avahi-publish"));
@@ -77,30 +77,30 @@ impl<'a> Avahi<'a> {
         Running::start(command.args(txt).stdout(Stdio::null()))
     }
 
-    /// What `avahi-browse` has to say about a type of services, one line each. `=` begins the line
-    /// of one that was resolved; labels come in decimal escapes.
+    /// Returns the output lines of `avahi-browse` for a service type. The line of a resolved service begins
+    /// with `=`; labels have decimal escapes.
     ///
-    /// When a record leaves while `avahi-browse` resolves it, that goes on waiting for it, for ever.
-    /// So it is ended after a while, and asked again.
+    /// `avahi-browse` hangs if a record disappears while it resolves it, so it is ended after a timeout and
+    /// started again.
     ///
     /// # Panics
-    /// When it fails.
+    /// If `avahi-browse` fails.
     #[must_use]
     pub fn browse(&self, service_type: &str) -> Vec<String> {
-        /// What `timeout` says of what it has ended.
-        const ENDED: i32 = 124;
-        for _ in 0..TRIES {
+        /// Exit code of `timeout` after it has ended its command.
+        const TIMED_OUT: i32 = 124;
+        for _ in 0..MAX_ATTEMPTS {
             let mut command = with_bus(self.host.command("timeout"));
-            command.args([PATIENCE, "avahi-browse", "-rpt", service_type]);
+            command.args([BROWSE_TIMEOUT, "avahi-browse", "-rpt", service_type]);
             let output = command.output().unwrap();
-            if output.status.code() == Some(ENDED) {
+            if output.status.code() == Some(TIMED_OUT) {
                 continue;
             }
             assert!(output.status.success(), "avahi-browse: {output:?}");
             let text = String::from_utf8_lossy(&output.stdout);
             return text.lines().map(str::to_owned).collect();
         }
-        panic!("avahi-browse does not end");
+        panic!("avahi-browse timed out {MAX_ATTEMPTS} times");
     }
 }
 
@@ -109,13 +109,13 @@ fn with_bus(mut command: Command) -> Command {
     command
 }
 
-fn until(what: &str, of: &mut Running, condition: impl Fn() -> bool) {
-    let give_up = Instant::now() + Duration::from_secs(60);
+fn until(what: &str, process: &mut Running, condition: impl Fn() -> bool) {
+    let deadline = Instant::now() + Duration::from_secs(60);
     while !condition() {
-        if let Some(status) = of.ended() {
+        if let Some(status) = process.ended() {
             panic!("{what} ended ({status}); its error is above");
         }
-        assert!(Instant::now() < give_up, "never came: {what}");
+        assert!(Instant::now() < deadline, "timed out: {what}");
         std::thread::sleep(Duration::from_millis(10));
     }
 }

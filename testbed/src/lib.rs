@@ -1,9 +1,9 @@
-//! Networks for tests: hosts in network namespaces, their links, and the real Avahi. And what peers
-//! say that are none of ours.
+//! Networks for tests: hosts in network namespaces, their links, and the real Avahi. Also frames of
+//! peers that do not use `fipa`.
 //!
-//! A test that needs a network of its own is two functions. The one that the test harness sees
-//! calls [`isolated`], which runs the other, ignored one in a process with namespaces of its own
-//! (network, mounts, processes). That one calls [`enter`], then builds what it needs:
+//! A test that needs a network consists of two functions. The test function calls [`isolated`], which
+//! runs the second, ignored test function in a process with new namespaces (network, mounts,
+//! processes). The second function calls [`enter`] and then builds its network:
 //!
 //! ```no_run
 //! #[test]
@@ -20,21 +20,20 @@
 //! }
 //! ```
 //!
-//! Nothing has to be cleaned up, however the test ends: with its process the kernel takes away
-//! the namespaces, everything started in them, and every interface. For the same reason names
-//! need not be unique.
+//! No cleanup is necessary, however the test ends: with its process the kernel removes the namespaces,
+//! their processes and their interfaces. For the same reason names need not be unique.
 //!
-//! What a test cannot do without and the machine does not have makes it a skipped one, which is
-//! said aloud, and a failed one when `CI=true`.
+//! If the machine lacks a requirement of a test, the test prints a note and is skipped; with `CI=true`
+//! it fails.
 //!
-//! Everything here panics when it fails: it is for tests only, which end then.
+//! All functions panic on failure, because this crate is for tests only.
 
-// The whole crate is for tests: what fails ends them, and what is skipped is told.
+// The whole crate is for tests: a failure panics, and a skipped test prints a note.
 #![allow(clippy::unwrap_used, clippy::print_stderr)]
 
 mod avahi;
-mod ghost;
 mod network;
+mod packet_repeater;
 mod peer;
 
 use std::io::{self, BufRead as _, BufReader, Read as _};
@@ -43,26 +42,25 @@ use std::process::{Child, ChildStderr, Command, ExitStatus, Stdio};
 use std::thread::JoinHandle;
 
 pub use avahi::Avahi;
-pub use ghost::Ghost;
 pub use network::{Host, Network};
+pub use packet_repeater::PacketRepeater;
 #[cfg(feature = "tls")]
 pub use peer::Anybody;
 pub use peer::{frame, frame_header};
 
-/// Environment variable that gives the process in the namespaces the directory of its test.
+/// Environment variable with the directory of the test, for the process in the namespaces.
 const INSIDE: &str = "FIPA_TESTBED_INSIDE";
-/// Environment variable that gives processes of `fipa` their runtime directory.
+/// Environment variable with the runtime directory of `fipa` processes.
 const RUNTIME_DIR: &str = "FIPA_RUNTIME_DIR";
 
-/// How long a test in namespaces may take, in seconds, before it counts as one that hangs. None needs
-/// half of it.
+/// Timeout of a hanging test in namespaces, in seconds. No test needs half of it.
 const WATCHDOG: &str = "900";
 
-/// Runs the ignored test `name` of this test program in namespaces of its own, as root. Skips it,
-/// aloud, when a right or one of the `tools` is missing; then fails if `CI=true`.
+/// Runs the ignored test `name` of this test program in new namespaces, as root. If root or one of the
+/// `tools` is missing, prints a note and skips the test, or panics if `CI=true`.
 ///
 /// # Panics
-/// When that test fails, or cannot be run in CI.
+/// If the test fails, or if it cannot run and `CI=true`.
 pub fn isolated(name: &str, tools: &[&str]) {
     let needed = ["ip", "mount", "timeout", "unshare"].iter().chain(tools);
     let mut missing: Vec<&str> = needed
@@ -79,10 +77,10 @@ pub fn isolated(name: &str, tools: &[&str]) {
         eprintln!("SKIPPED, not a success: {name} needs {missing}");
         return;
     }
-    // The program under test may lie below /tmp, so nothing is mounted there.
+    // The program under test may be below /tmp, so /tmp is not replaced by a mount.
     let directory = tempfile::tempdir().unwrap();
-    // What is started in there ends with it: the namespace of processes, too, is its own. What hangs is
-    // killed, as `unshare` heeds nothing less, and with it all else.
+    // All processes of the test end with its process namespace. A hanging test is killed with SIGKILL,
+    // because `unshare` ignores other signals.
     let status = Command::new("timeout")
         .args(["--foreground", "--signal=KILL", WATCHDOG, "unshare"])
         .args(["--net", "--mount", "--pid", "--fork", "--kill-child"])
@@ -97,11 +95,11 @@ pub fn isolated(name: &str, tools: &[&str]) {
     assert!(status.success(), "{name} failed; see above");
 }
 
-/// Prepares the namespaces that [`isolated`] has made: an empty `/run`, an empty
-/// [`directory`], and the loopback interface up.
+/// Prepares the namespaces that [`isolated`] has created: mounts an empty `/run` and an empty
+/// [`directory`], and sets the loopback interface up.
 ///
 /// # Panics
-/// Outside of them.
+/// Outside of these namespaces.
 pub fn enter() {
     let directory = directory();
     run("mount -t tmpfs tmpfs /run");
@@ -111,57 +109,57 @@ pub fn enter() {
     run("ip link set lo up");
 }
 
-/// Returns the directory of the running test. Temporary directories, and the runtime directory
-/// of `fipa` unless a test names another one, lie in it.
+/// Returns the directory of the running test. It contains the temporary directories and the default
+/// runtime directory of `fipa`.
 ///
 /// # Panics
-/// Outside of the namespaces that [`isolated`] has made.
+/// Outside of the namespaces that [`isolated`] has created.
 #[must_use]
 pub fn directory() -> PathBuf {
     let directory = std::env::var_os(INSIDE).map(PathBuf::from);
-    directory.expect("this test is started by another one")
+    directory.expect("this test must be started by another test")
 }
 
-/// Runs a command, its words separated by one blank each.
+/// Runs a command. Its arguments are separated by single spaces.
 ///
 /// # Panics
-/// When it fails.
+/// If the command fails.
 pub fn run(command: &str) {
     let mut words = command.split(' ');
     let program = words.next().unwrap();
     let output = Command::new(program).args(words).output();
     let output = output.unwrap_or_else(|error| panic!("{command}: {error}"));
-    let told = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{command}: {told}");
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{command}: {errors}");
 }
 
-/// Where a tool is: in `PATH`, or where Debian has those of the administrator.
+/// Finds a tool in `PATH` or in Debian's directories of administration tools.
 fn find(tool: &str) -> Option<PathBuf> {
     let path = std::env::var_os("PATH").unwrap_or_default();
     let dirs = std::env::split_paths(&path).chain(["/usr/sbin".into(), "/sbin".into()]);
     dirs.map(|dir| dir.join(tool)).find(|file| file.is_file())
 }
 
-/// A process that is killed when this is dropped.
+/// A process that is killed on drop.
 #[derive(Debug)]
 pub struct Running(Child);
 
 impl Running {
-    /// Starts it.
+    /// Starts the command.
     ///
     /// # Panics
-    /// When it cannot be started.
+    /// If the command cannot be started.
     pub fn start(command: &mut Command) -> Self {
         let started = command.spawn();
         Self(started.unwrap_or_else(|error| panic!("{command:?}: {error}")))
     }
 
-    /// Starts it, waits for its first line of output, and returns that line. Its standard error
-    /// is kept for the panic message, or shown when `FIPA_TEST_LOG` is set.
+    /// Starts the command, waits for the first line of its output, and returns that line. Its standard
+    /// error becomes part of the panic message, or is printed if `FIPA_TEST_LOG` is set.
     ///
     /// # Panics
-    /// When it cannot be started, or ends before it prints a line: with its status and its
-    /// standard error.
+    /// If the command cannot be started, or ends before it prints a line. The message has its status and
+    /// its standard error.
     pub fn until_ready(command: &mut Command) -> (Self, String) {
         let shows_errors = std::env::var_os("FIPA_TEST_LOG").is_some();
         command.stdout(Stdio::piped()).stderr(match shows_errors {
@@ -187,7 +185,7 @@ impl Running {
     /// Returns the status of the process if it has ended.
     ///
     /// # Panics
-    /// When the kernel refuses to say.
+    /// If the kernel does not return the status.
     pub fn ended(&mut self) -> Option<ExitStatus> {
         self.0.try_wait().unwrap()
     }
@@ -198,7 +196,7 @@ impl Running {
     }
 }
 
-/// Reads to the end, and returns the last few kilobytes.
+/// Reads to the end and returns the last 8 KiB.
 fn collect_last(mut from: ChildStderr) -> JoinHandle<String> {
     const KEPT: usize = 8 << 10;
     std::thread::spawn(move || {
@@ -214,7 +212,7 @@ fn collect_last(mut from: ChildStderr) -> JoinHandle<String> {
 
 impl Drop for Running {
     fn drop(&mut self) {
-        // It may have ended already, which is as good.
+        // The process may have ended already.
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
@@ -225,13 +223,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_program_under_test_is_not_hidden() {
-        isolated("tests::inside_the_program_under_test_is_not_hidden", &[]);
+    fn entering_the_namespaces_does_not_hide_the_program_under_test() {
+        isolated(
+            "tests::inside_entering_the_namespaces_does_not_hide_the_program_under_test",
+            &[],
+        );
     }
 
     #[test]
     #[ignore = "is run by the other test in namespaces of its own"]
-    fn inside_the_program_under_test_is_not_hidden() {
+    fn inside_entering_the_namespaces_does_not_hide_the_program_under_test() {
         let outside = std::env::temp_dir().join("outside");
         std::fs::write(&outside, "").unwrap();
         enter();
@@ -239,7 +240,7 @@ mod tests {
         assert_eq!(std::env::temp_dir(), directory());
         let runtime_dir = PathBuf::from(std::env::var_os(RUNTIME_DIR).unwrap());
         assert!(runtime_dir.starts_with(directory()));
-        assert!(!outside.exists(), "the directory is not this test's own");
+        assert!(!outside.exists(), "the directory is shared");
     }
 
     #[test]
@@ -250,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn a_process_is_ready_with_its_first_line() {
+    fn a_process_is_ready_when_it_prints_its_first_line() {
         let mut command = Command::new("sh");
         command.args(["-c", "echo here I am; exec cat /dev/zero"]);
         let (mut running, ready) = Running::until_ready(&mut command);

@@ -1,4 +1,4 @@
-//! Hosts on one switch.
+//! Hosts in network namespaces, connected by a virtual switch.
 
 use std::fs::File;
 use std::net::{Ipv4Addr, Ipv6Addr};
@@ -9,22 +9,22 @@ use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 
 use crate::run;
 
-/// Hosts, each with one interface `eth0` on the same switch: 10.99.0.1/24 and fd99::1/64 for the
-/// first, and so on.
+/// A network of hosts. Each host has one interface `eth0` on the same switch, with the addresses
+/// 10.99.0.1/24 and fd99::1/64 for the first host, and so on.
 #[derive(Debug)]
 pub struct Network {
     hosts: Vec<Host>,
 }
 
 impl Network {
-    /// A network of so many hosts, all of them plugged in. One process can have one.
+    /// Creates a network of this number of hosts, all connected. A process can have only one network.
     ///
     /// # Panics
-    /// When it cannot be made, or there would be more than 200 hosts.
+    /// If the network cannot be created, or for more than 200 hosts.
     #[must_use]
     pub fn new(hosts: u8) -> Self {
-        assert!(hosts <= 200, "no more than 200 hosts");
-        // Without snooping, multicast goes to everybody, as on a plain switch.
+        assert!(hosts <= 200, "at most 200 hosts");
+        // Without snooping, the bridge forwards multicast to all ports, as a simple switch does.
         run("ip link add switch type bridge mcast_snooping 0 stp_state 0");
         run("ip link set switch up");
         let hosts = (1..=hosts).map(Host::new).collect();
@@ -37,10 +37,10 @@ impl Network {
         &self.hosts
     }
 
-    /// One of the hosts, from 0.
+    /// The host with this index, from 0.
     ///
     /// # Panics
-    /// When there is none.
+    /// If there is no such host.
     #[must_use]
     pub fn host(&self, index: usize) -> &Host {
         &self.hosts[index]
@@ -68,7 +68,7 @@ impl Host {
         run(&format!("ip link set {port} master switch up"));
         host.ip("link set lo up");
         host.ip(&format!("addr add {}/24 dev eth0", host.ipv4()));
-        // Without the wait for somebody who has the address already.
+        // Skips duplicate address detection, which delays the use of the address.
         host.ip(&format!("addr add {}/64 dev eth0 nodad", host.ipv6()));
         host.ip("link set eth0 up");
         host
@@ -80,24 +80,24 @@ impl Host {
         &self.name
     }
 
-    /// Its address.
+    /// Its IPv4 address.
     #[must_use]
     pub fn ipv4(&self) -> Ipv4Addr {
         Ipv4Addr::new(10, 99, 0, self.number)
     }
 
-    /// Its address of the other family.
+    /// Its IPv6 address.
     #[must_use]
     pub fn ipv6(&self) -> Ipv6Addr {
         Ipv6Addr::new(0xfd99, 0, 0, 0, 0, 0, 0, self.number.into())
     }
 
-    /// The end of its cable at the switch.
+    /// The name of its port at the switch.
     fn port(&self) -> String {
         format!("port{}", self.number)
     }
 
-    /// A command to be run on this host.
+    /// A command that runs on this host.
     #[must_use]
     pub fn command(&self, program: impl AsRef<std::ffi::OsStr>) -> Command {
         let mut command = Command::new("ip");
@@ -105,19 +105,19 @@ impl Host {
         command
     }
 
-    /// `ip` with these words, for this host: `host.ip("link set eth0 down")`.
+    /// Runs `ip` with these arguments for this host: `host.ip("link set eth0 down")`.
     ///
     /// # Panics
-    /// When it fails.
+    /// If the command fails.
     pub fn ip(&self, words: &str) {
         run(&format!("ip -n {} {words}", self.name));
     }
 
-    /// Does something on this host, in a thread of its own. What that starts (threads, runtimes,
-    /// sockets, processes) is on this host as well, and may outlive the call.
+    /// Runs `work` on this host, in a new thread. Threads, runtimes, sockets and processes that it creates
+    /// are on this host as well, and may outlive the call.
     ///
     /// # Panics
-    /// When `work` does, or the namespace is gone.
+    /// If `work` panics, or the namespace does not exist.
     pub fn enter<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
         let namespace = File::open(format!("/run/netns/{}", self.name)).unwrap();
         std::thread::scope(|scope| {
@@ -133,21 +133,20 @@ impl Host {
         })
     }
 
-    /// Cuts it off at the switch: nothing comes through any more, and it cannot tell, as when a
-    /// radio is out of range.
+    /// Disconnects the host at the switch. The host cannot detect this, as with a radio out of range.
     pub fn unplug(&self) {
         run(&format!("ip link set {} nomaster", self.port()));
     }
 
-    /// Connects it again.
+    /// Connects the host again.
     pub fn plug(&self) {
         run(&format!("ip link set {} master switch", self.port()));
     }
 
-    /// Whether the switch passes multicast on to this host, as it does from the start; much Wi-Fi
-    /// does not.
-    pub fn hears_multicast(&self, yes: bool) {
-        let flood = if yes { "on" } else { "off" };
+    /// Sets whether the switch forwards multicast to this host (initially yes; many Wi-Fi access points do
+    /// not).
+    pub fn forward_multicast(&self, enabled: bool) {
+        let flood = if enabled { "on" } else { "off" };
         let port = self.port();
         run(&format!(
             "ip link set {port} type bridge_slave mcast_flood {flood}"

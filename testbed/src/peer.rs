@@ -1,4 +1,4 @@
-//! Somebody who speaks to gateways, and is none of ours.
+//! Building blocks of peers that do not use `fipa`.
 
 #[cfg(feature = "tls")]
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
@@ -7,8 +7,8 @@ use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 #[cfg(feature = "tls")]
 use rustls::{DigitallySignedStruct, Error, SignatureScheme, crypto::ring};
 
-/// A frame between gateways: kind, number, and what it says. Written by hand, so that what reads
-/// them is not tested with itself.
+/// Builds a frame of the protocol between gateways from its kind, number and body. Written by hand, so
+/// that the reader is not tested with the writer of the same crate.
 #[must_use]
 pub fn frame(kind: u8, id: u64, body: &[u8]) -> Vec<u8> {
     let mut frame = frame_header(kind, id, body.len() as u64).to_vec();
@@ -16,7 +16,7 @@ pub fn frame(kind: u8, id: u64, body: &[u8]) -> Vec<u8> {
     frame
 }
 
-/// The header of a frame that says so much.
+/// Builds the header of a frame with a body of this length in bytes.
 #[must_use]
 pub fn frame_header(kind: u8, id: u64, body_len: u64) -> [u8; 24] {
     let mut header = [0; 24];
@@ -27,7 +27,7 @@ pub fn frame_header(kind: u8, id: u64, body_len: u64) -> [u8; 24] {
     header
 }
 
-/// Takes everybody for whom he says he is: whoever listens is welcome.
+/// Accepts every server certificate without verification.
 #[cfg(feature = "tls")]
 #[derive(Debug)]
 pub struct Anybody;

@@ -1,6 +1,6 @@
-//! The networks that other tests rely on do what they say.
+//! Tests of the networks that other tests use.
 
-// The exception that clippy.toml makes for tests does not reach what they call.
+// The exception in clippy.toml covers test functions, but not the functions that they call.
 #![allow(clippy::unwrap_used)]
 
 use std::net::UdpSocket;
@@ -9,13 +9,13 @@ use std::time::Duration;
 use fipa_testbed::{Host, Network};
 
 #[test]
-fn hosts_reach_each_other_unless_they_are_cut_off() {
-    fipa_testbed::isolated("inside_hosts_reach_each_other", &[]);
+fn packets_reach_only_connected_hosts() {
+    fipa_testbed::isolated("inside_packets_reach_only_connected_hosts", &[]);
 }
 
 #[test]
 #[ignore = "is run by the other test in namespaces of its own"]
-fn inside_hosts_reach_each_other() {
+fn inside_packets_reach_only_connected_hosts() {
     fipa_testbed::enter();
     let network = Network::new(2);
     let (one, two) = (network.host(0), network.host(1));
@@ -26,7 +26,7 @@ fn inside_hosts_reach_each_other() {
     one.plug();
     assert!(arrives(one, two, &receiver));
     assert!(multicast_arrives(one, &receiver));
-    two.hears_multicast(false);
+    two.forward_multicast(false);
     assert!(!multicast_arrives(one, &receiver));
     assert!(arrives(one, two, &receiver));
     two.ip("link set eth0 down");
@@ -39,12 +39,12 @@ fn receiver(host: &Host) -> UdpSocket {
     socket
         .join_multicast_v4(&"239.1.2.3".parse().unwrap(), &address)
         .unwrap();
-    let patience = Some(Duration::from_millis(300));
-    socket.set_read_timeout(patience).unwrap();
+    let timeout = Some(Duration::from_millis(300));
+    socket.set_read_timeout(timeout).unwrap();
     socket
 }
 
-/// Sent again a few times: who is cut off never hears it, others need not at once.
+/// Whether one of five packets is received: a connected host may lose the first ones.
 fn arrives(from: &Host, to: &Host, receiver: &UdpSocket) -> bool {
     sent(from, &format!("{}:7000", to.ipv4()), receiver)
 }
@@ -57,7 +57,7 @@ fn sent(from: &Host, to: &str, receiver: &UdpSocket) -> bool {
     let address = from.ipv4();
     let socket = from.enter(move || UdpSocket::bind((address, 0)).unwrap());
     (0..5).any(|_| {
-        // What cannot be sent does not arrive.
+        // A packet that cannot be sent counts as not received.
         let _ = socket.send_to(b"x", to);
         receiver.recv(&mut [0; 8]).is_ok()
     })

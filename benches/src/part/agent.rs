@@ -214,7 +214,7 @@ impl Running {
     where
         F: Future<Output = (Agent, T)> + Send + 'static,
     {
-        let agent = self.agent.take().ok_or("the agent is gone")?;
+        let agent = self.agent.take().ok_or("the agent is not available")?;
         let task = self.runtime.spawn(async move { work(agent).await });
         let (agent, done) = self.runtime.block_on(task).map_err(to_text)?;
         self.agent = Some(agent);
@@ -293,7 +293,7 @@ pub(super) fn gateway(config: &Config) -> Result<(), String> {
 
 fn runtime() -> Result<Runtime, String> {
     let runtime = Builder::new_current_thread().enable_all().build();
-    runtime.map_err(|error| format!("no runtime: {error}"))
+    runtime.map_err(|error| format!("cannot start the runtime: {error}"))
 }
 
 fn orders() -> Lines<BufReader<Stdin>> {

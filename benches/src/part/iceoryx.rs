@@ -46,7 +46,7 @@ pub(super) fn node(config: &Config) -> Result<RawNode, String> {
 pub(super) fn place(config: &Config, what: &str) -> Result<ShmConfig, String> {
     let place = std::env::var_os("FIPA_RUNTIME_DIR")
         .filter(|place| place != OsStr::new(""))
-        .ok_or("a part needs FIPA_RUNTIME_DIR")?;
+        .ok_or("FIPA_RUNTIME_DIR is not set")?;
     let root = PathBuf::from(place).join(format!("{what}-{}", config.domain));
     let shm = &config.transport.shm;
     Ok(ShmConfig {

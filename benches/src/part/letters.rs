@@ -97,7 +97,7 @@ struct Both {
 impl Both {
     /// Dispatches a letter and returns the time before.
     fn begin(&mut self, letters: &Letters, number: usize) -> Result<(AttemptId, u64), String> {
-        let to = self.to.as_ref().ok_or("no other end was found")?;
+        let to = self.to.as_ref().ok_or("no receiver is set")?;
         let byte = byte_of(number);
         let ready = (letters.fill == Fill::Copied).then(|| {
             make_ready(&mut self.ready, letters.size, byte);

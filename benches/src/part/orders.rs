@@ -137,7 +137,7 @@ pub(crate) trait Peer {
     }
 
     fn send(&mut self, _letters: &Letters) -> Result<Sent, String> {
-        Err("this part sends nothing".to_owned())
+        Err("this process does not send".to_owned())
     }
 
     fn spread(&mut self, _what: Spread, _letters: &Letters) -> Result<Sent, String> {

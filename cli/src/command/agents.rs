@@ -1,4 +1,4 @@
-//! `fipa agents`: who is there, and where.
+//! `fipa agents`: lists the agents of a domain.
 
 mod watch;
 
@@ -17,13 +17,14 @@ use crate::options::Global;
 use crate::output;
 use crate::report::Failure;
 
-/// Show who is there, and where
+/// List the agents of the domain
 ///
-/// Lists the agents and coalitions of the domain on this host and, when a gateway is running (`fipa up`), those
-/// that it knows on other hosts; the gateway itself too. Needs no gateway.
+/// Lists the agents, coalitions and the gateway of the domain on this host. If a gateway is running
+/// (`fipa up`), it also lists the agents on other hosts that the gateway knows. The command itself
+/// needs no gateway.
 ///
-/// A pattern is a regular expression for the whole text, such as `arm_.*`. What has none of
-/// `* + ? [ ( { | ^ $ \` is compared as it is. Of several filters all have to match.
+/// A pattern is a regular expression for the whole text, such as `arm_.*`. A text without any of
+/// `* + ? [ ( { | ^ $ \` is compared literally. If several filters are given, all must match.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
@@ -34,62 +35,62 @@ Examples:
   fipa agents --watch
 
 Columns:
-  REACH      this host, or the gateway that letters go through
-  LOCATIONS  where it takes letters, in order of preference; of a coalition, its members
-  MTS        the message transport service that delivers to it
-  LEARNT     how: host (a process of this host), mdns (announced on the network), exchange (told by
-             its gateway), static (the configuration), contact (it has written)
-  AGE        since it was registered
+  REACH      this host, or the gateway that forwards letters to the agent
+  LOCATIONS  addresses for letters, in order of preference; for a coalition, its members
+  MTS        message transport service that delivers to the agent
+  SOURCE     origin of the entry: host (a process of this host), mdns (announced on the network),
+             exchange (from its gateway), static (the configuration), contact (a letter from it)
+  AGE        time since its registration
 
 JSON:
-  { \"domain\": text, \"gateway\": the name of this host's gateway, or null,
+  { \"domain\": text, \"gateway\": name of this host's gateway, or null,
     \"agents\": [ { \"name\", \"type\", \"description\", \"role\": \"agent\", \"gateway\" or \"coalition\",
-                  \"members\": [ name ] and \"leader\": name or null, of a coalition,
-                  \"reach\": \"local\" or \"remote\", \"gateway\": name, when it is remote,
-                  \"locations\": [ text ], \"unsupported_transports\": [ transport ], when it has
-                  no location of another transport, \"mts\": { \"name\", \"incarnation\" },
-                  \"incarnation\", \"registered\": time, \"source\": how it was learnt } ] }
+                  \"members\": [ name ] and \"leader\": name or null, for a coalition,
+                  \"reach\": \"local\" or \"remote\", \"gateway\": name, if remote,
+                  \"locations\": [ text ], \"unsupported_transports\": [ transport ], if no
+                  location has a supported one, \"mts\": { \"name\", \"incarnation\" },
+                  \"incarnation\", \"registered\": time, \"source\": as above } ] }
 
-With --watch, one object on each line, the first for those who are there already:
+With --watch, one object on each line; the first lines are the agents present at the start:
   { \"time\", \"change\": \"present\", \"joined\", \"changed\" or \"left\", \"agent\": as above }")]
 pub(crate) struct Arguments {
-    /// Only those with this name, or whose name matches this pattern
+    /// Show only agents with this name or with a name that matches this pattern
     #[arg(value_parser = Matcher::parse)]
     pattern: Option<Matcher>,
 
-    /// Only those of this type, or whose type matches this pattern
+    /// Show only agents of this type or with a type that matches this pattern
     #[arg(long = "type", value_name = "TYPE", value_parser = Matcher::parse)]
     agent_type: Option<Matcher>,
 
-    /// Only those with such a location, written kind://address
+    /// Show only agents with a matching location, written kind://address
     #[arg(long, value_name = "LOCATION", value_parser = Matcher::parse)]
     location: Option<Matcher>,
 
-    /// Only those with this description
+    /// Show only agents with a matching description
     #[arg(long, value_name = "TEXT", value_parser = Matcher::parse)]
     description: Option<Matcher>,
 
-    /// Only those that this message transport service delivers to
+    /// Show only agents of this message transport service
     #[arg(long, value_name = "NAME", value_parser = Matcher::parse)]
     mts: Option<Matcher>,
 
-    /// Only those registered at this time, in UTC, such as '2026-03-01T09:.*'
+    /// Show only agents registered at a matching time, in UTC, such as '2026-03-01T09:.*'
     #[arg(long, value_name = "TIME", value_parser = Matcher::parse)]
     registered: Option<Matcher>,
 
-    /// Only coalitions with this member
+    /// Show only coalitions with this member
     #[arg(long, value_name = "NAME", value_parser = Matcher::parse)]
     member: Option<Matcher>,
 
-    /// Only those on this host
+    /// Show only agents on this host
     #[arg(long)]
     local: bool,
 
-    /// Only those on other hosts
+    /// Show only agents on other hosts
     #[arg(long, conflicts_with = "local")]
     remote: bool,
 
-    /// Go on, and tell who joins, changes and leaves until Ctrl-C
+    /// Continue and print each agent that joins, changes or leaves, until Ctrl-C
     #[arg(long, short)]
     watch: bool,
 
@@ -98,7 +99,7 @@ pub(crate) struct Arguments {
     json: bool,
 }
 
-/// Whom to show.
+/// Selects the agents to show.
 struct Filter {
     query: Query,
     local: bool,
@@ -139,7 +140,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         directory.refresh();
         let entries = directory.entries();
         let listed = Listed {
-            nobody: entries.is_empty(),
+            domain_is_empty: entries.is_empty(),
             gateway: gateway(directory).map(|entry| entry.name.to_string()),
             entries: entries
                 .iter()
@@ -157,12 +158,12 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         );
     }
     if listed.entries.is_empty() {
-        let description = match listed.nobody {
+        let matching = match listed.domain_is_empty {
             true => "",
-            false => " by that description",
+            false => " that matches the filters",
         };
         return output::text(&format!(
-            "nobody in the domain {} is known here{description}\n",
+            "no agent{matching} is known in domain {}\n",
             config.domain
         ));
     }
@@ -176,15 +177,15 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
 }
 
 struct Listed {
-    /// Whether there is nobody at all, whatever is looked for.
-    nobody: bool,
+    /// Whether the directory has no entry at all, before filtering.
+    domain_is_empty: bool,
     gateway: Option<String>,
     entries: Vec<Row>,
 }
 
-const COLUMNS: [&str; 7] = ["NAME", "TYPE", "REACH", "LOCATIONS", "MTS", "LEARNT", "AGE"];
+const COLUMNS: [&str; 7] = ["NAME", "TYPE", "REACH", "LOCATIONS", "MTS", "SOURCE", "AGE"];
 
-/// One agent, for people and for programs.
+/// An agent as table cells and as JSON.
 struct Row {
     cells: [String; 7],
     json: Value,
@@ -196,7 +197,7 @@ impl Row {
             Reach::Local => None,
             Reach::Remote { gateway } => Some(match directory.known_incarnation(gateway) {
                 Some(gateway) => gateway.name.to_string(),
-                None => "a gateway".to_owned(),
+                None => "an unknown gateway".to_owned(),
             }),
         };
         let locations = entry.locations.iter().map(ToString::to_string);
@@ -222,19 +223,20 @@ impl Row {
             let kinds: BTreeSet<Kind> = kinds.collect();
             json["unsupported_transports"] = json!(kinds);
         }
-        let places: Vec<String> = match &entry.role {
+        let locations: Vec<String> = match &entry.role {
             Role::Coalition(members) => {
                 json["members"] = json!(members.names());
                 json["leader"] = json!(members.leader());
-                let leads = |name: &Arc<str>| members.leader().is_some_and(|leader| leader == name);
+                let is_leader =
+                    |name: &Arc<str>| members.leader().is_some_and(|leader| leader == name);
                 let names = members.names().iter();
-                let line = |name: &Arc<str>| match leads(name) {
-                    true => format!("{} (leads)", escape(name)),
+                let line = |name: &Arc<str>| match is_leader(name) {
+                    true => format!("{} (leader)", escape(name)),
                     false => escape(name).into_owned(),
                 };
                 names.map(line).collect()
             }
-            _ => entry.locations.iter().map(place).collect(),
+            _ => entry.locations.iter().map(location_text).collect(),
         };
         let reach = match through {
             None => "this host".to_owned(),
@@ -244,17 +246,17 @@ impl Row {
             escape(&entry.name).into_owned(),
             escape(&entry.agent_type).into_owned(),
             reach,
-            places.join("\n"),
+            locations.join("\n"),
             escape(&entry.mts.name).into_owned(),
-            learnt(entry.source).to_owned(),
+            source(entry.source).to_owned(),
             age(entry),
         ];
         Self { cells, json }
     }
 }
 
-/// A location, for people.
-fn place(location: &Location) -> String {
+/// A location as table text.
+fn location_text(location: &Location) -> String {
     let kind = location.kind();
     match kind.is_supported() {
         true => location.to_string(),
@@ -279,7 +281,7 @@ fn role(role: &Role) -> &'static str {
     }
 }
 
-fn learnt(source: Source) -> &'static str {
+fn source(source: Source) -> &'static str {
     match source {
         Source::Memory | Source::Host => "host",
         Source::Static => "static",
@@ -290,7 +292,8 @@ fn learnt(source: Source) -> &'static str {
     }
 }
 
-/// In whole seconds, by the clocks of two hosts; nothing when they disagree.
+/// The time since registration in whole seconds. Zero if the clocks of the two hosts differ so much
+/// that the registration is in the future.
 fn age(entry: &Entry) -> String {
     let age = entry.registered.elapsed().unwrap_or_default();
     humantime::format_duration(Duration::from_secs(age.as_secs())).to_string()

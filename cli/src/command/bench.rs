@@ -12,17 +12,18 @@ use crate::options::Global;
 use crate::report::{Failure, warn};
 use crate::{membership, output};
 
-/// Measure how fast letters go on this machine, beside what the bare mechanisms can do
+/// Measure latency and throughput on this machine, compared with the raw mechanisms
 ///
-/// Compares every configured transport: latency one way and round trip, throughput and processor
-/// time, for content from 100 bytes to 4 MB, each beside its limit (bare iceoryx2, Unix
-/// domain socket, a bare relay) measured in the same rounds, with the ratio. Gateways also speak TCP with
-/// TLS, and QUIC, with keys made for the measurement, beside TCP without. All traffic stays on this
-/// machine, and nothing is left behind.
+/// Measures one-way latency, round trip, throughput and CPU time of every configured transport, for
+/// content from 100 bytes to 4 MB. Each transport is compared with its limit, which is measured in the
+/// same rounds: raw iceoryx2, a raw Unix domain socket, or a raw relay. Gateways are also measured
+/// with TCP over TLS and with QUIC, with temporary keys. All traffic stays on this machine, and no
+/// files are left.
 ///
-/// Times are worth little on a busy machine; ratios more.
+/// On a busy machine the times are unreliable; the ratios are less affected.
 #[derive(Debug, Args)]
-#[command(after_help = "Examples:
+#[command(after_help = "\
+Examples:
   fipa bench
   fipa bench shm --quick
   fipa bench net --json | jq '.rows[] | {path, size, p50: .one_way_us.p50, ratio}'
@@ -30,19 +31,19 @@ use crate::{membership, output};
   fipa bench --zenoh comparison/zenoh/target/release/fipa-comparison-zenoh
   fipa bench paper --dir docs")]
 pub(crate) struct Arguments {
-    /// What to compare; everything unless given
+    /// Part to measure [default: shm and net]
     #[arg(value_enum)]
     what: Option<What>,
     /// Print JSON instead of a table
     #[arg(long)]
     json: bool,
-    /// Draw latency over size into this file too
+    /// Also draw latency over content size to this file
     #[arg(long, value_name = "FILE")]
     svg: Option<PathBuf>,
-    /// Measure less, in a few seconds: figures scatter more
+    /// Take fewer samples: a few seconds, with a larger spread
     #[arg(long)]
     quick: bool,
-    /// Sizes of content; `paper` has its own
+    /// Content sizes; not used by `paper`
     #[arg(
         long,
         value_delimiter = ',',
@@ -51,27 +52,27 @@ pub(crate) struct Arguments {
         default_value = "100B,1KiB,64KiB,1MiB,4MiB"
     )]
     sizes: Vec<ByteSize>,
-    /// Where `paper` writes its tables and pictures [default: docs]
+    /// Directory for the tables and drawings of `paper` [default: docs]
     #[arg(long, value_name = "DIRECTORY")]
     dir: Option<PathBuf>,
-    /// Measure zenoh in the same rounds, through this program (see comparison/zenoh)
+    /// Also measure zenoh in the same rounds, with this program (see comparison/zenoh)
     #[arg(long, value_name = "PROGRAM")]
     zenoh: Option<PathBuf>,
-    /// Plays a part in the measurement of another process
+    /// Run as a process of a measurement
     #[arg(long, hide = true)]
     part: Option<String>,
-    /// Processor to play it on
+    /// Run on this CPU
     #[arg(long, hide = true, requires = "part")]
     core: Option<usize>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum What {
-    /// Two agents on one host, through shared memory
+    /// Shared memory between two agents on one host
     Shm,
-    /// Through sockets: two agents directly, and through a gateway on either side
+    /// Sockets between two agents, directly and through two gateways
     Net,
-    /// Encodings, as in the evaluation of the C++ libraries; writes tables and pictures
+    /// Encodings, as in the paper about the C++ libraries; writes tables and drawings
     Paper,
 }
 
@@ -79,18 +80,19 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     let config = global.config()?;
     if let Some(part) = &arguments.part {
         let played = fipa_bench::play(part, arguments.core, &config);
-        let advice = "see the report of the measurement that started this process";
-        return played
-            .map_err(|error| Failure::failed(error.to_string(), "a part of fipa bench", advice));
+        let advice = "see the report of the measurement";
+        return played.map_err(|error| {
+            Failure::failed(error.to_string(), "a process of fipa bench", advice)
+        });
     }
     if arguments.what == Some(What::Paper) {
         return measure_paper(&arguments);
     }
     if arguments.dir.is_some() {
         return Err(Failure::wrong_usage(
-            "only `fipa bench paper` writes into a directory",
+            "--dir is only for `fipa bench paper`",
             "--dir",
-            "leave it out, or use --svg FILE for a picture",
+            "omit --dir, or use --svg FILE for a drawing",
         ));
     }
     let mut comparison = Comparison::new(
@@ -134,24 +136,24 @@ async fn measure(comparison: Comparison) -> Result<Measurement, Failure> {
 fn measure_paper(arguments: &Arguments) -> Result<(), Failure> {
     if arguments.svg.is_some() {
         return Err(Failure::wrong_usage(
-            "`fipa bench paper` draws pictures of its own",
+            "`fipa bench paper` has no --svg: it always writes its drawings",
             "--svg",
-            "leave it out, and name with --dir where the pictures go",
+            "omit --svg, and give the directory of the drawings with --dir",
         ));
     }
     if arguments.zenoh.is_some() {
         return Err(Failure::wrong_usage(
-            "`fipa bench paper` is about encodings, which zenoh has none of",
+            "`fipa bench paper` measures encodings, and zenoh has none",
             "--zenoh",
-            "leave it out, or leave out `paper`",
+            "omit --zenoh or `paper`",
         ));
     }
     let directory = arguments.dir.as_deref().unwrap_or(Path::new("docs"));
     if !directory.is_dir() {
         return Err(Failure::wrong_usage(
-            format!("{} is no directory", directory.display()),
+            format!("{} is not a directory", directory.display()),
             "--dir",
-            "run it where the sources are, or name the directory to write into",
+            "give an existing directory, or run the command in the source directory",
         ));
     }
     let cycles = if arguments.quick {
@@ -190,7 +192,7 @@ fn failed(error: BenchError) -> Failure {
     let advice = match &error {
         BenchError::Prepare(_) => "check that this user can write to $TMPDIR",
         BenchError::NothingMeasured(_) => {
-            "see `fipa config show` for mts.transports, and run it with -v for the logs"
+            "check mts.transports (`fipa config show`), and run the command with -v for the logs"
         }
         BenchError::Write { .. } => "check that this user can write there",
         _ => "report it as a bug of fipa, with this text",
@@ -204,7 +206,7 @@ fn failed(error: BenchError) -> Failure {
 
 fn size(text: &str) -> Result<ByteSize, String> {
     let size = text.parse();
-    size.map_err(|_| "use a size such as 100B, 64KiB or 1MiB".to_owned())
+    size.map_err(|_| "expected a size such as 100B, 64KiB or 1MiB".to_owned())
 }
 
 fn effort(arguments: &Arguments) -> Result<Effort, Failure> {
@@ -216,7 +218,7 @@ fn effort(arguments: &Arguments) -> Result<Effort, Failure> {
     };
     effort.map_err(|error| {
         let what = match &error {
-            BenchError::Size(size) => format!("content of {} cannot be measured", ByteSize(*size)),
+            BenchError::Size(size) => format!("cannot measure content of {}", ByteSize(*size)),
             other => other.to_string(),
         };
         let most = ByteSize(Effort::MAX_SIZE);
@@ -254,9 +256,9 @@ fn advance(progress: &ProgressBar, step: &str) {
 fn program(given: &Path) -> Result<PathBuf, Failure> {
     given.canonicalize().map_err(|error| {
         Failure::wrong_usage(
-            format!("{}: {error}", given.display()),
+            format!("cannot find {}: {error}", given.display()),
             "--zenoh",
-            "build it: cargo build --release --manifest-path comparison/zenoh/Cargo.toml",
+            "build the program: cargo build --release --manifest-path comparison/zenoh/Cargo.toml",
         )
     })
 }

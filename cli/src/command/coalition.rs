@@ -1,4 +1,4 @@
-//! `fipa coalition`: one name for several agents.
+//! `fipa coalition`: one shared name for several agents.
 
 use clap::Args;
 use fipa::{AgentId, CoalitionError, Domain, RegisterOptions};
@@ -9,11 +9,11 @@ use crate::options::{self, Global};
 use crate::output;
 use crate::report::Failure;
 
-/// Form a coalition: one name for several agents
+/// Form a coalition: one shared name for several agents
 ///
-/// A message to that name reaches all members but its sender, or only the leader when there is
-/// one. Members are named, not held: they may be on any host, move, and come later. The coalition
-/// lasts until Ctrl-C.
+/// A message to the name of the coalition is delivered to all members except its sender, or only to
+/// the leader if there is one. Members are found by name: they may be on any host, move to another
+/// host, or register later. The coalition exists until Ctrl-C.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
@@ -24,22 +24,22 @@ In another terminal:
   fipa agents platoon
   fipa send --to platoon --content forward")]
 pub(crate) struct Arguments {
-    /// The name of the coalition
+    /// Name of the coalition
     name: AgentId,
 
-    /// The names of its members
+    /// Names of the members
     #[arg(required = true, value_name = "MEMBER")]
     members: Vec<AgentId>,
 
-    /// The member that gets all messages to the coalition
+    /// Member that receives all messages to the coalition
     #[arg(long, value_name = "MEMBER")]
     leader: Option<AgentId>,
 
-    /// What kind of coalition it is, for `fipa agents --type`
+    /// Type of the coalition, for `fipa agents --type`
     #[arg(long = "type", value_name = "TYPE", default_value = "")]
     agent_type: String,
 
-    /// What it says about itself
+    /// Description of the coalition, for `fipa agents --description`
     #[arg(long, value_name = "TEXT", default_value = "")]
     description: String,
 }
@@ -56,28 +56,28 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             other => Failure::wrong_usage(
                 other.to_string(),
                 "the command line",
-                "name other members or another leader",
+                "change the members or the leader",
             ),
         });
-        let told = match formed {
+        let done = match formed {
             Ok(coalition) => {
                 let members = match coalition.members().names().len() {
                     1 => "1 member".to_owned(),
                     several => format!("{several} members"),
                 };
-                let told = output::text(&format!(
-                    "{} of the domain {} has {members}; Ctrl-C dissolves it\n",
+                let done = output::text(&format!(
+                    "coalition {} of domain {} has {members}; press Ctrl-C to dissolve it\n",
                     escape(coalition.name()),
                     config.domain,
                 ));
                 stop.requested().await;
                 Stop::ending();
-                told
+                done
             }
             Err(failure) => Err(failure),
         };
         domain.close().await;
-        told
+        done
     })?
 }
 

@@ -1,4 +1,4 @@
-//! `fipa config`: the configuration that counts, and whether it has mistakes.
+//! `fipa config`: shows and checks the effective configuration.
 
 use std::path::Path;
 
@@ -10,18 +10,18 @@ use crate::options::Global;
 use crate::output;
 use crate::report::Failure;
 
-/// Show the configuration that counts, or check it for mistakes
+/// Show the effective configuration, or check it for errors
 ///
-/// The configuration is one TOML file. The first of these counts, and no other is read: the one
-/// given with --config, the one named by $FIPA_CONFIG, ./fipa.toml, ~/.config/fipa/fipa.toml. What
-/// it does not say has its default, and --set KEY=VALUE overrides single keys.
+/// The configuration is one TOML file: the file given with --config, else the file named by
+/// $FIPA_CONFIG, else ./fipa.toml, else ~/.config/fipa/fipa.toml. No other file is read. Keys that
+/// the file does not set have their defaults. --set KEY=VALUE overrides single keys.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  fipa config show                          what counts here, and where it comes from
-  fipa config show > new.toml               a file to start from
-  fipa --set mts.deadline=9s config show    what an override does
-  fipa config check --config robot.toml     whether a file has mistakes")]
+  fipa config show                          prints each value with its origin
+  fipa config show > new.toml               writes a file with all keys
+  fipa --set mts.deadline=9s config show    shows the effect of an override
+  fipa config check --config robot.toml     checks a file for errors")]
 pub(crate) struct Arguments {
     #[command(subcommand)]
     action: Action,
@@ -29,10 +29,10 @@ pub(crate) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Action {
-    /// Print the configuration that counts, with the origin of every value
+    /// Print the effective configuration with the origin of every value
     ///
-    /// What is printed is a configuration file itself that says the same: every key, followed by
-    /// where its value comes from, `# default`, `# fipa.toml:12` (file and line) or `# --set`.
+    /// The output is a valid configuration file with every key. A comment after each value names its
+    /// origin: `# default`, `# fipa.toml:12` (file and line) or `# --set`.
     #[command(after_help = "\
 Examples:
   fipa config show
@@ -47,11 +47,10 @@ JSON:
                             | { \"from\": \"set\", \"assignment\": \"key=value\" } } ] }")]
     Show(Json),
 
-    /// Say whether the configuration has mistakes, and where
+    /// Check the configuration for errors
     ///
-    /// Names every mistake with file, line and key, and says what is allowed there. The exit code is
-    /// 0 when there is none and 2 otherwise, so that a script can check a file before a robot is
-    /// started with it.
+    /// Reports every error with file, line, key and the allowed values. The exit code is 0 if there is
+    /// no error and 2 otherwise, so that a script can check a file before it starts a robot.
     #[command(after_help = "\
 Examples:
   fipa config check
@@ -62,7 +61,7 @@ JSON:
   { \"ok\": true or false,
     \"mistakes\": [ { \"what\": text, \"help\": text,
                     \"place\": an origin as in `fipa config show` } ] }
-  A file that cannot be read is an error as without --json.")]
+  A file that cannot be read is reported on standard error, as without --json.")]
     Check(Json),
 }
 
@@ -94,18 +93,18 @@ fn show(effective: &Effective, json: bool) -> Result<(), Failure> {
 fn check(effective: &Effective) -> Result<(), Failure> {
     let checked = match effective.file() {
         Some(file) => file.to_string_lossy(),
-        None => "no file, only defaults".into(),
+        None => "no configuration file, all keys have their defaults".into(),
     };
-    output::text(&format!("no mistakes: {checked}\n"))
+    output::text(&format!("no errors: {checked}\n"))
 }
 
-/// The mistakes are what was asked for, so they go to standard output and nowhere else.
+/// Prints the errors on standard output only: they are the result of this command.
 fn check_json(loaded: Result<Effective, ConfigError>) -> Result<(), Failure> {
     match loaded {
         Ok(_) => output::json(&json!({ "ok": true, "mistakes": [] })),
         Err(ConfigError::Mistakes(mistakes)) => {
             output::json(&json!({ "ok": false, "mistakes": mistakes }))?;
-            Err(Failure::wrong_usage_already_told())
+            Err(Failure::wrong_usage_already_reported())
         }
         Err(other) => Err(other.into()),
     }

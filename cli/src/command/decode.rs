@@ -1,4 +1,4 @@
-//! `fipa decode`: bytes as JSON, or explained byte by byte.
+//! `fipa decode`: prints bytes as JSON, or explains them byte by byte.
 
 mod explained;
 
@@ -16,13 +16,13 @@ use crate::{input, output};
 
 /// Print a recorded message or letter as JSON
 ///
-/// Reads one encoded message (bit-efficient, FIPA00069; string, FIPA00070; XML, FIPA00071) or one
-/// letter, an envelope (bit-efficient, FIPA00088; XML, FIPA00085) with a message behind it; the
-/// first bytes tell which. Bytes that are neither are an error that says where they break which
-/// clause of the standards.
+/// Reads one encoded message (bit-efficient, FIPA00069; string, FIPA00070; XML, FIPA00071), or one
+/// letter: an envelope (bit-efficient, FIPA00088; XML, FIPA00085) followed by a message. The first
+/// bytes decide which. For invalid input, the error has the byte offset and the violated clause of
+/// the standard.
 ///
-/// With --explain it prints every byte of what is bit-efficient and what it means, up to the error
-/// if there is one.
+/// With --explain it prints the meaning of every byte of a bit-efficient encoding, up to the first
+/// error.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
@@ -40,42 +40,42 @@ JSON of a message:
 
 JSON of a letter:
   { \"envelope\": { \"base\": parameters, \"extensions\": [parameters], oldest first },
-    \"effective\": parameters, what counts of these,
-    \"message\" as above, or \"payload_base64\" if it is none that can be read }
+    \"effective\": parameters, the newest value of each,
+    \"message\" as above, or \"payload_base64\" if the payload is not a valid message }
   parameters: { \"to\", \"from\", \"comments\", \"acl_representation\", \"payload_length\",
                 \"payload_encoding\", \"date\", \"intended_receivers\", \"received\",
                 \"transport_behaviour\", \"user_defined\" }
 
-Keys appear only when set. Times are in UTC, with milliseconds.
+Keys without a value are omitted. Times are in UTC, with milliseconds.
 
 JSON with --explain:
-  { \"length\": how many bytes there are,
-    \"spans\": [ { \"offset\", \"length\", \"depth\", \"meaning\" } ], one behind the other,
+  { \"length\": number of bytes,
+    \"spans\": [ { \"offset\", \"length\", \"depth\", \"meaning\" } ], in order, without gaps,
     \"error\": { \"offset\", \"problem\", \"clause\" }, if there is one }")]
 pub(crate) struct Arguments {
-    /// The file to read; - for standard input
+    /// File to read; - for standard input
     #[arg(default_value = "-")]
     file: PathBuf,
 
-    /// The input is text: hexadecimal digits, with or without white space, colons and 0x between
+    /// Read hexadecimal digits; white space, commas, colons and 0x between bytes are ignored
     #[arg(long)]
     hex: bool,
 
-    /// Print it on one line
+    /// Print the JSON on one line
     #[arg(long)]
     compact: bool,
 
-    /// Print the bytes and what they mean
+    /// Print the bytes with their meaning
     #[arg(long, conflicts_with = "compact")]
     explain: bool,
 
-    /// Print JSON also with --explain
+    /// Print JSON with --explain, too
     #[arg(long)]
     json: bool,
 }
 
-/// The largest content, and ample room for what stands around it.
-const MOST: u64 = Message::MAX_CONTENT + (1 << 20);
+/// Maximum input, in bytes: the largest content, and 1 MiB for the other fields.
+const MAX_INPUT: u64 = Message::MAX_CONTENT + (1 << 20);
 
 pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
     let Arguments {
@@ -85,8 +85,8 @@ pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
         explain,
         json,
     } = arguments;
-    // Three characters a byte, usually.
-    let mut bytes = input::read(&file, if hex { 3 * MOST } else { MOST })?;
+    // A byte usually takes three characters.
+    let mut bytes = input::read(&file, if hex { 3 * MAX_INPUT } else { MAX_INPUT })?;
     if hex {
         bytes = from_hex(&bytes, &file)?;
     }
@@ -106,9 +106,9 @@ pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
     }
 }
 
-/// An envelope begins with the base (`FE`) or an extension (`FD`): FIPA00088 BaseEnvelopeHeader
-/// and ExtEnvelopeHeader; or it is the first element of XML. Everything else is tried as a
-/// message, whose error says what is wrong.
+/// Whether the input begins with an envelope: with a base (`FE`) or an extension (`FD`), FIPA00088
+/// BaseEnvelopeHeader and ExtEnvelopeHeader, or with an `envelope` element in XML. Other input is
+/// decoded as a message, whose error describes what is wrong.
 fn is_letter(bytes: &[u8]) -> bool {
     matches!(bytes.first(), Some(0xfd | 0xfe)) || is_xml_envelope(bytes)
 }
@@ -117,7 +117,7 @@ fn is_xml_envelope(bytes: &[u8]) -> bool {
     if Representation::detect(bytes) != Some(Representation::Xml) {
         return false;
     }
-    // What stands in front of the first element begins with <? or <!.
+    // Declarations and comments before the first element begin with <? or <!.
     let mut tags = bytes.split(|&byte| byte == b'<').skip(1);
     let element = tags.find(|tag| !matches!(tag.first(), Some(b'?' | b'!')));
     let name = element.and_then(|element| element.get(..b"envelope".len()));
@@ -143,7 +143,7 @@ fn letter(bytes: Vec<u8>, file: &Path) -> Result<Value, DecodeError> {
             Err(error) => format!(": {error}"),
         };
         report::warn(&format!(
-            "{}: the payload behind the envelope of {} bytes is no message that can be read{why}",
+            "{}: the payload after the {}-byte envelope is not a valid message{why}",
             input::name(file),
             letter.envelope_len()
         ));
@@ -155,18 +155,18 @@ fn malformed(error: &DecodeError, file: &Path) -> Failure {
     Failure::failed(
         format!("{} ({})", error.problem(), error.clause()),
         format!("{}, byte {}", input::name(file), error.offset()),
-        "see whether it is one whole message or letter, and whether --hex is missing; --explain \
-         shows what stands in front of it",
+        "check that the input is one complete message or letter, and whether --hex is missing; \
+         --explain shows the bytes before the error",
     )
 }
 
-/// The bytes that the hexadecimal digits stand for.
+/// Parses hexadecimal digits.
 fn from_hex(text: &[u8], file: &Path) -> Result<Vec<u8>, Failure> {
-    let wrong = |what: String, at: usize| {
+    let invalid = |problem: String, at: usize| {
         Failure::failed(
-            what,
+            problem,
             format!("{}, character {}", input::name(file), at + 1),
-            "give two hexadecimal digits for each byte, or leave out --hex",
+            "give two hexadecimal digits for each byte, or omit --hex",
         )
     };
     let mut bytes = Vec::with_capacity(text.len() / 2);
@@ -177,7 +177,7 @@ fn from_hex(text: &[u8], file: &Path) -> Result<Vec<u8>, Failure> {
             b'a'..=b'f' => byte - b'a' + 10,
             b'A'..=b'F' => byte - b'A' + 10,
             b':' | b',' if high.is_none() => continue,
-            // The prefix of a byte: the zero before it was no digit.
+            // The prefix 0x of a byte: its zero is not a digit of the byte.
             b'x' | b'X' if high == Some(0) => {
                 high = None;
                 continue;
@@ -185,7 +185,10 @@ fn from_hex(text: &[u8], file: &Path) -> Result<Vec<u8>, Failure> {
             _ if byte.is_ascii_whitespace() && high.is_none() => continue,
             _ => {
                 let found = char::from(byte);
-                return Err(wrong(format!("{found:?} is no hexadecimal digit here"), at));
+                return Err(invalid(
+                    format!("expected a hexadecimal digit, not {found:?}"),
+                    at,
+                ));
             }
         };
         match high.take() {
@@ -195,8 +198,8 @@ fn from_hex(text: &[u8], file: &Path) -> Result<Vec<u8>, Failure> {
     }
     match high {
         None => Ok(bytes),
-        Some(_) => Err(wrong(
-            "the last byte has one digit only".to_owned(),
+        Some(_) => Err(invalid(
+            "the last byte has only one digit".to_owned(),
             text.len(),
         )),
     }
@@ -207,7 +210,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn hexadecimal_text_in_the_usual_forms() {
+    fn hexadecimal_text_is_read_in_the_usual_forms() {
         let expected = vec![0xfa, 0x00, 0x0b];
         for text in [
             "fa000b",

@@ -1,4 +1,4 @@
-//! `fipa doctor`: what is wrong with this machine.
+//! `fipa doctor`: checks this machine.
 
 use clap::Args;
 use comfy_table::{Table, presets};
@@ -10,11 +10,11 @@ use crate::options::Global;
 use crate::output;
 use crate::report::Failure;
 
-/// Examine what is wrong with this machine
+/// Check this machine for problems
 ///
-/// Looks at what the configured transports need: the size of /dev/shm, limits, permissions, what
-/// dead processes have left; and, where discovery.mdns is on, at what the network does with
-/// multicast on each interface, which takes three seconds. Changes nothing.
+/// Checks the requirements of the configured transports: the size of /dev/shm, limits, permissions,
+/// files left by dead processes. If discovery.mdns is on, it also tests multicast on each network
+/// interface, which takes three seconds. It changes nothing.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
@@ -24,13 +24,13 @@ Examples:
   fipa doctor --json | jq -r '.checks[] | select(.verdict != \"fine\") | .advice'
 
 Verdicts:
-  fine      as it should be
-  doubtful  works, and may fail under load, or later
-  bad       does not work; the exit code is 1 then
+  fine      no problem
+  doubtful  works, but may fail under load or later
+  bad       does not work; the exit code is 1
 
 JSON:
-  { \"verdict\": the worst of all,
-    \"checks\": [ { \"area\", \"check\", \"verdict\", \"found\", \"advice\": when it is not fine } ] }")]
+  { \"verdict\": the worst verdict,
+    \"checks\": [ { \"area\", \"check\", \"verdict\", \"found\", \"advice\": unless the verdict is fine } ] }")]
 pub(crate) struct Arguments {
     /// Print JSON
     #[arg(long)]
@@ -54,9 +54,12 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         .map(|check| format!("{}: {}", check.area, check.check))
         .collect();
     Err(Failure::failed(
-        "something does not work here",
+        match bad.len() {
+            1 => "1 check failed".to_owned(),
+            several => format!("{several} checks failed"),
+        },
         bad.join(", "),
-        "what the table says",
+        "follow the advice (->) beside each of them",
     ))
 }
 

@@ -11,35 +11,35 @@ use crate::options::{self, Global};
 use crate::output;
 use crate::report::{self, Failure};
 
-/// Run an agent that answers every message with an inform of the same content
+/// Run an agent that answers each message with an inform of the same content
 ///
-/// Prints one line per message it gets, until Ctrl-C. Works with and without a gateway.
+/// The agent prints one line per received message, until Ctrl-C. It works with and without a gateway.
 ///
-/// It answers what asks for an answer: any message that is no reply itself (has no in-reply-to)
-/// and is no failure or not-understood; an inform only when it has reply-with. Its own answers
-/// have none, so two of them never talk to each other forever.
+/// The agent answers every message except replies (messages with in-reply-to), failure and
+/// not-understood. It answers an inform only if that has reply-with. Its own answers have no
+/// reply-with, so two echo agents cannot answer each other endlessly.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   fipa echo arm_1
   fipa echo arm_1 --type arm --description 'left front'
-  fipa echo arm_1 --count 1          end after one message
+  fipa echo arm_1 --count 1          ends after one message
 
 In another terminal:
   fipa send --to arm_1 --content hello --wait")]
 pub(crate) struct Arguments {
-    /// The name of the agent
+    /// Name of the agent
     name: AgentId,
 
-    /// What kind of agent it is, for `fipa agents --type`
+    /// Type of the agent, for `fipa agents --type`
     #[arg(long = "type", value_name = "TYPE", default_value = "")]
     agent_type: String,
 
-    /// What it says about itself
+    /// Description of the agent, for `fipa agents --description`
     #[arg(long, value_name = "TEXT", default_value = "")]
     description: String,
 
-    /// End after so many messages
+    /// End after this number of messages
     #[arg(long, value_name = "N")]
     count: Option<u64>,
 }
@@ -58,7 +58,7 @@ async fn serve(arguments: Arguments, config: &Config) -> Result<(), Failure> {
     };
     let agent = membership::register(&domain, arguments.name.name(), options, config)?;
     output::text(&format!(
-        "{} of the domain {} answers; Ctrl-C ends it\n",
+        "agent {} of domain {} is ready; press Ctrl-C to stop\n",
         escape(agent.name()),
         config.domain
     ))?;
@@ -79,7 +79,7 @@ async fn answer_all(agent: &Agent, count: Option<u64>) -> Result<(), Failure> {
             Ok(incoming) => {
                 received += 1;
                 output::text(&line(&incoming))?;
-                if wants_an_answer(&incoming.message) {
+                if requires_answer(&incoming.message) {
                     answer(agent, &incoming).await;
                 }
             }
@@ -91,7 +91,7 @@ async fn answer_all(agent: &Agent, count: Option<u64>) -> Result<(), Failure> {
                 return Err(Failure::failed(
                     error.to_string(),
                     format!("agent {:?}", agent.name()),
-                    "start it again",
+                    "restart the agent",
                 ));
             }
         }
@@ -106,7 +106,7 @@ fn line(incoming: &Incoming) -> String {
     }
 }
 
-fn wants_an_answer(message: &Message) -> bool {
+fn requires_answer(message: &Message) -> bool {
     if message.in_reply_to().is_some() {
         return false;
     }
@@ -117,10 +117,10 @@ fn wants_an_answer(message: &Message) -> bool {
     }
 }
 
-/// What goes wrong with one answer does not end the agent.
+/// Answers a message. A failed answer does not end the agent.
 async fn answer(agent: &Agent, incoming: &Incoming) {
     let message = &incoming.message;
-    // Not `Agent::reply`, whose reply-with would ask for an answer to the answer.
+    // `Agent::reply` would set reply-with, which requests an answer to the answer.
     let reply = message.reply(Performative::Inform);
     let mut reply = reply.sender(agent.id().clone());
     if let Some(content) = message.content() {
@@ -131,14 +131,14 @@ async fn answer(agent: &Agent, incoming: &Incoming) {
     }
     let reply = match reply.build() {
         Ok(reply) if reply.receivers().is_empty() => {
-            return report::warn("no answer: the message does not say who sent it");
+            return report::warn("cannot answer: the message has no sender");
         }
         Ok(reply) => reply,
-        Err(error) => return report::warn(&format!("no answer: {error}")),
+        Err(error) => return report::warn(&format!("cannot answer: {error}")),
     };
     match agent.send(reply).await {
         Ok(deliveries) if deliveries.all_succeeded() => {}
-        Ok(deliveries) => report::warn(&format!("the answer did not arrive: {deliveries}")),
-        Err(error) => report::warn(&format!("no answer: {error}")),
+        Ok(deliveries) => report::warn(&format!("the answer was not delivered: {deliveries}")),
+        Err(error) => report::warn(&format!("cannot answer: {error}")),
     }
 }

@@ -1,4 +1,4 @@
-//! `fipa encode`: JSON as bytes.
+//! `fipa encode`: encodes JSON as bytes.
 
 use std::path::{Path, PathBuf};
 
@@ -12,14 +12,14 @@ use crate::options::Global;
 use crate::report::Failure;
 use crate::{input, output};
 
-/// Write a message or a letter as bytes, given as JSON
+/// Encode a message or a letter from JSON
 ///
-/// Reads the JSON that `fipa decode` prints: a message, or a letter, which is an envelope with a
-/// message behind it, and writes it to standard output in the encoding asked for.
+/// Reads JSON in the format of `fipa decode`: a message, or a letter (an envelope with a message).
+/// Writes the encoded bytes to standard output.
 ///
-/// In a letter, the envelope says how the message is encoded (`acl_representation`); left out, it
-/// is put in, as --representation says. A `payload_length` becomes the length of the encoded
-/// message. `effective` follows from the envelope and is passed over.
+/// The `acl_representation` of an envelope sets the encoding of the message. If the envelope has
+/// none, it is set from --representation. A `payload_length` is set to the length of the encoded
+/// message. `effective` is ignored, because it follows from the envelope.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
@@ -29,7 +29,7 @@ Examples:
   fipa encode message.json --representation string --dialect jade
   fipa encode letter.json --envelope xml --dialect fipa-services > letter.xml
 
-JSON of a message, with or without { \"message\": … } around it:
+JSON of a message, optionally within { \"message\": … }:
   { \"performative\", \"sender\": agent, \"receivers\": [agent], \"reply_to\": [agent],
     \"content\" (text) or \"content_base64\", \"language\", \"encoding\", \"ontology\", \"protocol\",
     \"conversation_id\", \"reply_with\", \"in_reply_to\", \"reply_by\", \"user_defined\": { name: text } }
@@ -37,15 +37,15 @@ JSON of a message, with or without { \"message\": … } around it:
 
 JSON of a letter:
   { \"envelope\": { \"base\": parameters, \"extensions\": [parameters], oldest first },
-    \"message\" as above, or \"payload_base64\", or neither for an envelope alone }
+    \"message\" as above, or \"payload_base64\"; without both, the letter has an envelope only }
   parameters: { \"to\", \"from\", \"comments\", \"acl_representation\", \"payload_length\",
                 \"payload_encoding\", \"date\", \"intended_receivers\", \"received\",
                 \"transport_behaviour\", \"user_defined\" }
 
-Only \"performative\" has to be there; in bit-efficient letters also \"date\" in the base, and
+Only \"performative\" is required; a bit-efficient letter also needs \"date\" in the base, and
 \"received\" in every extension. Times are RFC 3339, or relative as in +00000000T000030000 (30 s).")]
 pub(crate) struct Arguments {
-    /// The file to read; - for standard input
+    /// File to read; - for standard input
     #[arg(default_value = "-")]
     file: PathBuf,
 
@@ -53,11 +53,11 @@ pub(crate) struct Arguments {
     #[arg(long)]
     hex: bool,
 
-    /// The encoding of the message [default: what the envelope says, else bit-efficient]
+    /// Encoding of the message [default: acl_representation of the envelope, else bit-efficient]
     #[arg(long, value_enum, value_name = "ENCODING")]
     representation: Option<MessageEncoding>,
 
-    /// The encoding of the envelope
+    /// Encoding of the envelope
     #[arg(
         long,
         value_enum,
@@ -66,9 +66,9 @@ pub(crate) struct Arguments {
     )]
     envelope: EnvelopeEncoding,
 
-    /// Whose reader it is for
+    /// Dialect of the target implementation
     #[arg(long, value_enum, default_value = "standard")]
-    dialect: Reader,
+    dialect: Target,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -90,8 +90,8 @@ enum EnvelopeEncoding {
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
-enum Reader {
-    /// The standards to the letter
+enum Target {
+    /// Strictly as in the FIPA standards
     Standard,
     /// The C++ libraries fipa_acl and fipa_services
     FipaServices,
@@ -118,24 +118,24 @@ impl From<EnvelopeEncoding> for Representation {
     }
 }
 
-impl From<Reader> for Dialect {
-    fn from(reader: Reader) -> Self {
-        match reader {
-            Reader::Standard => Self::Standard,
-            Reader::FipaServices => Self::FipaServices,
-            Reader::Jade => Self::Jade,
+impl From<Target> for Dialect {
+    fn from(target: Target) -> Self {
+        match target {
+            Target::Standard => Self::Standard,
+            Target::FipaServices => Self::FipaServices,
+            Target::Jade => Self::Jade,
         }
     }
 }
 
-/// The largest content as base64, and ample room for what stands around it.
-const MOST: u64 = Message::MAX_CONTENT / 3 * 4 + (1 << 20);
+/// Maximum input, in bytes: the largest content as base64, and 1 MiB for the other fields.
+const MAX_INPUT: u64 = Message::MAX_CONTENT / 3 * 4 + (1 << 20);
 
 pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
     let file = &arguments.file;
-    let text = input::read(file, MOST)?;
-    let json: Value = serde_json::from_slice(&text).map_err(|error| no_json(&error, file))?;
-    let document = document_from_json(&json).map_err(|error| misdescribed(&error, file))?;
+    let text = input::read(file, MAX_INPUT)?;
+    let json: Value = serde_json::from_slice(&text).map_err(|error| invalid_json(&error, file))?;
+    let document = document_from_json(&json).map_err(|error| invalid_document(&error, file))?;
     let bytes = encoded(document, &arguments)?;
     if arguments.hex {
         output::text(&hexadecimal(&bytes))
@@ -147,7 +147,7 @@ pub(crate) fn run(arguments: Arguments, _: &Global) -> Result<(), Failure> {
 fn encoded(document: Document, arguments: &Arguments) -> Result<Vec<u8>, Failure> {
     let Arguments { file, dialect, .. } = arguments;
     let dialect = Dialect::from(*dialect);
-    let refused = |error: EncodeError| unwritable(&error, file);
+    let refused = |error: EncodeError| not_encodable(&error, file);
     let asked = arguments.representation.map(Representation::from);
     let (envelope, payload) = match document {
         Document::Message(message) => {
@@ -163,9 +163,9 @@ fn encoded(document: Document, arguments: &Arguments) -> Result<Vec<u8>, Failure
         }
         Document::EncodedLetter(_, _) if asked.is_some() => {
             return Err(Failure::wrong_usage(
-                "there is no message to encode: the letter has an encoded payload, or none",
+                "--representation has no effect: the letter has no `message` to encode",
                 input::name(file),
-                "leave out --representation, or give the message instead of payload_base64",
+                "omit --representation, or give `message` instead of `payload_base64`",
             ));
         }
         Document::EncodedLetter(envelope, payload) => (envelope, payload.into()),
@@ -174,8 +174,8 @@ fn encoded(document: Document, arguments: &Arguments) -> Result<Vec<u8>, Failure
     Ok([encoded.map_err(refused)?, payload].concat())
 }
 
-/// How the message of a letter is to be encoded: as its envelope says, which has to say it and
-/// must not say anything else than asked for.
+/// The encoding of a letter's message. An envelope without `acl_representation` gets the requested
+/// one; an envelope with a different one is an error.
 fn agreed(
     envelope: &mut Envelope,
     asked: Option<Representation>,
@@ -198,27 +198,27 @@ fn agreed(
         (Some(known), None) => Ok(known),
         (Some(known), Some(asked)) if known == asked => Ok(known),
         (_, Some(asked)) => Err(Failure::wrong_usage(
-            format!("the envelope says that the message is {said}, which is not {asked}"),
+            format!("the envelope has acl_representation {said}, but --representation is {asked}"),
             format!("{}, envelope: acl_representation", input::name(file)),
-            "leave out --representation, or acl_representation",
+            "omit --representation or acl_representation",
         )),
         (None, None) => Err(Failure::failed(
-            format!("messages cannot be encoded as {said}"),
+            format!("cannot encode a message as {said}: not a supported encoding"),
             format!("{}, envelope: acl_representation", input::name(file)),
-            "leave it out, or give payload_base64 instead of the message",
+            "omit acl_representation, or give `payload_base64` instead of `message`",
         )),
     }
 }
 
-/// Where an envelope says a length it says the right one.
+/// Corrects the payload lengths in an envelope that has them.
 fn set_payload_length(envelope: &mut Envelope, len: u64) {
     let parts = envelope.extensions.iter_mut().chain([&mut envelope.base]);
-    for said in parts.filter_map(|part| part.payload_length.as_mut()) {
-        *said = len;
+    for payload_length in parts.filter_map(|part| part.payload_length.as_mut()) {
+        *payload_length = len;
     }
 }
 
-/// Sixteen bytes a line.
+/// Hexadecimal digits, sixteen bytes per line.
 fn hexadecimal(bytes: &[u8]) -> String {
     let line = |bytes: &[u8]| {
         let digits: Vec<String> = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
@@ -227,22 +227,22 @@ fn hexadecimal(bytes: &[u8]) -> String {
     bytes.chunks(16).map(line).collect()
 }
 
-fn no_json(error: &serde_json::Error, file: &Path) -> Failure {
+fn invalid_json(error: &serde_json::Error, file: &Path) -> Failure {
     let (line, column) = (error.line(), error.column());
-    // The place is told apart from what is wrong.
-    let what = error.to_string();
-    let what = what.strip_suffix(&format!(" at line {line} column {column}"));
+    // The report has the position on a line of its own.
+    let problem = error.to_string();
+    let problem = problem.strip_suffix(&format!(" at line {line} column {column}"));
     Failure::failed(
         format!(
-            "not JSON: {}",
-            what.map_or_else(|| error.to_string(), str::to_owned)
+            "invalid JSON: {}",
+            problem.map_or_else(|| error.to_string(), str::to_owned)
         ),
         format!("{}, line {line}, column {column}", input::name(file)),
-        "give one JSON document, such as `fipa decode` prints",
+        "give one JSON document in the format of `fipa decode`",
     )
 }
 
-fn misdescribed(error: &JsonError, file: &Path) -> Failure {
+fn invalid_document(error: &JsonError, file: &Path) -> Failure {
     let place = match error.path() {
         "" => input::name(file),
         path => format!("{}, {path}", input::name(file)),
@@ -250,14 +250,14 @@ fn misdescribed(error: &JsonError, file: &Path) -> Failure {
     Failure::failed(
         error.problem().to_string(),
         place,
-        "see `fipa encode --help` for what a message and a letter consist of",
+        "`fipa encode --help` lists the fields of messages and letters",
     )
 }
 
-fn unwritable(error: &EncodeError, file: &Path) -> Failure {
+fn not_encodable(error: &EncodeError, file: &Path) -> Failure {
     Failure::failed(
         error.to_string(),
         input::name(file),
-        "change it, or choose another encoding (--representation, --envelope) or --dialect",
+        "change the input, or choose another encoding (--representation, --envelope) or --dialect",
     )
 }

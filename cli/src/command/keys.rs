@@ -1,4 +1,4 @@
-//! `fipa keys`: who this host is, and which others it speaks with.
+//! `fipa keys`: the keys of this host and the certificates that it trusts.
 
 use std::path::{self, Path, PathBuf};
 use std::time::Duration;
@@ -14,21 +14,21 @@ use crate::options::{self, Global};
 use crate::report::Failure;
 use crate::{input, output};
 
-/// Make this host's keys, and say which other hosts are trusted
+/// Manage this host's keys and its trusted hosts
 ///
-/// Hosts that have keys speak TLS 1.3 with each other, and with nobody else: both prove who they are
-/// by a certificate that the owner of the other one has been given, and trusts. There is no
-/// authority in between.
+/// Hosts with keys communicate only over TLS 1.3. Each host proves its identity by its certificate,
+/// and the owner of the other host has to trust that certificate first. There is no certificate
+/// authority.
 ///
-/// A gateway that runs uses what has changed within a second or two.
+/// A running gateway applies changes within two seconds.
 #[derive(Debug, Args)]
 #[command(after_help = "\
-Examples, on the host of rover-mts and on that of crex-mts alike:
-  fipa keys init                           once; says where the certificate is
-  fipa keys trust crex.pem                 the file own.pem of the other host
+Examples, on the host of rover-mts (on the host of crex-mts with rover.pem):
+  fipa keys init                           once; prints the path of the certificate
+  fipa keys trust crex.pem                 crex.pem is the file own.pem of the other host
   fipa up --set security.keys=$HOME/.config/fipa/keys --set transport.tcp.listen=0.0.0.0:7788")]
 pub(crate) struct Arguments {
-    /// The directory of the keys [default: security.keys, else ~/.config/fipa/keys]
+    /// Directory of the keys [default: security.keys, else ~/.config/fipa/keys]
     #[arg(long, value_name = "DIRECTORY", global = true)]
     dir: Option<PathBuf>,
     #[command(subcommand)]
@@ -37,38 +37,38 @@ pub(crate) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Action {
-    /// Make a key and a certificate for this host
+    /// Create a key and a certificate for this host
     ///
-    /// The certificate is of the gateway that mts.name names. Give the file own.pem to the owners of
-    /// other hosts; keep own.key to yourself.
+    /// The certificate names the gateway mts.name. Give the file own.pem to the owners of other hosts;
+    /// keep own.key secret.
     #[command(after_help = "\
 Examples:
   fipa keys init
-  fipa keys init --agent rover --agent 'arm_*'     it speaks for these agents only
+  fipa keys init --agent rover --agent 'arm_*'     limits the certificate to these agents
   fipa keys init --valid 90days --set mts.name=rover-mts")]
     Init {
-        /// An agent that this host may speak for; one that ends with * stands for all that begin so
-        /// [default: every agent]
+        /// Agent for which this host may send; a final * stands for any ending; repeatable [default:
+        /// every agent]
         #[arg(long = "agent", value_name = "NAME", value_parser = NonEmptyStringValueParser::new())]
         agents: Vec<String>,
-        /// How long the certificate holds [default: ten years]
+        /// Validity of the certificate, for example 90days [default: ten years]
         #[arg(long, value_name = "DURATION", value_parser = options::duration)]
         valid: Option<Duration>,
     },
 
     /// Trust the certificates in a file
     ///
-    /// Compare the fingerprint with what `fipa keys list` shows on the other host.
+    /// Compare the printed fingerprint with the output of `fipa keys list` on the other host.
     #[command(after_help = "\
 Examples:
   fipa keys trust crex.pem
   ssh crex cat .config/fipa/keys/own.pem | fipa keys trust -")]
     Trust {
-        /// The file own.pem of another host; - for standard input
+        /// File own.pem of another host; - for standard input
         file: PathBuf,
     },
 
-    /// Show this host's certificate, the next one, and those that are trusted or revoked
+    /// List this host's certificate, its next certificate, and the trusted and revoked certificates
     #[command(after_help = "\
 Examples:
   fipa keys list
@@ -84,34 +84,37 @@ JSON:
         json: bool,
     },
 
-    /// Trust a host no more
+    /// Revoke the trust in a host
     ///
-    /// Its connections end, and its certificate is never trusted again.
+    /// Open connections to the host are closed, and its certificate is never trusted again.
     #[command(after_help = "\
 Examples:
   fipa keys revoke crex-mts
   fipa keys revoke 5d41402abc4b")]
     Revoke {
-        /// The name of its gateway, or the first 8 or more digits of a fingerprint
+        /// Name of its gateway, or the first 8 or more digits of the fingerprint
+        #[arg(value_name = "NAME|FINGERPRINT")]
         which: String,
     },
 
-    /// Make the next key and certificate, and change over to them when all peers trust them
+    /// Create the next key and certificate, or switch to them
+    ///
+    /// Switch only after the owners of the other hosts have trusted the next certificate.
     #[command(after_help = "\
 Examples:
-  fipa keys renew              makes next.pem, to be trusted by the owners of other hosts
-  fipa keys renew --use        uses it from now on")]
+  fipa keys renew              creates next.pem; give it to the owners of other hosts
+  fipa keys renew --use        switches to the next key and certificate")]
     Renew {
-        /// Use what was made before
+        /// Switch to the key and certificate created before
         #[arg(long = "use", conflicts_with = "valid")]
-        change_over: bool,
-        /// How long the certificate holds [default: ten years]
+        switch: bool,
+        /// Validity of the certificate, for example 90days [default: ten years]
         #[arg(long, value_name = "DURATION", value_parser = options::duration)]
         valid: Option<Duration>,
     },
 }
 
-/// Longest text with certificates, in bytes.
+/// Maximum size of a file with certificates, in bytes.
 const MAX_PEM: u64 = 1 << 20;
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
@@ -119,20 +122,20 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
     let keys = match arguments.dir {
         Some(dir) => Keys::at(dir),
         None if !config.security.keys.is_empty() => Keys::at(&config.security.keys),
-        None => Keys::at(usual_place()?),
+        None => Keys::at(default_directory()?),
     };
     match arguments.action {
         Action::Init { agents, valid } => {
             let made = keys.init(&config.mts.name, &agents, valid.unwrap_or(VALID));
             let made = made.map_err(|error| failed(&error, &keys))?;
             output::text(&format!(
-                "made a key and a certificate for {}\n{}\
-                 give {} to the owners of other hosts, and use it:\n\n\
+                "created a key and a certificate for {}\n{}\
+                 give {} to the owners of other hosts, and add to the configuration:\n\n\
                  [security]\nkeys = {:?}\n",
                 escape(made.certified().mts()),
                 described(&made),
                 keys.own_file().display(),
-                // From wherever the gateway is started.
+                // Absolute, so that it is valid in any working directory of the gateway.
                 path::absolute(keys.dir())
                     .as_deref()
                     .unwrap_or(keys.dir())
@@ -149,14 +152,14 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
                 | KeysError::Certificate(_) => Failure::failed(
                     error.to_string(),
                     file.display().to_string(),
-                    "use the file own.pem of the other host",
+                    "give the file own.pem of the other host",
                 ),
                 other => failed(&other, &keys),
             })?;
             let mut text = String::new();
             for certificate in &trusted {
                 text.push_str(&format!(
-                    "trusts {}\n",
+                    "trusted {}\n",
                     escape(certificate.certified().mts())
                 ));
                 text.push_str(&described(certificate));
@@ -170,90 +173,95 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             let mut text = String::new();
             for certificate in &revoked {
                 text.push_str(&format!(
-                    "trusts {} no more\n{}",
+                    "revoked {}\n{}",
                     escape(certificate.certified().mts()),
                     described(certificate)
                 ));
             }
             output::text(&text)
         }
-        Action::Renew { change_over, valid } => {
-            let renewed = match change_over {
+        Action::Renew { switch, valid } => {
+            let renewed = match switch {
                 true => keys.switch(),
                 false => keys.renew(valid.unwrap_or(VALID)),
             };
             let renewed = renewed.map_err(|error| failed(&error, &keys))?;
-            let what = match change_over {
-                true => "is used from now on".to_owned(),
+            let done = match switch {
+                true => "switched to the next certificate".to_owned(),
                 false => format!(
-                    "is in {}: give it to the owners of other hosts, then `fipa keys renew --use`",
+                    "created the next certificate, {}: give it to the owners of other hosts, then run \
+                     `fipa keys renew --use`",
                     keys.next_file().display()
                 ),
             };
-            output::text(&format!("the certificate {what}\n{}", described(&renewed)))
+            output::text(&format!("{done}\n{}", described(&renewed)))
         }
     }
 }
 
-/// Where keys are when nothing else is said.
-fn usual_place() -> Result<PathBuf, Failure> {
+/// The directory of the keys without `--dir` and `security.keys`.
+fn default_directory() -> Result<PathBuf, Failure> {
     let home = std::env::var_os("HOME").filter(|home| !home.is_empty());
     let home = home.ok_or_else(|| {
         Failure::wrong_usage(
-            "it is not known where the keys are",
-            "$HOME is not set",
-            "name their directory with --dir, or as security.keys",
+            "cannot determine the directory of the keys: $HOME is not set",
+            "the environment",
+            "give the directory with --dir, or set security.keys",
         )
     })?;
     Ok(PathBuf::from(home).join(".config/fipa/keys"))
 }
 
 fn failed(error: &KeysError, keys: &Keys) -> Failure {
-    let advice = match error {
+    let help = match error {
         KeysError::Exists(file) if is_next(file) => {
-            "give next.pem to the owners of other hosts, then `fipa keys renew --use`"
+            "give next.pem to the owners of other hosts, then run `fipa keys renew --use`"
         }
-        KeysError::Exists(_) => "`fipa keys renew` makes the next ones",
-        KeysError::Validity(_) => "use more than 0, and nothing beyond the year 9999",
-        KeysError::Certificate(_) => "use other names (mts.name, --agent)",
-        KeysError::Contents { .. } => "put a right file in its place, or take it away",
-        KeysError::Which { .. } => "give the name of a gateway, or more of a fingerprint",
-        KeysError::Revoked(_) => "ask for another certificate (`fipa keys renew` there)",
+        KeysError::Exists(_) => "to replace this host's keys, run `fipa keys renew`",
+        KeysError::Validity(_) => "give a validity above 0 that ends by the year 9999",
+        KeysError::Certificate(_) => "change the names (mts.name, --agent)",
+        KeysError::Contents { .. } => "replace the file with a valid one, or remove it",
+        KeysError::Which { .. } => {
+            "give the name of a gateway, or more digits of a fingerprint; see `fipa keys list`"
+        }
+        KeysError::Revoked(_) => {
+            "get a new certificate from its owner (`fipa keys renew` on the other host)"
+        }
         KeysError::Missing(_) | KeysError::NoNext(_) => {
-            "`fipa keys init` makes keys, `fipa keys renew` the next ones"
+            "`fipa keys init` creates keys, `fipa keys renew` creates the next ones"
         }
-        _ => "see whether this user may read and write there",
+        _ => "check whether this user can read and write in this directory",
     };
-    Failure::failed(error.to_string(), keys.dir().display().to_string(), advice)
+    Failure::failed(error.to_string(), keys.dir().display().to_string(), help)
 }
 
-/// Whether the file is one that `fipa keys renew` makes.
+/// Whether `fipa keys renew` creates this file.
 fn is_next(file: &Path) -> bool {
     file.file_stem().is_some_and(|stem| stem == "next")
 }
 
 fn described(certificate: &Certificate) -> String {
     format!(
-        "  fingerprint {}\n  speaks for {}\n  holds until {}\n",
+        "  fingerprint: {}\n  agents: {}\n  valid until: {}\n",
         certificate.fingerprint(),
-        spoken_for(certificate),
-        ends(certificate)
+        agents(certificate),
+        valid_until(certificate)
     )
 }
 
-/// The day until which it holds, and what is to be said of that.
-fn ends(certificate: &Certificate) -> String {
+/// The last day of validity, with a note if the certificate is not valid now or expires soon.
+fn valid_until(certificate: &Certificate) -> String {
     let date = date(certificate.validity().1);
     match Holding::of(certificate).told() {
-        Some(what) => format!("{date} ({what})"),
+        Some(note) => format!("{date} ({note})"),
         None => date,
     }
 }
 
-/// The agents that its host may speak for.
-fn spoken_for(certificate: &Certificate) -> String {
+/// The agents for which the host of the certificate may send.
+fn agents(certificate: &Certificate) -> String {
     match certificate.certified().agents() {
-        [] => "every agent".to_owned(),
+        [] => "all".to_owned(),
         agents => {
             let escaped: Vec<_> = agents.iter().map(|agent| escape(agent)).collect();
             escaped.join(", ")
@@ -261,7 +269,7 @@ fn spoken_for(certificate: &Certificate) -> String {
     }
 }
 
-/// A day in UTC.
+/// The date in UTC of a time in seconds since 1970.
 fn date(seconds: i64) -> String {
     let since = Duration::from_secs(u64::try_from(seconds).unwrap_or(0));
     let time = humantime::format_rfc3339_seconds(std::time::UNIX_EPOCH + since).to_string();
@@ -289,7 +297,7 @@ fn list(keys: &Keys, json: bool) -> Result<Result<(), Failure>, KeysError> {
     let dir = keys.dir().display();
     let missing = match own {
         Some(_) => String::new(),
-        None => format!("there are no keys in {dir}; make them with `fipa keys init`\n"),
+        None => format!("{dir} has no keys; create them with `fipa keys init`\n"),
     };
     let all = [
         ("own", own.as_slice()),
@@ -302,14 +310,14 @@ fn list(keys: &Keys, json: bool) -> Result<Result<(), Failure>, KeysError> {
     }
     let mut table = Table::new();
     table.load_style(presets::NOTHING);
-    table.set_header(["", "gateway", "speaks for", "until", "fingerprint"]);
-    for (what, certificates) in all {
+    table.set_header(["", "gateway", "agents", "valid until", "fingerprint"]);
+    for (list, certificates) in all {
         for certificate in certificates {
             table.add_row([
-                what.to_owned(),
+                list.to_owned(),
                 escape(certificate.certified().mts()).into_owned(),
-                spoken_for(certificate),
-                ends(certificate),
+                agents(certificate),
+                valid_until(certificate),
                 certificate.fingerprint().to_string(),
             ]);
         }

@@ -1,4 +1,4 @@
-//! `fipa protocol`: the interaction protocols that are known, and files with others.
+//! `fipa protocol`: lists, shows, checks and draws interaction protocols.
 
 mod drawing;
 mod mermaid;
@@ -19,10 +19,9 @@ use crate::report::Failure;
 
 /// List, show, check and draw interaction protocols
 ///
-/// The protocols of the FIPA standards are built in; files that `monitor.protocols` names in the
-/// configuration come before them. A file is SCXML in the form of fipa_acl, with additions in a
-/// namespace (urn:fipa-rs:protocol) for what that form cannot say: a state for each participant,
-/// optional steps, time-outs.
+/// The protocols of the FIPA standards are built in. Files in `monitor.protocols` of the
+/// configuration take precedence over them. A file is SCXML in the format of fipa_acl. Attributes in
+/// the namespace urn:fipa-rs:protocol add per-participant states, optional steps and timeouts.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
@@ -38,8 +37,12 @@ pub(crate) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Action {
-    /// List the protocols that are known, with the names that peers have for them
+    /// List the known protocols with their aliases
     #[command(after_help = "\
+Examples:
+  fipa protocol list
+  fipa protocol list --json | jq -r '.[].name'
+
 JSON:
   [ { \"name\", \"aliases\": [ text ], \"title\": text or null, \"roles\": [ text ], \"states\": number } ]")]
     List {
@@ -48,32 +51,40 @@ JSON:
         json: bool,
     },
 
-    /// Show the states of a protocol, and what leads from one to another
+    /// Show the states and transitions of a protocol
     #[command(after_help = "\
+Examples:
+  fipa protocol show fipa-request
+  fipa protocol show my.scxml --json
+
 JSON:
   { \"name\", \"aliases\", \"title\", \"scope\": \"participant\" or \"conversation\",
     \"cancel\": \"initiator\", \"anyone\" or \"nobody\", \"roles\", \"initiator\", \"initial\",
     \"states\": [ { \"id\", \"final\",
                   \"transitions\": [ { \"performative\", \"from\", \"to\", \"target\", \"optional\" } ],
                   \"subprotocols\": [ { \"name\", \"from\", \"proxied_to\" } ],
-                  \"timeout\": { \"after\": \"reply-by\" or a span, \"target\" } or null } ] }")]
+                  \"timeout\": { \"after\": \"reply-by\" or a duration, \"target\" } or null } ] }")]
     Show {
-        /// The name of a protocol, or an SCXML file
+        /// Name of a protocol, or an SCXML file
         protocol: String,
         /// Print JSON
         #[arg(long)]
         json: bool,
     },
 
-    /// Say whether files are protocols, and where they have mistakes
+    /// Check protocol files for errors
     ///
-    /// Every mistake is told with its line: unknown and unreachable states, transitions with two
-    /// meanings, roles that nobody can have. The exit code is 0 when there is none.
+    /// Reports every error with its line: unknown and unreachable states, ambiguous transitions, roles
+    /// that no agent can take. The exit code is 0 if there is no error.
     #[command(after_help = "\
+Examples:
+  fipa protocol check my.scxml
+  fipa protocol check protocols/*.scxml --json
+
 JSON:
   [ { \"file\", \"name\": text or null, \"mistakes\": [ { \"line\", \"what\" } ] } ]")]
     Check {
-        /// SCXML files, or - for standard input
+        /// SCXML files; - for standard input
         #[arg(required = true)]
         files: Vec<PathBuf>,
         /// Print JSON
@@ -81,14 +92,18 @@ JSON:
         json: bool,
     },
 
-    /// Draw a protocol as SVG, or as a Mermaid state diagram
+    /// Draw a protocol as SVG or as a Mermaid state diagram
+    #[command(after_help = "\
+Examples:
+  fipa protocol draw fipa-request --output request.svg
+  fipa protocol draw my.scxml --format mermaid")]
     Draw {
-        /// The name of a protocol, or an SCXML file
+        /// Name of a protocol, or an SCXML file
         protocol: String,
-        /// What to draw
+        /// Output format
         #[arg(long, value_enum, default_value_t = Format::Svg)]
         format: Format,
-        /// Write it to this file instead of standard output
+        /// Write the drawing to this file instead of standard output
         #[arg(short, long, value_name = "FILE")]
         output: Option<PathBuf>,
     },
@@ -96,9 +111,9 @@ JSON:
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Format {
-    /// A drawing, for browsers and documents
+    /// Drawing for browsers and documents
     Svg,
-    /// Text that GitHub and others draw
+    /// Text that GitHub and other tools render
     Mermaid,
 }
 
@@ -108,9 +123,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         Action::Show { protocol, json } => {
             let machine = find(&protocol, global)?;
             if json {
-                return output::json(&described(&machine));
+                return output::json(&as_json(&machine));
             }
-            output::text(&told(&machine))
+            output::text(&as_text(&machine))
         }
         Action::Check { files, json } => check(&files, json),
         Action::Draw {
@@ -126,15 +141,16 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
             match output {
                 None => output::text(&drawn),
                 Some(path) => std::fs::write(&path, drawn).map_err(|error| {
-                    let advice = "name a file that this user can write";
-                    Failure::failed(format!("cannot write: {error}"), input::name(&path), advice)
+                    let help = "give a file that this user can write";
+                    let problem = format!("cannot write the drawing: {error}");
+                    Failure::failed(problem, input::name(&path), help)
                 }),
             }
         }
     }
 }
 
-/// The protocols of the standard, and those of the configuration.
+/// Loads the protocols of the standards and of the configuration.
 fn library(global: &Global) -> Result<Library, Failure> {
     let mut library = Library::standard();
     for file in &global.config()?.monitor.protocols {
@@ -143,14 +159,14 @@ fn library(global: &Global) -> Result<Library, Failure> {
             Failure::failed(
                 error.to_string(),
                 file.as_str(),
-                "list fewer in monitor.protocols",
+                "list fewer files in monitor.protocols",
             )
         })?;
     }
     Ok(library)
 }
 
-/// What is named: a protocol that is known, else a file.
+/// Finds a known protocol by its name, else reads the file of that name.
 fn find(named: &str, global: &Global) -> Result<Machine, Failure> {
     let path = Path::new(named);
     let library = library(global)?;
@@ -160,9 +176,9 @@ fn find(named: &str, global: &Global) -> Result<Machine, Failure> {
         None => {
             let names: Vec<&str> = library.iter().map(Machine::name).collect();
             Err(Failure::failed(
-                format!("no protocol is called {named:?}, and no file either"),
-                "the protocols that are known",
-                format!("name a file, or one of {}", names.join(", ")),
+                format!("no protocol and no file has the name {named:?}"),
+                "the command line",
+                format!("give a file, or one of {}", names.join(", ")),
             ))
         }
     }
@@ -174,11 +190,11 @@ fn read(path: &Path) -> Result<Machine, Failure> {
     Machine::read(&name, &text).map_err(|error| {
         let all = error.mistakes.iter().map(|mistake| {
             let place = format!("{name}:{}", mistake.line);
-            Failure::failed(mistake.problem.to_string(), place, "correct the file")
+            Failure::failed(mistake.problem.to_string(), place, "fix the file")
         });
         match Failure::all(all) {
             Err(failure) => failure,
-            Ok(()) => Failure::failed(error.to_string(), name.as_str(), "correct the file"),
+            Ok(()) => Failure::failed(error.to_string(), name.as_str(), "fix the file"),
         }
     })
 }
@@ -186,8 +202,9 @@ fn read(path: &Path) -> Result<Machine, Failure> {
 fn text_of(path: &Path) -> Result<String, Failure> {
     let bytes = input::read(path, MAX_FILE as u64)?;
     String::from_utf8(bytes).map_err(|error| {
-        let what = format!("not UTF-8 at byte {}", error.utf8_error().valid_up_to());
-        Failure::failed(what, input::name(path), "save it as UTF-8")
+        let at = error.utf8_error().valid_up_to();
+        let problem = format!("invalid UTF-8 at byte {at}");
+        Failure::failed(problem, input::name(path), "save the file as UTF-8")
     })
 }
 
@@ -206,7 +223,7 @@ fn list(library: &Library, as_json: bool) -> Result<(), Failure> {
     }
     let mut table = Table::new();
     table.load_style(presets::NOTHING);
-    table.set_header(["PROTOCOL", "", "ALSO CALLED"]);
+    table.set_header(["PROTOCOL", "TITLE", "ALIASES"]);
     for machine in library.iter() {
         let aliases = machine.aliases().join(", ");
         table.add_row([
@@ -224,7 +241,7 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
         for file in files {
             match read(file) {
                 Ok(machine) => output::text(&format!(
-                    "{}: {}, states: {}, no mistakes\n",
+                    "{}: {}, states: {}, no errors\n",
                     input::name(file),
                     escape(machine.name()),
                     machine.states().len()
@@ -234,12 +251,12 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
         }
         return Failure::all(failures);
     }
-    let mut told = Vec::new();
-    let mut wrong = false;
+    let mut results = Vec::new();
+    let mut invalid = false;
     for file in files {
         let name = input::name(file);
         let read = Machine::read(&name, &text_of(file)?);
-        wrong |= read.is_err();
+        invalid |= read.is_err();
         let mistakes: Vec<Value> = match &read {
             Ok(_) => Vec::new(),
             Err(error) => {
@@ -249,11 +266,11 @@ fn check(files: &[PathBuf], as_json: bool) -> Result<(), Failure> {
             }
         };
         let name_of = read.as_ref().ok().map(Machine::name);
-        told.push(json!({ "file": name, "name": name_of, "mistakes": mistakes }));
+        results.push(json!({ "file": name, "name": name_of, "mistakes": mistakes }));
     }
-    output::json(&told)?;
-    if wrong {
-        return Err(Failure::already_told());
+    output::json(&results)?;
+    if invalid {
+        return Err(Failure::already_reported());
     }
     Ok(())
 }
@@ -273,7 +290,7 @@ fn cancel(machine: &Machine) -> &'static str {
     }
 }
 
-/// When a time-out is, in words.
+/// The time of a timeout, as text.
 fn after(when: After) -> String {
     match when {
         After::Span(span) => humantime::format_duration(span).to_string(),
@@ -281,23 +298,23 @@ fn after(when: After) -> String {
     }
 }
 
-/// What is said, in words.
+/// The performative of a transition, as text.
 fn act(step: &Transition) -> &str {
     match step.performative() {
-        ".*" => "anything",
+        ".*" => "any message",
         named => named,
     }
 }
 
-/// Who says it or hears it, in words.
+/// The role of a sender or receiver, as text.
 fn role(named: &str) -> &str {
     match named {
-        ".*" => "anybody",
+        ".*" => "any role",
         named => named,
     }
 }
 
-/// The protocols that may run within a state, in words.
+/// The protocols that are allowed within a state, as text.
 fn within(sub: &Subprotocol) -> String {
     match sub.name() {
         ".*" => "any protocol".to_owned(),
@@ -305,7 +322,7 @@ fn within(sub: &Subprotocol) -> String {
     }
 }
 
-fn described(machine: &Machine) -> Value {
+fn as_json(machine: &Machine) -> Value {
     let state = |state: &State| {
         let transitions = state.transitions().iter().map(|transition| {
             json!({
@@ -346,20 +363,20 @@ fn described(machine: &Machine) -> Value {
     })
 }
 
-fn told(machine: &Machine) -> String {
+fn as_text(machine: &Machine) -> String {
     let mut lines = vec![match machine.title() {
         Some(title) => format!("{}: {title}", machine.name()),
         None => machine.name().to_owned(),
     }];
     if !machine.aliases().is_empty() {
-        lines.push(format!("also called {}", machine.aliases().join(", ")));
+        lines.push(format!("aliases: {}", machine.aliases().join(", ")));
     }
     lines.push(format!("roles: {}", machine.roles().join(", ")));
     lines.push(match machine.scope() {
-        Scope::Participant => "each participant has a state of its own".to_owned(),
-        _ => "one state for the whole conversation".to_owned(),
+        Scope::Participant => "scope: one state per participant".to_owned(),
+        _ => "scope: one state for the whole conversation".to_owned(),
     });
-    lines.push(format!("may be cancelled by: {}", cancel(machine)));
+    lines.push(format!("may be canceled by: {}", cancel(machine)));
     for state in machine.states() {
         let begins = state.id() == machine.initial().id();
         let marks = match (begins, state.is_final()) {
@@ -372,7 +389,7 @@ fn told(machine: &Machine) -> String {
         lines.push(format!("{}{marks}", state.id()));
         for step in state.transitions() {
             let optional = if step.is_optional() {
-                " (may be left out)"
+                " (optional)"
             } else {
                 ""
             };
@@ -387,9 +404,9 @@ fn told(machine: &Machine) -> String {
         for sub in state.subprotocols() {
             let answers = sub
                 .proxied_to()
-                .map(|to| format!(", its answers to {}", role(to)));
+                .map(|to| format!(", answers go to {}", role(to)));
             lines.push(format!(
-                "  {} within, begun by {}{}",
+                "  {} within this state, started by {}{}",
                 within(sub),
                 role(sub.from()),
                 answers.unwrap_or_default()

@@ -1,4 +1,4 @@
-//! `fipa routes`: which way letters would go, and why.
+//! `fipa routes`: the routes that letters would take now.
 
 use std::time::Duration;
 
@@ -14,37 +14,45 @@ use crate::options::Global;
 use crate::output;
 use crate::report::Failure;
 
-/// Show which way letters would go now, and why
+/// Show the routes that letters would take now
 ///
-/// For every agent that is known here: the ways from a process of this host that starts now, in
-/// the order in which they would be tried; for agents of other hosts also those from the gateway,
-/// as it says itself. Then what has happened on each way of the gateway since it was started, its
-/// static peers, and the gateways it is connected with.
+/// Lists, for every known agent, the routes from a new process of this host in the order in which
+/// they would be tried. For agents on other hosts it also lists the routes from the gateway, as the
+/// gateway reports them. Then it lists the gateway's counters for each route since its start, its
+/// static peers and its connected gateways.
 ///
-/// A way that failed is put back: it is tried after all that work, until some time has passed,
-/// and more time after every further failure.
+/// A route that failed is tried after all working routes until its backoff ends. The backoff grows
+/// with each further failure.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   fipa routes
-  fipa routes 'arm_.*'
+  fipa routes 'arm_.*'                      routes to agents whose names match
   fipa routes --json | jq '.gateway.ways[] | select(.failed > 0)'
 
+Columns:
+  STATUS       whether and when the route would be used; first and then give the order
+  IN FLIGHT    letters sent and not yet answered
+  TRIED        attempts to send a letter
+  TAKEN        letters accepted by the peer, or sent to a peer that cannot confirm
+  REJECTED     letters that the peer did not accept, for example because its queue was full
+  FAILED       attempts without a connection or an answer
+
 JSON:
-  { \"domain\": text, \"process\": report, \"gateway\": report, or null when none is running }
+  { \"domain\": text, \"process\": report, \"gateway\": report, or null if no gateway is running }
   report = { \"mts\": name, \"incarnation\", \"locations\": [ text ],
     \"routes\": [ { \"receiver\", \"incarnation\", \"gateway\": incarnation or null,
-                  \"exception\": the pattern of [routes] that decides, or null,
-                  \"ways\": [ { \"location\", \"standing\": { \"standing\": \"ready\", \"failing\"
+                  \"exception\": the matching pattern of [routes], or null,
+                  \"ways\": [ { \"location\", \"standing\": { \"standing\": \"ready\", \"failing\",
                               \"not_in_order\" or \"unsupported\", with \"milliseconds\", \"failures\" and
-                              \"error\" when it is failing } } ] } ],
+                              \"error\" if it is failing } } ] } ],
     \"ways\": [ { \"location\", \"standing\", \"in_flight\", \"tried\", \"taken\", \"turned_back\",
                 \"failed\", \"last_error\", \"last_error_seconds\" } ],
     \"peers\": [ { \"name\", \"answers\": location or null, \"failures\": [ [ location, text ] ],
                  \"asked_again_in\": milliseconds or null } ],
     \"neighbours\": [ { \"name\", \"incarnation\", \"locations\", \"connections\", \"seconds\" } ] }")]
 pub(crate) struct Arguments {
-    /// Only to those with this name, or whose name matches this pattern
+    /// Show only routes to agents with this name or with a name that matches this pattern
     #[arg(value_parser = parse_receivers)]
     pattern: Option<Receivers>,
 
@@ -53,7 +61,7 @@ pub(crate) struct Arguments {
     json: bool,
 }
 
-/// Receivers as they were written, and what that means.
+/// A pattern of receivers: its text and its parsed form.
 #[derive(Debug, Clone)]
 struct Receivers {
     text: String,
@@ -67,8 +75,8 @@ fn parse_receivers(text: &str) -> Result<Receivers, fipa::PatternError> {
     })
 }
 
-/// How long the gateway has to answer.
-const PATIENCE: Duration = Duration::from_secs(5);
+/// Maximum time for the gateway's answer.
+const GATEWAY_TIMEOUT: Duration = Duration::from_secs(5);
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
@@ -78,9 +86,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         let domain = membership::join(&config).await?;
         domain.directory().refresh();
         let process = domain.routes(&query);
-        let asked = ask(&domain, pattern.map(|it| it.text.as_str())).await;
+        let gateway = gateway_report(&domain, pattern.map(|it| it.text.as_str())).await;
         domain.close().await;
-        Ok((process, asked?))
+        Ok((process, gateway?))
     })?;
     if arguments.json {
         return output::json(
@@ -88,17 +96,18 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> 
         );
     }
     if process.routes.is_empty() {
-        let name = pattern.map_or("", |_| " by that name");
+        let named = pattern.map_or("", |_| " with this name");
         let domain = &config.domain;
-        return output::text(&format!(
-            "nobody in the domain {domain} is known here{name}\n"
-        ));
+        return output::text(&format!("no agent{named} is known in domain {domain}\n"));
     }
-    output::text(&told(&process, gateway.as_ref()))
+    output::text(&described(&process, gateway.as_ref()))
 }
 
-/// What the gateway of this host says, if there is one.
-async fn ask(domain: &Domain, receivers: Option<&str>) -> Result<Option<Report>, Failure> {
+/// Requests the report of this host's gateway. Returns `None` when no gateway is running.
+async fn gateway_report(
+    domain: &Domain,
+    receivers: Option<&str>,
+) -> Result<Option<Report>, Failure> {
     let entries = domain.directory().entries();
     let mut gateways = entries
         .iter()
@@ -107,17 +116,17 @@ async fn ask(domain: &Domain, receivers: Option<&str>) -> Result<Option<Report>,
         return Ok(None);
     };
     let name = format!("fipa-routes-{}", Incarnation::random());
-    let not_told = |error: &dyn std::fmt::Display| {
+    let failed = |error: &dyn std::fmt::Display| {
         Failure::failed(
             error.to_string(),
-            format!("the gateway {:?}", gateway.name),
-            "see its log; if it hangs, end it and start it again with `fipa up`",
+            format!("gateway {:?}", gateway.name),
+            "check the log of the gateway; if it hangs, restart it (`fipa up`)",
         )
     };
     let agent = domain
         .register_with(&name, RegisterOptions::default())
-        .map_err(|error| not_told(&error))?;
-    let report = routes::of_gateway(&agent, gateway, receivers, PATIENCE).await;
+        .map_err(|error| failed(&error))?;
+    let report = routes::of_gateway(&agent, gateway, receivers, GATEWAY_TIMEOUT).await;
     match report {
         Ok(mut report) => {
             report.routes.retain(|route| route.receiver != name);
@@ -126,40 +135,40 @@ async fn ask(domain: &Domain, receivers: Option<&str>) -> Result<Option<Report>,
         Err(AskError::NotDelivered(_)) if domain.directory().lookup(&gateway.name).is_none() => {
             Ok(None)
         }
-        Err(error) => Err(not_told(&error)),
+        Err(error) => Err(failed(&error)),
     }
 }
 
-fn told(process: &Report, gateway: Option<&Report>) -> String {
+fn described(process: &Report, gateway: Option<&Report>) -> String {
     let mut text = String::new();
-    let mut table = table(&["TO", "FROM", "WAY", "STANDING"]);
+    let mut table = table(&["TO", "FROM", "ROUTE", "STATUS"]);
     for route in &process.routes {
-        rows_of(&mut table, route, "here");
-        let onwards = gateway.filter(|_| route.gateway.is_some());
+        rows_of(&mut table, route, "this host");
+        let remote = gateway.filter(|_| route.gateway.is_some());
         let same = |other: &&Route| other.incarnation == route.incarnation;
-        if let Some(onwards) = onwards.and_then(|it| it.routes.iter().find(same)) {
-            rows_of(&mut table, onwards, "the gateway");
+        if let Some(onward) = remote.and_then(|it| it.routes.iter().find(same)) {
+            rows_of(&mut table, onward, "gateway");
         }
     }
     text.push_str(&format!("{}\n", table.trim_fmt()));
     match gateway {
-        Some(gateway) => text.push_str(&gateway_told(gateway)),
-        None => text.push_str("\nno gateway is running; agents of other hosts are not reached\n"),
+        Some(gateway) => text.push_str(&gateway_described(gateway)),
+        None => text.push_str("\nno gateway is running, so agents on other hosts are unreachable; start one with `fipa up`\n"),
     }
     text
 }
 
-fn gateway_told(gateway: &Report) -> String {
+fn gateway_described(gateway: &Report) -> String {
     let locations: Vec<String> = gateway.locations.iter().map(ToString::to_string).collect();
-    let mut text = format!("\nThe gateway {}:\n", escape(&gateway.mts));
-    text.push_str(&format!("takes letters at {}\n", locations.join(", ")));
+    let mut text = format!("\nGateway {}:\n", escape(&gateway.mts));
+    text.push_str(&format!("listening on {}\n", locations.join(", ")));
     let mut ways = table(&[
-        "WAY",
-        "STANDING",
-        "UNDER WAY",
+        "ROUTE",
+        "STATUS",
+        "IN FLIGHT",
         "TRIED",
         "TAKEN",
-        "TURNED BACK",
+        "REJECTED",
         "FAILED",
         "LAST ERROR",
     ]);
@@ -176,27 +185,30 @@ fn gateway_told(gateway: &Report) -> String {
         ]);
     }
     if gateway.ways.is_empty() {
-        text.push_str("has sent no letters yet\n");
+        text.push_str("no letters sent yet\n");
     } else {
         text.push_str(&format!("{}\n", ways.trim_fmt()));
     }
     for peer in &gateway.peers {
-        let stands = match (&peer.answers, peer.failures.last()) {
-            (Some(location), _) => format!("answers at {location}"),
+        let status = match (&peer.answers, peer.failures.last()) {
+            (Some(location), _) => format!("responding at {location}"),
             (None, Some((location, why))) => {
-                format!("does not answer; last at {location}: {}", escape(why))
+                format!(
+                    "not responding; last attempt at {location}: {}",
+                    escape(why)
+                )
             }
-            (None, None) => "has not answered yet".to_owned(),
+            (None, None) => "no response yet".to_owned(),
         };
-        text.push_str(&format!("static peer {}: {stands}\n", escape(&peer.name)));
+        text.push_str(&format!("static peer {}: {status}\n", escape(&peer.name)));
     }
-    for neighbour in &gateway.neighbours {
-        let locations = neighbour.locations.iter().map(ToString::to_string);
+    for neighbor in &gateway.neighbours {
+        let locations = neighbor.locations.iter().map(ToString::to_string);
         let locations: Vec<String> = locations.collect();
-        let since = humantime::format_duration(Duration::from_secs(neighbour.seconds));
+        let since = humantime::format_duration(Duration::from_secs(neighbor.seconds));
         text.push_str(&format!(
-            "connected with {} for {since}: {}\n",
-            escape(&neighbour.name),
+            "connected to {} for {since}: {}\n",
+            escape(&neighbor.name),
             locations.join(", ")
         ));
     }
@@ -209,7 +221,12 @@ fn rows_of(table: &mut Table, route: &Route, from: &str) {
         None => escape(&route.receiver).into_owned(),
     };
     if route.ways.is_empty() {
-        table.add_row([receiver.as_str(), from, "none", "it has no locations"]);
+        table.add_row([
+            receiver.as_str(),
+            from,
+            "none",
+            "the agent has no locations",
+        ]);
     }
     let mut first = true;
     for way in &route.ways {
@@ -233,12 +250,13 @@ fn standing(standing: &Standing) -> String {
             error,
         } => {
             let left = humantime::format_duration(Duration::from_millis(*milliseconds));
+            let times = if *failures == 1 { "time" } else { "times" };
             format!(
-                "failed {failures} times, put back for {left}: {}",
+                "failed {failures} {times}, tried last for {left}: {}",
                 escape(error)
             )
         }
-        Standing::NotInOrder => "not used: not in the order of transports".to_owned(),
+        Standing::NotInOrder => "not used: transport not listed in mts.transports".to_owned(),
         Standing::Unsupported => "not used: unsupported transport".to_owned(),
         other => format!("{other:?}"),
     }

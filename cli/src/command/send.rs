@@ -1,4 +1,4 @@
-//! `fipa send`: one message, and what became of it.
+//! `fipa send`: sends one message and prints its outcomes.
 
 mod advice;
 
@@ -17,54 +17,55 @@ use crate::options::{self, Global};
 use crate::report::{self, Failure};
 use crate::{input, membership, output};
 
-/// Send one message, and say what became of it
+/// Send one message and print its outcome
 ///
-/// Registers an agent for as long as it takes, sends the message to every receiver and prints one
-/// outcome for each: delivered (it is in the receiver's queue), sent (the peer cannot confirm) or
-/// failed, the way it went, and the ways that were tried before. With --wait also the first reply.
+/// Registers a temporary agent, sends the message to every receiver and prints one outcome per
+/// receiver: delivered (the letter is in the receiver's queue), sent (the peer cannot confirm) or
+/// failed. Each outcome has the route of the letter and the failed attempts before it. With --wait it
+/// also prints the first reply.
 ///
-/// Works with and without a gateway; agents of other hosts are reached when one is running
-/// (`fipa up`). The exit code is 0 only if every receiver has got the message and, with --wait, a
-/// reply came. A failure message about the letter itself, from the message transport service of
-/// either host, is no reply.
+/// Works with and without a gateway; agents on other hosts are reachable while a gateway is running
+/// (`fipa up`). The exit code is 0 only if no outcome is failed and, with --wait, a reply was
+/// received. A FIPA failure message about the letter from a message transport service does not count
+/// as a reply.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   fipa send --to arm_1 --content hello
   fipa send --to arm_1 --performative request --content '(lift sample-3)' --wait
-  fipa send --to 'arm_.*' --content stop               everybody whose name matches
+  fipa send --to 'arm_.*' --content stop               to all agents whose names match
   fipa send --to camera --content-file picture.raw --deadline 30s
   head -c 4096 /dev/urandom | fipa send --to camera --content-file - --json
 
 JSON:
   { \"deliveries\": [ { \"receiver\": name, \"outcome\": \"delivered\", \"sent\" or \"failed\",
-                      \"via\": transport, unless it failed, \"reason\": text, if it failed,
+                      \"via\": transport, unless failed, \"reason\": text, if failed,
                       \"attempts\": [ { \"via\", \"location\", \"error\" } ] } ],
-    \"reply\": the message, as `fipa decode` prints it, if one came,
-    \"failures\": [ { \"from\": name, \"receiver\": name or null, \"reason\": text } ], if with --wait
-                failure messages about the letter came }")]
+    \"reply\": the reply as `fipa decode` prints it, if one was received,
+    \"failures\": [ { \"from\": name, \"receiver\": name or null, \"reason\": text } ], the failure
+                messages about the letter, if any were received with --wait }")]
 pub(crate) struct Arguments {
-    /// Name of the receiver, or a pattern of names such as 'arm_.*'; may be repeated
+    /// Name of the receiver, or a pattern such as 'arm_.*'; repeatable
     #[arg(long, required = true, value_name = "NAME")]
     to: Vec<AgentId>,
 
-    /// Name to send it under [default: a name that nobody else has]
+    /// Name of the sending agent [default: a random, unused name]
     #[arg(long, value_name = "NAME")]
     from: Option<AgentId>,
 
-    /// What the message does: inform, request, query-ref, …, or a word of your own
+    /// Performative: inform, request, query-ref and so on, or a word of your own
     #[arg(long, short, default_value = "inform", value_name = "ACT")]
     performative: Performative,
 
-    /// What it says
+    /// Content of the message
     #[arg(long, value_name = "TEXT", conflicts_with = "content_file")]
     content: Option<String>,
 
-    /// What it says, byte by byte as in this file; - for standard input
+    /// Content of the message: the bytes of this file; - for standard input
     #[arg(long, value_name = "FILE")]
     content_file: Option<PathBuf>,
 
-    /// How long the receivers have to take it [default: mts.deadline of the configuration]
+    /// Deadline of the delivery, for example 30s [default: mts.deadline]
     #[arg(long, value_name = "TIME", value_parser = deadline)]
     deadline: Option<Duration>,
 
@@ -72,7 +73,7 @@ pub(crate) struct Arguments {
     #[arg(long)]
     wait: bool,
 
-    /// How long to wait for it
+    /// Maximum wait for a reply, for example 10s
     #[arg(long, value_name = "TIME", default_value = "10s", requires = "wait",
           value_parser = options::duration)]
     timeout: Duration,
@@ -85,50 +86,50 @@ pub(crate) struct Arguments {
     parameters: Parameters,
 }
 
-/// What else a message can say of itself (FIPA00061).
+/// The other parameters of a message (FIPA00061).
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Parameters of the message")]
 struct Parameters {
-    /// The interaction protocol, for example fipa-request
+    /// Interaction protocol, for example fipa-request
     #[arg(long, value_name = "WORD")]
     protocol: Option<String>,
 
-    /// The conversation it belongs to; with --wait one of its own unless given
+    /// Conversation identifier [default with --wait: a random one]
     #[arg(long, value_name = "TEXT")]
     conversation_id: Option<String>,
 
-    /// What the reply is to have as in-reply-to; with --wait something unique unless given
+    /// Expected in-reply-to of the reply [default with --wait: a random text]
     #[arg(long, value_name = "TEXT")]
     reply_with: Option<String>,
 
-    /// Who is to get the replies, instead of the sender; may be repeated
+    /// Agent that receives the replies instead of the sender; repeatable
     #[arg(long, value_name = "NAME", conflicts_with = "wait")]
     reply_to: Vec<AgentId>,
 
-    /// The reply-with of the message that this one answers
+    /// The reply-with parameter of the message to which this is the reply
     #[arg(long, value_name = "TEXT")]
     in_reply_to: Option<String>,
 
-    /// The latest time for a reply: from now, such as 30s, or as in 2030-01-31T12:00:00Z
+    /// Latest time of a reply, for example 30s (from now) or 2030-01-31T12:00:00Z
     #[arg(long, value_name = "TIME", value_parser = reply_by)]
     reply_by: Option<Time>,
 
-    /// The language of the content
+    /// Language of the content
     #[arg(long, value_name = "TEXT")]
     language: Option<String>,
 
-    /// The encoding of the content
+    /// Encoding of the content
     #[arg(long, value_name = "TEXT")]
     encoding: Option<String>,
 
-    /// The ontology of the content
+    /// Ontology of the content
     #[arg(long, value_name = "TEXT")]
     ontology: Option<String>,
 }
 
 pub(crate) fn run(mut arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
-    // Before the domain is joined: a terminal may take its time.
+    // Read before the domain is joined: input from a terminal can take long.
     let content = match (arguments.content.take(), &arguments.content_file) {
         (Some(text), _) => Some(text.into_bytes()),
         (None, Some(file)) => Some(input::read(file, Message::MAX_CONTENT)?),
@@ -152,7 +153,7 @@ pub(crate) fn run(mut arguments: Arguments, global: &Global) -> Result<(), Failu
     })
 }
 
-/// Sends the message, waits for the reply if one is wanted, and prints what came of both.
+/// Sends the message, waits for the reply if requested, and prints the outcomes and the reply.
 async fn converse(
     agent: &Agent,
     arguments: &Arguments,
@@ -164,17 +165,17 @@ async fn converse(
     let sent = agent.send_within(message.clone(), deadline).await;
     let deliveries = sent.map_err(|error| {
         Failure::failed(
-            format!("the message cannot be sent: {error}"),
+            format!("cannot send the message: {error}"),
             "this process",
-            "see `fipa send --help` for what a message can have",
+            "`fipa send --help` describes the parameters of a message",
         )
     })?;
     if !arguments.json {
         output::text(&format!("{deliveries}\n"))?;
     }
-    let anybody_got_it = deliveries.0.iter().any(|one| one.outcome.is_success());
+    let any_succeeded = deliveries.0.iter().any(|one| one.outcome.is_success());
     let mut answers = Answers::default();
-    if arguments.wait && anybody_got_it {
+    if arguments.wait && any_succeeded {
         let sent = deliveries.0.iter().filter(|one| one.outcome.is_success());
         answers = wait(agent, &message, sent.count(), arguments.timeout).await?;
     }
@@ -193,14 +194,14 @@ async fn converse(
         Some(reply) => output::text(&format!("reply: {}\n", reply.message))?,
         None => {}
     }
-    let silent = arguments.wait && anybody_got_it && answers.timed_out;
-    let silent = silent.then(|| no_reply(&deliveries, arguments.timeout));
+    let without_reply = arguments.wait && any_succeeded && answers.timed_out;
+    let no_reply = without_reply.then(|| no_reply(&deliveries, arguments.timeout));
     let failures = advice::failures(&deliveries, agent, config);
-    let told = answers.failures.iter().map(FailureMessage::failure);
-    Failure::all(failures.into_iter().chain(told).chain(silent))
+    let reported = answers.failures.iter().map(FailureMessage::failure);
+    Failure::all(failures.into_iter().chain(reported).chain(no_reply))
 }
 
-/// What came while the command waited for a reply.
+/// The messages received during the wait for a reply.
 #[derive(Debug, Default)]
 struct Answers {
     reply: Option<Incoming>,
@@ -208,7 +209,7 @@ struct Answers {
     timed_out: bool,
 }
 
-/// A message that says that the letter was not delivered.
+/// A FIPA failure message about the delivery of the letter.
 #[derive(Debug)]
 struct FailureMessage {
     from: String,
@@ -232,8 +233,8 @@ impl FailureMessage {
         let receiver = receiver.as_deref().unwrap_or("a receiver");
         Failure::failed(
             format!("not delivered: {reason}"),
-            format!("{receiver:?}, as {:?} says in a failure message", self.from),
-            "see `fipa agents`, and the log of that message transport service",
+            format!("{receiver:?}, in a failure message from {:?}", self.from),
+            "check the receiver with `fipa agents`, and the log of that message transport service",
         )
     }
 }
@@ -282,24 +283,24 @@ fn message(
         Failure::wrong_usage(
             error.to_string(),
             "the command line",
-            "see `fipa send --help` for what a message can have",
+            "`fipa send --help` describes the parameters of a message",
         )
     })
 }
 
-/// Waits for the first reply. Failure messages about the letter are collected meanwhile; when there
-/// is one for each of the receivers that it was `sent` to, no reply is waited for.
+/// Waits for the first reply and collects failure messages about the letter. The wait ends early when
+/// there is one failure message for each of the `sent` letters.
 async fn wait(
     agent: &Agent,
     message: &Message,
     sent: usize,
-    patience: Duration,
+    timeout: Duration,
 ) -> Result<Answers, Failure> {
     let mut answers = Answers::default();
     let first = async {
         while answers.failures.len() < sent {
             match agent.receive().await {
-                // What this process tells the agent itself is in the outcomes already.
+                // A message of this process to its own agent; the outcomes have it already.
                 Ok(incoming) if incoming.via.is_none() => {}
                 Ok(incoming) if incoming.message.is_reply_to(message) => {
                     match FailureMessage::of(&incoming.message) {
@@ -310,41 +311,41 @@ async fn wait(
                         }
                     }
                 }
-                Ok(other) => report::warn(&format!("not a reply: {}", other.message)),
+                Ok(other) => report::warn(&format!("ignored, not a reply: {}", other.message)),
                 Err(error @ ReceiveError::Malformed { .. }) => report::warn(&error.to_string()),
                 Err(error) => {
                     return Err(Failure::failed(
                         format!("cannot wait for a reply: {error}"),
                         format!("agent {:?}", agent.name()),
-                        "send it again",
+                        "send the message again",
                     ));
                 }
             }
         }
         Ok(())
     };
-    match tokio::time::timeout(patience, first).await {
+    match tokio::time::timeout(timeout, first).await {
         Ok(ended) => ended?,
         Err(_) => answers.timed_out = true,
     }
     Ok(answers)
 }
 
-fn no_reply(deliveries: &Deliveries, patience: Duration) -> Failure {
-    let got_it = deliveries.0.iter().filter(|one| one.outcome.is_success());
-    let got_it: Vec<&str> = got_it.map(|one| &*one.receiver).collect();
+fn no_reply(deliveries: &Deliveries, timeout: Duration) -> Failure {
+    let reached = deliveries.0.iter().filter(|one| one.outcome.is_success());
+    let reached: Vec<&str> = reached.map(|one| &*one.receiver).collect();
     Failure::failed(
-        format!("no reply within {}", humantime::format_duration(patience)),
-        advice::receivers(&got_it),
-        "see whether it answers such a message at all, or wait longer with --timeout",
+        format!("no reply within {}", humantime::format_duration(timeout)),
+        advice::receivers(&reached),
+        "check whether the receiver answers such messages, or wait longer with --timeout",
     )
 }
 
-/// What the configuration allows for `mts.deadline`.
+/// Parses a deadline, with the limits of `mts.deadline`.
 fn deadline(text: &str) -> Result<Duration, String> {
     let deadline = options::duration(text)?;
     if deadline.is_zero() || deadline > Duration::from_secs(3600) {
-        return Err("use more than 0 and at most 1h".to_owned());
+        return Err("expected more than 0 and at most 1h".to_owned());
     }
     Ok(deadline)
 }

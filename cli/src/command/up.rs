@@ -7,44 +7,44 @@ use fipa::{Change, Config, Entry, Gateway};
 use fipa_acl::escape;
 use serde_json::{Value, json};
 
-use crate::membership::{self, Stop, Wish};
+use crate::membership::{self, SignalRequest, Stop};
 use crate::options::{self, Global};
 use crate::output;
 use crate::report::{self, Failure};
 
-/// Run the gateway, which connects the agents of this host with those of other hosts
+/// Run the gateway, which connects the agents of this host with agents on other hosts
 ///
-/// Listens on the network (transport.tcp.listen), announces the agents of this host by mDNS and
-/// finds those of others, until Ctrl-C. Agents of one host reach each other without it. A domain
-/// has one gateway on a host.
+/// The gateway listens on the network (transport.tcp.listen), announces the agents of this host by
+/// mDNS and discovers the agents of other hosts, until Ctrl-C. Agents of one host reach each other
+/// without it. A domain has at most one gateway on a host.
 ///
-/// A hang-up signal (`kill -HUP`) makes it read its configuration again, without losing a letter:
-/// mts.transports (their order), mts.deadline, [routes] and discovery.static; it says what has to
-/// wait until it is started again.
+/// On SIGHUP (`kill -HUP`) the gateway reads its configuration again and loses no letter. It applies
+/// the order of mts.transports, mts.deadline, [routes] and discovery.static, and warns about changes
+/// that take effect only after a restart.
 ///
-/// Says on standard output what it is and where it listens. With -v, it logs to standard error
-/// who joins and who leaves.
+/// The command prints the gateway's name and addresses on standard output. With -v it logs on
+/// standard error when agents join and leave.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   fipa up
-  fipa up -v                                        who joins and who leaves
+  fipa up -v                                        logs agents that join and leave
   fipa up --set security.keys=$HOME/.config/fipa/keys --set transport.tcp.listen=0.0.0.0:7788
-                                                    open to hosts that are trusted (fipa keys)
-  fipa up --set discovery.mdns=false                found by nobody who is not told
-  fipa up --json | head -n 1                        one line when it is ready
+                                                    open to trusted hosts (see fipa keys)
+  fipa up --set discovery.mdns=false                not discoverable; peers need a static address
+  fipa up --json | head -n 1                        prints one line when the gateway is ready
 
-JSON, one line when it is ready:
+JSON, one line when the gateway is ready:
   { \"name\": text, \"incarnation\": text, \"domain\": text, \"locations\": [ text ],
-    \"discovery\": { \"mdns\": true or false, \"problem\": text when there is one } }")]
+    \"discovery\": { \"mdns\": true or false, \"problem\": text, if there is one } }")]
 pub(crate) struct Arguments {
-    /// Print one line of JSON when it is ready
+    /// Print one line of JSON when the gateway is ready
     #[arg(long)]
     json: bool,
 }
 
-/// How often a problem with finding other hosts is looked for. Nothing waits for it.
-const LOOK_FOR_PROBLEMS: Duration = Duration::from_secs(5);
+/// Interval of checks for discovery problems.
+const PROBLEM_CHECK_INTERVAL: Duration = Duration::from_secs(5);
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
@@ -63,35 +63,35 @@ async fn serve(config: &Config, json: bool, global: &Global) -> Result<(), Failu
         output::text(&ready(config, &gateway, problem.as_deref()))?;
     }
     for entry in gateway.directory().entries().iter() {
-        tell("is there", entry);
+        log_entry("present", entry);
     }
-    let mut look = tokio::time::interval(LOOK_FOR_PROBLEMS);
+    let mut problem_check = tokio::time::interval(PROBLEM_CHECK_INTERVAL);
     loop {
         tokio::select! {
-            wish = stop.wish() => match wish {
-                Wish::End => break,
-                Wish::Reload => reload(&mut gateway, global),
+            request = stop.next_request() => match request {
+                SignalRequest::End => break,
+                SignalRequest::Reload => reload(&mut gateway, global),
             },
             Some(change) = changes.next() => log(&change),
-            _ = look.tick() => {
+            _ = problem_check.tick() => {
                 let now = gateway.discovery_problem();
                 if now != problem {
                     match &now {
-                        Some(text) => tracing::warn!("other hosts may not be found: {text}"),
-                        None => tracing::info!("other hosts are found again"),
+                        Some(text) => tracing::warn!("discovery of other hosts may fail: {text}"),
+                        None => tracing::info!("discovery of other hosts works again"),
                     }
                     problem = now;
                 }
             }
         }
     }
-    tracing::info!("ending");
+    tracing::info!("stopping the gateway");
     Stop::ending();
     gateway.close().await;
     Ok(())
 }
 
-/// Reads the configuration again. One with mistakes changes nothing.
+/// Reloads the configuration. An invalid configuration changes nothing.
 fn reload(gateway: &mut Gateway, global: &Global) {
     let reloaded = global.config().and_then(|config| {
         let later = gateway.reload(&config)?;
@@ -99,34 +99,36 @@ fn reload(gateway: &mut Gateway, global: &Global) {
     });
     match reloaded {
         Ok(later) => {
-            tracing::info!("the configuration was read again");
+            tracing::info!("configuration reloaded");
             if !later.is_empty() {
                 let later = later.join(", ");
                 report::warn(&format!(
-                    "what has changed in {later} is used when the gateway is started again"
+                    "changes to {later} take effect when the gateway is restarted"
                 ));
             }
         }
-        // It is told; the gateway goes on as it was.
+        // The gateway continues with its previous configuration.
         Err(failure) => drop(failure.report()),
     }
 }
 
 fn ready(config: &Config, gateway: &Gateway, problem: Option<&str>) -> String {
     let mut text = format!(
-        "gateway {} of the domain {} is ready\n",
+        "gateway {} of domain {} is ready\n",
         escape(gateway.name()),
         config.domain
     );
     for location in gateway.locations() {
-        text.push_str(&format!("  listens at {location}\n"));
+        text.push_str(&format!("  listening on {location}\n"));
     }
     let discovery = match (config.discovery.mdns, problem) {
-        (false, _) => "are not looked for (discovery.mdns = false)".to_owned(),
-        (true, None) => "are looked for by mDNS".to_owned(),
-        (true, Some(problem)) => format!("may not be found by mDNS: {}", escape(problem)),
+        (false, _) => "off (discovery.mdns = false)".to_owned(),
+        (true, None) => "mDNS".to_owned(),
+        (true, Some(problem)) => format!("mDNS, which may fail: {}", escape(problem)),
     };
-    text.push_str(&format!("  other hosts {discovery}\n  Ctrl-C ends it\n"));
+    text.push_str(&format!(
+        "  discovery of other hosts: {discovery}\n  press Ctrl-C to stop\n"
+    ));
     text
 }
 
@@ -149,18 +151,18 @@ fn ready_json(config: &Config, gateway: &Gateway, problem: Option<&str>) -> Valu
 fn log(change: &Change) {
     match change {
         Change::Together(changes) => changes.iter().for_each(log),
-        Change::Joined(entry) => tell("joined", entry),
-        Change::Changed { after, .. } => tell("changed", after),
-        Change::Left(entry) => tell("left", entry),
-        Change::Lagged => tracing::info!("many joined and left at once"),
+        Change::Joined(entry) => log_entry("joined", entry),
+        Change::Changed { after, .. } => log_entry("changed", after),
+        Change::Left(entry) => log_entry("left", entry),
+        Change::Lagged => tracing::info!("some changes are not listed: too many at once"),
     }
 }
 
-fn tell(what: &str, entry: &Entry) {
+fn log_entry(change: &str, entry: &Entry) {
     tracing::info!(
         name = %entry.name,
         reach = ?entry.reach,
         mts = %entry.mts.name,
-        "{what}"
+        "{change}"
     );
 }

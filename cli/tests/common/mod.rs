@@ -1,7 +1,7 @@
-//! Real processes of the `fipa` command, each test in a domain and places of its own.
+//! Runs processes of the `fipa` command. Each test has its own domain and directories.
 
-#![allow(dead_code, reason = "not every test uses all of it")]
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
+#![allow(dead_code, reason = "no test uses all items")]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
 
 use std::ffi::OsStr;
 use std::fs;
@@ -15,77 +15,81 @@ use std::time::Duration;
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// Ends a test that hangs; nothing is expected to take this long.
+/// Timeout for hanging tests. No step is expected to take this long.
 const WATCHDOG: Duration = Duration::from_secs(60);
 
-/// A host of its own: a domain that nobody else has, where its processes meet, and nothing from
-/// the outside.
+/// A simulated host: a unique domain with its own runtime directory and a clean environment.
 pub(crate) struct Host {
-    place: TempDir,
+    directory: TempDir,
     pub(crate) domain: String,
 }
 
 impl Host {
     pub(crate) fn new() -> Self {
-        let place = tempfile::tempdir().unwrap();
-        let random = place.path().file_name().and_then(OsStr::to_str).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let random = directory
+            .path()
+            .file_name()
+            .and_then(OsStr::to_str)
+            .unwrap();
         let random: String = random.chars().filter(char::is_ascii_alphanumeric).collect();
         Self {
             domain: format!("cli-{}-{random}", std::process::id()),
-            place,
+            directory,
         }
     }
 
     pub(crate) fn path(&self, name: &str) -> PathBuf {
-        self.place.path().join(name)
+        self.directory.path().join(name)
     }
 
-    /// The command with these arguments, in this domain and without mDNS.
+    /// A command with these arguments in this domain, without mDNS.
     pub(crate) fn command(&self, arguments: &[&str]) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_fipa"));
         command
             .args(["--set", &format!("domain={}", self.domain)])
             .args(["--set", "discovery.mdns=false"])
             .args(arguments)
-            .current_dir(self.place.path())
+            .current_dir(self.directory.path())
             .env_clear()
-            .env("HOME", self.place.path())
+            .env("HOME", self.directory.path())
             .env("FIPA_RUNTIME_DIR", self.path("run"))
             .stdin(Stdio::null());
         command
     }
 
-    /// Runs it to its end.
+    /// Runs a command to its end.
     pub(crate) fn run(&self, arguments: &[&str]) -> Ran {
         output_of(&mut self.command(arguments), Vec::new())
     }
 
-    /// Runs it to its end with something on standard input.
+    /// Runs a command to its end with this standard input.
     pub(crate) fn run_with_input(&self, arguments: &[&str], input: &[u8]) -> Ran {
         let mut command = self.command(arguments);
         output_of(command.stdin(Stdio::piped()), input.to_vec())
     }
 
-    /// Starts it and waits for the first line of its output.
+    /// Starts a command and waits for the first line of its output.
     pub(crate) fn start(&self, arguments: &[&str]) -> Running {
         Running::new(self.command(arguments))
     }
 
-    /// Starts an echo agent and waits until it is there.
+    /// Starts an echo agent and waits until it is registered.
     pub(crate) fn echo(&self, name: &str) -> Running {
         let running = self.start(&["echo", name]);
-        assert!(running.ready.starts_with(name), "{}", running.ready);
+        let expected = format!("agent {name} ");
+        assert!(running.ready.starts_with(&expected), "{}", running.ready);
         running
     }
 
-    /// What is left where the processes meet, and of their shared memory.
+    /// The remaining files in the runtime directory and in shared memory.
     pub(crate) fn left_behind(&self) -> Vec<PathBuf> {
-        let meeting = fs::read_dir(self.path("run"))
+        let runtime = fs::read_dir(self.path("run"))
             .into_iter()
             .flatten()
             .flatten();
-        let meeting = meeting.map(|entry| entry.path());
-        meeting.chain(self.shared_memory()).collect()
+        let runtime = runtime.map(|entry| entry.path());
+        runtime.chain(self.shared_memory()).collect()
     }
 
     fn shared_memory(&self) -> impl Iterator<Item = PathBuf> {
@@ -98,7 +102,7 @@ impl Host {
     }
 }
 
-/// Processes that were killed leave files in shared memory.
+/// Removes the shared memory files of killed processes.
 impl Drop for Host {
     fn drop(&mut self) {
         for file in self.shared_memory() {
@@ -107,7 +111,7 @@ impl Drop for Host {
     }
 }
 
-/// A command that came to its end.
+/// The result of a command that has ended.
 #[derive(Debug)]
 pub(crate) struct Ran {
     pub(crate) code: Option<i32>,
@@ -126,27 +130,27 @@ impl From<Output> for Ran {
 }
 
 impl Ran {
-    /// Its standard output, when it has done what it was told and had nothing to complain about.
+    /// Returns standard output. Requires success and an empty standard error.
     #[track_caller]
     pub(crate) fn done(self) -> String {
         assert_eq!((self.code, self.stderr.as_str()), (Some(0), ""), "{self:?}");
         String::from_utf8(self.stdout).unwrap()
     }
 
-    /// What it printed as JSON, when it has done what it was told.
+    /// Returns standard output as JSON. Requires success and an empty standard error.
     #[track_caller]
     pub(crate) fn done_json(self) -> Value {
         serde_json::from_str(&self.done()).unwrap()
     }
 
-    /// What it printed as JSON, and what it complained about, when it has failed.
+    /// Returns standard output as JSON, and standard error. Requires exit code 1.
     #[track_caller]
     pub(crate) fn failed_json(self) -> (Value, String) {
         assert_eq!(self.code, Some(1), "{self:?}");
         (serde_json::from_slice(&self.stdout).unwrap(), self.stderr)
     }
 
-    /// What it complained about, when it has failed with this code and printed nothing.
+    /// Returns standard error. Requires this exit code and an empty standard output.
     #[track_caller]
     pub(crate) fn failed(self, code: i32) -> String {
         assert_eq!(
@@ -158,13 +162,14 @@ impl Ran {
     }
 }
 
-/// A command that goes on until it is told to end; killed when the test ends before.
+/// A running command. It is killed when the value is dropped.
 pub(crate) struct Running {
     child: Child,
     lines: Receiver<String>,
     errors: Receiver<String>,
-    told: String,
-    /// The first line it printed.
+    /// The lines received from `errors` so far.
+    log: String,
+    /// The first line of its standard output.
     pub(crate) ready: String,
 }
 
@@ -183,52 +188,62 @@ impl Running {
             child,
             lines: printed,
             errors,
-            told: String::new(),
+            log: String::new(),
             ready: String::new(),
         };
         running.ready = running.line();
         running
     }
 
-    /// The next line it prints.
+    /// Waits for the next line of standard output.
     #[track_caller]
     pub(crate) fn line(&mut self) -> String {
         match self.lines.recv_timeout(WATCHDOG) {
             Ok(line) => line,
             Err(error) => {
                 let _ = self.child.kill();
-                panic!("no line was printed ({error}): {:?}", self.end());
+                panic!("no output ({error}): {:?}", self.end());
             }
         }
     }
 
-    /// The next line that it printed before it ended, if there is one.
+    /// Returns the next line of standard output, or `None` if the command has ended without one.
     pub(crate) fn next_line(&mut self) -> Option<String> {
         self.lines.recv_timeout(WATCHDOG).ok()
     }
 
-    /// Waits until it says something on standard error that has all these parts.
+    /// Waits for a line on standard error that contains all these parts.
     #[track_caller]
-    pub(crate) fn tells(&mut self, parts: &[&str]) {
+    pub(crate) fn wait_for_log(&mut self, parts: &[&str]) {
         loop {
             match self.errors.recv_timeout(WATCHDOG) {
                 Ok(line) => {
-                    self.told.push_str(&format!("{line}\n"));
+                    self.log.push_str(&format!("{line}\n"));
                     if parts.iter().all(|part| line.contains(part)) {
                         return;
                     }
                 }
-                Err(error) => panic!("{parts:?} was not told ({error}): {}", self.told),
+                Err(error) => panic!("no line with {parts:?} ({error}): {}", self.log),
             }
         }
     }
 
-    /// The number of its process.
+    /// Returns the TCP address of a gateway that was started with `up --json`.
+    #[track_caller]
+    pub(crate) fn tcp_address(&self) -> String {
+        let ready: Value = serde_json::from_str(&self.ready).unwrap();
+        let locations = ready["locations"].as_array().unwrap();
+        let mut locations = locations.iter().filter_map(Value::as_str);
+        let tcp = locations.find_map(|it| it.strip_prefix("tcp://")).unwrap();
+        tcp.split('#').next().unwrap().to_owned()
+    }
+
+    /// Its process identifier.
     pub(crate) fn pid(&self) -> String {
         self.child.id().to_string()
     }
 
-    /// Sends a signal, waits for its end, and returns the exit code and standard error.
+    /// Sends a signal, waits for the end, and returns the exit code and standard error.
     #[track_caller]
     pub(crate) fn signal(mut self, signal: &str) -> (Option<i32>, String) {
         self.send_signal(signal);
@@ -243,25 +258,25 @@ impl Running {
         assert!(sent.success());
     }
 
-    /// Whether it ends within a moment.
+    /// Whether the command ends within 100 ms.
     pub(crate) fn has_ended(&mut self) -> bool {
         match self.errors.recv_timeout(Duration::from_millis(100)) {
-            Ok(line) => self.told.push_str(&format!("{line}\n")),
+            Ok(line) => self.log.push_str(&format!("{line}\n")),
             Err(error) => return error == RecvTimeoutError::Disconnected,
         }
         false
     }
 
-    /// Waits for its end, and returns the exit code and all of standard error.
+    /// Waits for the end, and returns the exit code and all of standard error.
     #[track_caller]
     pub(crate) fn end(&mut self) -> (Option<i32>, String) {
-        let watchdog = Watchdog::over(&self.child);
+        let watchdog = Watchdog::new(&self.child);
         let status = self.child.wait().unwrap();
         drop(watchdog);
         for line in self.errors.iter() {
-            self.told.push_str(&format!("{line}\n"));
+            self.log.push_str(&format!("{line}\n"));
         }
-        (status.code(), std::mem::take(&mut self.told))
+        (status.code(), std::mem::take(&mut self.log))
     }
 }
 
@@ -272,35 +287,35 @@ impl Drop for Running {
     }
 }
 
-/// Runs a command to its end, with something on standard input if that is piped.
+/// Runs a command to its end. Writes `input` to its standard input if that is piped.
 fn output_of(command: &mut Command, input: Vec<u8>) -> Ran {
     let piped = command.stdout(Stdio::piped()).stderr(Stdio::piped());
     let mut child = piped.spawn().unwrap();
-    let watchdog = Watchdog::over(&child);
+    let watchdog = Watchdog::new(&child);
     let stdin = child.stdin.take();
     let writer = thread::spawn(move || stdin.map(|mut stdin| stdin.write_all(&input)));
     let output = child.wait_with_output().unwrap();
     drop(watchdog);
-    // Whoever does not read all of it has a reason, which the output tells.
+    // A command may end without reading all input; its output has the reason.
     let _ = writer.join().unwrap();
     output.into()
 }
 
-/// Kills a process that hangs, which then has no exit code. To be dropped once it has been waited for.
+/// Kills a process that hangs; the process then has no exit code. Drop it after the process has ended.
 struct Watchdog {
-    _waiting: Sender<()>,
+    _cancel: Sender<()>,
 }
 
 impl Watchdog {
-    fn over(child: &Child) -> Self {
+    fn new(child: &Child) -> Self {
         let pid = child.id().to_string();
-        let (waiting, ended) = channel();
+        let (cancel, canceled) = channel();
         thread::spawn(move || {
-            if ended.recv_timeout(WATCHDOG) == Err(RecvTimeoutError::Timeout) {
+            if canceled.recv_timeout(WATCHDOG) == Err(RecvTimeoutError::Timeout) {
                 let _ = Command::new("kill").args(["-KILL", &pid]).status();
             }
         });
-        Self { _waiting: waiting }
+        Self { _cancel: cancel }
     }
 }
 

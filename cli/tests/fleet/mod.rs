@@ -1,11 +1,8 @@
-//! Three hosts in network namespaces, each with a gateway process and an agent, and letters
-//! between all of them, every one of which is accounted for.
+//! Three hosts in network namespaces, each with a gateway process and an agent. The agents send
+//! letters to each other, and every letter is checked.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
-#![allow(
-    clippy::print_stderr,
-    reason = "what the letters came to is worth knowing"
-)]
+#![allow(clippy::unwrap_used, reason = "a panic fails the test")]
+#![allow(clippy::print_stderr, reason = "the test prints the outcomes")]
 
 use std::collections::{BTreeMap, HashMap};
 use std::pin::Pin;
@@ -24,26 +21,26 @@ use tokio::runtime::Runtime;
 
 use crate::hosts::{self, PORT, filter, keys, make_keys, nft};
 
-/// Ends what hangs. Nothing is expected to take this long.
+/// Timeout for hanging tests. No step is expected to take this long.
 const WATCHDOG: Duration = Duration::from_secs(90);
-/// Letters of one sender to one receiver that are under way at a time.
-const AT_ONCE: usize = 8;
-/// Pause between them: so that traffic lasts longer than what happens to it.
+/// Letters in flight from one sender to one receiver.
+const IN_FLIGHT: usize = 8;
+/// Pause between batches, so that the traffic lasts longer than the faults.
 const PAUSE: Duration = Duration::from_millis(8);
-/// Letters delivered in a row that count as traffic that goes on.
+/// Consecutive deliveries that prove that traffic has resumed.
 const IN_A_ROW: u64 = 40;
 
-/// What all parties have in common.
+/// Settings of a fleet.
 #[derive(Debug, Clone)]
 pub(crate) struct Plan {
     /// `mts.transports` of every process.
     pub(crate) transports: &'static [&'static str],
     /// `mts.deadline` of every letter.
     pub(crate) deadline: Duration,
-    /// A host of which the others are not told where it is, so that it dials them.
+    /// A host whose address the others do not have, so that it dials them.
     pub(crate) dials: Option<usize>,
-    /// A host that is not told where the others are, so that they dial it, at one of [`ADDRESSES`].
-    pub(crate) is_dialled: Option<usize>,
+    /// A host that has no addresses of the others, so that they dial it at one of [`ADDRESSES`].
+    pub(crate) is_dialed: Option<usize>,
 }
 
 impl Default for Plan {
@@ -52,35 +49,35 @@ impl Default for Plan {
             transports: &["shm", "unix", "tcp"],
             deadline: Duration::from_secs(3),
             dials: None,
-            is_dialled: None,
+            is_dialed: None,
         }
     }
 }
 
-/// The second host's address, and the other one that it has at times.
+/// The usual and the temporary address of the second host.
 pub(crate) const ADDRESSES: [&str; 2] = ["10.99.0.2", "10.99.0.52"];
 
 impl Plan {
-    /// Where others look for a host.
+    /// The static addresses of a host in the configuration of the others.
     fn addresses(&self, network: &Network, at: usize) -> Vec<String> {
-        if self.is_dialled == Some(at) {
+        if self.is_dialed == Some(at) {
             return ADDRESSES.map(str::to_owned).to_vec();
         }
         vec![network.host(at).ipv4().to_string()]
     }
 
-    /// Whether one host is told where another is.
-    fn tells(&self, at: usize, other: usize) -> bool {
-        other != at && self.dials != Some(other) && self.is_dialled != Some(at)
+    /// Whether host `at` has the address of host `other`.
+    fn has_address(&self, at: usize, other: usize) -> bool {
+        other != at && self.dials != Some(other) && self.is_dialed != Some(at)
     }
 
-    /// QUIC is not spoken without.
+    /// Whether the hosts need keys: QUIC requires them.
     fn has_keys(&self) -> bool {
         self.transports.contains(&"quic")
     }
 }
 
-/// The hosts and who is on them.
+/// The hosts with their gateways and agents.
 pub(crate) struct Fleet {
     pub(crate) network: Network,
     parties: Vec<Party>,
@@ -95,10 +92,10 @@ struct Party {
     agent: Arc<Agent>,
 }
 
-/// What became of every letter.
+/// The accounts of all letters.
 #[derive(Default)]
 struct Accounts {
-    /// Of each pair of hosts.
+    /// By pair of hosts.
     pairs: Mutex<BTreeMap<(usize, usize), Account>>,
     stop: AtomicBool,
 }
@@ -108,7 +105,7 @@ struct Account {
     sent: u64,
     outcomes: HashMap<u64, Outcome>,
     taken: Vec<u64>,
-    /// Delivered since somebody last looked, in a row.
+    /// Consecutive deliveries since the last reset.
     in_a_row: u64,
     failed_since: u64,
 }
@@ -116,7 +113,7 @@ struct Account {
 impl Fleet {
     /// Three hosts whose gateways know each other by address, and whose agents know each other.
     pub(crate) fn new(plan: &Plan) -> Self {
-        // What killed processes leave behind goes with the test.
+        // Files of killed processes vanish with the test.
         fipa_testbed::run("mount -t tmpfs tmpfs /dev/shm");
         if plan.has_keys() {
             make_keys(3);
@@ -129,7 +126,7 @@ impl Fleet {
             parties,
             accounts,
         };
-        fleet.wait("everybody knows everybody", || {
+        fleet.wait("all agents know each other", || {
             let pairs = (0..3).flat_map(|from| (0..3).map(move |to| (from, to)));
             pairs.filter(|(from, to)| from != to).all(|(from, to)| {
                 let directory = fleet.parties[from].agent.domain().directory();
@@ -139,39 +136,28 @@ impl Fleet {
         fleet
     }
 
-    /// Sends letters from everybody to everybody while `weather` happens, then until they arrive
-    /// again, and checks every one. At least `letters` in all.
-    pub(crate) fn through(&self, letters: u64, weather: impl FnOnce(&Self)) {
-        self.through_pairs(letters, |_, _| true, weather);
-    }
-
-    /// The same, where only some pairs are expected to get along in the end.
-    pub(crate) fn through_pairs(
-        &self,
-        letters: u64,
-        gets_along: impl Fn(usize, usize) -> bool,
-        weather: impl FnOnce(&Self),
-    ) {
+    /// Sends letters between all agents while `faults` runs, and then until traffic has resumed. Sends
+    /// at least `letters` in total and checks every one.
+    pub(crate) fn through(&self, letters: u64, faults: impl FnOnce(&Self)) {
         *self.accounts.pairs.lock() = pairs().map(|pair| (pair, Account::default())).collect();
         self.accounts.stop.store(false, Ordering::Release);
         let readers: Vec<_> = (0..3).map(|at| self.read(at)).collect();
         let writers: Vec<_> = pairs().map(|pair| self.write(pair)).collect();
-        weather(self);
+        faults(self);
         for account in self.accounts.pairs.lock().values_mut() {
             (account.in_a_row, account.failed_since) = (0, 0);
         }
-        self.wait("letters arrive again", || {
+        self.wait("traffic resumes and enough letters are sent", || {
             let all = self.accounts.pairs.lock();
-            let mut along = all.iter().filter(|((from, to), _)| gets_along(*from, *to));
-            let resumed = along.all(|(_, account)| account.in_a_row >= IN_A_ROW);
+            let resumed = all.values().all(|account| account.in_a_row >= IN_A_ROW);
             resumed && all.values().map(|account| account.sent).sum::<u64>() >= letters
         });
         self.accounts.stop.store(true, Ordering::Release);
         for (at, writer) in writers {
             self.finish(at, writer);
         }
-        // What was delivered lies in a queue at least.
-        self.wait("what was delivered is taken", || {
+        // A delivered letter is at least in the queue of its receiver.
+        self.wait("delivered letters are received", || {
             let all = self.accounts.pairs.lock();
             all.values().all(|account| {
                 let delivered = account.outcomes.iter();
@@ -198,7 +184,7 @@ impl Fleet {
         let task = async move {
             loop {
                 let message = agent.receive().await.unwrap().message;
-                // What failed is told by a failure message as well.
+                // A failed letter causes a failure message, too.
                 if *message.performative() != Performative::Inform {
                     continue;
                 }
@@ -213,15 +199,15 @@ impl Fleet {
     }
 
     fn write(&self, (from, to): (usize, usize)) -> (usize, tokio::task::JoinHandle<()>) {
-        // Letters of earlier weather may still come: numbers go on.
+        // Letters of an earlier run may still be delivered, so numbers are never reused.
         static NEXT: AtomicU64 = AtomicU64::new(1);
         let (agent, accounts) = (Arc::clone(&self.parties[from].agent), self.accounts.clone());
         let task = async move {
             while !accounts.stop.load(Ordering::Acquire) {
-                let numbers: Vec<u64> = (0..AT_ONCE)
+                let numbers: Vec<u64> = (0..IN_FLIGHT)
                     .map(|_| NEXT.fetch_add(1, Ordering::Relaxed))
                     .collect();
-                accounts.of((from, to)).sent += AT_ONCE as u64;
+                accounts.of((from, to)).sent += IN_FLIGHT as u64;
                 let sending = numbers.iter().map(|number| send(&agent, to, *number));
                 let outcomes = all(sending).await;
                 for (number, deliveries) in numbers.into_iter().zip(outcomes) {
@@ -233,7 +219,7 @@ impl Fleet {
         (from, self.parties[from].runtime.spawn(task))
     }
 
-    /// The promises, for every letter of the last weather.
+    /// Checks outcome, uniqueness and order of every letter of the last run.
     fn check(&self) {
         for ((from, to), account) in self.accounts.pairs.lock().iter() {
             let pair = format!("{} to {}", name(*from), name(*to));
@@ -241,7 +227,7 @@ impl Fleet {
             assert_eq!(count, account.sent, "{pair}: letters without an outcome");
             assert!(
                 account.taken.is_sorted_by(|a, b| a < b),
-                "{pair}: twice, or out of order: {:?}",
+                "{pair}: duplicate or out of order: {:?}",
                 account.taken.windows(2).find(|two| two[0] >= two[1])
             );
             for (number, outcome) in &account.outcomes {
@@ -256,8 +242,8 @@ impl Fleet {
                 }
             }
         }
-        let told = self.accounts.pairs.lock();
-        for ((from, to), account) in told.iter() {
+        let accounts = self.accounts.pairs.lock();
+        for ((from, to), account) in accounts.iter() {
             let mut by_reason: BTreeMap<String, u64> = BTreeMap::new();
             for outcome in account.outcomes.values() {
                 let key = match outcome {
@@ -270,20 +256,19 @@ impl Fleet {
         }
     }
 
-    /// How many letters of a pair have failed.
+    /// Number of failed letters of a pair.
     pub(crate) fn failed(&self, from: usize, to: usize) -> usize {
         let account = self.accounts.of((from, to));
         let outcomes = account.outcomes.values();
         outcomes.filter(|outcome| !outcome.is_success()).count()
     }
 
-    /// Waits until so many letters of every pair of which both are among `hosts` were delivered
-    /// from now on.
+    /// Waits until [`IN_A_ROW`] further letters of every pair within `hosts` were delivered.
     pub(crate) fn until_delivered(&self, hosts: &[usize]) {
         for account in self.accounts.pairs.lock().values_mut() {
             account.in_a_row = 0;
         }
-        self.wait("letters arrive", || {
+        self.wait("letters are delivered", || {
             let all = self.accounts.pairs.lock();
             let mut among = all
                 .iter()
@@ -292,15 +277,15 @@ impl Fleet {
         });
     }
 
-    /// Waits until letters of a pair fail from now on.
+    /// Waits until further letters of a pair fail.
     pub(crate) fn until_failing(&self, from: usize, to: usize) {
         self.accounts.of((from, to)).failed_since = 0;
         self.wait("letters fail", || {
-            self.accounts.of((from, to)).failed_since >= AT_ONCE as u64
+            self.accounts.of((from, to)).failed_since >= IN_FLIGHT as u64
         });
     }
 
-    /// Ends a gateway as a crash does, and says nothing to anybody.
+    /// Kills a gateway, as a crash does: peers get no notification.
     pub(crate) fn kill_gateway(&self, at: usize) {
         drop(self.parties[at].gateway.lock().take());
     }
@@ -311,31 +296,31 @@ impl Fleet {
         *party.gateway.lock() = Some(gateway);
     }
 
-    /// Lets so many of a hundred packets of a protocol (`tcp`, `udp`) that come from other hosts
-    /// be lost on every host.
-    pub(crate) fn lose(&self, protocol: &str, of_a_hundred: u32) {
+    /// Drops this percentage of the packets of a protocol (`tcp`, `udp`) from other hosts on every host.
+    pub(crate) fn lose(&self, protocol: &str, percent: u32) {
         for host in self.network.hosts() {
-            let what = format!("meta l4proto {protocol} numgen random mod 100 < {of_a_hundred}");
-            filter(host, &format!("iifname eth0 {what} drop"));
+            let packets = format!("meta l4proto {protocol} numgen random mod 100 < {percent}");
+            filter(host, &format!("iifname eth0 {packets} drop"));
         }
     }
 
-    /// Lets nothing of a protocol (`tcp`, `udp`) through between hosts, and says nothing.
-    pub(crate) fn pull(&self, protocol: &str) {
+    /// Silently drops all packets of a protocol (`tcp`, `udp`) between hosts.
+    pub(crate) fn block(&self, protocol: &str) {
         for host in self.network.hosts() {
             filter(host, &format!("iifname eth0 meta l4proto {protocol} drop"));
         }
     }
 
-    /// Whether letters of every pair were delivered by this transport.
-    pub(crate) fn went_by(&self, kind: Kind) -> bool {
+    /// Whether letters of every pair were delivered via this transport.
+    pub(crate) fn delivered_via(&self, kind: Kind) -> bool {
         let all = self.accounts.pairs.lock();
-        let went = |account: &Account| account.outcomes.values().any(|it| it.via() == Some(kind));
-        all.values().all(went)
+        let delivered =
+            |account: &Account| account.outcomes.values().any(|it| it.via() == Some(kind));
+        all.values().all(delivered)
     }
 
-    /// Takes back what [`lose`](Self::lose) and [`pull`](Self::pull) did.
-    pub(crate) fn lose_nothing(&self) {
+    /// Undoes [`lose`](Self::lose) and [`block`](Self::block).
+    pub(crate) fn restore(&self) {
         for host in self.network.hosts() {
             nft(host, "flush ruleset");
         }
@@ -346,14 +331,14 @@ impl Fleet {
         while !condition() {
             assert!(
                 started.elapsed() < WATCHDOG,
-                "never: {what}{}",
-                self.stand()
+                "timed out: {what}{}",
+                self.summary()
             );
             std::thread::sleep(Duration::from_millis(5));
         }
     }
 
-    fn stand(&self) -> String {
+    fn summary(&self) -> String {
         let mut text = String::new();
         for ((from, to), account) in self.accounts.pairs.lock().iter() {
             let last = account.outcomes.keys().max();
@@ -391,23 +376,23 @@ impl Account {
     }
 }
 
-/// Whether a transport leads to other hosts.
-fn is_beyond(kind: &str) -> bool {
+/// Whether a transport connects hosts.
+fn is_between_hosts(kind: &str) -> bool {
     !["shm", "unix"].contains(&kind)
 }
 
 impl Party {
     fn new(network: &Network, at: usize, plan: &Plan) -> Self {
         let host = network.host(at);
-        let known = (0..3).filter(|other| plan.tells(at, *other));
+        let known = (0..3).filter(|other| plan.has_address(at, *other));
         let peers = known.map(|other| {
             let addresses = plan.addresses(network, other);
-            let kinds = plan.transports.iter().filter(|kind| is_beyond(kind));
-            let ways: Vec<String> = kinds
+            let kinds = plan.transports.iter().filter(|kind| is_between_hosts(kind));
+            let locations: Vec<String> = kinds
                 .flat_map(|kind| addresses.iter().map(move |it| (kind, it)))
                 .map(|(kind, address)| format!("\"{kind}://{address}:{PORT}\""))
                 .collect();
-            format!("gateway{other} = [{}]", ways.join(", "))
+            format!("gateway{other} = [{}]", locations.join(", "))
         });
         let peers: Vec<String> = peers.collect();
         let transports = plan.transports.join(",");
@@ -423,7 +408,7 @@ impl Party {
             format!("mts.deadline={}ms", plan.deadline.as_millis()),
             format!("discovery.static={{ {} }}", peers.join(", ")),
         ];
-        for kind in plan.transports.iter().filter(|kind| is_beyond(kind)) {
+        for kind in plan.transports.iter().filter(|kind| is_between_hosts(kind)) {
             settings.push(format!("transport.{kind}.listen=[\"0.0.0.0:{PORT}\"]"));
         }
         let gateway = start_gateway(host, &settings);
@@ -466,7 +451,7 @@ async fn send(agent: &Agent, to: usize, number: u64) -> Deliveries {
     agent.send(message).await.unwrap()
 }
 
-/// Polls all of them in their order, so that letters leave in it.
+/// Polls all futures in order, so that their letters are sent in this order.
 async fn all<F: Future>(futures: impl Iterator<Item = F>) -> Vec<F::Output> {
     let mut pending: Vec<Pin<Box<F>>> = futures.map(Box::pin).collect();
     let mut done: Vec<Option<F::Output>> = pending.iter().map(|_| None).collect();

@@ -13,7 +13,7 @@ pub(crate) fn keys(at: usize) -> Keys {
     Keys::at(fipa_testbed::directory().join(format!("keys{at}")))
 }
 
-/// Makes keys for so many hosts. Every host trusts all others.
+/// Creates keys for this number of hosts. Every host trusts all others.
 pub(crate) fn make_keys(hosts: usize) {
     for at in 0..hosts {
         keys(at).init(&format!("gateway{at}"), &[], VALID).unwrap();
@@ -26,7 +26,8 @@ pub(crate) fn make_keys(hosts: usize) {
     }
 }
 
-/// Returns the command that starts a gateway on this host. It is ready with its first line, in JSON.
+/// Returns the command that starts a gateway on this host. The gateway is ready when it prints its
+/// first line, which is JSON.
 pub(crate) fn gateway(host: &Host, settings: &[String]) -> Command {
     let mut command = host.command(env!("CARGO_BIN_EXE_fipa"));
     command.args(["up", "--json"]);
@@ -40,7 +41,7 @@ pub(crate) fn gateway(host: &Host, settings: &[String]) -> Command {
     command
 }
 
-/// Adds a rule for incoming packets.
+/// Adds a packet filter rule for incoming packets.
 pub(crate) fn filter(host: &Host, rule: &str) {
     nft(host, "add table inet weather");
     let hook = "{ type filter hook input priority 0; }";

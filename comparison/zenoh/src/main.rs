@@ -1,14 +1,14 @@
-//! One end of the measurement of `fipa bench --zenoh PROGRAM` that goes through zenoh.
+//! A sender or receiver that uses zenoh, for `fipa bench --zenoh PROGRAM`.
 //!
-//! It obeys the same orders as the ends of `fipa bench` itself: a letter is a publication, and what
-//! acknowledges it is an empty publication in return. Peers are connected directly, over TCP on
-//! the loopback interface, with zenoh's shared memory or without.
+//! It executes the same orders as the processes of `fipa bench` itself. A letter is a publication; an
+//! empty publication in return acknowledges it. The peers are connected directly over TCP on the
+//! loopback interface, with or without zenoh's shared memory.
 
 use std::sync::mpsc::{Receiver as Queue, Sender as Into, channel};
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-use orders::{End, Fill, Letters, Peer, Sent, byte_of, check, now_ns, execute_orders, to_text};
+use orders::{End, Fill, Letters, Peer, Sent, byte_of, check, execute_orders, now_ns, to_text};
 use zenoh::bytes::ZBytes;
 use zenoh::pubsub::{Publisher, Subscriber};
 use zenoh::qos::{CongestionControl, Priority};
@@ -20,10 +20,12 @@ use zenoh::{Config, Session, Wait as _};
 #[path = "../../../benches/src/part/orders.rs"]
 mod orders;
 
-/// Play one end of `fipa bench --zenoh` (which starts this program)
+/// Run the zenoh sender or receiver of a measurement; `fipa bench --zenoh` starts this program
+///
+/// Example: fipa bench --zenoh comparison/zenoh/target/release/fipa-comparison-zenoh
 #[derive(Debug, Parser)]
 struct Arguments {
-    /// Which end: sender or receiver
+    /// Sender or receiver
     #[arg(long)]
     end: End,
     /// Use zenoh's shared memory
@@ -34,14 +36,14 @@ struct Arguments {
 const LETTERS: &str = "bench/letters";
 const ANSWERS: &str = "bench/answers";
 
-/// As much as `fipa bench` gives its own transport.
+/// Size of the shared memory, in bytes: the same as that of `fipa bench`.
 const CAPACITY: usize = 1 << 30;
 
-/// How long something may take that usually takes less than a second.
-const PATIENCE: Duration = Duration::from_secs(30);
+/// Timeout of steps that usually take less than a second.
+const STEP_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// How long the other end is given to answer a greeting before the next.
-const GREETING: Duration = Duration::from_millis(50);
+/// Maximum wait for the answer to a greeting before it is repeated.
+const GREETING_INTERVAL: Duration = Duration::from_millis(50);
 
 fn main() -> Result<(), String> {
     let Arguments { end, shared_memory } = Arguments::parse();
@@ -56,7 +58,7 @@ fn main() -> Result<(), String> {
         End::Receiver => {
             let session = open("listen", "tcp/127.0.0.1:0", shared_memory)?;
             let locators = session.info().locators().wait();
-            let address = locators.first().ok_or("zenoh listens nowhere")?;
+            let address = locators.first().ok_or("zenoh listens on no address")?;
             let address = address.to_string();
             let mut receiver = Receiver::new(session)?;
             execute_orders(&mut receiver, address);
@@ -65,7 +67,7 @@ fn main() -> Result<(), String> {
     Ok(())
 }
 
-/// Opens a session that has one address to listen on or to connect to, and looks for nobody else.
+/// Opens a session that listens on or connects to one address, without scouting.
 fn open(how: &str, address: &str, shared_memory: bool) -> Result<Session, String> {
     let mut config = Config::default();
     let other = if how == "listen" { "connect" } else { "listen" };
@@ -81,7 +83,7 @@ fn open(how: &str, address: &str, shared_memory: bool) -> Result<Session, String
     zenoh::open(config).wait().map_err(to_text)
 }
 
-/// A publisher that sends each publication at once, and blocks rather than drops it.
+/// Declares a publisher that sends each publication at once, and blocks instead of dropping it.
 fn publisher(session: &Session, key: &'static str) -> Result<Publisher<'static>, String> {
     let publisher = session
         .declare_publisher(key)
@@ -106,7 +108,7 @@ impl Receiver {
             .callback(move |sample| {
                 let at = now_ns();
                 let content = sample.payload().clone();
-                // What fails here, the sender misses.
+                // The sender detects a failed answer by its timeout.
                 let _answered = answers.put(ZBytes::new()).wait();
                 // A greeting has no content, and is only answered.
                 if !content.is_empty() {
@@ -127,7 +129,7 @@ impl Peer for Receiver {
     fn receive(&mut self, letters: &Letters) -> Result<Vec<u64>, String> {
         let mut at = Vec::with_capacity(letters.count);
         for number in 0..letters.count {
-            let (arrived, content) = self.arrived.recv_timeout(PATIENCE).map_err(to_text)?;
+            let (arrived, content) = self.arrived.recv_timeout(STEP_TIMEOUT).map_err(to_text)?;
             check(&content.to_bytes(), letters, number)?;
             at.push(arrived);
         }
@@ -177,21 +179,21 @@ impl Connected {
         Ok(connected)
     }
 
-    /// Until both ends know that the other listens.
+    /// Sends greetings until the receiver answers: then both subscriptions are active.
     fn greet(&self) -> Result<(), String> {
-        let until = Instant::now() + PATIENCE;
+        let until = Instant::now() + STEP_TIMEOUT;
         while Instant::now() < until {
             self.letters.put(ZBytes::new()).wait().map_err(to_text)?;
-            if self.answered.recv_timeout(GREETING).is_ok() {
-                // Greetings that were answered late.
-                while self.answered.recv_timeout(GREETING * 4).is_ok() {}
+            if self.answered.recv_timeout(GREETING_INTERVAL).is_ok() {
+                // Discards late answers to earlier greetings.
+                while self.answered.recv_timeout(GREETING_INTERVAL * 4).is_ok() {}
                 return Ok(());
             }
         }
-        Err("the other end does not answer".to_owned())
+        Err("no answer from the receiver".to_owned())
     }
 
-    /// Makes the content of a letter and notes when it was begun.
+    /// Creates the content of a letter and records its start time.
     fn content(
         &self,
         letters: &Letters,
@@ -200,7 +202,7 @@ impl Connected {
     ) -> Result<ZBytes, String> {
         let byte = byte_of(number);
         let (Some(memory), true) = (&self.memory, letters.fill != Fill::Copied) else {
-            // There is no memory to be loaned: what is not filled is there before.
+            // Without loaned memory, content that is not filled is prepared before the start time.
             if letters.fill == Fill::Filled {
                 let mut content = vec![0; letters.size];
                 began.push(now_ns());
@@ -222,7 +224,7 @@ impl Connected {
     }
 
     fn answer(&self) -> Result<u64, String> {
-        self.answered.recv_timeout(PATIENCE).map_err(to_text)
+        self.answered.recv_timeout(STEP_TIMEOUT).map_err(to_text)
     }
 }
 

@@ -1,4 +1,4 @@
-//! `fipa agents --watch`: who joins, changes and leaves.
+//! `fipa agents --watch`: prints each agent that joins, changes or leaves.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -13,24 +13,24 @@ use crate::options;
 use crate::output;
 use crate::report::Failure;
 
-/// Tells until a signal ends it.
+/// Prints changes until a signal, or until the output has no reader.
 pub(super) fn run(filter: &Filter, config: &Config, json: bool) -> Result<(), Failure> {
     options::block_on(async {
         let mut stop = Stop::listen()?;
         let mut reader = output::Reader::of_output();
         let domain = membership::join(config).await?;
         let directory = domain.directory();
-        // Watching begins before reading: what joins in between is told by one of them.
+        // Watching starts before reading, so that an agent that joins in between is not missed.
         let mut changes = directory.watch();
         directory.refresh();
         if !json {
             let domain = &config.domain;
-            output::text(&format!("watching the domain {domain}; Ctrl-C ends it\n"))?;
+            output::text(&format!("watching domain {domain}; press Ctrl-C to stop\n"))?;
         }
         let mut shown = Shown::default();
-        let mut told = shown.all(directory, filter, What::Present, json);
+        let mut printed = shown.all(directory, filter, ChangeKind::Present, json);
         loop {
-            if told.is_err() {
+            if printed.is_err() {
                 break;
             }
             tokio::select! {
@@ -40,7 +40,7 @@ pub(super) fn run(filter: &Filter, config: &Config, json: bool) -> Result<(), Fa
                     None => break,
                     Some(change) => {
                         let mut changes = change.single().iter();
-                        told = changes.try_for_each(|change| {
+                        printed = changes.try_for_each(|change| {
                             shown.change(change, directory, filter, json)
                         });
                     }
@@ -49,19 +49,19 @@ pub(super) fn run(filter: &Filter, config: &Config, json: bool) -> Result<(), Fa
         }
         Stop::ending();
         domain.close().await;
-        told
+        printed
     })?
 }
 
 #[derive(Clone, Copy)]
-enum What {
+enum ChangeKind {
     Present,
     Joined,
     Changed,
     Left,
 }
 
-impl What {
+impl ChangeKind {
     fn word(self) -> &'static str {
         match self {
             Self::Present => "present",
@@ -72,17 +72,17 @@ impl What {
     }
 }
 
-/// Those that have been shown and have not left.
+/// The agents that were shown and have not left.
 #[derive(Default)]
 struct Shown(BTreeMap<Arc<str>, Arc<Entry>>);
 
 impl Shown {
-    /// Tells what is different from what was shown; who is new is told as `new`.
+    /// Prints all differences from the shown agents; an agent that was not shown is printed as `new`.
     fn all(
         &mut self,
         directory: &dyn Directory,
         filter: &Filter,
-        new: What,
+        new: ChangeKind,
         json: bool,
     ) -> Result<(), Failure> {
         let entries = directory.entries();
@@ -93,14 +93,14 @@ impl Shown {
             .cloned()
             .collect();
         for name in gone {
-            self.now(&name, None, directory, filter, json)?;
+            self.update(&name, None, directory, filter, json)?;
         }
         for entry in entries.iter() {
             if filter.matches(entry) && !self.0.contains_key(&entry.name) {
                 self.0.insert(Arc::clone(&entry.name), Arc::clone(entry));
-                tell(new, entry, directory, json)?;
+                print(new, entry, directory, json)?;
             } else {
-                self.now(&entry.name, Some(entry), directory, filter, json)?;
+                self.update(&entry.name, Some(entry), directory, filter, json)?;
             }
         }
         Ok(())
@@ -115,16 +115,18 @@ impl Shown {
     ) -> Result<(), Failure> {
         match change {
             Change::Joined(entry) | Change::Changed { after: entry, .. } => {
-                self.now(&entry.name, Some(entry), directory, filter, json)
+                self.update(&entry.name, Some(entry), directory, filter, json)
             }
-            Change::Left(entry) => self.now(&entry.name, None, directory, filter, json),
-            // So many at once that some were missed: what is there is compared.
-            Change::Together(_) | Change::Lagged => self.all(directory, filter, What::Joined, json),
+            Change::Left(entry) => self.update(&entry.name, None, directory, filter, json),
+            // Single changes may have been missed, so the whole directory is compared.
+            Change::Together(_) | Change::Lagged => {
+                self.all(directory, filter, ChangeKind::Joined, json)
+            }
         }
     }
 
-    /// Tells what that name means now, if it is different from what was shown.
-    fn now(
+    /// Prints the current entry of a name if it differs from the shown one.
+    fn update(
         &mut self,
         name: &Arc<str>,
         entry: Option<&Arc<Entry>>,
@@ -132,29 +134,34 @@ impl Shown {
         filter: &Filter,
         json: bool,
     ) -> Result<(), Failure> {
-        // Who does not match any more has left, for who watches.
+        // An agent that no longer matches the filter is printed as left.
         let entry = entry.filter(|entry| filter.matches(entry));
         let before = match entry {
             Some(entry) => self.0.insert(Arc::clone(name), Arc::clone(entry)),
             None => self.0.remove(name),
         };
         match (before, entry) {
-            (None, Some(entry)) => tell(What::Joined, entry, directory, json),
+            (None, Some(entry)) => print(ChangeKind::Joined, entry, directory, json),
             (Some(before), Some(entry)) if before != *entry => {
-                tell(What::Changed, entry, directory, json)
+                print(ChangeKind::Changed, entry, directory, json)
             }
-            (Some(before), None) => tell(What::Left, &before, directory, json),
+            (Some(before), None) => print(ChangeKind::Left, &before, directory, json),
             _ => Ok(()),
         }
     }
 }
 
-fn tell(what: What, entry: &Entry, directory: &dyn Directory, json: bool) -> Result<(), Failure> {
+fn print(
+    change: ChangeKind,
+    entry: &Entry,
+    directory: &dyn Directory,
+    json: bool,
+) -> Result<(), Failure> {
     let row = Row::of(entry, directory);
     let time = Time::from_system_time(SystemTime::now()).ok();
     let time = time.and_then(Time::to_rfc3339).unwrap_or_default();
     if json {
-        let line = json!({ "time": time, "change": what.word(), "agent": row.json });
+        let line = json!({ "time": time, "change": change.word(), "agent": row.json });
         return output::json_line(&line);
     }
     let [name, agent_type, reach, locations, ..] = &row.cells;
@@ -163,8 +170,8 @@ fn tell(what: What, entry: &Entry, directory: &dyn Directory, json: bool) -> Res
         agent_type => format!(" ({agent_type})"),
     };
     let locations = locations.replace('\n', " ");
-    let what = what.word();
+    let change = change.word();
     output::text(&format!(
-        "{time}  {what:<7}  {name}{agent_type}  {reach}  {locations}\n"
+        "{time}  {change:<7}  {name}{agent_type}  {reach}  {locations}\n"
     ))
 }

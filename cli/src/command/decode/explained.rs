@@ -1,4 +1,4 @@
-//! Every byte and what it means.
+//! `fipa decode --explain`: every byte with its meaning.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -10,21 +10,21 @@ use serde_json::{Value, json};
 use crate::report::Failure;
 use crate::{input, output};
 
-/// Bytes on a line.
+/// Bytes per line.
 const LINE: usize = 16;
-/// Most lines for bytes that belong together.
-const LINES: usize = 4;
+/// Maximum number of lines per span.
+const MAX_LINES: usize = 4;
 
-/// Prints the explanation, up to the error if there is one.
+/// Prints the explanation up to the first error.
 pub(super) fn print(bytes: &[u8], json: bool, file: &Path) -> Result<(), Failure> {
     let explanation = explain(bytes);
     if let Some(Problem::UnsupportedRepresentation(other)) =
         explanation.error.as_ref().map(DecodeError::problem)
     {
         return Err(Failure::failed(
-            format!("only what is bit-efficient is explained, and this is {other}"),
+            format!("cannot explain {other}: --explain supports only bit-efficient encodings"),
             input::name(file),
-            "leave out --explain",
+            "omit --explain",
         ));
     }
     if json {
@@ -57,7 +57,7 @@ fn as_json(bytes: &[u8], explanation: &Explanation) -> Value {
     json
 }
 
-/// Offset, bytes and meaning of every span.
+/// The offset, bytes and meaning of every span.
 fn as_text(bytes: &[u8], explanation: &Explanation) -> String {
     let mut out = String::new();
     let mut end = 0;
@@ -67,17 +67,22 @@ fn as_text(bytes: &[u8], explanation: &Explanation) -> String {
         lines(&mut out, bytes, span.offset..end, &meaning);
     }
     if explanation.error.is_some() {
-        lines(&mut out, bytes, end..bytes.len(), "not read: see the error");
+        lines(
+            &mut out,
+            bytes,
+            end..bytes.len(),
+            "not decoded: see the error",
+        );
     }
     out
 }
 
-/// The lines for bytes that belong together. Of very many only the first ones are shown.
+/// Writes the lines of a span. Of a long span only the first lines are written.
 fn lines(out: &mut String, bytes: &[u8], range: std::ops::Range<usize>, meaning: &str) {
     let begin = range.start;
     let bytes = bytes.get(range).unwrap_or_default();
-    let shown = if bytes.len() > LINES * LINE {
-        (LINES - 1) * LINE
+    let shown = if bytes.len() > MAX_LINES * LINE {
+        (MAX_LINES - 1) * LINE
     } else {
         bytes.len()
     };
@@ -96,7 +101,7 @@ fn lines(out: &mut String, bytes: &[u8], range: std::ops::Range<usize>, meaning:
     if !rest.is_empty() {
         let _ = writeln!(
             out,
-            "{:>8}  … {} bytes more",
+            "{:>8}  … {} more bytes",
             begin + shown.len(),
             rest.len()
         );

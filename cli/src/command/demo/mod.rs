@@ -1,7 +1,7 @@
-//! `fipa demo`: the tour. Real processes on this machine show what the project promises.
+//! `fipa demo`: demonstrates the delivery guarantees with real processes on this machine.
 
-mod part;
-mod stage;
+mod process;
+mod processes;
 mod steps;
 
 use clap::Args;
@@ -11,61 +11,63 @@ use crate::options::{self, Global};
 use crate::output;
 use crate::report::Failure;
 
-/// Show what this is about: two hosts, several agents, and what happens between them
+/// Demonstrate the main functions with two simulated hosts and several agents
 ///
-/// Starts two gateways, each with a domain of its own on this machine (standing for two robots),
-/// and several agents, all as separate processes; no root needed, nothing leaves this machine.
-/// Agents converse through shared memory and between the hosts over TCP, large content moves
-/// without a copy, one agent is killed, shared memory is broken, an old peer's letter arrives, and an
-/// agent that breaks its protocol is caught by somebody who watches.
-/// What each step claims is checked by the process that received something.
+/// Starts two gateways and several agents, all as separate processes. Each gateway has its own domain
+/// on this machine and stands for one robot. Root is not needed, and no traffic leaves this machine.
 ///
-/// Exits with 0 only if every step did what it says, and leaves nothing behind.
+/// The agents converse through shared memory and, between the hosts, over TCP. Large content is
+/// delivered without a copy, one agent is killed, shared memory breaks, a legacy peer sends a letter,
+/// and a watcher reports an agent that violates its protocol. The receiving process checks each step.
+///
+/// The exit code is 0 only if every step passed and no file is left behind.
 #[derive(Debug, Args)]
 #[command(
-    after_help = "Examples:\n  fipa demo\n  fipa demo --json | jq '.steps[] | {name, ok, via}'"
+    after_help = "Examples:\n  fipa demo\n  fipa demo --json | jq '.steps[] | {name, ok, via}'\n\nJSON:\n  \
+                  { \"steps\": [ { \"name\", \"ok\", \"error\" if it failed, details of the step } ],\n    \
+                  \"measured\": the rows of the step \"measurement\" }"
 )]
 pub(crate) struct Arguments {
-    /// Print one JSON object instead of the story
+    /// Print one JSON object instead of the text
     #[arg(long)]
     json: bool,
-    /// Play a part in somebody else's demo
+    /// Run as a process of a demo
     #[arg(long, hide = true, requires = "name")]
-    part: Option<Part>,
-    /// The name of the agent or the gateway of that part
+    role: Option<Role>,
+    /// Name of the agent or gateway of this process
     #[arg(long, hide = true)]
     name: Option<String>,
 }
 
 #[derive(Debug, Clone, Copy, clap::ValueEnum)]
-enum Part {
+enum Role {
     Agent,
     Gateway,
     Watcher,
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
-    if let (Some(part), Some(name)) = (arguments.part, arguments.name) {
+    if let (Some(role), Some(name)) = (arguments.role, arguments.name) {
         let config = global.config()?;
-        let played = options::block_on(async {
-            match part {
-                Part::Agent => part::agent(&config, &name).await,
-                Part::Gateway => part::gateway(&config).await,
-                Part::Watcher => part::watcher(&config).await,
+        let ended = options::block_on(async {
+            match role {
+                Role::Agent => process::agent(&config, &name).await,
+                Role::Gateway => process::gateway(&config).await,
+                Role::Watcher => process::watcher(&config).await,
             }
         })?;
-        return played.map_err(|error| Failure::failed(error, name, "see the demo's own report"));
+        return ended.map_err(|error| Failure::failed(error, name, "see the report of the demo"));
     }
-    let report = options::block_on(steps::play(!arguments.json))??;
+    let report = options::block_on(steps::run(!arguments.json))??;
     if arguments.json {
         output::json(&json!({ "steps": report.steps, "measured": report.measured }))?;
     }
     match report.broken {
         None => Ok(()),
         Some(step) => Err(Failure::failed(
-            format!("the step \"{step}\" did not do what it says"),
+            format!("the step \"{step}\" failed"),
             "fipa demo",
-            "run it with -v for the logs of all processes, and report what you see",
+            "run `fipa doctor`; `RUST_LOG=info fipa demo` shows the logs of all processes",
         )),
     }
 }

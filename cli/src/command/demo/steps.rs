@@ -1,5 +1,5 @@
-//! The steps of the demo, in order: what is done, what the parts say they saw, and whether that is
-//! what was promised.
+//! The steps of the demo, in order. Each step acts, collects the events of the processes and checks
+//! them.
 
 use std::io::Write as _;
 use std::time::{Duration, Instant};
@@ -8,56 +8,61 @@ use serde_json::{Map, Value, json};
 use tokio::io::AsyncWriteExt;
 use tokio::net::TcpStream;
 
-use super::part::{Event, Listed, Order, Received};
-use super::stage::{Part, Stage};
+use super::process::{Event, Listed, Order, Received};
+use super::processes::{Process, Processes};
 use crate::report::Failure;
 
-/// A letter as the C++ library fipa_services puts it on a TCP connection, for the agent `echo`.
-const OLD_PEERS_LETTER: &[u8] = include_bytes!("../../../data/tcp_letter.bin");
+/// A letter for the agent `echo`, as the C++ library fipa_services sends it over TCP.
+const LEGACY_LETTER: &[u8] = include_bytes!("../../../data/tcp_letter.bin");
 const LARGE: usize = 4 << 20;
-/// How long the hosts may take to find each other.
-const FINDING: Duration = Duration::from_secs(30);
+/// Maximum time for the hosts to discover each other.
+const DISCOVERY_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// What the demo has to say in the end.
+/// The result of the demo.
 pub(super) struct Report {
     pub(super) steps: Vec<Value>,
     pub(super) measured: Value,
-    /// The first step that did not do what it says.
+    /// The first step that failed.
     pub(super) broken: Option<String>,
 }
 
-/// Plays the demo. `aloud`: tells the story on standard output while it happens.
-pub(super) async fn play(aloud: bool) -> Result<Report, Failure> {
-    let stage = Stage::new()
-        .map_err(|error| Failure::failed(error, "fipa demo", "see whether fipa can be run"))?;
-    let mut play = Play {
-        stage,
-        aloud,
+/// Runs the demo. If `verbose`, prints each step on standard output.
+pub(super) async fn run(verbose: bool) -> Result<Report, Failure> {
+    let processes = Processes::new().map_err(|error| {
+        Failure::failed(
+            error,
+            "fipa demo",
+            "check the permissions of the fipa executable",
+        )
+    })?;
+    let mut demo = Demo {
+        processes,
+        verbose,
         steps: Vec::new(),
         broken: None,
     };
     let interrupted = tokio::select! {
-        () = play.all() => false,
+        () = demo.all() => false,
         () = interrupt() => true,
     };
-    let left = play.stage.clear().await;
+    let left = demo.processes.clear().await;
     if interrupted {
         return Err(Failure::failed(
-            "interrupted; all processes of the demo have ended and nothing is left behind",
+            "interrupted; all processes of the demo have ended and no files are left",
             "fipa demo",
-            "run it again to see the rest",
+            "run the demo again",
         ));
     }
-    play.last_step(&left);
-    let measured = play.measured();
+    demo.last_step(&left);
+    let measured = demo.measured();
     Ok(Report {
-        steps: play.steps,
+        steps: demo.steps,
         measured,
-        broken: play.broken,
+        broken: demo.broken,
     })
 }
 
-/// Ctrl-C, or being told to end.
+/// Waits for SIGINT (Ctrl-C) or SIGTERM.
 async fn interrupt() {
     let terminated = async {
         use tokio::signal::unix::{SignalKind, signal};
@@ -72,14 +77,14 @@ async fn interrupt() {
     }
 }
 
-struct Play {
-    stage: Stage,
-    aloud: bool,
+struct Demo {
+    processes: Processes,
+    verbose: bool,
     steps: Vec<Value>,
     broken: Option<String>,
 }
 
-/// What a step found out, for its JSON object.
+/// The JSON fields of a step, or its error.
 type Found = Result<Map<String, Value>, String>;
 
 macro_rules! found {
@@ -98,18 +103,20 @@ macro_rules! ensure {
     };
 }
 
-impl Play {
+impl Demo {
     async fn all(&mut self) {
-        self.say("Two robots on this machine: each a domain with a gateway of its own.");
+        self.say(
+            "Two domains on this machine stand for two robots; each domain has its own gateway.",
+        );
         let found = self.listed().await;
         if !self.step("agents register and are listed", found) {
-            // Nobody is there to go on with.
+            // The other steps need these agents.
             return;
         }
         let found = self.request("arm_1", "shm").await;
         self.step("a conversation on one host", found);
         let found = self.request("crex_camera", "tcp").await;
-        self.step("the same conversation between the hosts", found);
+        self.step("the same conversation between two hosts", found);
         let found = self.large().await;
         self.step("large content without a copy", found);
         let found = self.multicast().await;
@@ -117,33 +124,33 @@ impl Play {
         let found = self.killed().await;
         self.step("an agent is killed", found);
         let found = self.broken_memory().await;
-        self.step("shared memory breaks, a Unix socket takes over", found);
-        let found = self.old_peer().await;
-        self.step("a letter of an old peer", found);
+        self.step("fallback from shared memory to a Unix domain socket", found);
+        let found = self.legacy_peer().await;
+        self.step("a letter from a legacy peer", found);
         let found = self.broken_protocol().await;
-        self.step("a protocol is broken, and it is seen", found);
+        self.step("a protocol violation is detected", found);
         let found = self.measurement().await;
         self.step("measurement", found);
     }
 
     fn say(&self, text: &str) {
-        if self.aloud {
-            // Whether anybody reads the story does not change what happens in it.
+        if self.verbose {
+            // A closed standard output does not change the steps.
             let mut out = std::io::stdout().lock();
             let _ = writeln!(out, "{text}").and_then(|()| out.flush());
         }
     }
 
-    /// Notes how a step went, and says whether it did what it says.
+    /// Records and prints the result of a step. Returns whether the step passed.
     fn step(&mut self, name: &str, found: Found) -> bool {
         let (ok, mut object) = match found {
             Ok(found) => (true, found),
-            Err(why) => (false, Map::from_iter([("error".to_owned(), json!(why))])),
+            Err(error) => (false, Map::from_iter([("error".to_owned(), json!(error))])),
         };
         let number = self.steps.len() + 1;
         self.say(&match object.get("error").and_then(Value::as_str) {
             None => format!("  [ok] {number}. {name}\n"),
-            Some(why) => format!("  [BROKEN] {number}. {name}: {why}\n"),
+            Some(error) => format!("  [FAILED] {number}. {name}: {error}\n"),
         });
         object.insert("name".to_owned(), json!(name));
         object.insert("ok".to_owned(), json!(ok));
@@ -155,16 +162,18 @@ impl Play {
     }
 
     async fn listed(&mut self) -> Found {
-        self.stage.start("rover", "rover-mts", "gateway").await?;
-        self.stage.start("crex", "crex-mts", "gateway").await?;
+        self.processes
+            .start("rover", "rover-mts", "gateway")
+            .await?;
+        self.processes.start("crex", "crex-mts", "gateway").await?;
         for agent in ["rover", "arm_1", "arm_2", "arm_3", "arm_4", "echo"] {
-            self.stage.start("rover", agent, "agent").await?;
-            let part = self.stage.part(agent)?;
-            let (pid, locations) = (part.pid(), part.locations.join("  "));
+            self.processes.start("rover", agent, "agent").await?;
+            let process = self.processes.get(agent)?;
+            let (pid, locations) = (process.pid(), process.locations.join("  "));
             self.say(&format!("  {agent:<12} process {pid:<7} {locations}"));
         }
-        self.stage.start("crex", "crex_camera", "agent").await?;
-        self.say("  crex_camera  on the other host; the gateways look for each other by mDNS ...");
+        self.processes.start("crex", "crex_camera", "agent").await?;
+        self.say("  crex_camera  on the other host; the gateways discover each other by mDNS ...");
         let started = Instant::now();
         let agents = loop {
             let agents = self.agents_seen_by("rover").await?;
@@ -172,13 +181,13 @@ impl Play {
                 break agents;
             }
             ensure!(
-                started.elapsed() < FINDING,
-                "crex_camera was not found in {FINDING:?}"
+                started.elapsed() < DISCOVERY_TIMEOUT,
+                "crex_camera was not discovered within {DISCOVERY_TIMEOUT:?}"
             );
             tokio::time::sleep(Duration::from_millis(50)).await;
         };
         let took = started.elapsed().as_millis();
-        self.say(&format!("  found after {took} ms"));
+        self.say(&format!("  discovered after {took} ms"));
         for agent in ["rover", "arm_1", "arm_2", "arm_3", "arm_4", "echo"] {
             let entry = agents.iter().find(|entry| entry.name == agent);
             let entry = entry.ok_or_else(|| format!("{agent} is not listed"))?;
@@ -191,34 +200,32 @@ impl Play {
         let remote = agents.iter().find(|agent| agent.name == "crex_camera");
         ensure!(
             remote.is_some_and(|agent| !agent.local),
-            "crex_camera counts as local"
+            "crex_camera is listed as local"
         );
         found!("agents": agents, "found_after_ms": took)
     }
 
     async fn agents_seen_by(&mut self, name: &str) -> Result<Vec<Listed>, String> {
-        match self.stage.part(name)?.tell(&Order::Agents).await? {
+        match self.processes.get(name)?.run(&Order::Agents).await? {
             Event::Agents { agents } => Ok(agents),
-            other => Err(format!(
-                "{name}: a list of agents was expected, not {other:?}"
-            )),
+            other => Err(format!("{name}: expected a list of agents, not {other:?}")),
         }
     }
 
     async fn send(&mut self, from: &str, order: Order) -> Result<Vec<Value>, String> {
-        match self.stage.part(from)?.tell(&order).await? {
+        match self.processes.get(from)?.run(&order).await? {
             Event::Outcomes {
                 deliveries: Value::Array(deliveries),
             } => Ok(deliveries),
-            other => Err(format!("{from}: outcomes were expected, not {other:?}")),
+            other => Err(format!("{from}: expected outcomes, not {other:?}")),
         }
     }
 
     async fn received_by(&mut self, name: &str) -> Result<Received, String> {
-        self.stage.part(name)?.received().await
+        self.processes.get(name)?.received().await
     }
 
-    /// request, agree, inform; each seen by its receiver.
+    /// A conversation of request, agree and inform; each receiver reports its message.
     async fn request(&mut self, to: &str, via: &str) -> Found {
         let order = Order::Send {
             performative: "request".into(),
@@ -228,22 +235,22 @@ impl Play {
         };
         let deliveries = self.send("rover", order).await?;
         let went = one_delivery(&deliveries)?;
-        ensure!(went["via"] == via, "the request went {went}");
+        ensure!(went["via"] == via, "outcome of the request: {went}");
         let seen = self.received_by(to).await?;
         self.say(&format!(
-            "  {to} saw: {} from {}",
+            "  {to} received {} from {}",
             seen.performative, seen.sender
         ));
         ensure!(
             seen.performative == "request"
                 && seen.sender == "rover"
                 && seen.content.as_deref() == Some("(lift sample-3)"),
-            "{to} saw {seen:?}"
+            "{to} received {seen:?}"
         );
         for (performative, content) in [("agree", "agreed"), ("inform", "done")] {
             let seen = self.received_by("rover").await?;
             self.say(&format!(
-                "  rover saw: {} from {}",
+                "  rover received {} from {}",
                 seen.performative, seen.sender
             ));
             ensure!(
@@ -253,14 +260,14 @@ impl Play {
                     && seen.in_reply_to.as_deref() == Some("question-1")
                     && seen.conversation_id == Some(format!("rover-to-{to}"))
                     && seen.protocol.as_deref() == Some("fipa-request"),
-                "rover saw {seen:?}"
+                "rover received {seen:?}"
             );
         }
         found!("via": via, "attempts": went["attempts"])
     }
 
     async fn large(&mut self) -> Found {
-        let mut ways = Vec::new();
+        let mut routes = Vec::new();
         for (to, via, in_place) in [("arm_1", "shm", true), ("crex_camera", "tcp", false)] {
             let order = Order::SendLarge {
                 to: to.into(),
@@ -268,25 +275,28 @@ impl Play {
             };
             let deliveries = self.send("rover", order).await?;
             let went = one_delivery(&deliveries)?;
-            ensure!(went["via"] == via, "the content for {to} went {went}");
+            ensure!(
+                went["via"] == via,
+                "outcome of the content for {to}: {went}"
+            );
             let seen = self.received_by(to).await?;
-            ensure!(seen.len == LARGE, "{to} got {} bytes", seen.len);
-            ensure!(seen.intact == Some(true), "{to} found another checksum");
+            ensure!(seen.len == LARGE, "{to} received {} bytes", seen.len);
+            ensure!(seen.intact == Some(true), "{to}: wrong checksum");
             ensure!(
                 !in_place || seen.in_shared_memory,
-                "the content lies in {to}'s own memory: it was copied"
+                "the content is in the private memory of {to}: it was copied"
             );
             let place = if in_place {
-                ", still in shared memory"
+                ", in shared memory without a copy"
             } else {
                 ""
             };
             self.say(&format!(
-                "  {to} got 4 MiB via {via}{place}; the checksum is right"
+                "  {to} received 4 MiB via {via}{place}; the checksum is correct"
             ));
-            ways.push(json!({ "receiver": to, "via": via, "in_place": seen.in_shared_memory }));
+            routes.push(json!({ "receiver": to, "via": via, "in_place": seen.in_shared_memory }));
         }
-        found!("via": "shm", "bytes": LARGE, "ways": ways)
+        found!("via": "shm", "bytes": LARGE, "ways": routes)
     }
 
     async fn multicast(&mut self) -> Found {
@@ -304,28 +314,31 @@ impl Play {
         reached.sort_unstable();
         ensure!(
             reached == ["arm_1", "arm_2", "arm_3"],
-            "it reached {reached:?}"
+            "delivered to {reached:?}"
         );
         for arm in ["arm_1", "arm_2", "arm_3"] {
             let seen = self.received_by(arm).await?;
             ensure!(
                 seen.sender == "arm_4" && seen.content.as_deref() == Some("stop"),
-                "{arm} saw {seen:?}"
+                "{arm} received {seen:?}"
             );
-            self.say(&format!("  {arm} saw: {} from arm_4", seen.performative));
+            self.say(&format!(
+                "  {arm} received {} from arm_4",
+                seen.performative
+            ));
         }
-        // Its own copy would have come by now: the others have had theirs.
-        match self.stage.part("arm_4")?.tell(&Order::Count).await? {
+        // A copy for arm_4 would have arrived by now: the others have their copies.
+        match self.processes.get("arm_4")?.run(&Order::Count).await? {
             Event::Count { received: 0 } => {}
-            other => return Err(format!("arm_4 heard itself: {other:?}")),
+            other => return Err(format!("arm_4 received its own message: {other:?}")),
         }
         found!("via": "shm", "receivers": reached)
     }
 
     async fn killed(&mut self) -> Found {
-        let pid = self.stage.part("arm_2")?.pid();
-        self.stage.kill("arm_2").await?;
-        self.say(&format!("  arm_2 (process {pid}) got SIGKILL"));
+        let pid = self.processes.get("arm_2")?.pid();
+        self.processes.kill("arm_2").await?;
+        self.say(&format!("  arm_2 (process {pid}) was killed with SIGKILL"));
         let order = Order::Send {
             performative: "inform".into(),
             to: "arm_2".into(),
@@ -334,45 +347,47 @@ impl Play {
         };
         let deliveries = self.send("rover", order).await?;
         let [went] = deliveries.as_slice() else {
-            return Err(format!("{} outcomes for one receiver", deliveries.len()));
+            return Err(format!("expected one outcome, not {}", deliveries.len()));
         };
         ensure!(
             went["outcome"] == "failed",
-            "the letter to the dead went {went}"
+            "outcome of the letter to arm_2: {went}"
         );
         let reason = went["reason"].as_str().unwrap_or_default().to_owned();
         let seen = self.received_by("rover").await?;
-        let told = seen.content.clone().unwrap_or_default();
+        let failure = seen.content.clone().unwrap_or_default();
         ensure!(
-            seen.performative == "failure" && told.contains(&reason) && !reason.is_empty(),
-            "rover saw {seen:?}, the outcome was {went}"
+            seen.performative == "failure" && failure.contains(&reason) && !reason.is_empty(),
+            "rover received {seen:?}, the outcome was {went}"
         );
-        self.say(&format!("  rover got a FIPA failure: {told}"));
-        found!("reason": reason, "failure": told, "attempts": went["attempts"])
+        self.say(&format!(
+            "  rover received a FIPA failure message: {failure}"
+        ));
+        found!("reason": reason, "failure": failure, "attempts": went["attempts"])
     }
 
     async fn broken_memory(&mut self) -> Found {
-        // What a careless hand does to /dev/shm; nobody has a connection to the newcomer yet.
-        let before = self.stage.shared_memory();
-        self.stage.start("rover", "arm_5", "agent").await?;
-        let mut mine = self.stage.shared_memory();
+        // Removes the new process's files in /dev/shm before any process is connected to it.
+        let before = self.processes.shared_memory();
+        self.processes.start("rover", "arm_5", "agent").await?;
+        let mut mine = self.processes.shared_memory();
         mine.retain(|file| !before.contains(file));
         for file in &mine {
             std::fs::remove_file(file).map_err(|error| format!("{}: {error}", file.display()))?;
         }
         self.say(&format!(
-            "  arm_5's shared memory, {} files, was removed",
+            "  removed the {} shared memory files of arm_5",
             mine.len()
         ));
         let order = Order::Send {
             performative: "inform".into(),
             to: "arm_5".into(),
-            content: "by another way".into(),
+            content: "by another route".into(),
             protocol: None,
         };
         let deliveries = self.send("rover", order).await?;
         let went = one_delivery(&deliveries)?;
-        ensure!(went["via"] == "unix", "the letter went {went}");
+        ensure!(went["via"] == "unix", "outcome of the letter: {went}");
         ensure!(
             went["attempts"][0]["via"] == "shm",
             "shared memory was not tried: {went}"
@@ -380,18 +395,18 @@ impl Play {
         let seen = self.received_by("arm_5").await?;
         ensure!(
             seen.via.as_deref() == Some("unix")
-                && seen.content.as_deref() == Some("by another way"),
-            "arm_5 saw {seen:?}"
+                && seen.content.as_deref() == Some("by another route"),
+            "arm_5 received {seen:?}"
         );
         let why = went["attempts"][0]["error"].as_str().unwrap_or_default();
         self.say(&format!(
-            "  shm failed ({why}); arm_5 saw the letter come by unix"
+            "  shm failed ({why}); arm_5 received the letter via unix"
         ));
         found!("via": "unix", "attempts": went["attempts"])
     }
 
-    async fn old_peer(&mut self) -> Found {
-        let gateway: &Part = self.stage.part("rover-mts")?;
+    async fn legacy_peer(&mut self) -> Found {
+        let gateway: &Process = self.processes.get("rover-mts")?;
         let url = gateway
             .locations
             .iter()
@@ -403,32 +418,32 @@ impl Play {
         let mut stream = TcpStream::connect(&address)
             .await
             .map_err(|error| error.to_string())?;
-        let thrown = async {
-            stream.write_all(OLD_PEERS_LETTER).await?;
+        let written = async {
+            stream.write_all(LEGACY_LETTER).await?;
             stream.shutdown().await
         };
-        thrown
+        written
             .await
             .map_err(|error| format!("{address}: {error}"))?;
         self.say(&format!(
-            "  {} recorded bytes thrown at {address}",
-            OLD_PEERS_LETTER.len()
+            "  sent {} recorded bytes of fipa_services to {address}",
+            LEGACY_LETTER.len()
         ));
         let seen = self.received_by("echo").await?;
         ensure!(
             seen.performative == "request"
                 && seen.sender == "cpp-sender"
                 && seen.content.as_deref() == Some("hello"),
-            "echo saw {seen:?}"
+            "echo received {seen:?}"
         );
-        self.say("  echo saw: request from cpp-sender: hello");
+        self.say("  echo received request from cpp-sender: hello");
         found!("via": "tcp", "sender": seen.sender, "content": seen.content)
     }
 
-    /// A call for proposals. One arm proposes; the other says that it is done already, and
-    /// nobody has awarded it anything. Nobody has asked the agents whether they are watched.
+    /// A call for proposals. One arm proposes; the other reports a result although it was not awarded
+    /// the task. The agents do not cooperate with the watcher.
     async fn broken_protocol(&mut self) -> Found {
-        self.stage.start("rover", "eye", "watcher").await?;
+        self.processes.start("rover", "watcher", "watcher").await?;
         for (from, performative, to) in [
             ("rover", "cfp", "arm_1"),
             ("rover", "cfp", "arm_3"),
@@ -442,40 +457,44 @@ impl Play {
             };
             one_delivery(&self.send(from, order).await?)?;
             let seen = self.received_by(to).await?;
-            ensure!(seen.performative == performative, "{to} saw {seen:?}");
-            self.say(&format!("  {from} says {performative} to {to}"));
+            ensure!(seen.performative == performative, "{to} received {seen:?}");
+            self.say(&format!("  {from} sends {performative} to {to}"));
         }
-        let (sender, performative, text, kept) = match self.stage.part("eye")?.caught().await? {
-            Event::Caught {
-                sender,
-                performative,
-                text,
-                kept,
-            } => (sender, performative, text, kept),
-            other => return Err(format!("a violation was expected, not {other:?}")),
-        };
+        let (sender, performative, text, accepted) =
+            match self.processes.get("watcher")?.violation().await? {
+                Event::Violation {
+                    sender,
+                    performative,
+                    text,
+                    accepted,
+                } => (sender, performative, text, accepted),
+                other => return Err(format!("expected a violation, not {other:?}")),
+            };
         ensure!(
             sender == "arm_3"
                 && performative == "inform"
                 && ["expected", "propose", "from arm_3"]
                     .iter()
                     .all(|part| text.contains(part)),
-            "seen was: {text}"
+            "the watcher reported: {text}"
         );
-        ensure!(kept == 3, "{kept} letters kept to the protocol, not 3");
-        self.say(&format!("  who watches sees: {text}"));
-        let caught_itself = self.stopped_by_itself().await?;
+        ensure!(
+            accepted == 3,
+            "{accepted} letters followed the protocol, not 3"
+        );
+        self.say(&format!("  the watcher reports: {text}"));
+        let caught_itself = self.enforced_by_agent().await?;
         found!(
-            "sender": sender, "performative": performative, "violation": text, "kept": kept,
+            "sender": sender, "performative": performative, "violation": text, "kept": accepted,
             "caught_itself": caught_itself
         )
     }
 
-    /// The same again by an agent that checks itself: what would break the protocol does not leave,
-    /// and it can still do what is right.
-    async fn stopped_by_itself(&mut self) -> Result<String, String> {
+    /// The same by an agent with `monitor.check=enforce`: the violating message is not sent, and a
+    /// correct message is still accepted afterwards.
+    async fn enforced_by_agent(&mut self) -> Result<String, String> {
         let set = "monitor.check=enforce";
-        self.stage
+        self.processes
             .start_with("rover", "arm_6", "agent", set)
             .await?;
         let converse = |performative: &str, to: &str| Order::Converse {
@@ -485,26 +504,26 @@ impl Play {
         };
         one_delivery(&self.send("rover", converse("cfp", "arm_6")).await?)?;
         self.received_by("arm_6").await?;
-        self.say("  rover says cfp to arm_6, which checks itself");
-        let broken = converse("inform", "rover");
-        let what = match self.stage.part("arm_6")?.tell(&broken).await {
-            Err(what) => what,
-            Ok(other) => return Err(format!("arm_6 was not stopped: {other:?}")),
+        self.say("  rover sends cfp to arm_6, which has monitor.check=enforce");
+        let violating = converse("inform", "rover");
+        let error = match self.processes.get("arm_6")?.run(&violating).await {
+            Err(error) => error,
+            Ok(other) => return Err(format!("the message of arm_6 was sent: {other:?}")),
         };
         ensure!(
-            what.contains("not sent: inform from arm_6") && what.contains("expected"),
-            "arm_6 was told: {what}"
+            error.contains("not sent: inform from arm_6") && error.contains("expected"),
+            "the error of arm_6: {error}"
         );
-        self.say(&format!("  stopped by itself, {what}"));
+        self.say(&format!("  {error}"));
         one_delivery(&self.send("arm_6", converse("propose", "rover")).await?)?;
-        // The next thing that comes from it: the inform has not left.
+        // This is the next message from arm_6: the inform was not sent.
         let seen = self.received_by("rover").await?;
         ensure!(
             seen.performative == "propose" && seen.sender == "arm_6",
-            "rover saw {seen:?}"
+            "rover received {seen:?}"
         );
-        self.say("  arm_6 says propose to rover instead");
-        Ok(what)
+        self.say("  arm_6 sends propose to rover instead");
+        Ok(error)
     }
 
     async fn measurement(&mut self) -> Found {
@@ -515,10 +534,10 @@ impl Play {
                 len: 1024,
                 rounds: 500,
             };
-            match self.stage.part("rover")?.tell(&order).await? {
+            match self.processes.get("rover")?.run(&order).await? {
                 Event::Measured { p50_us, p99_us } => {
                     self.say(&format!(
-                        "  1 KiB to {to} via {via}, sent and confirmed: \
+                        "  1 KiB to {to} via {via}, from send to confirmation: \
                          p50 {p50_us:.0} us, p99 {p99_us:.0} us"
                     ));
                     rows.push(json!({
@@ -526,7 +545,7 @@ impl Play {
                         "confirmed_us": { "p50": p50_us, "p99": p99_us },
                     }));
                 }
-                other => return Err(format!("a measurement was expected, not {other:?}")),
+                other => return Err(format!("expected a measurement, not {other:?}")),
             }
         }
         found!("rows": rows)
@@ -537,25 +556,25 @@ impl Play {
         step.map_or(Value::Null, |step| step["rows"].clone())
     }
 
-    /// Nothing may be left behind.
+    /// Checks that no files are left.
     fn last_step(&mut self, left: &[std::path::PathBuf]) {
         let found = match left {
             [] => found!("left": 0),
             [first, ..] => Err(format!(
-                "{} files had to be removed, {} first",
+                "{} files were left, the first is {}",
                 left.len(),
                 first.display()
             )),
         };
-        self.step("nothing is left behind", found);
+        self.step("no files are left behind", found);
     }
 }
 
-/// The only delivery, which succeeded.
+/// Returns the only delivery. Several deliveries, or a failed one, are an error.
 fn one_delivery(deliveries: &[Value]) -> Result<&Value, String> {
     match deliveries {
         [only] if only["outcome"] == "delivered" => Ok(only),
         [only] => Err(format!("not delivered: {only}")),
-        several => Err(format!("{} outcomes for one receiver", several.len())),
+        several => Err(format!("expected one outcome, not {}", several.len())),
     }
 }

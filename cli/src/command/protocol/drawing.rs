@@ -1,6 +1,6 @@
-//! A protocol as SVG: states below each other in the order of the file, each with what leads out of
-//! it, and on the right a line to every state, which all that lead to it join. Nothing ever lies on
-//! anything else, whatever the protocol looks like.
+//! A protocol as SVG. The states are stacked in the order of the file, each with its transitions. On
+//! the right, one line per target state collects all transitions to that state. By construction no
+//! two elements overlap, for any protocol.
 
 use std::fmt::Write as _;
 
@@ -13,22 +13,22 @@ const MARGIN: usize = 24;
 const ROW: usize = 22;
 const HEAD: usize = 30;
 const GAP: usize = 14;
-/// Between the lines on the right.
+/// Distance between the lines on the right.
 const TRACK: usize = 18;
-/// Width of a character, more or less: fonts differ.
+/// Approximate width of a character: fonts differ.
 const CHAR: usize = 8;
 
-/// Of roles, the initiator's first.
+/// Colors of the roles, the initiator's first.
 const ROLES: [&str; 5] = ["#1f5fa8", "#2b7a3d", "#a8571f", "#7a2b70", "#555555"];
-/// Of lines.
+/// Colors of the lines.
 const LINES: [&str; 6] = [
     "#4878b0", "#58964f", "#c07830", "#8a5a9c", "#a04848", "#5a8c8c",
 ];
 
-/// A line of a state's box.
+/// A text row in the box of a state.
 struct Row {
     text: String,
-    colour: &'static str,
+    color: &'static str,
     dashed: bool,
     target: Option<usize>,
 }
@@ -39,14 +39,14 @@ struct Placed<'m> {
     top: usize,
 }
 
-/// The line that leads to a state, and in which track it runs.
+/// The line to a target state, with its track.
 struct Line {
     target: usize,
     top: usize,
     bottom: usize,
     track: usize,
-    /// Of [`LINES`].
-    colour: usize,
+    /// Index into [`LINES`].
+    color: usize,
 }
 
 pub(super) fn svg(machine: &Machine) -> String {
@@ -133,14 +133,14 @@ fn rows(machine: &Machine, state: &State) -> Vec<Row> {
         };
         Row {
             text: format!("{}: {}{to}{optional}", role(step.from()), act(step)),
-            colour: colour(machine, step.from()),
+            color: color(machine, step.from()),
             dashed: step.is_optional(),
             target: number(machine.target(step)),
         }
     });
     let timeouts = state.timeout().map(|timeout| Row {
         text: format!("after {}", super::after(timeout.after())),
-        colour: "#777777",
+        color: "#777777",
         dashed: true,
         target: number(machine.timeout_target(timeout)),
     });
@@ -150,12 +150,12 @@ fn rows(machine: &Machine, state: &State) -> Vec<Row> {
             .map(|to| format!(", answers to {}", role(to)));
         Row {
             text: format!(
-                "{}: begins {}{}",
+                "{}: starts {}{}",
                 role(sub.from()),
                 within(sub),
                 answers.unwrap_or_default()
             ),
-            colour: colour(machine, sub.from()),
+            color: color(machine, sub.from()),
             dashed: false,
             target: None,
         }
@@ -163,7 +163,7 @@ fn rows(machine: &Machine, state: &State) -> Vec<Row> {
     messages.chain(timeouts).chain(within).collect()
 }
 
-fn colour(machine: &Machine, role: &str) -> &'static str {
+fn color(machine: &Machine, role: &str) -> &'static str {
     let mut others = machine
         .roles()
         .iter()
@@ -178,7 +178,7 @@ fn colour(machine: &Machine, role: &str) -> &'static str {
     ROLES[number.min(ROLES.len() - 1)]
 }
 
-/// One line per state that something leads to; those that would overlap run in different tracks.
+/// One line per state with incoming transitions. Lines that would overlap run in different tracks.
 fn lines(placed: &[Placed<'_>]) -> Vec<Line> {
     let mut lines: Vec<Line> = Vec::new();
     for (target, to) in placed.iter().enumerate() {
@@ -197,11 +197,11 @@ fn lines(placed: &[Placed<'_>]) -> Vec<Line> {
                 top: ends.iter().copied().min().unwrap_or(arrow),
                 bottom: ends.iter().copied().max().unwrap_or(arrow),
                 track: 0,
-                colour: 0,
+                color: 0,
             });
         }
     }
-    // Short ones inside, so that long ones go around them.
+    // Short lines get the inner tracks, so that long lines run around them.
     lines.sort_by_key(|line| line.bottom - line.top);
     for at in 0..lines.len() {
         let (before, rest) = lines.split_at_mut(at);
@@ -211,14 +211,14 @@ fn lines(placed: &[Placed<'_>]) -> Vec<Line> {
         let overlaps = |other: &Line| other.top < line.bottom + 6 && line.top < other.bottom + 6;
         let taken = |track: usize| before.iter().any(|it| it.track == track && overlaps(it));
         line.track = (0..).find(|track| !taken(*track)).unwrap_or(0);
-        // Lines that cross have different colours, as long as there are enough.
-        let used = |colour: usize, all: bool| {
-            let same = before.iter().filter(|other| other.colour == colour);
+        // Lines that cross have different colors, as far as there are enough colors.
+        let used = |color: usize, all: bool| {
+            let same = before.iter().filter(|other| other.color == color);
             same.filter(|other| all || overlaps(other)).count()
         };
-        let colours = 0..LINES.len();
-        line.colour = colours
-            .min_by_key(|colour| (used(*colour, false), used(*colour, true)))
+        let colors = 0..LINES.len();
+        line.color = colors
+            .min_by_key(|color| (used(*color, false), used(*color, true)))
             .unwrap_or(0);
     }
     lines
@@ -239,11 +239,11 @@ fn roles(out: &mut String, machine: &Machine) {
         .iter()
         .filter(|role| *role != machine.initiator());
     for role in std::iter::once(machine.initiator()).chain(others.map(String::as_str)) {
-        let colour = colour(machine, role);
+        let color = color(machine, role);
         let _ = writeln!(
             out,
-            "<circle cx=\"{}\" cy=\"52\" r=\"5\" fill=\"{colour}\"/>\
-             <text x=\"{}\" y=\"57\" fill=\"{colour}\">{}</text>",
+            "<circle cx=\"{}\" cy=\"52\" r=\"5\" fill=\"{color}\"/>\
+             <text x=\"{}\" y=\"57\" fill=\"{color}\">{}</text>",
             x + 5,
             x + 16,
             escaped(role)
@@ -296,7 +296,7 @@ fn state(out: &mut String, placed: &Placed<'_>, width: usize, initial: bool) {
     );
 }
 
-/// A line of a state's box, and what leads from it to the line of its target.
+/// Draws a row of a state's box, and its connection to the line of its target.
 fn leading(out: &mut String, row: &Row, y: usize, width: usize, lines: &[Line]) {
     let x = 2 * MARGIN;
     let y = middle(y);
@@ -305,17 +305,17 @@ fn leading(out: &mut String, row: &Row, y: usize, width: usize, lines: &[Line]) 
         "<circle cx=\"{}\" cy=\"{y}\" r=\"4\" fill=\"{}\"/>\
          <text x=\"{}\" y=\"{}\" fill=\"{}\">{}</text>",
         x + 20,
-        row.colour,
+        row.color,
         x + 32,
         y + 5,
-        row.colour,
+        row.color,
         escaped(&row.text)
     );
     let line = row
         .target
         .and_then(|target| lines.iter().find(|line| line.target == target));
     if let Some(line) = line {
-        let colour = LINES[line.colour];
+        let color = LINES[line.color];
         let dashes = if row.dashed {
             " stroke-dasharray=\"5 4\""
         } else {
@@ -324,9 +324,9 @@ fn leading(out: &mut String, row: &Row, y: usize, width: usize, lines: &[Line]) 
         let end = track_x(x + width, line.track);
         let _ = writeln!(
             out,
-            "<path d=\"M {} {y} H {end}\" fill=\"none\" stroke=\"{colour}\" \
+            "<path d=\"M {} {y} H {end}\" fill=\"none\" stroke=\"{color}\" \
              stroke-width=\"1.6\"{dashes}/><circle cx=\"{end}\" cy=\"{y}\" r=\"2.6\" \
-             fill=\"{colour}\"/>",
+             fill=\"{color}\"/>",
             x + width
         );
     }
@@ -336,27 +336,27 @@ fn line_to(out: &mut String, line: &Line, placed: &[Placed<'_>], end: usize) {
     let Some(target) = placed.get(line.target) else {
         return;
     };
-    let colour = LINES[line.colour];
+    let color = LINES[line.color];
     let (x, y) = (track_x(end, line.track), target.top + HEAD / 2);
     let _ = writeln!(
         out,
-        "<path d=\"M {x} {} V {}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"1.6\"/>\
-         <path d=\"M {x} {y} H {}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"1.6\"/>{}",
+        "<path d=\"M {x} {} V {}\" fill=\"none\" stroke=\"{color}\" stroke-width=\"1.6\"/>\
+         <path d=\"M {x} {y} H {}\" fill=\"none\" stroke=\"{color}\" stroke-width=\"1.6\"/>{}",
         line.top,
         line.bottom,
         end + 8,
-        arrow_left(end, y, colour)
+        arrow_left(end, y, color)
     );
 }
 
-fn arrow_left(x: usize, y: usize, colour: &str) -> String {
+fn arrow_left(x: usize, y: usize, color: &str) -> String {
     let (tail, up, down) = (x + 9, y - 5, y + 5);
-    format!("<path d=\"M {x} {y} L {tail} {up} V {down} Z\" fill=\"{colour}\"/>")
+    format!("<path d=\"M {x} {y} L {tail} {up} V {down} Z\" fill=\"{color}\"/>")
 }
 
-fn arrow_right(x: usize, y: usize, colour: &str) -> String {
+fn arrow_right(x: usize, y: usize, color: &str) -> String {
     let (tail, up, down) = (x - 9, y - 5, y + 5);
-    format!("<path d=\"M {x} {y} L {tail} {up} V {down} Z\" fill=\"{colour}\"/>")
+    format!("<path d=\"M {x} {y} L {tail} {up} V {down} Z\" fill=\"{color}\"/>")
 }
 
 fn escaped(text: &str) -> String {

@@ -42,7 +42,7 @@ pub(super) fn diagram(machine: &Machine) -> String {
                 .proxied_to()
                 .map(|to| format!(", answers to {}", role(to)));
             let answers = answers.unwrap_or_default();
-            let label = format!("{} begun by {}{answers}", within(sub), role(sub.from()));
+            let label = format!("{} started by {}{answers}", within(sub), role(sub.from()));
             let _ = writeln!(out, "    s{at} --> s{at} : {}", escaped(&label));
         }
         if state.is_final() {
@@ -52,12 +52,12 @@ pub(super) fn diagram(machine: &Machine) -> String {
     out
 }
 
-/// Without what means something to Mermaid.
+/// Escapes the characters that have a meaning in Mermaid.
 fn escaped(text: &str) -> String {
     let mut out = String::new();
     for c in escape(text).chars() {
         match c {
-            // Older versions take a second colon for the end of a label.
+            // Older versions end a label at a second colon.
             ':' => out.push_str("#58;"),
             '#' => out.push_str("#35;"),
             ';' => out.push_str("#59;"),

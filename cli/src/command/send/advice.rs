@@ -1,10 +1,10 @@
-//! What to do when a message was not delivered.
+//! Remedies for messages that were not delivered.
 
 use fipa::{Agent, Config, Deliveries, FailureReason, Outcome, Pattern, Role, is_pattern};
 
 use crate::report::Failure;
 
-/// One failure for every reason there is, with the receivers it is about.
+/// One failure per reason, with the receivers that it concerns.
 pub(super) fn failures(deliveries: &Deliveries, agent: &Agent, config: &Config) -> Vec<Failure> {
     let mut reasons: Vec<(FailureReason, Vec<&str>)> = Vec::new();
     for delivery in &deliveries.0 {
@@ -17,20 +17,16 @@ pub(super) fn failures(deliveries: &Deliveries, agent: &Agent, config: &Config) 
         }
     }
     let failure = |(reason, names): (FailureReason, Vec<&str>)| {
-        let advice = match reason {
+        let help = match reason {
             FailureReason::NoSuchAgent => no_such_agent(&names, agent, config),
             other => advice(other, config),
         };
-        Failure::failed(
-            format!("not delivered: {reason}"),
-            receivers(&names),
-            advice,
-        )
+        Failure::failed(format!("not delivered: {reason}"), receivers(&names), help)
     };
     reasons.into_iter().map(failure).collect()
 }
 
-/// Names of receivers, for people.
+/// The quoted names of receivers.
 pub(super) fn receivers(names: &[&str]) -> String {
     let quoted: Vec<String> = names.iter().map(|name| format!("{name:?}")).collect();
     quoted.join(", ")
@@ -46,13 +42,13 @@ fn no_such_agent(names: &[&str], agent: &Agent, config: &Config) -> String {
     let domain = &config.domain;
     match gateway {
         Some(gateway) => format!(
-            "`fipa agents` lists who is there in the domain {domain:?}; on other hosts, only \
-             those are known that the gateway {:?} has found",
+            "`fipa agents` lists the agents of domain {domain:?}, and the agents on other hosts that \
+             gateway {:?} has discovered",
             gateway.name
         ),
         None => format!(
-            "`fipa agents` lists who is there in the domain {domain:?}; no gateway is running \
-             here, so agents of other hosts are not known: start one with `fipa up`"
+            "`fipa agents` lists the agents of domain {domain:?}; no gateway is running on this host, \
+             so agents on other hosts are unknown: start one with `fipa up`"
         ),
     }
 }
@@ -60,39 +56,38 @@ fn no_such_agent(names: &[&str], agent: &Agent, config: &Config) -> String {
 fn advice(reason: FailureReason, config: &Config) -> String {
     match reason {
         FailureReason::QueueFull => {
-            "it takes its messages too slowly: give it more time with --deadline, or a longer \
-             queue with mts.queue and mts.queue_bytes"
+            "the receiver reads its messages too slowly: increase --deadline, or its queue with \
+             mts.queue and mts.queue_bytes"
                 .to_owned()
         }
         FailureReason::Unreachable => {
-            "see above what was tried; `fipa agents` shows where it should be".to_owned()
+            "see the attempts above; `fipa agents` shows the receiver's locations".to_owned()
         }
         FailureReason::TooLarge => format!(
-            "send it in pieces, or allow larger letters with transport.shm.max_letter (here {} \
-             bytes) in the configuration of both sides",
+            "split the message, or increase transport.shm.max_letter (now {} bytes here) in the \
+             configuration of both hosts",
             config.transport.shm.max_letter
         ),
         FailureReason::Inexpressible => {
-            "see above which parameter the peer's dialect has no form for: change or leave out that \
-             parameter"
+            "change or omit the parameter named above, which the peer's dialect cannot encode"
                 .to_owned()
         }
         FailureReason::Unsupported => {
-            "see above the transports of the peer, which this program does not have: have the peer \
-             listen on TCP, too"
+            "configure the peer to listen on TCP too; the transports named above are not supported"
                 .to_owned()
         }
-        FailureReason::TimedOut => {
-            "give it more time with --deadline; see above what was tried".to_owned()
-        }
+        FailureReason::TimedOut => "increase --deadline; see the attempts above".to_owned(),
         FailureReason::Unconfirmed => {
-            "it may or may not have got it: ask it before you send it again".to_owned()
+            "the message may have been delivered: ask the receiver before sending it again"
+                .to_owned()
         }
         FailureReason::Loop => {
-            "gateways hand it to each other: see the locations in `fipa agents`, and \
-             discovery.static of their configurations"
+            "gateways forward the letter to each other: check the locations in `fipa agents`, and \
+             discovery.static in their configurations"
                 .to_owned()
         }
-        _ => "see above who did not take it, and its log".to_owned(),
+        _ => {
+            "see the attempts above, and the log of the process that rejected the letter".to_owned()
+        }
     }
 }

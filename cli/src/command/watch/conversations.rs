@@ -1,4 +1,4 @@
-//! The letters of each conversation, to be drawn.
+//! Collects the letters of each conversation for the diagrams.
 
 use std::collections::{BTreeMap, HashMap};
 use std::time::{Duration, Instant, SystemTime};
@@ -7,24 +7,24 @@ use fipa::Outcome;
 use fipa::watch::{Fate, Passage};
 use fipa_acl::escape;
 
-use super::judge::Judged;
-use super::person::Look;
+use super::checker::CheckResult;
 use super::sequence;
+use super::text::Look;
 
-/// Conversations that are kept; the one that rests longest goes first.
+/// Maximum number of stored conversations; the one that is idle longest is evicted first.
 const MAX_CONVERSATIONS: usize = 1000;
-/// Letters of one that are kept; of a longer one, the first.
+/// Maximum number of stored letters per conversation; further letters are only counted.
 const MAX_STEPS: usize = 2000;
-/// One that may be over is drawn when nothing has come for so long,
-const QUIET: Duration = Duration::from_secs(1);
-/// and any other when nothing has come for so long.
-const ABANDONED: Duration = Duration::from_secs(10);
+/// Idle time after which a complete conversation is drawn.
+const COMPLETE_IDLE: Duration = Duration::from_secs(1);
+/// Idle time after which an incomplete conversation is drawn.
+const INCOMPLETE_IDLE: Duration = Duration::from_secs(10);
 
-/// All conversations that have been seen.
+/// The conversations seen so far.
 #[derive(Debug, Default)]
 pub(super) struct Conversations {
     by_id: HashMap<String, Conversation>,
-    /// In the order in which they began.
+    /// Identifiers by the order in which the conversations began.
     order: BTreeMap<u64, String>,
     begun: u64,
 }
@@ -35,32 +35,33 @@ pub(super) struct Conversation {
     pub(super) id: String,
     pub(super) protocol: Option<String>,
     pub(super) steps: Vec<Step>,
-    /// How many letters were left out.
+    /// Number of letters that are not stored.
     pub(super) left_out: u64,
-    place: u64,
+    /// Key in `Conversations::order`.
+    position: u64,
     last: Instant,
     complete: bool,
-    /// How many of the steps have been drawn.
+    /// Number of steps that were drawn.
     drawn: usize,
 }
 
-/// A letter of a conversation. All texts are [escaped](escape).
+/// A letter of a conversation. All its texts are [escaped](escape).
 #[derive(Debug, Clone)]
 pub(super) struct Step {
     pub(super) at: SystemTime,
     pub(super) from: String,
     pub(super) to: String,
-    /// The performative, and the way unless it is shared memory.
+    /// The performative, and the transport unless it is shared memory.
     pub(super) label: String,
-    /// Why it did not arrive.
+    /// Reason of the failed delivery.
     pub(super) failed: Option<String>,
-    /// In which way it breaks the protocol.
+    /// Description of the protocol violation.
     pub(super) violation: Option<String>,
 }
 
 impl Conversations {
-    /// Takes a letter in. What must be drawn now, because there is no room for it any more.
-    pub(super) fn add(&mut self, passage: &Passage, judged: &Judged) -> Option<Conversation> {
+    /// Adds a letter. Returns a conversation that was evicted before it was drawn.
+    pub(super) fn add(&mut self, passage: &Passage, checked: &CheckResult) -> Option<Conversation> {
         let message = passage.message.as_ref()?;
         let id = message.conversation_id()?;
         let mut evicted = None;
@@ -75,7 +76,7 @@ impl Conversations {
                 protocol: None,
                 steps: Vec::new(),
                 left_out: 0,
-                place: self.begun,
+                position: self.begun,
                 last: Instant::now(),
                 complete: false,
                 drawn: 0,
@@ -85,16 +86,16 @@ impl Conversations {
         let conversation = self.by_id.get_mut(id)?;
         conversation.last = Instant::now();
         if conversation.protocol.is_none() {
-            let said = judged.protocol().or_else(|| message.protocol());
-            conversation.protocol = said.map(str::to_owned);
+            let protocol = checked.protocol().or_else(|| message.protocol());
+            conversation.protocol = protocol.map(str::to_owned);
         }
-        if let Judged::Accepted { complete, .. } = judged {
+        if let CheckResult::Accepted { complete, .. } = checked {
             conversation.complete = *complete;
         }
         if conversation.steps.len() >= MAX_STEPS {
             conversation.left_out += 1;
         } else {
-            conversation.steps.push(Step::of(passage, judged));
+            conversation.steps.push(Step::of(passage, checked));
         }
         evicted
     }
@@ -102,24 +103,24 @@ impl Conversations {
     fn evict(&mut self) -> Option<Conversation> {
         let oldest = self.by_id.values().min_by_key(|it| it.last)?.id.clone();
         let conversation = self.by_id.remove(&oldest)?;
-        self.order.remove(&conversation.place);
+        self.order.remove(&conversation.position);
         (conversation.drawn < conversation.steps.len()).then_some(conversation)
     }
 
-    /// Those that have come to rest and were not drawn yet.
-    pub(super) fn resting(&mut self) -> impl Iterator<Item = &Conversation> {
-        self.undrawn(|conversation| {
-            let quiet = conversation.last.elapsed();
-            quiet >= ABANDONED || (conversation.complete && quiet >= QUIET)
+    /// Takes the idle conversations that were not drawn yet.
+    pub(super) fn take_idle(&mut self) -> impl Iterator<Item = &Conversation> {
+        self.take_undrawn(|conversation| {
+            let idle = conversation.last.elapsed();
+            idle >= INCOMPLETE_IDLE || (conversation.complete && idle >= COMPLETE_IDLE)
         })
     }
 
-    /// All that were not drawn yet.
-    pub(super) fn rest(&mut self) -> impl Iterator<Item = &Conversation> {
-        self.undrawn(|_| true)
+    /// Takes all conversations that were not drawn yet.
+    pub(super) fn take_all(&mut self) -> impl Iterator<Item = &Conversation> {
+        self.take_undrawn(|_| true)
     }
 
-    fn undrawn(
+    fn take_undrawn(
         &mut self,
         wanted: impl Fn(&Conversation) -> bool,
     ) -> impl Iterator<Item = &Conversation> {
@@ -127,27 +128,29 @@ impl Conversations {
         for conversation in self.by_id.values_mut() {
             if conversation.drawn < conversation.steps.len() && wanted(conversation) {
                 conversation.drawn = conversation.steps.len();
-                due.push(conversation.place);
+                due.push(conversation.position);
             }
         }
         due.sort_unstable();
-        let ids = due.into_iter().filter_map(|place| self.order.get(&place));
+        let ids = due
+            .into_iter()
+            .filter_map(|position| self.order.get(&position));
         ids.filter_map(|id| self.by_id.get(id))
     }
 
-    /// All, in the order in which they began.
+    /// All stored conversations in the order in which they began.
     pub(super) fn all(&self) -> impl Iterator<Item = &Conversation> {
         self.order.values().filter_map(|id| self.by_id.get(id))
     }
 }
 
 impl Conversation {
-    /// As a sequence diagram in the terminal, with a blank line behind it.
+    /// The conversation as a sequence diagram for the terminal, followed by a blank line.
     pub(super) fn drawn(&self, look: Look) -> String {
         sequence::draw(self, look) + "\n"
     }
 
-    /// What stands above its diagram.
+    /// The title of the diagram.
     pub(super) fn title(&self) -> String {
         let id = escape(&self.id);
         match &self.protocol {
@@ -156,7 +159,7 @@ impl Conversation {
         }
     }
 
-    /// Who takes part, in the order in which they appear.
+    /// The participants in the order of their first letters.
     pub(super) fn participants(&self) -> Vec<&str> {
         let mut names: Vec<&str> = Vec::new();
         let mut known = std::collections::HashSet::new();
@@ -177,7 +180,7 @@ impl Conversation {
             protocol: Some(protocol.to_owned()),
             steps,
             left_out: 0,
-            place: 1,
+            position: 1,
             last: Instant::now(),
             complete: true,
             drawn: 0,
@@ -186,7 +189,7 @@ impl Conversation {
 }
 
 impl Step {
-    fn of(passage: &Passage, judged: &Judged) -> Self {
+    fn of(passage: &Passage, checked: &CheckResult) -> Self {
         let message = passage.message.as_ref();
         let performative = message.map_or("?", |it| it.performative().as_str());
         let mut label = escape(performative).into_owned();
@@ -204,8 +207,8 @@ impl Step {
                 | Fate::Passed(Outcome::Failed { reason, .. }) => Some(reason.to_string()),
                 _ => None,
             },
-            violation: match judged {
-                Judged::Violation(violation) => Some(violation.to_string()),
+            violation: match checked {
+                CheckResult::Violation(violation) => Some(violation.to_string()),
                 _ => None,
             },
         }

@@ -1,11 +1,11 @@
-//! Which letters are shown.
+//! Selects the letters to show.
 
 use fipa::watch::Passage;
 use fipa::{Matcher, Performative};
 
-use super::judge::Judged;
+use super::checker::CheckResult;
 
-/// What a letter must be to be shown; of what is not given, anything is.
+/// The conditions for showing a letter. An empty list accepts every letter.
 #[derive(Debug)]
 pub(super) struct Filter<'a> {
     pub(super) agents: &'a [Matcher],
@@ -15,7 +15,8 @@ pub(super) struct Filter<'a> {
     pub(super) violations: bool,
 }
 
-/// A conversation as it was named. Ids are made by programs and may look like patterns.
+/// A conversation identifier or pattern. Programs make identifiers, so one can look like a pattern;
+/// therefore the text is compared in both meanings.
 #[derive(Debug, Clone)]
 pub(super) struct Conversation {
     id: String,
@@ -31,24 +32,24 @@ pub(super) fn conversation(text: &str) -> Result<Conversation, fipa::PatternErro
 }
 
 impl Filter<'_> {
-    pub(super) fn takes(&self, passage: &Passage, judged: &Judged) -> bool {
+    pub(super) fn takes(&self, passage: &Passage, checked: &CheckResult) -> bool {
         let message = passage.message.as_ref();
         let of = |agent: &Matcher| {
             let from = passage.sender().is_some_and(|sender| agent.matches(sender));
             from || agent.matches(&passage.receiver)
         };
         let performative = message.map(fipa::Message::performative);
-        // What the conversation is about is known when the message does not say.
+        // The checker knows the protocol of a conversation when the message has none.
         let protocol = message.and_then(fipa::Message::protocol);
-        let protocol = protocol.or_else(|| judged.protocol());
+        let protocol = protocol.or_else(|| checked.protocol());
         (self.agents.is_empty() || self.agents.iter().any(of))
             && (self.performatives.is_empty()
                 || performative.is_some_and(|it| self.performatives.contains(it)))
             && self.takes_conversation(protocol, message.and_then(fipa::Message::conversation_id))
-            && (!self.violations || judged.is_violation())
+            && (!self.violations || checked.is_violation())
     }
 
-    /// Whether these are asked for, whoever writes.
+    /// Whether the filter accepts this protocol and conversation, for any agent.
     pub(super) fn takes_conversation(
         &self,
         protocol: Option<&str>,

@@ -1,4 +1,4 @@
-//! Conversations as one Mermaid sequence diagram, for documents.
+//! Conversations as a Mermaid sequence diagram.
 
 use std::collections::HashMap;
 use std::fmt::Write as _;
@@ -7,14 +7,14 @@ use std::path::Path;
 use super::conversations::Conversation;
 use crate::report::Failure;
 
-/// The diagram of these conversations, one behind the other.
+/// One diagram with all conversations in order.
 pub(super) fn diagram<'a>(conversations: impl Iterator<Item = &'a Conversation>) -> String {
     let conversations: Vec<&Conversation> = conversations.collect();
     let mut text = String::from("sequenceDiagram\n");
     let mut aliases: HashMap<&str, String> = HashMap::new();
     for name in conversations.iter().flat_map(|it| it.participants()) {
         if !aliases.contains_key(name) {
-            // Names may be anything, and mean something to Mermaid.
+            // A name can contain any text, also with a meaning in Mermaid.
             let alias = format!("p{}", aliases.len() + 1);
             let _ = writeln!(text, "    participant {alias} as {}", escaped(name));
             aliases.insert(name, alias);
@@ -49,13 +49,13 @@ pub(super) fn diagram<'a>(conversations: impl Iterator<Item = &'a Conversation>)
         }
         if conversation.left_out > 0 {
             let (over, more) = (alias(first), conversation.left_out);
-            let _ = writeln!(text, "    Note over {over}: and {more} letters more");
+            let _ = writeln!(text, "    Note over {over}: {more} more letters");
         }
     }
     text
 }
 
-/// Without what means something to Mermaid.
+/// Escapes the characters that have a meaning in Mermaid.
 fn escaped(text: &str) -> String {
     let mut out = String::new();
     for c in text.chars() {
@@ -74,7 +74,7 @@ pub(super) fn write(file: &Path, text: &str) -> Result<(), Failure> {
         Failure::failed(
             format!("cannot write the diagram: {error}"),
             file.display().to_string(),
-            "name a file that this user can write",
+            "give a file that this user can write",
         )
     })
 }
@@ -85,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_contract_net_is_drawn() {
+    fn a_contract_net_becomes_a_mermaid_diagram() {
         let conversation = contract_net();
         assert_eq!(
             diagram([&conversation].into_iter()),
@@ -106,7 +106,7 @@ sequenceDiagram
     }
 
     #[test]
-    fn names_mean_nothing_to_mermaid() {
+    fn characters_with_a_meaning_in_mermaid_are_escaped() {
         assert_eq!(escaped("a;b#1:<end>"), "a#59;b#35;1#58;#60;end#62;");
     }
 }

@@ -1,13 +1,13 @@
-//! `fipa watch`: the letters of this host, while they pass.
+//! `fipa watch`: shows the letters of this host live.
 
+pub(super) mod checker;
 mod conversations;
 mod filter;
-pub(super) mod judge;
-mod machine;
+mod json;
 mod mermaid;
-mod person;
 mod sequence;
 mod tally;
+mod text;
 
 use std::path::PathBuf;
 use std::pin::pin;
@@ -18,48 +18,48 @@ use fipa::watch::{Event, Passage, WatchOptions, Watcher};
 use fipa::{Config, Matcher, Performative};
 use tokio::time::Instant;
 
+use self::checker::{CheckResult, Checker};
 use self::conversations::Conversations;
 use self::filter::Filter;
-use self::judge::{Judge, Judged};
-use self::person::{Look, Person};
 use self::tally::Tally;
+use self::text::{Look, TextOutput};
 use crate::membership::{self, Stop};
 use crate::options::{self, Global};
 use crate::output;
 use crate::report::Failure;
 
-/// Show letters passing on this host, live
+/// Show the letters of this host live
 ///
-/// Shows the letters of all processes of the domain on this host, those through shared memory too:
-/// who writes to whom, what, by which way, what becomes of it, and whether it keeps to the
-/// interaction protocol of its conversation. Agents need not be asked and are not slowed; content
-/// is not shown unless asked for. A letter between hosts is seen at both.
+/// Shows the letters of all processes of the domain on this host, including those through shared
+/// memory: sender, receiver, performative, transport, outcome, and whether the letter follows the
+/// interaction protocol of its conversation. The agents need no configuration for it and are not
+/// slowed down. Content is shown only with --content. A letter between hosts is visible on both.
 ///
-/// Letters are shown in the order in which they were sent, each when its outcome is known, or after
-/// a quarter of a second; an outcome that comes later has a line of its own. Whoever reads too
-/// slowly is told how much was missed.
+/// Letters are shown in the order in which they were sent, each when its outcome is known or after
+/// 250 ms. A later outcome is printed on a line of its own. If the output is read too slowly, the
+/// command reports the number of lost records.
 ///
-/// Ctrl-C ends it, with a summary.
+/// Ctrl-C stops the command and prints a summary.
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
   fipa watch
   fipa watch --agent 'arm_.*' --protocol fipa-contract-net
   fipa watch --violations --protocols ./protocols
-  fipa watch --sequence                          conversations as sequence diagrams
-  fipa watch --conversation c1 --mermaid c1.mmd  the same for documents, written at the end
+  fipa watch --sequence                          draws conversations as sequence diagrams
+  fipa watch --conversation c1 --mermaid c1.mmd  writes a diagram for documents at the end
   fipa watch --json | jq -r 'select(.verdict.verdict == \"violation\") | .verdict.text'
 
-Columns: time (UTC), from and to, performative, protocol, conversation, length of the letter, way,
-outcome, verdict. The verdict is the state that the conversation is in now, `-` where there is
-nothing to be checked, or VIOLATION with what was expected of whom.
+Columns: time (UTC), sender and receiver, performative, protocol, conversation, size of the letter,
+transport, outcome, verdict. The verdict is the new state of the conversation, `-` for a letter that
+cannot be checked, or VIOLATION with the expected messages.
 
 JSON, one object on a line:
-  { \"event\": \"watching\", \"domain\", \"processes\": how many were there }
+  { \"event\": \"watching\", \"domain\", \"processes\": number of processes }
   { \"event\": \"letter\", \"number\", \"time\", \"sender\", \"receiver\", \"performative\", \"protocol\",
     \"conversation_id\", \"size\", \"content_length\", \"content_cut\", \"via\", \"gateway\",
-    \"message\": the same for all receivers of one message,
-    \"outcome\": \"delivered\", \"sent\", \"failed\", \"taken\" (seen at the receiver only) or
+    \"message\": identifier, the same for all receivers of a message,
+    \"outcome\": \"delivered\", \"sent\", \"failed\", \"taken\" (seen only at the receiver) or
     \"under_way\", \"reason\", \"attempts\": [ { \"via\", \"location\", \"error\" } ],
     \"verdict\": { \"verdict\": \"accepted\", \"violation\" or \"unchecked\", ... },
     \"letter\": { \"envelope\", \"effective\", \"message\" } as `fipa decode` prints it }
@@ -70,45 +70,44 @@ JSON, one object on a line:
   { \"event\": \"summary\", \"seconds\", \"letters\", \"shown\", \"outcomes\", \"conversations\",
     \"violations\", \"lost\" }")]
 pub(crate) struct Arguments {
-    /// Only letters from or to this agent, or agents whose names match this pattern; may be repeated
+    /// Show only letters from or to this agent, or agents matching this pattern; repeatable
     #[arg(long, value_name = "AGENT", value_parser = Matcher::parse)]
     agent: Vec<Matcher>,
 
-    /// Only letters of this protocol, or of those that match this pattern; may be repeated
+    /// Show only letters of this protocol, or protocols matching this pattern; repeatable
     #[arg(long, value_name = "PROTOCOL", value_parser = Matcher::parse)]
     protocol: Vec<Matcher>,
 
-    /// Only letters with this performative; may be repeated
+    /// Show only letters with this performative; repeatable
     #[arg(long, value_name = "PERFORMATIVE")]
     performative: Vec<Performative>,
 
-    /// Only letters of this conversation, or of those that match this pattern; may be repeated
+    /// Show only letters of this conversation, or conversations matching this pattern; repeatable
     #[arg(long, value_name = "ID", value_parser = filter::conversation)]
     conversation: Vec<filter::Conversation>,
 
-    /// Only letters that break their protocols
+    /// Show only letters that violate their protocols
     #[arg(long)]
     violations: bool,
 
-    /// Show content, too: so many bytes of each message at most
+    /// Show content, at most this number of bytes per message
     #[arg(long, value_name = "BYTES", num_args = 0..=1, default_missing_value = "80",
           require_equals = true, value_parser = bytes)]
     content: Option<usize>,
 
-    /// Protocols besides those of the FIPA standards: SCXML files in this directory
+    /// Directory with SCXML files of protocols in addition to those of the FIPA standards
     #[arg(long, value_name = "DIR")]
     protocols: Option<PathBuf>,
 
-    /// Draw conversations as sequence diagrams, each when it has come to its end or nothing more
-    /// comes
+    /// Draw each conversation as a sequence diagram when it has ended or is idle
     #[arg(long, conflicts_with = "json")]
     sequence: bool,
 
-    /// Write the conversations as a Mermaid sequence diagram into this file, at the end
+    /// Write the conversations as a Mermaid sequence diagram to this file at the end
     #[arg(long, value_name = "FILE")]
     mermaid: Option<PathBuf>,
 
-    /// End after so many letters
+    /// End after this number of shown letters
     #[arg(long, value_name = "N")]
     count: Option<u64>,
 
@@ -123,25 +122,25 @@ pub(crate) struct Arguments {
 
 fn bytes(text: &str) -> Result<usize, String> {
     let bytes = text.parse();
-    bytes.map_err(|_| "use a number of bytes such as 80".to_owned())
+    bytes.map_err(|_| "expected a number of bytes such as 80".to_owned())
 }
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> Result<(), Failure> {
     let config = global.config()?;
-    let judge = Judge::new(arguments.protocols.as_deref())?;
+    let checker = Checker::new(arguments.protocols.as_deref())?;
     if let Some(file) = &arguments.mermaid {
-        // Better known now than at the end.
+        // An unwritable file is reported at the start, not at the end.
         mermaid::write(file, "sequenceDiagram\n")?;
     }
-    options::block_on(watch(&arguments, judge, &config))?
+    options::block_on(watch(&arguments, checker, &config))?
 }
 
-async fn watch(arguments: &Arguments, judge: Judge, config: &Config) -> Result<(), Failure> {
+async fn watch(arguments: &Arguments, checker: Checker, config: &Config) -> Result<(), Failure> {
     let mut stop = Stop::listen()?;
     let content = arguments.content.unwrap_or(0);
     let watcher = Watcher::open(config, WatchOptions { content }).await;
     let mut watcher = watcher.map_err(|error| membership::not_joined(error, config))?;
-    let mut show = Show {
+    let mut display = Display {
         filter: Filter {
             agents: &arguments.agent,
             protocols: &arguments.protocol,
@@ -149,55 +148,59 @@ async fn watch(arguments: &Arguments, judge: Judge, config: &Config) -> Result<(
             conversations: &arguments.conversation,
             violations: arguments.violations,
         },
-        judge,
+        checker,
         tally: Tally::default(),
         conversations: (arguments.sequence || arguments.mermaid.is_some())
             .then(Conversations::default),
-        form: if arguments.json {
-            Form::Json
+        format: if arguments.json {
+            Format::Json
         } else if arguments.sequence {
-            Form::Sequence(Look::of_stdout())
+            Format::Sequence(Look::of_stdout())
         } else {
-            Form::Lines(Person::new(Look::of_stdout()))
+            Format::Text(TextOutput::new(Look::of_stdout()))
         },
-        open: true,
+        has_reader: true,
     };
-    show.begin(&config.domain, watcher.processes())?;
-    // Beyond all clocks is never.
+    display.begin(&config.domain, watcher.processes())?;
+    // A time beyond the range of the clock means no end.
     let ends = arguments
         .time
         .and_then(|time| Instant::now().checked_add(time));
     {
         let mut stopped = pin!(stop.requested());
-        while show.open && arguments.count.is_none_or(|count| show.tally.shown < count) {
+        while display.has_reader
+            && arguments
+                .count
+                .is_none_or(|count| display.tally.shown < count)
+        {
             tokio::select! {
-                event = watcher.next() => show.event(&event)?,
+                event = watcher.next() => display.event(&event)?,
                 () = tokio::time::sleep(TICK) => {}
                 () = &mut stopped => break,
                 () = at(ends) => break,
             }
-            show.time_passes()?;
+            display.handle_timeout()?;
         }
     }
     let full = || {
         arguments
             .count
-            .is_some_and(|count| show.tally.shown >= count)
+            .is_some_and(|count| display.tally.shown >= count)
     };
     if !full() {
         while let Some(event) = watcher.finish() {
-            show.event(&event)?;
+            display.event(&event)?;
         }
     }
     Stop::ending();
     drop(watcher);
-    show.end(arguments.mermaid.as_deref())
+    display.end(arguments.mermaid.as_deref())
 }
 
-/// How often what is overdue is looked for.
+/// Interval of checks for overdue messages.
 const TICK: Duration = Duration::from_millis(200);
-/// Letters are seen this much later than they were sent, at most: nothing is overdue before.
-const SEEN_AFTER: Duration = Duration::from_millis(500);
+/// Maximum delay between sending a letter and observing it. A message is overdue only after it.
+const OBSERVATION_DELAY: Duration = Duration::from_millis(500);
 
 async fn at(end: Option<Instant>) {
     match end {
@@ -206,37 +209,37 @@ async fn at(end: Option<Instant>) {
     }
 }
 
-/// Shows what is seen.
-struct Show<'a> {
+/// Prints the observed events.
+struct Display<'a> {
     filter: Filter<'a>,
-    judge: Judge,
+    checker: Checker,
     tally: Tally,
     conversations: Option<Conversations>,
-    form: Form,
-    /// Whether anybody reads what is printed.
-    open: bool,
+    format: Format,
+    /// Whether standard output still has a reader.
+    has_reader: bool,
 }
 
-enum Form {
-    Lines(Person),
+enum Format {
+    Text(TextOutput),
     Json,
     Sequence(Look),
 }
 
-impl Show<'_> {
+impl Display<'_> {
     fn begin(&mut self, domain: &str, processes: usize) -> Result<(), Failure> {
-        match &self.form {
-            Form::Json => self.print(&machine::watching(domain, processes)),
-            Form::Lines(person) => {
-                let text = person.head(domain, processes);
+        match &self.format {
+            Format::Json => self.print(&json::watching(domain, processes)),
+            Format::Text(output) => {
+                let text = output.head(domain, processes);
                 self.print(&text)
             }
-            Form::Sequence(_) => self.print(&person::first_line(domain, processes)),
+            Format::Sequence(_) => self.print(&text::first_line(domain, processes)),
         }
     }
 
     fn print(&mut self, text: &str) -> Result<(), Failure> {
-        self.open &= output::text_if_read(text)?;
+        self.has_reader &= output::text_if_read(text)?;
         Ok(())
     }
 
@@ -245,12 +248,12 @@ impl Show<'_> {
             Event::Letter(passage) => self.letter(passage),
             Event::Later(passage) => {
                 self.tally.later(passage);
-                // Only of what was shown; a violation was shown with the letter.
-                if !self.filter.violations && self.filter.takes(passage, &Judged::Later) {
-                    let text = match &self.form {
-                        Form::Lines(person) => person.later(passage),
-                        Form::Json => machine::later(passage),
-                        Form::Sequence(_) => String::new(),
+                // Only for letters that were shown; a violation was printed with its letter.
+                if !self.filter.violations && self.filter.takes(passage, &CheckResult::Checked) {
+                    let text = match &self.format {
+                        Format::Text(output) => output.later(passage),
+                        Format::Json => json::later(passage),
+                        Format::Sequence(_) => String::new(),
                     };
                     self.print(&text)?;
                 }
@@ -258,69 +261,72 @@ impl Show<'_> {
             }
             Event::Lost { process, records } => {
                 self.tally.lost += records;
-                let text = match &self.form {
-                    Form::Json => machine::lost(process, *records),
-                    Form::Lines(Person { look }) | Form::Sequence(look) => {
-                        person::lost(*look, process, *records)
+                let text = match &self.format {
+                    Format::Json => json::lost(process, *records),
+                    Format::Text(TextOutput { look }) | Format::Sequence(look) => {
+                        text::lost(*look, process, *records)
                     }
                 };
                 self.print(&text)
             }
             Event::Refused { process, why } => {
-                let text = match &self.form {
-                    Form::Json => machine::refused(process, &why.to_string()),
-                    Form::Lines(Person { look }) | Form::Sequence(look) => {
-                        person::refused(*look, process, &why.to_string())
+                let text = match &self.format {
+                    Format::Json => json::refused(process, &why.to_string()),
+                    Format::Text(TextOutput { look }) | Format::Sequence(look) => {
+                        text::refused(*look, process, &why.to_string())
                     }
                 };
                 self.print(&text)
             }
-            // What a later version sees.
+            // Events of later versions.
             _ => Ok(()),
         }
     }
 
     fn letter(&mut self, passage: &Passage) -> Result<(), Failure> {
-        // All of them, whatever is shown: a conversation is more than the letters shown of it.
-        let judged = self.judge.judge(passage);
-        self.tally.letter(passage, &judged);
-        if !self.filter.takes(passage, &judged) {
+        // Every letter is checked, whether shown or not: the state of a conversation depends on all its
+        // letters.
+        let checked = self.checker.check(passage);
+        self.tally.letter(passage, &checked);
+        if !self.filter.takes(passage, &checked) {
             return Ok(());
         }
         self.tally.shown += 1;
         let mut evicted = None;
         if let Some(conversations) = &mut self.conversations {
-            evicted = conversations.add(passage, &judged);
+            evicted = conversations.add(passage, &checked);
         }
-        let text = match &self.form {
-            Form::Lines(person) => person.letter(passage, &judged),
-            Form::Json => machine::letter(passage, &judged),
-            Form::Sequence(look) => evicted.map_or_else(String::new, |it| it.drawn(*look)),
+        let text = match &self.format {
+            Format::Text(output) => output.letter(passage, &checked),
+            Format::Json => json::letter(passage, &checked),
+            Format::Sequence(look) => evicted.map_or_else(String::new, |it| it.drawn(*look)),
         };
         self.print(&text)
     }
 
-    /// What is noticed without a letter.
-    fn time_passes(&mut self) -> Result<(), Failure> {
-        let now = SystemTime::now() - SEEN_AFTER;
-        for event in self.judge.time_passes(now) {
+    /// Prints overdue messages and the diagrams of idle conversations.
+    fn handle_timeout(&mut self) -> Result<(), Failure> {
+        let now = SystemTime::now() - OBSERVATION_DELAY;
+        for event in self.checker.handle_timeout(now) {
             if self
                 .filter
                 .takes_conversation(event.protocol(), event.conversation())
             {
-                let text = match &self.form {
-                    Form::Json => machine::overdue(&event),
-                    Form::Lines(Person { look }) | Form::Sequence(look) => {
-                        person::overdue(*look, &event)
+                let text = match &self.format {
+                    Format::Json => json::overdue(&event),
+                    Format::Text(TextOutput { look }) | Format::Sequence(look) => {
+                        text::overdue(*look, &event)
                     }
                 };
                 self.print(&text)?;
             }
         }
-        if let (Form::Sequence(look), Some(conversations)) = (&self.form, &mut self.conversations) {
+        if let (Format::Sequence(look), Some(conversations)) =
+            (&self.format, &mut self.conversations)
+        {
             let look = *look;
             let text = conversations
-                .resting()
+                .take_idle()
                 .map(|it| it.drawn(look))
                 .collect::<String>();
             self.print(&text)?;
@@ -329,19 +335,25 @@ impl Show<'_> {
     }
 
     fn end(mut self, mermaid: Option<&std::path::Path>) -> Result<(), Failure> {
-        if let (Form::Sequence(look), Some(conversations)) = (&self.form, &mut self.conversations) {
+        if let (Format::Sequence(look), Some(conversations)) =
+            (&self.format, &mut self.conversations)
+        {
             let look = *look;
             let text = conversations
-                .rest()
+                .take_all()
                 .map(|it| it.drawn(look))
                 .collect::<String>();
             self.print(&text)?;
         }
-        let text = match &self.form {
-            Form::Json => machine::summary(&self.tally),
-            Form::Lines(Person { look }) => self.tally.told(*look),
-            // Behind a diagram there is a blank line already.
-            Form::Sequence(look) => self.tally.told(*look).trim_start_matches('\n').to_owned(),
+        let text = match &self.format {
+            Format::Json => json::summary(&self.tally),
+            Format::Text(TextOutput { look }) => self.tally.summary(*look),
+            // A diagram ends with a blank line already.
+            Format::Sequence(look) => self
+                .tally
+                .summary(*look)
+                .trim_start_matches('\n')
+                .to_owned(),
         };
         self.print(&text)?;
         if let (Some(file), Some(conversations)) = (mermaid, &self.conversations) {

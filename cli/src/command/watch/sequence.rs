@@ -1,30 +1,31 @@
 //! A conversation as a sequence diagram of characters.
 //!
-//! Every participant has a lifeline, every letter two lines: what it says, and an arrow. What does
-//! not fit beside each other is put together: those who come last share the last lifeline.
+//! Every participant has a lifeline; every letter has two lines, a label and an arrow. If the lifelines
+//! do not fit into the width, the last participants share the last lifeline.
 
 use unicode_width::UnicodeWidthChar;
 
 use super::conversations::{Conversation, Step};
-use super::person::{Ink, Look, cut};
+use super::text::{Ink, Look, cut};
 
-/// Columns for a lifeline: at least, at most.
-const NARROWEST: usize = 12;
-const WIDEST: usize = 28;
-/// Columns for the time at the left, in front of the first lifeline.
+/// Minimum number of columns per lifeline.
+const MIN_SPACING: usize = 12;
+/// Maximum number of columns per lifeline.
+const MAX_SPACING: usize = 28;
+/// Columns for the time, left of the first lifeline.
 const TIME: usize = 9;
-/// The width where there is no terminal that has one.
-const PIPED: usize = 100;
-/// Less is not drawn on.
-const LEAST: usize = 40;
+/// Width of the diagram if the output is not a terminal.
+const DEFAULT_WIDTH: usize = 100;
+/// Minimum width of the diagram.
+const MIN_WIDTH: usize = 40;
 
 /// Draws a conversation.
 pub(super) fn draw(conversation: &Conversation, look: Look) -> String {
-    let width = look.width.unwrap_or(PIPED).max(LEAST);
+    let width = look.width.unwrap_or(DEFAULT_WIDTH).max(MIN_WIDTH);
     let names = conversation.participants();
-    let most = ((width - TIME) / NARROWEST).max(2);
+    let most = ((width - TIME) / MIN_SPACING).max(2);
     let columns = names.len().clamp(1, most);
-    let spacing = ((width - TIME) / columns).clamp(NARROWEST, WIDEST);
+    let spacing = ((width - TIME) / columns).clamp(MIN_SPACING, MAX_SPACING);
     let diagram = Diagram {
         width,
         spacing,
@@ -56,7 +57,7 @@ pub(super) fn draw(conversation: &Conversation, look: Look) -> String {
     }
     lines.push(diagram.lifelines());
     if conversation.left_out > 0 {
-        lines.push(format!("and {} letters more", conversation.left_out));
+        lines.push(format!("{} more letters", conversation.left_out));
     }
     let mut text = String::new();
     for line in lines {
@@ -74,13 +75,13 @@ struct Diagram<'a> {
 }
 
 impl Diagram<'_> {
-    /// The lifeline of a participant.
+    /// The index of a participant's lifeline.
     fn column(&self, name: &str) -> usize {
         let place = self.names.iter().position(|other| *other == name);
         place.unwrap_or(0).min(self.columns - 1)
     }
 
-    /// Where that lifeline is drawn.
+    /// The screen column of a lifeline.
     fn x(&self, column: usize) -> usize {
         TIME + column * self.spacing
     }
@@ -122,24 +123,24 @@ impl Diagram<'_> {
         if let Some(failed) = &step.failed {
             label.push_str(&format!(": {failed}"));
         }
-        // Whose it is does not show where several share a lifeline.
+        // A shared lifeline does not identify the participant, so the label names it.
         if self.shared(&step.from) {
             label = format!("{}: {label}", step.from);
         }
         if self.shared(&step.to) {
             label.push_str(&format!(" → {}", step.to));
         }
-        let mut says = self.blank();
-        says.put(0, &cut(time, TIME - 1));
+        let mut label_line = self.blank();
+        label_line.put(0, &cut(time, TIME - 1));
         let begin = left + 2;
         let own = if right > left {
             right - begin - 1
         } else {
             self.spacing - 3
         };
-        // Beyond the arrow it covers lifelines, which is better than being cut.
+        // A long label covers lifelines right of the arrow instead of being cut.
         let room = self.width.saturating_sub(begin).max(own);
-        says.put(begin, &cut(&label, room));
+        label_line.put(begin, &cut(&label, room));
         let mut arrow = self.blank();
         if from == to {
             let corner = (left + 3).min(self.width.saturating_sub(1));
@@ -147,7 +148,7 @@ impl Diagram<'_> {
             arrow.put(left + 1, &"─".repeat(corner - left - 1));
             arrow.put(corner, "╮");
             arrow.put(left + 1, if step.failed.is_some() { "✗" } else { "◄" });
-            return [says.text(), arrow.text()];
+            return [label_line.text(), arrow.text()];
         }
         for x in left + 1..right {
             arrow.put(x, "─");
@@ -167,7 +168,7 @@ impl Diagram<'_> {
         };
         arrow.put(self.x(from), start);
         arrow.put(end, head);
-        [says.text(), arrow.text()]
+        [label_line.text(), arrow.text()]
     }
 }
 
@@ -179,8 +180,8 @@ impl Line {
         Self(vec![Some(' '); width])
     }
 
-    /// Writes over what is there; what does not fit is left out. A wide character takes two
-    /// columns, of which the second is empty.
+    /// Overwrites the line from column `x`; characters beyond its end are omitted. A wide character takes
+    /// two columns; the second one stays empty.
     fn put(&mut self, x: usize, text: &str) {
         let mut x = x;
         for c in text.chars() {
@@ -205,7 +206,7 @@ impl Line {
     }
 }
 
-/// The text in lines of at most so many columns, broken at blanks where possible.
+/// The text in lines of at most `width` columns, broken at spaces where possible.
 fn wrapped(text: &str, width: usize) -> Vec<String> {
     let mut lines: Vec<String> = Vec::new();
     for word in text.split(' ') {

@@ -1,4 +1,4 @@
-//! What was seen, in numbers.
+//! Counts the observed letters.
 
 use std::collections::HashSet;
 use std::time::Instant;
@@ -6,27 +6,27 @@ use std::time::Instant;
 use fipa::Outcome;
 use fipa::watch::{Fate, Passage};
 
-use super::judge::Judged;
-use super::person::{Ink, Look};
+use super::checker::CheckResult;
+use super::text::{Ink, Look};
 
-/// What was seen, in numbers.
+/// Counters of the observed letters.
 #[derive(Debug)]
 pub(super) struct Tally {
     began: Instant,
     pub(super) letters: u64,
-    /// Those that were shown.
+    /// Letters that were shown.
     pub(super) shown: u64,
     pub(super) delivered: u64,
     pub(super) failed: u64,
-    /// Those of which more may become known.
+    /// Letters whose outcome is not known yet.
     pub(super) open: u64,
     pub(super) violations: u64,
-    /// Records that processes could not tell.
+    /// Lost records of the watched processes.
     pub(super) lost: u64,
     conversations: HashSet<String>,
 }
 
-/// Conversations that are told apart.
+/// Maximum number of conversations to count.
 const MAX_CONVERSATIONS: usize = 100_000;
 
 impl Default for Tally {
@@ -46,10 +46,10 @@ impl Default for Tally {
 }
 
 impl Tally {
-    pub(super) fn letter(&mut self, passage: &Passage, judged: &Judged) {
+    pub(super) fn letter(&mut self, passage: &Passage, checked: &CheckResult) {
         self.letters += 1;
-        self.violations += u64::from(judged.is_violation());
-        *self.of(&passage.fate) += 1;
+        self.violations += u64::from(checked.is_violation());
+        *self.counter(&passage.fate) += 1;
         let id = passage.message.as_ref().and_then(|it| it.conversation_id());
         if let Some(id) = id
             && self.conversations.len() < MAX_CONVERSATIONS
@@ -59,16 +59,16 @@ impl Tally {
         }
     }
 
-    /// News of a letter that was open.
+    /// Counts the later outcome of an open letter.
     pub(super) fn later(&mut self, passage: &Passage) {
-        // Only from under way to something else; what was delivered stays so.
+        // Only an open letter changes its counter; an outcome is final.
         if !matches!(passage.fate, Fate::UnderWay) && self.open > 0 {
             self.open -= 1;
-            *self.of(&passage.fate) += 1;
+            *self.counter(&passage.fate) += 1;
         }
     }
 
-    fn of(&mut self, fate: &Fate) -> &mut u64 {
+    fn counter(&mut self, fate: &Fate) -> &mut u64 {
         match fate {
             Fate::UnderWay => &mut self.open,
             Fate::Settled(Outcome::Failed { .. }) | Fate::Passed(Outcome::Failed { .. }) => {
@@ -86,17 +86,17 @@ impl Tally {
         self.began.elapsed().as_secs_f64()
     }
 
-    /// The summary, for people.
-    pub(super) fn told(&self, look: Look) -> String {
+    /// The summary as text.
+    pub(super) fn summary(&self, look: Look) -> String {
         let mut parts = vec![format!("{} delivered", self.delivered)];
         if self.failed > 0 {
             parts.push(look.paint(Ink::Bad, &format!("{} failed", self.failed)));
         }
         if self.open > 0 {
-            parts.push(format!("{} of unknown outcome", self.open));
+            parts.push(format!("{} with unknown outcome", self.open));
         }
         let violations = match self.violations {
-            0 => "no violation".to_owned(),
+            0 => "no violations".to_owned(),
             1 => look.paint(Ink::Bad, "1 violation"),
             many => look.paint(Ink::Bad, &format!("{many} violations")),
         };
@@ -114,7 +114,7 @@ impl Tally {
             text.push_str(&look.paint(
                 Ink::Warning,
                 &format!(
-                    "{} lost: letters may be missing, and verdicts after them may be wrong\n",
+                    "{} lost: letters may be missing, and later verdicts may be wrong\n",
                     counted(self.lost, "record")
                 ),
             ));
@@ -123,7 +123,7 @@ impl Tally {
     }
 }
 
-fn counted(number: u64, what: &str) -> String {
+fn counted(number: u64, noun: &str) -> String {
     let plural = if number == 1 { "" } else { "s" };
-    format!("{number} {what}{plural}")
+    format!("{number} {noun}{plural}")
 }

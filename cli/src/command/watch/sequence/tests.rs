@@ -15,7 +15,7 @@ fn step(ms: u64, from: &str, to: &str, label: &str) -> Step {
     }
 }
 
-/// A contract net that goes wrong.
+/// A contract net with a protocol violation and a failed delivery.
 pub(in super::super) fn contract_net() -> Conversation {
     let steps = vec![
         step(0, "rover", "arm_1", "cfp"),
@@ -37,7 +37,7 @@ pub(in super::super) fn contract_net() -> Conversation {
 fn a_contract_net_is_drawn() {
     let look = Look {
         width: Some(60),
-        colour: false,
+        color: false,
     };
     let expected = "\
 conversation lift-7 (fipa-contract-net)
@@ -59,7 +59,7 @@ conversation lift-7 (fipa-contract-net)
 }
 
 #[test]
-fn it_fits_whatever_the_width_and_the_names() {
+fn a_diagram_fits_any_width_with_any_names() {
     let mut steps = Vec::new();
     for other in 0..30 {
         let name = format!("机器人_with_a_very_long_name_{other}");
@@ -71,23 +71,23 @@ fn it_fits_whatever_the_width_and_the_names() {
     for width in [1, 40, 61, 80, 133, 400] {
         let look = Look {
             width: Some(width),
-            colour: false,
+            color: false,
         };
         for line in draw(&conversation, look).lines() {
-            assert!(line.width() <= width.max(LEAST), "{width}: {line}");
+            assert!(line.width() <= width.max(MIN_WIDTH), "{width}: {line}");
         }
     }
 }
 
 #[test]
-fn who_shares_a_lifeline_is_named() {
+fn labels_name_the_participants_of_a_shared_lifeline() {
     let steps: Vec<Step> = (0..9)
         .map(|other| step(other, "rover", &format!("arm_{other}"), "cfp"))
         .collect();
     let conversation = Conversation::of("c", "fipa-contract-net", steps);
     let look = Look {
         width: Some(60),
-        colour: false,
+        color: false,
     };
     let text = draw(&conversation, look);
     assert!(text.contains("7 others"), "{text}");
@@ -95,10 +95,10 @@ fn who_shares_a_lifeline_is_named() {
 }
 
 #[test]
-fn colour_is_for_what_is_wrong() {
+fn only_violations_and_failures_are_colored() {
     let look = Look {
         width: Some(60),
-        colour: true,
+        color: true,
     };
     let text = draw(&contract_net(), look);
     let painted = text.lines().filter(|line| line.contains('\u{1b}')).count();

@@ -1,4 +1,4 @@
-//! Whether letters keep to the protocols of their conversations.
+//! Checks letters against the protocols of their conversations.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -10,15 +10,15 @@ use fipa_monitor::{Event, Header, Library, LibraryError, Monitor, Unchecked, Ver
 
 use crate::report::Failure;
 
-/// Checks every letter that is seen.
-pub(in crate::command) struct Judge {
+/// Checks every observed letter.
+pub(in crate::command) struct Checker {
     monitor: Monitor,
 }
 
-/// What is said of a letter.
+/// The result of checking a letter.
 #[derive(Debug, Clone)]
-pub(in crate::command) enum Judged {
-    /// It fits.
+pub(in crate::command) enum CheckResult {
+    /// The letter follows the protocol.
     Accepted {
         protocol: String,
         state: String,
@@ -27,17 +27,17 @@ pub(in crate::command) enum Judged {
         complete: bool,
         late: bool,
     },
-    /// It does not.
+    /// The letter violates the protocol.
     Violation(Box<Violation>),
-    /// Nothing can be said.
+    /// The letter cannot be checked.
     Unchecked(Unchecked),
-    /// It is no part of a conversation between agents, for this reason.
-    Left(&'static str),
-    /// It was judged when it was first seen.
-    Later,
+    /// The letter is not part of a conversation between agents, for this reason.
+    Excluded(&'static str),
+    /// The letter was checked when it was first seen.
+    Checked,
 }
 
-impl Judged {
+impl CheckResult {
     pub(super) fn is_violation(&self) -> bool {
         matches!(self, Self::Violation(_))
     }
@@ -51,7 +51,7 @@ impl Judged {
     }
 }
 
-/// What is noticed without a letter: that none came.
+/// A message that the protocol requires and that did not arrive in time.
 pub(super) struct Overdue {
     pub(super) protocol: String,
     pub(super) conversation_id: String,
@@ -69,11 +69,11 @@ impl Overdue {
     }
 }
 
-/// Largest protocol file, in bytes.
+/// Maximum size of a protocol file, in bytes.
 const MAX_FILE: u64 = 1 << 20;
 
-impl Judge {
-    /// One who knows the protocols of the standards, and those in this directory.
+impl Checker {
+    /// A checker with the protocols of the standards and those in this directory.
     pub(in crate::command) fn new(directory: Option<&Path>) -> Result<Self, Failure> {
         let mut library = Library::standard();
         if let Some(directory) = directory {
@@ -88,20 +88,20 @@ impl Judge {
         })
     }
 
-    pub(in crate::command) fn judge(&mut self, passage: &Passage) -> Judged {
+    pub(in crate::command) fn check(&mut self, passage: &Passage) -> CheckResult {
         let Some(message) = &passage.message else {
-            return Judged::Left("the message cannot be read");
+            return CheckResult::Excluded("the message cannot be decoded");
         };
         if passage.from_service {
-            return Judged::Left("told by a message transport service");
+            return CheckResult::Excluded("sent by a message transport service");
         }
         if let Fate::Settled(Outcome::Failed { .. }) = passage.fate {
-            return Judged::Left("not delivered");
+            return CheckResult::Excluded("not delivered");
         }
-        // Each letter goes to one of the receivers of its message.
+        // A letter has exactly one receiver, a message can have several.
         let header = Header::from(message).receivers([&*passage.receiver]);
         match self.monitor.check(&header, passage.at) {
-            Verdict::Accepted(accepted) => Judged::Accepted {
+            Verdict::Accepted(accepted) => CheckResult::Accepted {
                 protocol: accepted.protocol.to_owned(),
                 state: accepted.state.to_owned(),
                 opened: accepted.opened,
@@ -109,14 +109,14 @@ impl Judge {
                 complete: accepted.complete,
                 late: accepted.late,
             },
-            Verdict::Violation(violation) => Judged::Violation(violation),
-            Verdict::Unchecked(why) => Judged::Unchecked(why),
-            _ => Judged::Left("the verdict is not understood"),
+            Verdict::Violation(violation) => CheckResult::Violation(violation),
+            Verdict::Unchecked(why) => CheckResult::Unchecked(why),
+            _ => CheckResult::Excluded("the verdict is unknown"),
         }
     }
 
-    /// What has been waited for too long by now.
-    pub(super) fn time_passes(&mut self, now: SystemTime) -> Vec<Overdue> {
+    /// Returns the messages that have become overdue by `now`.
+    pub(super) fn handle_timeout(&mut self, now: SystemTime) -> Vec<Overdue> {
         if self.monitor.poll_timeout().is_none_or(|due| due > now) {
             return Vec::new();
         }
@@ -143,9 +143,9 @@ impl Judge {
 fn protocol_files(directory: &Path) -> Result<Vec<std::path::PathBuf>, Failure> {
     let failed = |error: std::io::Error| {
         Failure::wrong_usage(
-            format!("cannot read the directory of protocols: {error}"),
+            format!("cannot read the protocol directory: {error}"),
             directory.display().to_string(),
-            "name a directory with SCXML files (*.scxml or *.xml)",
+            "give a directory with SCXML files (*.scxml or *.xml)",
         )
     };
     let mut files = Vec::new();
@@ -163,11 +163,11 @@ fn protocol_files(directory: &Path) -> Result<Vec<std::path::PathBuf>, Failure> 
 
 fn read(library: &mut Library, file: &Path) -> Result<(), Failure> {
     let name = file.display().to_string();
-    let failed = |what: String| {
+    let failed = |problem: String| {
         Failure::wrong_usage(
-            what,
+            problem,
             name.clone(),
-            "correct the file, or take it out of the directory",
+            "fix the file, or remove it from the directory",
         )
     };
     let length = std::fs::metadata(file)
@@ -175,7 +175,7 @@ fn read(library: &mut Library, file: &Path) -> Result<(), Failure> {
         .len();
     if length > MAX_FILE {
         return Err(failed(format!(
-            "{length} bytes are too many for a protocol"
+            "the file has {length} bytes, more than the limit of {MAX_FILE}"
         )));
     }
     let text = std::fs::read_to_string(file).map_err(|error| failed(error.to_string()))?;

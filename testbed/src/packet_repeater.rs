@@ -1,4 +1,4 @@
-//! Somebody who goes on saying what another one has said.
+//! Repeats a captured multicast DNS packet.
 
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 use std::sync::Arc;
@@ -8,28 +8,29 @@ use std::time::{Duration, Instant};
 
 use socket2::{Domain, Protocol, Socket, Type};
 
-/// More often than anybody expects it.
-const PAUSE: Duration = Duration::from_millis(500);
+/// Interval of the repetitions, shorter than the interval of beacons.
+const INTERVAL: Duration = Duration::from_millis(500);
 const WATCHDOG: Duration = Duration::from_secs(60);
 
-/// Repeats a packet of multicast DNS over and over, until dropped: whoever has said it seems to be
-/// there still, to those who only listen.
-pub struct Ghost {
+/// Repeats a multicast DNS packet until it is dropped. To hosts that only listen, the sender of the
+/// packet seems to be running.
+pub struct PacketRepeater {
     socket: UdpSocket,
     group: SocketAddr,
     packet: Vec<u8>,
     ended: Arc<AtomicBool>,
-    speaking: Option<JoinHandle<()>>,
+    thread: Option<JoinHandle<()>>,
 }
 
-impl Ghost {
-    /// Waits for a packet with these bytes in it, at this port of the group, on the interface with
-    /// this address. Within a host ([`Host::enter`](crate::Host::enter)) it is that host's.
+impl PacketRepeater {
+    /// Captures a packet that contains these bytes, at this port of the group 224.0.0.251, on the
+    /// interface with this address. Call it within [`Host::enter`](crate::Host::enter) for the interface
+    /// of a host.
     ///
     /// # Panics
-    /// When none comes.
+    /// If no such packet is received within 60 s.
     #[must_use]
-    pub fn of(bytes: &str, interface: Ipv4Addr, port: u16) -> Self {
+    pub fn capture(bytes: &str, interface: Ipv4Addr, port: u16) -> Self {
         let group = Ipv4Addr::new(224, 0, 0, 251);
         let address = SocketAddr::from((group, port));
         let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP)).unwrap();
@@ -38,13 +39,13 @@ impl Ghost {
         socket.set_multicast_if_v4(&interface).unwrap();
         socket.set_multicast_ttl_v4(255).unwrap();
         socket.join_multicast_v4(&group, &interface).unwrap();
-        socket.set_read_timeout(Some(PAUSE)).unwrap();
+        socket.set_read_timeout(Some(INTERVAL)).unwrap();
         socket.bind(&address.into()).unwrap();
         let socket = UdpSocket::from(socket);
         let started = Instant::now();
         let mut buffer = [0; 9000];
         let packet = loop {
-            assert!(started.elapsed() < WATCHDOG, "nobody says {bytes:?}");
+            assert!(started.elapsed() < WATCHDOG, "no packet with {bytes:?}");
             let Ok(len) = socket.recv(&mut buffer) else {
                 continue;
             };
@@ -58,32 +59,32 @@ impl Ghost {
             group: address,
             packet,
             ended: Arc::default(),
-            speaking: None,
+            thread: None,
         }
     }
 
-    /// Begins to say it.
+    /// Starts the repetition.
     ///
     /// # Panics
-    /// When it cannot.
-    pub fn speak(&mut self) {
+    /// If the socket or the thread cannot be created.
+    pub fn start(&mut self) {
         let (socket, group) = (self.socket.try_clone().unwrap(), self.group);
         let (packet, ended) = (self.packet.clone(), Arc::clone(&self.ended));
-        self.speaking = Some(std::thread::spawn(move || {
+        self.thread = Some(std::thread::spawn(move || {
             while !ended.load(Ordering::Relaxed) {
                 socket.send_to(&packet, group).unwrap();
-                std::thread::sleep(PAUSE);
+                std::thread::sleep(INTERVAL);
             }
         }));
     }
 }
 
-impl Drop for Ghost {
+impl Drop for PacketRepeater {
     fn drop(&mut self) {
         self.ended.store(true, Ordering::Relaxed);
-        if let Some(speaking) = self.speaking.take() {
-            // That it has panicked has been said.
-            let _ = speaking.join();
+        if let Some(thread) = self.thread.take() {
+            // A panic of the thread was printed already.
+            let _ = thread.join();
         }
     }
 }

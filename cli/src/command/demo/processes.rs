@@ -1,4 +1,4 @@
-//! The processes of the demo: started, spoken with, killed, and none left behind.
+//! Starts, controls and ends the processes of the demo.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
@@ -8,23 +8,23 @@ use std::time::Duration;
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader, Lines};
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 
-use super::part::{Event, Order, Received};
+use super::process::{Event, Order, Received};
 
-/// How long the demo waits for something that should happen at once.
-const PATIENCE: Duration = Duration::from_secs(20);
+/// Timeout for actions that normally take milliseconds.
+const STEP_TIMEOUT: Duration = Duration::from_secs(20);
 
 /// One process of the demo.
-pub(super) struct Part {
+pub(super) struct Process {
     name: String,
     child: Child,
     orders: Option<ChildStdin>,
     events: Lines<BufReader<ChildStdout>>,
-    /// Messages that were received while the demo waited for something else.
+    /// Messages received while the demo waited for another event.
     received: VecDeque<Received>,
     pub(super) locations: Vec<String>,
 }
 
-impl Part {
+impl Process {
     /// Waits for the next event that is not a received message.
     async fn event(&mut self) -> Result<Event, String> {
         loop {
@@ -37,43 +37,40 @@ impl Part {
 
     async fn next(&mut self) -> Result<Event, String> {
         let name = &self.name;
-        let line = tokio::time::timeout(PATIENCE, self.events.next_line()).await;
-        let line = line.map_err(|_| format!("{name} said nothing for {PATIENCE:?}"))?;
+        let line = tokio::time::timeout(STEP_TIMEOUT, self.events.next_line()).await;
+        let line = line.map_err(|_| format!("no event from {name} within {STEP_TIMEOUT:?}"))?;
         let line = line.map_err(|error| format!("{name}: {error}"))?;
         let line = line.ok_or_else(|| format!("{name} ended unexpectedly"))?;
         match serde_json::from_str(&line) {
-            Ok(Event::Failed { what }) => Err(format!("{name}: {what}")),
+            Ok(Event::Failed { error }) => Err(format!("{name}: {error}")),
             Ok(event) => Ok(event),
-            Err(error) => Err(format!("{name} said {line:?}: {error}")),
+            Err(error) => Err(format!("invalid event {line:?} from {name}: {error}")),
         }
     }
 
-    /// Tells the part to do something and waits until it is done.
-    pub(super) async fn tell(&mut self, order: &Order) -> Result<Event, String> {
+    /// Sends an order to the process and waits for its result.
+    pub(super) async fn run(&mut self, order: &Order) -> Result<Event, String> {
         let mut line = serde_json::to_string(order).map_err(|error| error.to_string())?;
         line.push('\n');
-        let orders = self.orders.as_mut().ok_or("the part was told to end")?;
+        let orders = self.orders.as_mut().ok_or("the process is ending")?;
         let written = orders.write_all(line.as_bytes()).await;
         written.map_err(|error| format!("{}: {error}", self.name))?;
         self.event().await
     }
 
-    /// The next letter that the part, which watches, has seen to break its protocol.
-    pub(super) async fn caught(&mut self) -> Result<Event, String> {
+    /// Waits for the watcher to report a protocol violation.
+    pub(super) async fn violation(&mut self) -> Result<Event, String> {
         self.event().await
     }
 
-    /// The next message that the part has received.
+    /// Waits for the next message that the process receives.
     pub(super) async fn received(&mut self) -> Result<Received, String> {
         if let Some(received) = self.received.pop_front() {
             return Ok(received);
         }
         match self.next().await? {
             Event::Received(received) => Ok(received),
-            other => Err(format!(
-                "{}: a message was expected, not {other:?}",
-                self.name
-            )),
+            other => Err(format!("{}: expected a message, not {other:?}", self.name)),
         }
     }
 
@@ -82,22 +79,22 @@ impl Part {
     }
 }
 
-/// All processes of the demo, and the place where their domains meet.
-pub(super) struct Stage {
+/// All processes of the demo, and the runtime directory of their domains.
+pub(super) struct Processes {
     program: PathBuf,
-    /// Set for all parts, so that nothing of this user's real domains is touched.
-    place: PathBuf,
-    parts: BTreeMap<String, Part>,
+    /// `FIPA_RUNTIME_DIR` of all processes, separate from the domains of this user.
+    runtime_dir: PathBuf,
+    by_name: BTreeMap<String, Process>,
 }
 
-impl Stage {
+impl Processes {
     pub(super) fn new() -> Result<Self, String> {
         let program = std::env::current_exe().map_err(|error| error.to_string())?;
-        let place = std::env::temp_dir().join(format!("fipa-demo-{}", std::process::id()));
+        let runtime_dir = std::env::temp_dir().join(format!("fipa-demo-{}", std::process::id()));
         Ok(Self {
             program,
-            place,
-            parts: BTreeMap::new(),
+            runtime_dir,
+            by_name: BTreeMap::new(),
         })
     }
 
@@ -106,13 +103,13 @@ impl Stage {
         format!("demo-{}-{host}", std::process::id())
     }
 
-    /// Starts a process with an agent of this name, or with a gateway, and waits until it is
-    /// there.
+    /// Starts a process with an agent of this name, a gateway or a watcher, and waits until it is
+    /// ready.
     pub(super) async fn start(&mut self, host: &str, name: &str, role: &str) -> Result<(), String> {
         self.start_with(host, name, role, "monitor.check=off").await
     }
 
-    /// The same with something else in its configuration.
+    /// Like [`start`](Self::start), with one more configuration setting.
     pub(super) async fn start_with(
         &mut self,
         host: &str,
@@ -121,20 +118,20 @@ impl Stage {
         set: &str,
     ) -> Result<(), String> {
         let mut child = Command::new(&self.program)
-            .args(["demo", "--part", role, "--name", name])
+            .args(["demo", "--role", role, "--name", name])
             .args(["--set", &format!("domain={}", Self::domain(host))])
             .args(["--set", &format!("mts.name={name}")])
-            // Nothing of the demo leaves this machine.
+            // No traffic of the demo leaves this machine.
             .args(["--set", "discovery.interfaces=lo"])
             .args(["--set", "transport.tcp.listen=127.0.0.1:0"])
             .args(["--set", "mts.transports=shm,unix,tcp"])
             .args(["--set", set])
-            .env("FIPA_RUNTIME_DIR", &self.place)
+            .env("FIPA_RUNTIME_DIR", &self.runtime_dir)
             .env_remove("FIPA_CONFIG")
             .current_dir("/")
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
-            // A Ctrl-C is for the demo, which ends its parts in order.
+            // Ctrl-C is sent to the demo only, which ends its processes in order.
             .process_group(0)
             .kill_on_drop(true)
             .spawn()
@@ -143,8 +140,8 @@ impl Stage {
         let stdout = child
             .stdout
             .take()
-            .ok_or("a process without standard output")?;
-        let mut part = Part {
+            .ok_or("the process has no standard output")?;
+        let mut process = Process {
             name: name.to_owned(),
             child,
             orders,
@@ -152,30 +149,34 @@ impl Stage {
             received: VecDeque::new(),
             locations: Vec::new(),
         };
-        match part.event().await? {
-            Event::Ready { locations } => part.locations = locations,
-            other => return Err(format!("{name} began with {other:?}")),
+        match process.event().await? {
+            Event::Ready { locations } => process.locations = locations,
+            other => return Err(format!("{name}: expected `ready`, not {other:?}")),
         }
-        self.parts.insert(name.to_owned(), part);
+        self.by_name.insert(name.to_owned(), process);
         Ok(())
     }
 
-    pub(super) fn part(&mut self, name: &str) -> Result<&mut Part, String> {
-        self.parts
+    pub(super) fn get(&mut self, name: &str) -> Result<&mut Process, String> {
+        self.by_name
             .get_mut(name)
-            .ok_or_else(|| format!("{name} is not on stage"))
+            .ok_or_else(|| format!("{name} is not running"))
     }
 
-    /// Kills a process with SIGKILL and waits until it is gone.
+    /// Kills a process with SIGKILL and waits for its end.
     pub(super) async fn kill(&mut self, name: &str) -> Result<(), String> {
-        let mut part = self
-            .parts
+        let mut process = self
+            .by_name
             .remove(name)
-            .ok_or_else(|| format!("{name} is not there"))?;
-        part.child.kill().await.map_err(|error| error.to_string())
+            .ok_or_else(|| format!("{name} is not running"))?;
+        process
+            .child
+            .kill()
+            .await
+            .map_err(|error| error.to_string())
     }
 
-    /// The shared memory of the demo's domains.
+    /// The shared memory files of the demo's domains.
     pub(super) fn shared_memory(&self) -> Vec<PathBuf> {
         let mark = format!("fipa_demo-{}-", std::process::id());
         let files = std::fs::read_dir("/dev/shm")
@@ -186,32 +187,31 @@ impl Stage {
         ours.map(|file| file.path()).collect()
     }
 
-    /// Everything the demo has in the file system.
+    /// All files of the demo.
     fn files(&self) -> Vec<PathBuf> {
         let mut files = self.shared_memory();
-        collect(&self.place, &mut files);
+        collect(&self.runtime_dir, &mut files);
         files
     }
 
-    /// Ends everybody in order, then makes sure that nothing is left. Says what had to be removed
-    /// by force.
+    /// Ends all processes in order, then removes the files that are left. Returns those files.
     pub(super) async fn clear(&mut self) -> Vec<PathBuf> {
-        for part in self.parts.values_mut() {
-            part.orders = None;
+        for process in self.by_name.values_mut() {
+            process.orders = None;
         }
-        for part in self.parts.values_mut() {
-            let ended = tokio::time::timeout(PATIENCE, part.child.wait()).await;
+        for process in self.by_name.values_mut() {
+            let ended = tokio::time::timeout(STEP_TIMEOUT, process.child.wait()).await;
             if ended.is_err() {
-                let _ = part.child.kill().await;
+                let _ = process.child.kill().await;
             }
         }
-        self.parts.clear();
+        self.by_name.clear();
         let left = self.files();
         for file in &left {
             let _ = std::fs::remove_file(file);
         }
-        if self.place.exists() {
-            let _ = std::fs::remove_dir_all(&self.place);
+        if self.runtime_dir.exists() {
+            let _ = std::fs::remove_dir_all(&self.runtime_dir);
         }
         left
     }

@@ -1,8 +1,8 @@
-//! A part in the demo: one process with one agent or one gateway, which does what it is told on
-//! standard input and says on standard output what it saw. One JSON document per line each way.
+//! A process of the demo with one agent, gateway or watcher. It reads orders from standard input and
+//! writes events to standard output, one JSON document per line.
 //!
-//! What a step of the demo claims is checked here, in the process that received something.
-//! A part ends when its standard input does, so that none outlives the demo.
+//! The receiving process reports what it received, which the steps of the demo check. The process
+//! ends at the end of its standard input, so that it cannot outlive the demo.
 
 use std::io::Write;
 use std::time::{Duration, Instant};
@@ -13,13 +13,13 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use tokio::io::{AsyncBufReadExt, BufReader, Lines, Stdin};
 
-use crate::command::watch::judge::{Judge, Judged};
+use crate::command::watch::checker::{CheckResult, Checker};
 use crate::output;
 
-/// The protocol of messages whose only purpose is the time they take.
+/// The protocol of messages that are sent only to measure their time.
 const MEASURING: &str = "demo-measure";
 
-/// What a part is told to do.
+/// An order to a process.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(tag = "do", rename_all = "snake_case")]
 pub(super) enum Order {
@@ -36,14 +36,14 @@ pub(super) enum Order {
         to: String,
         conversation: String,
     },
-    /// Send content of this length, made in loaned memory, and its checksum with it.
+    /// Send content of this length, in bytes, written into loaned memory, with its checksum.
     SendLarge { to: String, len: usize },
-    /// Say who is there.
+    /// List the agents of the directory.
     Agents,
-    /// Say how many messages were received so far.
+    /// Report the number of messages received so far.
     Count,
-    /// Send this many messages, each after the one before was confirmed, and say how long it
-    /// took.
+    /// Send `rounds` messages of `len` bytes, each after the confirmation of the previous one, and
+    /// report the times.
     Measure {
         to: String,
         len: usize,
@@ -51,33 +51,33 @@ pub(super) enum Order {
     },
 }
 
-/// What a part saw.
+/// An event from a process.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub(super) enum Event {
-    /// It is there.
+    /// The process is ready.
     Ready { locations: Vec<String> },
-    /// A message came.
+    /// A message was received.
     Received(Received),
-    /// What became of a message it sent.
+    /// The outcomes of a message that it sent.
     Outcomes { deliveries: Value },
-    /// Who is there.
+    /// The agents of the directory.
     Agents { agents: Vec<Listed> },
-    /// How many messages came.
+    /// The number of received messages.
     Count { received: u64 },
-    /// How long a confirmed message takes, in microseconds.
+    /// Time from sending to confirmation, in microseconds.
     Measured { p50_us: f64, p99_us: f64 },
-    /// A letter was seen to break its protocol.
-    Caught {
+    /// The watcher saw a letter that violates its protocol.
+    Violation {
         sender: String,
         performative: String,
-        /// What was wrong, and what was expected of whom.
+        /// The violation, with the expected messages and senders.
         text: String,
-        /// How many letters were seen before that kept to theirs.
-        kept: u64,
+        /// Number of letters before it that followed their protocols.
+        accepted: u64,
     },
-    /// It could not do what it was told.
-    Failed { what: String },
+    /// The order failed.
+    Failed { error: String },
 }
 
 /// A message as its receiver saw it.
@@ -89,12 +89,12 @@ pub(super) struct Received {
     pub(super) conversation_id: Option<String>,
     pub(super) in_reply_to: Option<String>,
     pub(super) via: Option<String>,
-    /// The content when it is short text.
+    /// The content if it is text of at most 1024 bytes.
     pub(super) content: Option<String>,
     pub(super) len: usize,
-    /// Whether the content lies in memory that belongs to the domain's shared memory.
+    /// Whether the content is in the shared memory of the domain.
     pub(super) in_shared_memory: bool,
-    /// Whether its checksum is the one that was sent with it.
+    /// Whether the content has the checksum that was sent with it; none without a checksum.
     pub(super) intact: Option<bool>,
 }
 
@@ -116,23 +116,23 @@ pub(super) async fn gateway(config: &Config) -> Result<(), String> {
         .iter()
         .map(ToString::to_string)
         .collect();
-    say(&Event::Ready { locations });
+    emit(&Event::Ready { locations });
     let mut orders = orders();
     while next(&mut orders).await.is_some() {}
     gateway.close().await;
     Ok(())
 }
 
-/// Watches the domain until standard input ends, and says which letters break their protocols.
+/// Watches the domain until standard input ends, and reports letters that violate their protocols.
 pub(super) async fn watcher(config: &Config) -> Result<(), String> {
     let watcher = Watcher::open(config, WatchOptions::default()).await;
     let mut watcher = watcher.map_err(|error| error.to_string())?;
-    let mut judge = Judge::new(None).map_err(|_| "the protocols cannot be read")?;
-    say(&Event::Ready {
+    let mut checker = Checker::new(None).map_err(|_| "cannot read the protocols")?;
+    emit(&Event::Ready {
         locations: Vec::new(),
     });
     let mut orders = orders();
-    let mut kept = 0;
+    let mut accepted = 0;
     loop {
         let seen = tokio::select! {
             line = next(&mut orders) => match line {
@@ -144,13 +144,13 @@ pub(super) async fn watcher(config: &Config) -> Result<(), String> {
         let fipa::watch::Event::Letter(passage) = seen else {
             continue;
         };
-        match judge.judge(&passage) {
-            Judged::Accepted { .. } => kept += 1,
-            Judged::Violation(violation) => say(&Event::Caught {
+        match checker.check(&passage) {
+            CheckResult::Accepted { .. } => accepted += 1,
+            CheckResult::Violation(violation) => emit(&Event::Violation {
                 sender: violation.sender.clone(),
                 performative: violation.performative.clone(),
                 text: violation.to_string(),
-                kept,
+                accepted,
             }),
             _ => {}
         }
@@ -165,7 +165,7 @@ pub(super) async fn agent(config: &Config, name: &str) -> Result<(), String> {
     let agent = domain.register(name).map_err(|error| error.to_string())?;
     let entry = domain.directory().lookup(name);
     let locations = entry.map(|entry| entry.locations.iter().map(ToString::to_string).collect());
-    say(&Event::Ready {
+    emit(&Event::Ready {
         locations: locations.unwrap_or_default(),
     });
     let mut orders = orders();
@@ -174,20 +174,20 @@ pub(super) async fn agent(config: &Config, name: &str) -> Result<(), String> {
         tokio::select! {
             line = next(&mut orders) => match line {
                 Some(line) => {
-                    let done = obey(&agent, &line, received).await;
-                    say(&done.unwrap_or_else(|what| Event::Failed { what }));
+                    let done = execute(&agent, &line, received).await;
+                    emit(&done.unwrap_or_else(|error| Event::Failed { error }));
                 }
                 None => break,
             },
             incoming = agent.receive() => match incoming {
                 Ok(incoming) => {
                     received += 1;
-                    // Nobody wants to hear of those that only count.
+                    // Messages of a measurement are counted, but not reported.
                     if incoming.message.protocol() != Some(MEASURING) {
-                        say(&Event::Received(seen(&incoming)));
+                        emit(&Event::Received(received_message(&incoming)));
                     }
-                    if let Err(what) = answer(&agent, &incoming).await {
-                        say(&Event::Failed { what });
+                    if let Err(error) = answer(&agent, &incoming).await {
+                        emit(&Event::Failed { error });
                     }
                 }
                 Err(error) => return Err(error.to_string()),
@@ -207,15 +207,15 @@ async fn next(orders: &mut Lines<BufReader<Stdin>>) -> Option<String> {
     orders.next_line().await.ok().flatten()
 }
 
-fn say(event: &Event) {
-    // Who listens may be gone; then standard input ends too.
+fn emit(event: &Event) {
+    // The demo may have ended; then standard input ends too.
     if let Ok(line) = serde_json::to_string(event) {
         let mut out = std::io::stdout().lock();
         let _ = writeln!(out, "{line}").and_then(|()| out.flush());
     }
 }
 
-async fn obey(agent: &Agent, line: &str, received: u64) -> Result<Event, String> {
+async fn execute(agent: &Agent, line: &str, received: u64) -> Result<Event, String> {
     let order: Order = serde_json::from_str(line).map_err(|error| error.to_string())?;
     match order {
         Order::Send {
@@ -300,7 +300,7 @@ async fn send_large(agent: &Agent, to: &str, len: usize) -> Result<Event, String
     )
 }
 
-/// Bytes that do not repeat in step with any buffer.
+/// A byte pattern whose period matches no buffer size.
 fn pattern(len: usize) -> impl Iterator<Item = u8> {
     (0..len).map(|index| (index.wrapping_mul(0x9e37_79b1) >> 13) as u8)
 }
@@ -356,7 +356,7 @@ async fn measure(agent: &Agent, to: &str, len: usize, rounds: usize) -> Result<E
     })
 }
 
-fn seen(incoming: &Incoming) -> Received {
+fn received_message(incoming: &Incoming) -> Received {
     let message = &incoming.message;
     let content = message.content().cloned().unwrap_or_default();
     let sent = message
@@ -376,14 +376,14 @@ fn seen(incoming: &Incoming) -> Received {
         via: incoming.via.map(|kind| kind.to_string()),
         content: (content.len() <= 1024).then(text).flatten(),
         len: content.len(),
-        in_shared_memory: lies_in_shared_memory(&content),
+        in_shared_memory: is_in_shared_memory(&content),
         intact: sent
             .map(|(_, sent)| *sent == format!("{:016x}", checksum_of(content.iter().copied()))),
     }
 }
 
-/// Whether the kernel says that these bytes are a mapping of the domain's shared memory.
-fn lies_in_shared_memory(bytes: &[u8]) -> bool {
+/// Whether these bytes are in a mapping of the domain's shared memory, according to the kernel.
+fn is_in_shared_memory(bytes: &[u8]) -> bool {
     let address = bytes.as_ptr() as usize;
     let maps = std::fs::read_to_string("/proc/self/maps").unwrap_or_default();
     maps.lines()
@@ -403,9 +403,9 @@ fn lies_in_shared_memory(bytes: &[u8]) -> bool {
 /// The participant's side of fipa-request (FIPA00026): agree, then inform of the result.
 async fn answer(agent: &Agent, incoming: &Incoming) -> Result<(), String> {
     let message = &incoming.message;
-    let asked = *message.performative() == Performative::Request
+    let is_request = *message.performative() == Performative::Request
         && message.protocol() == Some("fipa-request");
-    if !asked {
+    if !is_request {
         return Ok(());
     }
     for (performative, content) in [

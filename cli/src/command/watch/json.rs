@@ -1,11 +1,11 @@
-//! What is seen, as JSON for programs: one object on a line.
+//! Output of `fipa watch` as JSON, one object per line.
 
 use fipa::watch::{Fate, Passage};
 use fipa::{Attempt, MessageBuilder, Outcome, Time};
 use fipa_acl::json::{letter_to_json, message_to_json};
 use serde_json::{Map, Value, json};
 
-use super::judge::{Judged, Overdue};
+use super::checker::{CheckResult, Overdue};
 use super::tally::Tally;
 use crate::output;
 
@@ -17,7 +17,7 @@ pub(super) fn watching(domain: &str, processes: usize) -> String {
     line(&json!({ "event": "watching", "domain": domain, "processes": processes }))
 }
 
-pub(super) fn letter(passage: &Passage, judged: &Judged) -> String {
+pub(super) fn letter(passage: &Passage, checked: &CheckResult) -> String {
     let message = passage.message.as_ref();
     let cut = passage
         .content_len
@@ -58,7 +58,7 @@ pub(super) fn letter(passage: &Passage, judged: &Judged) -> String {
     put("gateway", passage.gateway.as_deref().map(Value::from));
     put("message", submission.map(Value::from));
     fate(&mut object, &passage.fate);
-    object.insert("verdict".to_owned(), verdict(judged));
+    object.insert("verdict".to_owned(), verdict(checked));
     object.insert("letter".to_owned(), contents(passage));
     line(&Value::Object(object))
 }
@@ -110,9 +110,9 @@ fn fate(object: &mut Map<String, Value>, fate: &Fate) {
     object.insert("attempts".to_owned(), attempts.into());
 }
 
-fn verdict(judged: &Judged) -> Value {
-    match judged {
-        Judged::Accepted {
+fn verdict(checked: &CheckResult) -> Value {
+    match checked {
+        CheckResult::Accepted {
             protocol,
             state,
             opened,
@@ -123,7 +123,7 @@ fn verdict(judged: &Judged) -> Value {
             "verdict": "accepted", "protocol": protocol, "state": state, "opened": opened,
             "ended": ended, "complete": complete, "late": late,
         }),
-        Judged::Violation(violation) => {
+        CheckResult::Violation(violation) => {
             let expected = violation.expected.iter().map(|expected| {
                 json!({
                     "performative": expected.performative,
@@ -138,19 +138,19 @@ fn verdict(judged: &Judged) -> Value {
                 "expected": expected.collect::<Vec<Value>>(), "text": violation.to_string(),
             })
         }
-        Judged::Unchecked(why) => json!({ "verdict": "unchecked", "reason": why.to_string() }),
-        Judged::Left(why) => json!({ "verdict": "unchecked", "reason": why }),
-        Judged::Later => Value::Null,
+        CheckResult::Unchecked(why) => json!({ "verdict": "unchecked", "reason": why.to_string() }),
+        CheckResult::Excluded(why) => json!({ "verdict": "unchecked", "reason": why }),
+        CheckResult::Checked => Value::Null,
     }
 }
 
-/// The letter as `fipa decode` prints it, as far as it was told.
+/// The observed parts of the letter, in the format of `fipa decode`.
 fn contents(passage: &Passage) -> Value {
     let message = passage.message.clone().map(|message| {
         let bare = message.clone();
         match passage.content.is_empty() {
             true => message,
-            // Content of any bytes can be put into a message that was one before.
+            // A valid message stays valid with any content.
             false => MessageBuilder::from(message)
                 .content(passage.content.clone())
                 .build()

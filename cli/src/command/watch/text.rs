@@ -1,4 +1,4 @@
-//! What is seen, as lines for people.
+//! Output of `fipa watch` as text.
 
 use std::io::IsTerminal;
 use std::time::SystemTime;
@@ -9,17 +9,17 @@ use fipa::{Message, Outcome, Time};
 use fipa_acl::escape;
 use unicode_width::{UnicodeWidthChar, UnicodeWidthStr};
 
-use super::judge::{Judged, Overdue};
+use super::checker::{CheckResult, Overdue};
 
-/// Where the lines are shown.
+/// The properties of the terminal.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Look {
-    /// Columns of the terminal; none when it is no terminal.
+    /// Columns of the terminal; none if the output is not a terminal.
     pub(super) width: Option<usize>,
-    pub(super) colour: bool,
+    pub(super) color: bool,
 }
 
-/// What stands out, and how.
+/// Emphasis of a text.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Ink {
     Bad,
@@ -37,12 +37,12 @@ impl Look {
             width: size
                 .filter(|_| terminal)
                 .map(|(width, _)| usize::from(width.0)),
-            colour: terminal && !plain,
+            color: terminal && !plain,
         }
     }
 
     pub(super) fn paint(self, ink: Ink, text: &str) -> String {
-        if !self.colour || text.is_empty() {
+        if !self.color || text.is_empty() {
             return text.to_owned();
         }
         let style = match ink {
@@ -55,9 +55,9 @@ impl Look {
     }
 }
 
-/// Lines for people.
+/// Prints one line per letter, with details on extra lines.
 #[derive(Debug)]
-pub(super) struct Person {
+pub(super) struct TextOutput {
     pub(super) look: Look,
 }
 
@@ -69,9 +69,9 @@ struct Columns {
     protocol: usize,
     conversation: usize,
     size: usize,
-    way: usize,
+    via: usize,
     outcome: usize,
-    /// Whether words are cut short.
+    /// Whether words are abbreviated.
     narrow: bool,
 }
 
@@ -82,7 +82,7 @@ const WIDE: Columns = Columns {
     protocol: 18,
     conversation: 18,
     size: 10,
-    way: 4,
+    via: 4,
     outcome: 10,
     narrow: false,
 };
@@ -94,15 +94,15 @@ const NARROW: Columns = Columns {
     protocol: 9,
     conversation: 7,
     size: 7,
-    way: 3,
+    via: 3,
     outcome: 1,
     narrow: true,
 };
 
-/// From this width on, nothing is cut short.
+/// Minimum width of the terminal for the wide columns.
 const WIDE_ENOUGH: usize = 140;
 
-impl Person {
+impl TextOutput {
     pub(super) fn new(look: Look) -> Self {
         Self { look }
     }
@@ -114,7 +114,7 @@ impl Person {
         }
     }
 
-    /// What stands above the letters.
+    /// The lines above the letters.
     pub(super) fn head(&self, domain: &str, processes: usize) -> String {
         let columns = self.columns();
         let outcome = if columns.narrow { "" } else { "OUTCOME" };
@@ -125,19 +125,19 @@ impl Person {
             "PROTOCOL",
             "CONVERSATION",
             "SIZE",
-            "WAY",
+            "VIA",
             outcome,
         ];
         let head = row(columns, names.map(str::to_owned), "VERDICT");
         first_line(domain, processes) + &self.look.paint(Ink::Quiet, head.trim_end()) + "\n"
     }
 
-    /// A letter, and what is wrong with it on lines of its own.
-    pub(super) fn letter(&self, passage: &Passage, judged: &Judged) -> String {
+    /// The line of a letter, and further lines for a violation, a failure and the content.
+    pub(super) fn letter(&self, passage: &Passage, checked: &CheckResult) -> String {
         let (columns, look) = (self.columns(), self.look);
         let message = passage.message.as_ref();
         let protocol = message.and_then(Message::protocol);
-        let protocol = protocol.or_else(|| judged.protocol()).unwrap_or("-");
+        let protocol = protocol.or_else(|| checked.protocol()).unwrap_or("-");
         let protocol = match columns.narrow {
             true => protocol.strip_prefix("fipa-").unwrap_or(protocol),
             false => protocol,
@@ -158,13 +158,13 @@ impl Person {
             passage.via.map_or("-", fipa::Kind::name).to_owned(),
             outcome(&passage.fate, columns.narrow).to_owned(),
         ];
-        let verdict = match judged {
-            Judged::Accepted { state, late, .. } => {
+        let verdict = match checked {
+            CheckResult::Accepted { state, late, .. } => {
                 let state = look.paint(Ink::Good, &escape(state));
                 let late = if *late { " (late)" } else { "" };
                 format!("{state}{}", look.paint(Ink::Warning, late))
             }
-            Judged::Violation(_) => look.paint(Ink::Bad, "VIOLATION"),
+            CheckResult::Violation(_) => look.paint(Ink::Bad, "VIOLATION"),
             _ => "-".to_owned(),
         };
         let mut text = row(columns, cells, &verdict);
@@ -172,14 +172,14 @@ impl Person {
             text = look.paint(Ink::Warning, &text);
         }
         text.push('\n');
-        let mut below = |ink, what: &str| {
-            text.push_str(&format!("    {}\n", look.paint(ink, what)));
+        let mut below = |ink, line: &str| {
+            text.push_str(&format!("    {}\n", look.paint(ink, line)));
         };
-        if let Judged::Violation(violation) = judged {
+        if let CheckResult::Violation(violation) = checked {
             below(Ink::Bad, &format!("✗ {violation}"));
         }
-        if let Some(told) = trouble(&passage.fate) {
-            below(Ink::Warning, &told);
+        if let Some(problem) = delivery_problem(&passage.fate) {
+            below(Ink::Warning, &problem);
         }
         if !passage.content.is_empty() {
             below(Ink::Quiet, &escape(&content(passage)));
@@ -187,9 +187,9 @@ impl Person {
         text
     }
 
-    /// News of a letter that was shown before.
+    /// The later outcome of a letter that was shown before.
     pub(super) fn later(&self, passage: &Passage) -> String {
-        let what = trouble(&passage.fate).unwrap_or_else(|| {
+        let news = delivery_problem(&passage.fate).unwrap_or_else(|| {
             let via = passage
                 .via
                 .map_or(String::new(), |via| format!(" via {via}"));
@@ -200,7 +200,7 @@ impl Person {
             .as_ref()
             .map(|it| it.performative().to_string());
         let text = format!(
-            "    later: {} from {} to {}: {what}",
+            "    later: {} from {} to {}: {news}",
             escape(performative.as_deref().unwrap_or("a letter")),
             escape(passage.sender().unwrap_or("?")),
             escape(&passage.receiver),
@@ -216,28 +216,23 @@ impl Person {
 
 pub(super) fn first_line(domain: &str, processes: usize) -> String {
     let processes = match processes {
-        0 => "no process yet".to_owned(),
+        0 => "no process so far".to_owned(),
         1 => "1 process".to_owned(),
         many => format!("{many} processes"),
     };
-    format!("watching the domain {domain}, {processes}; Ctrl-C ends it\n")
+    format!("watching domain {domain}, {processes}; press Ctrl-C to stop\n")
 }
 
 pub(super) fn lost(look: Look, process: &str, records: u64) -> String {
     let what = format!(
-        "    {} could not tell everything: {records} records lost; letters may be missing here, \
-         and verdicts wrong",
+        "    {records} records of {} were lost; letters may be missing here, and verdicts may be wrong",
         escape(process),
     );
     look.paint(Ink::Warning, &what) + "\n"
 }
 
 pub(super) fn refused(look: Look, process: &str, why: &str) -> String {
-    let what = format!(
-        "    {} is not listened to any more: {}",
-        escape(process),
-        escape(why)
-    );
+    let what = format!("    stopped watching {}: {}", escape(process), escape(why));
     look.paint(Ink::Warning, &what) + "\n"
 }
 
@@ -245,7 +240,7 @@ pub(super) fn overdue(look: Look, overdue: &Overdue) -> String {
     let with = overdue.participant.as_ref();
     let with = with.map(|it| format!(" with {}", escape(it)));
     let what = format!(
-        "    overdue: no message came in conversation {:?} of {}, state {:?}{}",
+        "    overdue: no message in conversation {:?} of {}, state {:?}{}",
         overdue.conversation_id,
         escape(&overdue.protocol),
         overdue.state,
@@ -262,7 +257,7 @@ fn row(columns: &Columns, cells: [String; 8], verdict: &str) -> String {
         protocol,
         conversation,
         size,
-        way,
+        via,
         outcome,
     ] = cells;
     let gap = if columns.narrow { " " } else { "  " };
@@ -280,21 +275,21 @@ fn row(columns: &Columns, cells: [String; 8], verdict: &str) -> String {
     }
     let blank = " ".repeat(columns.size.saturating_sub(size.width()));
     text.push_str(&format!("{blank}{size}{gap}"));
-    for (cell, width) in [(way, columns.way), (outcome, columns.outcome)] {
+    for (cell, width) in [(via, columns.via), (outcome, columns.outcome)] {
         text.push_str(&fitted(&cell, width));
         text.push_str(gap);
     }
     text + verdict
 }
 
-/// The text in just so many columns: cut, or filled with blanks.
+/// The text in exactly this number of columns: shortened, or padded with spaces.
 pub(super) fn fitted(text: &str, width: usize) -> String {
     let text = cut(text, width);
     let blank = " ".repeat(width.saturating_sub(text.width()));
     text + &blank
 }
 
-/// The text in at most so many columns.
+/// The text in at most this number of columns.
 pub(super) fn cut(text: &str, width: usize) -> String {
     if text.width() <= width {
         return text.to_owned();
@@ -352,8 +347,8 @@ fn is_failure(fate: &Fate) -> bool {
     )
 }
 
-/// What went wrong on the way, if anything did.
-fn trouble(fate: &Fate) -> Option<String> {
+/// The outcome of a letter that failed or needed several attempts.
+fn delivery_problem(fate: &Fate) -> Option<String> {
     match fate {
         Fate::Settled(outcome) | Fate::Passed(outcome)
             if is_failure(fate) || !outcome.attempts().is_empty() =>
@@ -369,11 +364,11 @@ fn content(passage: &Passage) -> String {
     let rest = length.saturating_sub(passage.content.len() as u64);
     let text = match std::str::from_utf8(&passage.content) {
         Ok(text) => text,
-        // The last character was cut in two.
+        // Only the last character is incomplete.
         Err(error) if error.error_len().is_none() => {
             std::str::from_utf8(&passage.content[..error.valid_up_to()]).unwrap_or_default()
         }
-        Err(_) => return format!("{length} bytes that are no text"),
+        Err(_) => return format!("{length} bytes of binary content"),
     };
     let more = if rest > 0 {
         format!("… ({length} bytes)")
@@ -396,17 +391,17 @@ mod tests {
     }
 
     #[test]
-    fn colour_is_only_where_it_is_wanted() {
+    fn only_a_look_with_color_paints() {
         let look = Look {
             width: None,
-            colour: true,
+            color: true,
         };
         assert_eq!(look.paint(Ink::Good, "x"), "\u{1b}[32mx\u{1b}[0m");
         assert_eq!(Look::default().paint(Ink::Bad, "x"), "x");
     }
 
     #[test]
-    fn sizes_are_short() {
+    fn a_size_is_printed_in_its_largest_fitting_unit() {
         assert_eq!(size(271), "271 B");
         assert_eq!(size(65_536), "64 KiB");
         assert_eq!(size(64 << 20), "64 MiB");
