@@ -296,6 +296,11 @@ mod tests {
 
     use super::*;
 
+    fn lines(owned: &[(String, Vec<String>)]) -> impl Iterator<Item = Line<'_>> {
+        let lines = owned.iter();
+        lines.map(|(sender, receivers)| (sender.as_str(), receivers.as_slice()))
+    }
+
     fn access(deny: &[(&str, &[&str])], allow: &[(&str, &[&str])], rate: usize) -> Access {
         let owned = |lines: &[(&str, &[&str])]| -> Vec<(String, Vec<String>)> {
             let lines = lines.iter().map(|(sender, receivers)| {
@@ -305,12 +310,6 @@ mod tests {
             lines.collect()
         };
         let (deny, allow) = (owned(deny), owned(allow));
-        let lines = |lines: &'_ [(String, Vec<String>)]| -> Vec<Line<'_>> {
-            let lines = lines.iter();
-            lines
-                .map(|(sender, receivers)| (sender.as_str(), receivers.as_slice()))
-                .collect()
-        };
         Access::new(lines(&deny), lines(&allow), rate)
             .unwrap()
             .unwrap()

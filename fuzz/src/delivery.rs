@@ -22,8 +22,8 @@ use fipa_mts::letter_for;
 use fipa_sds::{Directory, Entry, Mts, Reach, Role, Source, Subscriber};
 use fipa_transport::{
     Answer, Arrival, Attempt, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation,
-    Introduction, Kind, LegacySource, Location, Outcome, Parcel, Principal, Report, Signature,
-    Stream, Ticket, Verdict, WayError, WayFault,
+    Introduction, Kind, LegacySource, Location, Mandate, Outcome, Parcel, Principal, Report,
+    Signature, Stream, Ticket, Verdict, WayError, WayFault,
 };
 
 use crate::input::Input;
@@ -284,6 +284,7 @@ impl World {
                     name: format!("mts-{peer}").into(),
                     hop: hop(peer, Kind::Tcp),
                     dialled: None,
+                    mandate: Mandate::Unproved,
                 };
                 let clocks = world.clocks();
                 let core = &mut world.service(gateway).core;
@@ -499,6 +500,7 @@ impl World {
             name: input.one_of(&["mts-3", "mts-1", "liar", "gw"]).into(),
             hop: self.lying_hop(how, input),
             dialled: None,
+            mandate: Mandate::Unproved,
         };
         let now = self.clocks();
         self.service(at).core.handle_introduced(now, &introduction);

@@ -7,8 +7,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use fipa_sds::{Directory, Entry, Exchange, Mts, Reach, Role, Source};
-use fipa_transport::{Incarnation, Location};
+use fipa_sds::{Directory, Entry, Exchange, Mts, Present, Reach, Role, Source};
+use fipa_transport::{Incarnation, Location, Mandate};
 
 use crate::input::Input;
 
@@ -53,10 +53,13 @@ pub fn play(bytes: &[u8]) {
     let arm = agent("arm", 101, OWN);
     here.handle_own(now, [&arm]);
     there.handle_own(now, [&rover, &lander]);
-    let gateways = |with: &[Incarnation]| -> Vec<(Mts, Vec<Location>)> {
-        let all = with.iter();
-        all.map(|one| (Mts::new("mts", *one), vec![location(*one)]))
-            .collect()
+    let gateways = |with: &[Incarnation]| -> Vec<Present> {
+        let all = with.iter().map(|one| Present {
+            mts: Mts::new("mts", *one),
+            locations: vec![location(*one)],
+            mandate: Mandate::Unproved,
+        });
+        all.collect()
     };
     let mut present = vec![HONEST, LIARS[0], LIARS[1], LIARS[2]];
     here.handle_neighbours(now, &gateways(&present));

@@ -178,6 +178,7 @@ fn a_service_cannot_introduce_itself_as_the_agent_of_another_host() {
             name: "rover".into(),
             hop: link(agent, LIAR),
             dialled: None,
+            mandate: Mandate::Unproved,
         };
         bench.core.handle_introduced(bench.now, &introduction);
         let junk = bench.letter(link(agent, LIAR), (agent, ARM), 2);

@@ -16,7 +16,7 @@ use fipa_mts::letter_for;
 use fipa_sds::{Directory, Role};
 use fipa_transport::{
     Answer, Attempt, AttemptId, Body, Conclusion, FailureReason, Hop, Incarnation, Introduction,
-    Kind, Outcome, Parcel, Principal, Report, Stream, WayError, WayFault,
+    Kind, Mandate, Outcome, Parcel, Principal, Report, Stream, WayError, WayFault,
 };
 
 use super::links::Flown;
@@ -174,6 +174,7 @@ impl World {
                 principal: certificate(host),
             },
             dialled: None,
+            mandate: Mandate::Certified([].into()),
         }
     }
 
@@ -484,6 +485,7 @@ impl World {
                 principal: certificate(self.processes[liar].host),
             },
             dialled: None,
+            mandate: Mandate::Certified([].into()),
         };
         self.trace(|| format!("{liar} introduces itself to {target} as {service}"));
         let core = &mut self.processes[target].core;

@@ -231,23 +231,6 @@ proptest! {
 
     /// Whatever happens in whatever order, a connection that lives answers everything.
     #[test]
-fn a_peer_that_says_it_is_this_service_is_refused() {
-    let now = Instant::now();
-    for role in [
-        Role::Acceptor,
-        Role::Dialler {
-            expected: Incarnation::UNKNOWN,
-        },
-    ] {
-        let mut connection = Connection::new(limits(), role, sample(1), now);
-        connection.connected(now);
-        let other = connection.handle_frame(Frame::Hello(sample(1)), now);
-        assert!(matches!(other, Err(End::Nonsense(_))), "{other:?}");
-        assert_eq!(connection.poll_event(), None);
-    }
-}
-
-#[test]
     fn every_parcel_is_answered_once_and_in_order(
         steps in prop::collection::vec(step(), 0..200),
     ) {
@@ -570,4 +553,21 @@ fn a_hello_must_come_in_time() {
         a.connection.handle_timeout(late, 0),
         Err(End::TooSlow(_))
     ));
+}
+
+#[test]
+fn a_peer_that_says_it_is_this_service_is_refused() {
+    let now = Instant::now();
+    for role in [
+        Role::Acceptor,
+        Role::Dialler {
+            expected: Incarnation::UNKNOWN,
+        },
+    ] {
+        let mut connection = Connection::new(limits(), role, sample(1), now);
+        connection.connected(now);
+        let other = connection.handle_frame(Frame::Hello(sample(1)), now);
+        assert!(matches!(other, Err(End::Nonsense(_))), "{other:?}");
+        assert_eq!(connection.poll_event(), None);
+    }
 }
