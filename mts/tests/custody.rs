@@ -240,7 +240,28 @@ fn a_gateway_says_which_letters_it_has() {
     // A report that names another transfer would not be believed.
     assert_eq!(asked(&mut gateway, 1, 5, 72), without);
     gateway.answer(2, attempt, Answer::Accepted);
-    assert_eq!(asked(&mut gateway, 3, 5, 70), without);
+    // Its report is on the way and tells more.
+    let (report, _) = gateway.dispatched().unwrap();
+    assert_eq!(asked(&mut gateway, 3, 5, 70), Answer::Accepted);
+    assert_eq!(asked(&mut gateway, 3, 5, 72), without);
+    gateway.answer(4, report, Answer::Accepted);
+    assert_eq!(asked(&mut gateway, 5, 5, 70), without);
+}
+
+#[test]
+fn a_report_that_is_refused_hides_no_lost_letter() {
+    let mut gateway = Service::new(true);
+    gateway.arrive(0, 5, 70);
+    let (attempt, _) = gateway.dispatched().unwrap();
+    gateway.answer(1, attempt, Answer::Accepted);
+    let (report, _) = gateway.dispatched().unwrap();
+    gateway.answer(
+        2,
+        report,
+        Answer::failed(FailureReason::Refused, "impostor"),
+    );
+    let asked = gateway.receive(3, Kind::Shm, parcel(5, 70, Body::Predecessor));
+    assert_eq!(asked, Verdict::Now(Answer::Returned { uncertain: true }));
 }
 
 #[test]

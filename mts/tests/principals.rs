@@ -188,6 +188,24 @@ fn a_service_cannot_introduce_itself_as_the_agent_of_another_host() {
     }
 }
 
+/// A transport that knows the incarnation by its hello only would hand over letters for that service.
+#[test]
+fn a_connected_service_is_accepted_with_its_own_certificate_only() {
+    let bench = Bench::new();
+    let accepts = |claimed, principal| {
+        bench.core.accepts(&Introduction {
+            name: "mts".into(),
+            hop: link(claimed, principal),
+            dialled: None,
+            mandate: Mandate::Unproved,
+        })
+    };
+    assert!(accepts(HONEST, HONEST));
+    assert!(!accepts(HONEST, LIAR));
+    assert!(accepts(LIAR, LIAR));
+    assert!(accepts(Incarnation::from_u64(77), LIAR));
+}
+
 #[test]
 fn only_the_service_that_has_a_letter_reports_of_it() {
     let mut bench = Bench::new();

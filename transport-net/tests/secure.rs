@@ -9,6 +9,7 @@ mod common;
 
 use std::io::{Read as _, Write as _};
 use std::net::{IpAddr, Ipv4Addr, TcpStream};
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
 use common::certificates::Host;
@@ -83,6 +84,7 @@ over_both! {
     withdrawn_trust_ends_the_connection,
     an_expired_certificate_ends_the_connection,
     a_new_key_takes_over_while_letters_pass,
+    a_peer_that_the_service_refuses_gets_no_letter_and_sends_none,
     who_sends_more_than_it_may_is_read_later_and_loses_nothing,
     a_restarted_gateway_takes_the_place_of_its_older_connection_at_once,
 }
@@ -215,6 +217,18 @@ fn who_proved_one_name_cannot_take_another<T: Proving>() {
     let (from, to) = friends::<T>(&rover, &crex);
     let told = assert_refused(&from, &to);
     assert!(told.contains("somebody-else"), "{told}");
+}
+
+/// The service may be connected over another transport, with another certificate.
+fn a_peer_that_the_service_refuses_gets_no_letter_and_sends_none<T: Proving>() {
+    let (rover, crex) = (Host::new(NAME, &[]), Host::new(NAME, &[]));
+    for refusing in [true, false] {
+        let (from, to) = friends::<T>(&rover, &crex);
+        let refused_by = if refusing { &from } else { &to };
+        refused_by.sink.refuses_peers.store(true, Ordering::Relaxed);
+        assert_refused(&from, &to);
+        assert!(refused_by.sink.record.lock().introduced.is_empty());
+    }
 }
 
 fn a_peer_speaks_for_its_own_agents_only<T: Proving>() {

@@ -237,6 +237,10 @@ impl Sink for Filter {
         self.sink.relocated(locations);
     }
 
+    fn accepts(&self, peer: &Introduction) -> bool {
+        self.sink.accepts(peer)
+    }
+
     fn introduced(&self, peer: &Introduction) {
         self.sink.introduced(peer);
     }

@@ -169,6 +169,14 @@ pub trait Sink: Send + Sync {
         let _ = locations;
     }
 
+    /// Whether the peer of a new connection may be the service that it claims to be. `false` if another
+    /// principal has proved to be that service: the transport then ends the connection before a parcel
+    /// passes in either direction. Called before [`introduced`](Self::introduced).
+    fn accepts(&self, peer: &Introduction) -> bool {
+        let _ = peer;
+        true
+    }
+
     /// A service has introduced itself on a new connection, so parcels can be sent both ways.
     /// Transports without connections do not call this.
     fn introduced(&self, peer: &Introduction) {

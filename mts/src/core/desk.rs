@@ -164,6 +164,23 @@ pub(crate) struct Note {
     pub(crate) until: Option<Instant>,
 }
 
+impl Note {
+    fn is_report(&self) -> bool {
+        matches!(self.parcel.body, Body::Report(_))
+    }
+
+    /// The hand-over that the note is about: stream, sequence and transfer.
+    fn transfer(&self) -> (Stream, u64, u64) {
+        let Parcel {
+            stream,
+            sequence,
+            transfer,
+            ..
+        } = self.parcel;
+        (stream, sequence, transfer)
+    }
+}
+
 /// What all lanes share.
 pub(crate) struct Desk {
     pub(crate) config: CoreConfig,
@@ -182,6 +199,8 @@ pub(crate) struct Desk {
     health: Map<Location, Health>,
     /// The time in which services acknowledge reports.
     round_trips: Map<Incarnation, Duration>,
+    /// Hand-overs whose end was reported and neither acknowledged nor refused yet.
+    open_reports: Map<(Stream, u64, u64), ()>,
     /// Lanes that found no room on the way to a location, in order.
     waiting_for_room: Map<Location, VecDeque<LaneId>>,
     next_attempt: u64,
@@ -214,6 +233,7 @@ impl Desk {
             watched: false,
             health: Map::default(),
             round_trips: Map::default(),
+            open_reports: Map::default(),
             waiting_for_room: Map::default(),
             next_attempt: 1,
         }
@@ -263,6 +283,9 @@ impl Desk {
     pub(crate) fn note(&mut self, mut note: Note) {
         if note.tries > 0 {
             note.location = self.present_location(&note);
+        }
+        if note.tries == 0 && note.is_report() {
+            self.open_reports.insert(note.transfer(), ());
         }
         note.tries += 1;
         let (location, parcel) = (note.location.clone(), note.parcel.clone());
@@ -485,6 +508,20 @@ impl Desk {
     pub(super) fn failing(&self, now: Instant, location: &Location) -> Option<(u32, Instant)> {
         let health = self.health.get(location)?;
         (health.retry_at > now).then_some((health.failures, health.retry_at))
+    }
+
+    /// A note was answered, or is not repeated any more. A report that was refused may not be believed
+    /// when it is repeated.
+    pub(crate) fn note_ended(&mut self, note: &Note) {
+        if note.is_report() {
+            self.open_reports.remove(&note.transfer());
+        }
+    }
+
+    /// Whether the end of this hand-over of a letter is being reported and not acknowledged yet.
+    pub(crate) fn is_reporting(&self, stream: Stream, sequence: u64, transfer: u64) -> bool {
+        self.open_reports
+            .contains_key(&(stream, sequence, transfer))
     }
 
     /// A service has acknowledged a report within this time.

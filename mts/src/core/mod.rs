@@ -573,6 +573,10 @@ impl Core {
                     });
                 }
                 self.tell_failures(now);
+                // A report that is on its way tells more than that the letter is gone.
+                let (sequence, transfer) = (parcel.sequence, parcel.transfer);
+                let is_reported = self.desk.is_reporting(parcel.stream, sequence, transfer);
+                let is_here = is_here || is_reported;
                 Verdict::Now(match is_here {
                     true => Answer::Accepted,
                     false => Answer::Returned { uncertain: true },
@@ -638,6 +642,11 @@ impl Core {
             let took = now.instant.saturating_duration_since(sent);
             self.desk.acknowledged(note.location.incarnation(), took);
         }
+        let again = note.until.is_some_and(|until| now.instant < until);
+        let again = again && !arrived && self.notes.len() < MAX_LATE_NOTES;
+        if !again || matches!(conclusion, Conclusion::Answered(_)) {
+            self.desk.note_ended(&note);
+        }
         if note.parcel.body == Body::Predecessor && is_denied(&conclusion) {
             let Parcel {
                 stream,
@@ -654,8 +663,7 @@ impl Core {
             return;
         }
         // Other notes that are lost are made up for by the pauses of those they are for.
-        let again = note.until.is_some_and(|until| now.instant < until);
-        if !arrived && again && self.notes.len() < MAX_LATE_NOTES {
+        if again {
             let pause = FIRST_NOTE_PAUSE.saturating_mul(1 << note.tries.min(10));
             let due = now.instant + pause.min(LONGEST_NOTE_PAUSE);
             self.notes
@@ -767,6 +775,13 @@ impl Core {
         if let Some(dialled) = &peer.dialled {
             self.peers.parted(now.instant, dialled);
         }
+    }
+
+    /// Whether a peer may be the service that it claims to be: `false` if another principal has proved
+    /// to be it and is connected, or if its incarnation is that of another principal's agent.
+    #[must_use]
+    pub fn accepts(&self, peer: &Introduction) -> bool {
+        self.principals.accepts(peer)
     }
 
     /// A service has introduced itself on a connection. From now on its incarnation belongs to what the

@@ -63,18 +63,13 @@ impl Principals {
         if !peer.hop.is_remote() || !incarnation.is_known() {
             return;
         }
-        let principal = peer.hop.principal;
-        if let Some(known) = self.services.get_mut(&incarnation) {
-            let renewed = known.connections == 0 && known.name == peer.name;
-            if renewed {
-                known.principal = principal;
-            }
-            known.connections += usize::from(known.principal == principal);
+        if !self.accepts(peer) {
             return;
         }
-        // The registration of an agent of another principal, which has written before.
-        let of_others = |owner: &Option<Principal>| *owner != Some(principal);
-        if self.senders.get(&incarnation).is_some_and(of_others) {
+        let principal = peer.hop.principal;
+        if let Some(known) = self.services.get_mut(&incarnation) {
+            known.principal = principal;
+            known.connections += 1;
             return;
         }
         self.make_room();
@@ -85,6 +80,22 @@ impl Principals {
         };
         self.services.insert(incarnation, service);
         self.order.push_back(incarnation);
+    }
+
+    /// Whether the peer may be the service that it claims to be.
+    pub(super) fn accepts(&self, peer: &Introduction) -> bool {
+        let incarnation = peer.hop.location.incarnation();
+        if !peer.hop.is_remote() || !incarnation.is_known() {
+            return true;
+        }
+        let principal = peer.hop.principal;
+        if let Some(known) = self.services.get(&incarnation) {
+            let renewed = known.connections == 0 && known.name == peer.name;
+            return renewed || known.principal == principal;
+        }
+        // The registration of an agent of another principal, which has written before.
+        let of_others = |owner: &Option<Principal>| *owner != Some(principal);
+        !self.senders.get(&incarnation).is_some_and(of_others)
     }
 
     /// A connection with this service has ended.

@@ -98,6 +98,14 @@ impl Sink for Receiving {
         shared.carry_out(state);
     }
 
+    fn accepts(&self, peer: &Introduction) -> bool {
+        let Some(shared) = self.shared.upgrade() else {
+            return false;
+        };
+        let state = shared.state.lock();
+        state.core.accepts(peer)
+    }
+
     fn introduced(&self, peer: &Introduction) {
         let Some(shared) = self.shared.upgrade() else {
             return;

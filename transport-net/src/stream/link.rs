@@ -647,12 +647,16 @@ impl Running {
                         self.link.state.lock().connection.welcome();
                     }
                     let hop = entered?;
-                    self.peer = Some(Introduction {
+                    let introduction = Introduction {
                         name: peer.identity.name.into(),
                         hop,
                         dialled: self.dialled.clone(),
                         mandate,
-                    });
+                    };
+                    if !self.sink.accepts(&introduction) {
+                        return Err(End::Impostor("another certificate belongs to this service"));
+                    }
+                    self.peer = Some(introduction);
                 }
                 self.link.state.lock().connection.welcome();
                 self.link.replace_suspects();

@@ -11,6 +11,7 @@ use std::collections::HashMap;
 use std::ops::Deref;
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
@@ -146,6 +147,8 @@ pub(crate) struct Recorder {
     lent: Option<Arc<Mutex<(usize, usize)>>>,
     /// Where every service is as well.
     pub(crate) also_at: Mutex<Vec<Location>>,
+    /// Whether the sink refuses each peer that introduces itself.
+    pub(crate) refuses_peers: AtomicBool,
 }
 
 impl Default for Recorder {
@@ -155,6 +158,7 @@ impl Default for Recorder {
             verdict: Verdict::Now(Answer::Accepted),
             lent: None,
             also_at: Mutex::default(),
+            refuses_peers: AtomicBool::new(false),
         }
     }
 }
@@ -214,6 +218,10 @@ impl Sink for Recorder {
             "the tests' peers are here, not at {from:?}"
         );
         self.record.lock().unframed.push((letter, via));
+    }
+
+    fn accepts(&self, _: &Introduction) -> bool {
+        !self.refuses_peers.load(Ordering::Relaxed)
     }
 
     fn introduced(&self, peer: &Introduction) {
