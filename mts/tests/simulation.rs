@@ -56,9 +56,9 @@ macro_rules! profiles {
 }
 
 /// Seeds of each profile, unless the environment says otherwise.
-const SEEDS: u64 = 50;
+const SEEDS: u64 = 20;
 /// Seeds of each profile with hostile members.
-const FEW_SEEDS: u64 = 5;
+const FEW_SEEDS: u64 = 2;
 
 /// Runs every seed, and fails with the first breach of each invariant and the number of seeds in
 /// which it was broken. Returns how many letters a later registration of their receiver took.
