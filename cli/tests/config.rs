@@ -222,7 +222,7 @@ fn mistakes_are_told_with_place_and_advice() {
 error: unknown key `mts.deadlin`
 where: fipa.toml:2
    do: did you mean `mts.deadline`? (known in [mts]: name, transports, deadline, queue, queue_bytes)
-error: `mts.queue` is wrong: \"x\": a string cannot stand here
+error: `mts.queue` is invalid: \"x\": a string is not allowed here
 where: fipa.toml:3
    do: expected a number of letters such as 256
 ";
@@ -238,7 +238,7 @@ where: fipa.toml:3
               "help": "did you mean `mts.deadline`? \
                        (known in [mts]: name, transports, deadline, queue, queue_bytes)",
               "place": { "from": "file", "path": "fipa.toml", "line": 2 } },
-            { "what": "`mts.queue` is wrong: \"x\": a string cannot stand here",
+            { "what": "`mts.queue` is invalid: \"x\": a string is not allowed here",
               "help": "expected a number of letters such as 256",
               "place": { "from": "file", "path": "fipa.toml", "line": 3 } },
         ] })

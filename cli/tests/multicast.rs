@@ -24,7 +24,7 @@ fn inside_the_doctor_says_what_the_network_does() {
 
     let (verdict, found) = multicast(here);
     assert_eq!(verdict, "doubtful", "{found}");
-    assert!(found.contains("nobody answered"), "{found}");
+    assert!(found.contains("no other host answered"), "{found}");
 
     let mut up = fipa(there, "there");
     let _gateway = Running::until_ready(up.arg("up"));
@@ -39,20 +39,26 @@ fn inside_the_doctor_says_what_the_network_does() {
         }
         assert!(Instant::now() < deadline, "{found}");
     };
-    assert!(found.contains("goes both ways, with 10.99.0.2"), "{found}");
+    assert!(
+        found.contains("works in both directions, with 10.99.0.2"),
+        "{found}"
+    );
 
     // The switch keeps multicast from this host, which others hear.
     here.hears_multicast(false);
     let (verdict, found) = multicast(here);
     assert_eq!(verdict, "doubtful", "{found}");
-    assert!(found.contains("does not come in: 10.99.0.2"), "{found}");
+    assert!(found.contains("incoming does not: 10.99.0.2"), "{found}");
     here.hears_multicast(true);
 
     // The other way round.
     there.hears_multicast(false);
     let (verdict, found) = multicast(here);
     assert_eq!(verdict, "doubtful", "{found}");
-    assert!(found.contains("may not get out: 10.99.0.2"), "{found}");
+    assert!(
+        found.contains("outgoing may not: packets of 10.99.0.2"),
+        "{found}"
+    );
     there.hears_multicast(true);
 
     here.ip("link set eth0 down");

@@ -1,29 +1,32 @@
-//! Where the processes of the domain meet.
+//! Checks the directory of the domain.
 
 use super::{Area, Check, Verdict};
 use crate::Config;
-use crate::place::Place;
+use crate::domain_dir::DomainDir;
 
 const AREA: Area = Area("domain");
 
 pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
-    checks.push(directory(&Place::of(&config.domain)));
+    checks.push(directory(&DomainDir::of(&config.domain)));
 }
 
-fn directory(place: &Place) -> Check {
+fn directory(dir: &DomainDir) -> Check {
     const CHECK: &str = "directory of the domain";
-    let path = place.path();
-    match place.look() {
+    let path = dir.path();
+    match dir.exists() {
         Ok(true) => AREA.fine(CHECK, format!("{} is private", path.display())),
         Ok(false) => {
-            let found = format!("{} is made when the first process starts", path.display());
+            let found = format!(
+                "{} does not exist yet; the first process creates it",
+                path.display()
+            );
             AREA.fine(CHECK, found)
         }
         Err(error) => AREA.wrong(
             CHECK,
             Verdict::Bad,
             error.to_string(),
-            "no process can join the domain until that is so",
+            "repair it; until then no process can join the domain",
         ),
     }
 }
