@@ -48,7 +48,7 @@ pub enum Value {
 }
 
 impl Effective {
-    /// Finds, reads and checks the configuration.
+    /// Finds, reads and checks the configuration, and records the origin of every value.
     ///
     /// # Errors
     /// If a file cannot be read, or if the configuration has mistakes; the error lists all of them.
