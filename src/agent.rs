@@ -1,5 +1,6 @@
 //! An agent: a name that sends and receives messages.
 
+use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
@@ -233,6 +234,15 @@ impl Agent {
     }
 }
 
+impl fmt::Debug for Agent {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Agent")
+            .field("name", &self.endpoint.name)
+            .field("incarnation", &self.endpoint.incarnation)
+            .finish_non_exhaustive()
+    }
+}
+
 /// The messages that a deregistered agent had not received, as [`Agent::receive`] would have returned
 /// them.
 pub type Unread = Vec<Result<Incoming, ReceiveError>>;
@@ -268,5 +278,13 @@ impl Loan {
     /// Returns the memory of the content, to be written. Its initial bytes are arbitrary.
     pub fn content_mut(&mut self) -> &mut [u8] {
         self.content.content_mut()
+    }
+}
+
+impl fmt::Debug for Loan {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Loan")
+            .field("message", &self.message)
+            .finish_non_exhaustive()
     }
 }

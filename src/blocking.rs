@@ -33,7 +33,7 @@ pub enum OpenError {
 }
 
 /// The membership of this process in a domain; see [`crate::Domain`].
-#[derive(Clone)]
+#[derive(Debug, Clone)]
 pub struct Domain {
     // Declared first, because it must be dropped before the runtime that it uses.
     domain: crate::Domain,
@@ -41,13 +41,14 @@ pub struct Domain {
 }
 
 /// An agent of this process; see [`crate::Agent`].
+#[derive(Debug)]
 pub struct Agent {
     agent: crate::Agent,
     runtime: Background,
 }
 
 /// The runtime of the background thread.
-#[derive(Clone)]
+#[derive(Debug, Clone)]
 struct Background {
     runtime: Arc<Runtime>,
     owner: Owner,

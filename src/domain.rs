@@ -1,5 +1,6 @@
 //! The membership of a process in a domain.
 
+use std::fmt;
 use std::sync::Arc;
 
 use fipa_acl::{Dialect, Message, Performative, Representation};
@@ -40,6 +41,14 @@ impl Drop for Inner {
         if self.owner.is_this() {
             self.service.abort();
         }
+    }
+}
+
+impl fmt::Debug for Domain {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Domain")
+            .field("mts", &self.inner.service.own)
+            .finish_non_exhaustive()
     }
 }
 

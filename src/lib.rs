@@ -84,15 +84,15 @@ pub use domain_dir::DomainDirError;
 pub use error::ProtocolError;
 pub use error::{OpenError, ReceiveError, SendError};
 pub use fipa_acl::{
-    AgentId, AgentIdError, BuildError, DecodeError, Envelope, EnvelopeParams, Letter, Message,
-    MessageBuilder, Payload, Performative, Time,
+    AgentId, AgentIdError, BuildError, DecodeError, EncodeError, Envelope, EnvelopeParams, Letter,
+    Message, MessageBuilder, Payload, Performative, Time, TimeError,
 };
 #[cfg(feature = "monitor")]
 pub use fipa_monitor as monitor;
-pub use fipa_mts::DeliveryFailure;
+pub use fipa_mts::{DeliveryFailure, PostError};
 pub use fipa_sds::{
-    Change, Directory, Entry, Matcher, Members, MembersError, Pattern, PatternError, Query, Reach,
-    RegisterError, Role, Source, Watch, is_pattern,
+    Change, DeregisterError, Directory, Entry, HostError, Matcher, Members, MembersError, Pattern,
+    PatternError, Query, Reach, RegisterError, Role, Source, Watch, is_pattern,
 };
 pub use fipa_transport::{
     Attempt, FailureReason, Forked, Incarnation, Kind, ListenError, Location, Outcome, Signature,

@@ -104,7 +104,7 @@ async fn a_letter_to_a_coalition_reaches_its_members_or_its_leader() {
     far.knows(&["team", "rover"]).await;
     near.knows(&["arm", "camera"]).await;
 
-    // From a member, on the other host than who has formed it.
+    // The sender is a member on another host than the owner of the coalition.
     let sent = tell(&camera, "team", "all").await;
     assert!(sent.all_succeeded(), "{sent}");
     assert_eq!(to(&sent), BTreeSet::from(["arm", "rover"]));
@@ -112,7 +112,7 @@ async fn a_letter_to_a_coalition_reaches_its_members_or_its_leader() {
     hears(&arm, "all").await;
     assert!(camera.try_receive().unwrap().is_none());
 
-    // Its leader is on the other host.
+    // The leader is on the other host.
     team.change(["rover", "arm", "camera"], Some("arm"))
         .unwrap();
     let sent = tell(&rover, "team", "lead").await;
@@ -120,7 +120,7 @@ async fn a_letter_to_a_coalition_reaches_its_members_or_its_leader() {
     assert!(sent.all_succeeded());
     hears(&arm, "lead").await;
 
-    // A loan works, although nobody can lend for several.
+    // A loan works although its memory cannot be shared by several receivers.
     team.change(["arm", "camera"], None).unwrap();
     let message = rover
         .message(Performative::Inform)
@@ -134,7 +134,7 @@ async fn a_letter_to_a_coalition_reaches_its_members_or_its_leader() {
     hears(&arm, "large").await;
     hears(&camera, "large").await;
 
-    // Who is not there has an outcome, too.
+    // A member that is not registered has an outcome, too.
     team.change(["arm", "leg"], None).unwrap();
     let sent = tell(&rover, "team", "who").await;
     assert_eq!(to(&sent), BTreeSet::from(["arm", "leg"]));
@@ -148,14 +148,14 @@ async fn a_letter_to_a_coalition_reaches_its_members_or_its_leader() {
     ));
     hears(&arm, "who").await;
     team.dissolve().unwrap();
-    assert!(!tell(&rover, "team", "nobody").await.all_succeeded());
+    assert!(!tell(&rover, "team", "dissolved").await.all_succeeded());
     for host in [near, far] {
         host.gateway.close().await;
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_cannot_be_is_refused_and_changes_nothing() {
+async fn refused_changes_leave_a_coalition_as_it_was() {
     let host = Host::start(None).await;
     let mut team = host.form("team", &["a", "b"], Some("b"));
     let options = RegisterOptions::default;
@@ -177,7 +177,7 @@ async fn what_cannot_be_is_refused_and_changes_nothing() {
     let many = host.domain.form("many", many, None, options()).unwrap();
     let (error, many) = *team.merge(many).unwrap_err();
     assert!(matches!(error, CoalitionError::Members(_)));
-    // One that was formed in another domain is not removed here.
+    // A coalition of another domain cannot be merged.
     let elsewhere = Host::start(None).await;
     let foreign = elsewhere.form("foreign", &["q"], None);
     let (error, foreign) = *team.merge(foreign).unwrap_err();
@@ -191,14 +191,14 @@ async fn what_cannot_be_is_refused_and_changes_nothing() {
     assert_eq!(names, ["a", "b"]);
     let seen = host.domain.directory().lookup("team").unwrap();
     assert_eq!(seen.role, Role::Coalition(team.members().clone()));
-    // Who leads goes with the part that has the leader.
+    // If the leader is split off, the rest has no leader.
     let part = team.split("part", &["b"], Some("b"), options()).unwrap();
     assert_eq!(team.members().leader(), None);
     team.merge(part).unwrap();
     drop((taken, many, foreign));
 }
 
-/// Who is in which coalition, as it is told to somebody who only watches.
+/// The members of each coalition, as a watcher of the directory sees them.
 #[derive(Default)]
 struct Seen(BTreeMap<Arc<str>, Members>);
 
@@ -219,7 +219,7 @@ impl Seen {
         }
     }
 
-    /// Each module is in one coalition: never in two, never in none.
+    /// Checks that each module is in exactly one coalition.
     fn check(&self) {
         let mut all: Vec<&str> = self
             .0
@@ -238,26 +238,26 @@ async fn watch(domain: Domain, over: Arc<AtomicBool>) -> usize {
         seen.put(entry);
     }
     seen.check();
-    let mut told = 0;
+    let mut changed = 0;
     while !over.load(Ordering::Relaxed) {
         let waited = tokio::time::timeout(Duration::from_millis(20), changes.next()).await;
         if let Ok(Some(change)) = waited {
             seen.take(&change);
             seen.check();
-            told += 1;
+            changed += 1;
         }
-        // Who looks sees no half state either.
-        let mut looked = Seen::default();
+        // A lookup sees no intermediate state either.
+        let mut current = Seen::default();
         for entry in domain.directory().entries().iter() {
-            looked.put(entry);
+            current.put(entry);
         }
-        looked.check();
+        current.check();
     }
-    told
+    changed
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn nobody_sees_a_merger_or_a_split_half_done() {
+async fn a_merger_or_split_is_atomic_for_watchers() {
     let near = Host::start(None).await;
     let far = Host::start(Some(&near)).await;
     let modules = ["m0", "m1", "m2", "m3", "m4", "m5"];
@@ -291,7 +291,7 @@ async fn nobody_sees_a_merger_or_a_split_half_done() {
     far.knows(&["last"]).await;
     over.store(true, Ordering::Relaxed);
     for watching in watching {
-        assert!(watching.await.unwrap() > 0, "nothing was told");
+        assert!(watching.await.unwrap() > 0, "no change was reported");
     }
     drop((whole, last));
     for host in [near, far] {

@@ -16,6 +16,7 @@ use crate::protocol::{
 
 /// One side of a conversation with blocking calls: a [`Request`], [`Subscription`], [`ContractNet`],
 /// [`Auction`], [`Proxied`] or [`Task`]. Dereferences to that type for the calls that do not wait.
+#[derive(Debug)]
 #[must_use = "the conversation goes on with the calls of the inner type"]
 pub struct Side<'a, T> {
     inner: T,

@@ -64,6 +64,7 @@ impl Agent {
 /// the bidders.
 ///
 /// FIPA defines no cancel for auctions.
+#[derive(Debug)]
 #[must_use = "an auction goes on until it is closed"]
 pub struct Auction<'a> {
     dialogue: Dialogue<'a>,

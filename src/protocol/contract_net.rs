@@ -1,5 +1,6 @@
 //! The initiator's side of the contract net (FIPA00029) and the iterated contract net (FIPA00030).
 
+use std::fmt;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
@@ -77,6 +78,16 @@ pub struct Awarded {
     pub agent: String,
     /// Its `inform`, or the error instead of one.
     pub result: Result<Message, DialogueError>,
+}
+
+impl fmt::Debug for ContractNet<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("ContractNet")
+            .field("dialogue", &self.dialogue)
+            .field("bids", &self.bids)
+            .field("open", &self.open)
+            .finish_non_exhaustive()
+    }
 }
 
 impl<'a> ContractNet<'a> {

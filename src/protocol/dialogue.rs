@@ -1,5 +1,6 @@
 //! One conversation that a call leads.
 
+use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -362,6 +363,16 @@ impl<'a> Dialogue<'a> {
             Verdict::Unchecked(why) => Err(CheckFailure::Unchecked(why)),
             _ => Ok(own),
         }
+    }
+}
+
+impl fmt::Debug for Dialogue<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Dialogue")
+            .field("protocol", &self.protocol)
+            .field("id", &self.id)
+            .field("state", &self.state)
+            .finish_non_exhaustive()
     }
 }
 

@@ -99,6 +99,7 @@ pub enum Decision {
 }
 
 /// A request or query. Dropping it does not cancel it; further answers go to [`Agent::receive`].
+#[derive(Debug)]
 #[must_use = "result() returns the answer"]
 pub struct Request<'a> {
     dialogue: Dialogue<'a>,

@@ -67,6 +67,7 @@ impl Agent {
 
 /// The participant's side of a conversation. Dropping it without a reply sends nothing to the
 /// initiator.
+#[derive(Debug)]
 pub struct Task<'a> {
     dialogue: Dialogue<'a>,
     first: Message,

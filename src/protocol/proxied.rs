@@ -57,6 +57,7 @@ impl Agent {
 
 /// A message that a broker or recruiter has passed on. After dropping it, the answers go to
 /// [`Agent::receive`].
+#[derive(Debug)]
 #[must_use = "next() returns the answers"]
 pub struct Proxied<'a> {
     dialogue: Dialogue<'a>,

@@ -39,6 +39,7 @@ impl Agent {
 }
 
 /// A subscription. Dropping it does not cancel it; further notifications go to [`Agent::receive`].
+#[derive(Debug)]
 #[must_use = "next() returns the notifications"]
 pub struct Subscription<'a> {
     dialogue: Dialogue<'a>,

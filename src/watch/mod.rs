@@ -15,6 +15,7 @@ mod socket;
 mod watchers;
 
 use std::collections::HashSet;
+use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -174,6 +175,14 @@ impl Watcher {
     #[must_use]
     pub fn directory(&self) -> &dyn Directory {
         &*self.host
+    }
+}
+
+impl fmt::Debug for Watcher {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Watcher")
+            .field("dir", &self.dir.path())
+            .finish_non_exhaustive()
     }
 }
 
