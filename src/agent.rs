@@ -121,7 +121,7 @@ impl Agent {
     /// Sends a message to its receivers, each the name of an agent or a pattern of names. Waits until
     /// every receiver has an outcome, at most for the deadline of the configuration (`mts.deadline`).
     ///
-    /// Letters are sent in the order of the calls, in whatever order the futures are awaited. Dropping
+    /// Letters are sent in the order of the calls, independently of the order in which the futures are awaited. Dropping
     /// the future does not stop the letter.
     ///
     /// # Errors

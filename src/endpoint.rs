@@ -85,8 +85,7 @@ impl Endpoint {
         }
     }
 
-    /// Sends a message. Its letter is on its way when this returns; dropping the result does not
-    /// stop it.
+    /// Sends a message. The letter is sent before this returns; dropping the result does not stop it.
     pub(crate) fn send(
         &self,
         message: &Message,

@@ -98,8 +98,8 @@ async fn rules_are_kept(kind: Kind) {
     assert_eq!(next(&rover).await.sender().unwrap().name(), "arm");
     let failure = next(&rover).await;
     assert_eq!(*failure.performative(), Performative::Failure);
-    let told = String::from_utf8_lossy(failure.content().unwrap()).into_owned();
-    assert!(told.contains("refused"), "{told}");
+    let text = String::from_utf8_lossy(failure.content().unwrap()).into_owned();
+    assert!(text.contains("refused"), "{text}");
     assert_eq!(*next(&arm).await.performative(), Performative::Inform);
     assert_eq!(*next(&arm).await.performative(), Performative::Request);
     assert!(arm.try_receive().unwrap().is_none());

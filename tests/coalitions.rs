@@ -30,9 +30,9 @@ impl Host {
             "discovery.mdns=false".to_owned(),
         ];
         if let Some(peer) = peer {
-            let mut ways = peer.gateway.locations().into_iter();
-            let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
-            let address = way.address();
+            let mut locations = peer.gateway.locations().into_iter();
+            let location = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
+            let address = location.address();
             set.push(format!(
                 "discovery.static={{ peer = [\"tcp://{address}\"] }}"
             ));
@@ -57,7 +57,7 @@ impl Host {
         formed.unwrap()
     }
 
-    async fn knows(&self, names: &[&str]) {
+    async fn until_known(&self, names: &[&str]) {
         let directory = self.domain.directory();
         until(&format!("{names:?} are known"), || {
             names.iter().all(|name| directory.known(name).is_some())
@@ -74,7 +74,7 @@ async fn until(what: &str, condition: impl Fn() -> bool) {
     }
 }
 
-async fn tell(from: &Agent, to: &str, content: &str) -> Deliveries {
+async fn send(from: &Agent, to: &str, content: &str) -> Deliveries {
     let message = from
         .message(Performative::Inform)
         .receiver(AgentId::new(to).unwrap())
@@ -84,7 +84,7 @@ async fn tell(from: &Agent, to: &str, content: &str) -> Deliveries {
     from.send(message).await.unwrap()
 }
 
-async fn hears(agent: &Agent, content: &str) {
+async fn receives(agent: &Agent, content: &str) {
     let received = agent.receive().await.unwrap();
     assert_eq!(received.message.content().unwrap(), content);
 }
@@ -101,24 +101,24 @@ async fn a_letter_to_a_coalition_reaches_its_members_or_its_leader() {
     let arm = far.domain.register("arm").unwrap();
     let camera = far.domain.register("camera").unwrap();
     let mut team = near.form("team", &["rover", "arm", "camera"], None);
-    far.knows(&["team", "rover"]).await;
-    near.knows(&["arm", "camera"]).await;
+    far.until_known(&["team", "rover"]).await;
+    near.until_known(&["arm", "camera"]).await;
 
     // The sender is a member on another host than the owner of the coalition.
-    let sent = tell(&camera, "team", "all").await;
+    let sent = send(&camera, "team", "all").await;
     assert!(sent.all_succeeded(), "{sent}");
     assert_eq!(to(&sent), BTreeSet::from(["arm", "rover"]));
-    hears(&rover, "all").await;
-    hears(&arm, "all").await;
+    receives(&rover, "all").await;
+    receives(&arm, "all").await;
     assert!(camera.try_receive().unwrap().is_none());
 
     // The leader is on the other host.
     team.change(["rover", "arm", "camera"], Some("arm"))
         .unwrap();
-    let sent = tell(&rover, "team", "lead").await;
+    let sent = send(&rover, "team", "lead").await;
     assert_eq!(to(&sent), BTreeSet::from(["arm"]), "{sent}");
     assert!(sent.all_succeeded());
-    hears(&arm, "lead").await;
+    receives(&arm, "lead").await;
 
     // A loan works although its memory cannot be shared by several receivers.
     team.change(["arm", "camera"], None).unwrap();
@@ -131,12 +131,12 @@ async fn a_letter_to_a_coalition_reaches_its_members_or_its_leader() {
     loan.content_mut().copy_from_slice(b"large");
     let sent = rover.send_loan(loan).await.unwrap();
     assert!(sent.all_succeeded(), "{sent}");
-    hears(&arm, "large").await;
-    hears(&camera, "large").await;
+    receives(&arm, "large").await;
+    receives(&camera, "large").await;
 
     // A member that is not registered has an outcome, too.
     team.change(["arm", "leg"], None).unwrap();
-    let sent = tell(&rover, "team", "who").await;
+    let sent = send(&rover, "team", "unregistered").await;
     assert_eq!(to(&sent), BTreeSet::from(["arm", "leg"]));
     let leg = sent.0.iter().find(|one| &*one.receiver == "leg").unwrap();
     assert!(matches!(
@@ -146,9 +146,9 @@ async fn a_letter_to_a_coalition_reaches_its_members_or_its_leader() {
             ..
         }
     ));
-    hears(&arm, "who").await;
+    receives(&arm, "unregistered").await;
     team.dissolve().unwrap();
-    assert!(!tell(&rover, "team", "dissolved").await.all_succeeded());
+    assert!(!send(&rover, "team", "dissolved").await.all_succeeded());
     for host in [near, far] {
         host.gateway.close().await;
     }
@@ -262,7 +262,7 @@ async fn a_merger_or_split_is_atomic_for_watchers() {
     let far = Host::start(Some(&near)).await;
     let modules = ["m0", "m1", "m2", "m3", "m4", "m5"];
     let mut whole = near.form("whole", &modules, Some("m0"));
-    far.knows(&["whole"]).await;
+    far.until_known(&["whole"]).await;
     let over = Arc::new(AtomicBool::new(false));
     let beside = Domain::open(&near.config).await.unwrap();
     until("it is known beside", || {
@@ -288,7 +288,7 @@ async fn a_merger_or_split_is_atomic_for_watchers() {
     let last = whole
         .split("last", &["m5"], None, RegisterOptions::default())
         .unwrap();
-    far.knows(&["last"]).await;
+    far.until_known(&["last"]).await;
     over.store(true, Ordering::Relaxed);
     for watching in watching {
         assert!(watching.await.unwrap() > 0, "no change was reported");

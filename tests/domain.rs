@@ -208,8 +208,8 @@ async fn a_full_queue_fails_at_the_deadline_and_does_not_block_other_receivers()
     let (blocked, ()) = tokio::join!(blocked, meanwhile);
     assert_eq!(reason(&blocked.unwrap()), FailureReason::QueueFull);
     // The sender gets a failure message. The next letter waits until the receiver reads.
-    let told = rover.receive().await.unwrap();
-    assert_eq!(*told.message.performative(), Performative::Failure);
+    let failure = rover.receive().await.unwrap();
+    assert_eq!(*failure.message.performative(), Performative::Failure);
     let waiting = rover.send(inform(&rover, "slow", "in time"));
     let reading = async {
         let mut seen = Vec::new();
@@ -268,10 +268,10 @@ async fn an_unknown_name_yields_one_failure_message() {
     for to in ["unknown", "unknown_.*", "broken("] {
         let deliveries = rover.send(inform(&rover, to, "hello")).await.unwrap();
         assert_eq!(reason(&deliveries), FailureReason::NoSuchAgent);
-        let told = rover.receive().await.unwrap().message;
-        assert_eq!(*told.performative(), Performative::Failure);
-        assert_eq!(told.ontology(), Some("fipa-agent-management"));
-        let content = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
+        let failure = rover.receive().await.unwrap().message;
+        assert_eq!(*failure.performative(), Performative::Failure);
+        assert_eq!(failure.ontology(), Some("fipa-agent-management"));
+        let content = String::from_utf8(failure.content().unwrap().to_vec()).unwrap();
         assert!(
             content.contains("no such agent") && content.contains(to),
             "{content}"
@@ -458,7 +458,7 @@ async fn a_deregistered_agent_is_unknown_and_its_successor_is_reached() {
     let arm = there.register("arm").unwrap();
     assert!(
         rover
-            .send(inform(&rover, "arm", "first life"))
+            .send(inform(&rover, "arm", "first"))
             .await
             .unwrap()
             .all_succeeded()
@@ -467,20 +467,20 @@ async fn a_deregistered_agent_is_unknown_and_its_successor_is_reached() {
     let [Ok(unread)] = &unread[..] else {
         panic!("one message waited: {unread:?}");
     };
-    assert_eq!(unread.message.content().unwrap(), "first life");
+    assert_eq!(unread.message.content().unwrap(), "first");
     let gone = rover.send(inform(&rover, "arm", "between")).await.unwrap();
     assert_eq!(reason(&gone), FailureReason::NoSuchAgent);
     let arm = there.register("arm").unwrap();
     assert!(
         rover
-            .send(inform(&rover, "arm", "second life"))
+            .send(inform(&rover, "arm", "second"))
             .await
             .unwrap()
             .all_succeeded()
     );
     assert_eq!(
         arm.receive().await.unwrap().message.content().unwrap(),
-        "second life"
+        "second"
     );
 }
 

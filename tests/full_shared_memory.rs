@@ -46,7 +46,7 @@ async fn large_contents() {
         there.register("arm_0").unwrap(),
         there.register("arm_1").unwrap(),
     ];
-    let mut ways = Vec::new();
+    let mut transports_used = Vec::new();
     // The letters are kept, so that each needs new memory. They are for one receiver, loaned for one,
     // and for both, in turn.
     let mut kept = Vec::new();
@@ -81,11 +81,11 @@ async fn large_contents() {
                 let reason = attempt.to_string();
                 assert!(reason.contains("/dev/shm"), "{reason}");
             }
-            ways.push(via);
+            transports_used.push(via);
         }
     }
-    assert!(ways.contains(&Kind::Shm), "{ways:?}");
-    assert!(ways.contains(&Kind::Unix), "{ways:?}");
+    assert!(transports_used.contains(&Kind::Shm), "{transports_used:?}");
+    assert!(transports_used.contains(&Kind::Unix), "{transports_used:?}");
     // Small letters are still delivered.
     kept.clear();
     let message = rover

@@ -268,13 +268,13 @@ async fn a_second_gateway_of_a_domain_or_on_a_port_is_refused() {
         Gateway::open(&another).await,
         Err(OpenError::GatewayRunning(name)) if name == gateway.name()
     ));
-    let mut ways = gateway.locations().into_iter();
-    let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
-    let taken = format!("transport.tcp.listen={}", way.address());
+    let mut locations = gateway.locations().into_iter();
+    let location = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
+    let taken = format!("transport.tcp.listen={}", location.address());
     let other = Host::new(&["discovery.mdns=false", &taken]);
     match Gateway::open(&other.config).await {
         Err(error @ OpenError::Listen { .. }) => {
-            assert!(error.to_string().contains(way.address()), "{error}");
+            assert!(error.to_string().contains(location.address()), "{error}");
         }
         Err(other) => panic!("{other}"),
         Ok(_) => panic!("two on one port"),
@@ -341,8 +341,12 @@ async fn the_gateway_reports_the_routes_of_letters_and_their_state() {
     assert_eq!(route.exception.as_deref(), Some("arm.*"));
     assert_eq!(route.ways[0].location.incarnation(), far.incarnation());
     assert_eq!(route.ways[0].standing, Standing::Ready);
-    let way = &route.ways[0].location;
-    let counted = report.ways.iter().find(|it| it.location == *way).unwrap();
+    let location = &route.ways[0].location;
+    let counted = report
+        .ways
+        .iter()
+        .find(|it| it.location == *location)
+        .unwrap();
     // The messages between the gateways use the same route, and count as well.
     assert!(counted.taken >= 5 && counted.failed == 0, "{counted:?}");
     let mut connected = report.neighbours.iter();
@@ -362,7 +366,7 @@ async fn the_gateway_reports_the_routes_of_letters_and_their_state() {
     let lost = rover.send(inform(&rover, arm.name(), "?")).await.unwrap();
     assert!(!lost.all_succeeded(), "{lost}");
     let report = ask().await.unwrap();
-    let counted = report.ways.iter().find(|it| it.location == *way);
+    let counted = report.ways.iter().find(|it| it.location == *location);
     let counted = counted.unwrap();
     assert!(counted.failed > 0, "{counted:?}");
     assert!(counted.last_error.is_some(), "{counted:?}");

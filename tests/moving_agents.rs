@@ -65,9 +65,9 @@ impl Host {
     }
 
     fn address(&self) -> String {
-        let mut ways = self.gateway.locations().into_iter();
-        let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
-        way.address().to_owned()
+        let mut locations = self.gateway.locations().into_iter();
+        let location = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
+        location.address().to_owned()
     }
 
     /// Registers the agent here as soon as this host knows that it has left the other host.

@@ -76,8 +76,8 @@ impl Host {
     }
 
     fn address(&self) -> String {
-        let mut ways = self.gateway.locations().into_iter();
-        let tcp = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
+        let mut locations = self.gateway.locations().into_iter();
+        let tcp = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
         tcp.address().to_owned()
     }
 
@@ -207,10 +207,10 @@ async fn fipa_services_gets_a_failure_for_a_letter_that_cannot_be_decoded() {
     assert_eq!(failure.receivers()[0].name(), "alice");
     let theirs = failure.encode(Representation::BitEfficient, Dialect::FipaServices);
     assert_eq!(letter.payload().to_bytes(), theirs.unwrap());
-    let told = String::from_utf8_lossy(failure.content().unwrap()).into_owned();
+    let text = String::from_utf8_lossy(failure.content().unwrap()).into_owned();
     assert!(
-        told.contains("cannot be decoded") && told.contains("bob"),
-        "{told}"
+        text.contains("cannot be decoded") && text.contains("bob"),
+        "{text}"
     );
     // A complete letter follows, and is the first that the agent receives.
     send_as_peer(recorded, &host.address()).await;
@@ -377,8 +377,8 @@ async fn fipa_services_gets_a_failure_in_its_dialect_for_a_letter_that_a_rule_re
     assert_eq!(failure.receivers()[0].name(), "alice");
     let theirs = failure.encode(Representation::BitEfficient, Dialect::FipaServices);
     assert_eq!(letter.payload().to_bytes(), theirs.unwrap());
-    let told = String::from_utf8_lossy(failure.content().unwrap()).into_owned();
-    assert!(told.contains("refused") && told.contains("bob"), "{told}");
+    let text = String::from_utf8_lossy(failure.content().unwrap()).into_owned();
+    assert!(text.contains("refused") && text.contains("bob"), "{text}");
     assert!(bob.try_receive().unwrap().is_none());
     drop(carol);
     host.gateway.close().await;

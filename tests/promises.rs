@@ -141,8 +141,11 @@ impl StreamRecord {
             match outcome {
                 Outcome::Delivered { via, attempts } => {
                     assert!(taken, "{number}: lost, but reported as delivered");
-                    let mut ways = attempts.iter().map(|it| it.via).chain([*via]);
-                    assert!(ways.all(|way| ORDER.contains(&way)), "{number}: {outcome}");
+                    let mut kinds = attempts.iter().map(|it| it.via).chain([*via]);
+                    assert!(
+                        kinds.all(|kind| ORDER.contains(&kind)),
+                        "{number}: {outcome}"
+                    );
                 }
                 Outcome::Failed {
                     reason: FailureReason::Unconfirmed,

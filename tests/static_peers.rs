@@ -28,9 +28,9 @@ fn config(set: &[String]) -> Config {
 }
 
 fn address(gateway: &Gateway) -> String {
-    let mut ways = gateway.locations().into_iter();
-    let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
-    way.address().to_owned()
+    let mut locations = gateway.locations().into_iter();
+    let location = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
+    location.address().to_owned()
 }
 
 fn knowing(name: &str, addresses: &[&str]) -> String {
@@ -57,13 +57,13 @@ async fn a_static_peer_is_connected_before_any_letter_and_again_after_its_restar
     // No process listens on the first address.
     let near = config(&[knowing("far", &["127.0.0.1:9", &at])]);
     let near = Gateway::open(&near).await.unwrap();
-    let far_is = |neighbours: Vec<Neighbour>, life| {
+    let far_is = |neighbours: Vec<Neighbour>, incarnation| {
         let mut all = neighbours.into_iter();
-        all.any(|it| it.entry.incarnation == life && it.peer.as_deref() == Some("far"))
+        all.any(|it| it.entry.incarnation == incarnation && it.peer.as_deref() == Some("far"))
     };
-    let first_life = far.incarnation();
+    let first_incarnation = far.incarnation();
     until("the far gateway is a neighbor", || {
-        far_is(near.neighbours(), first_life)
+        far_is(near.neighbours(), first_incarnation)
     })
     .await;
     // It accepts gateways that are not in its configuration.
@@ -77,10 +77,10 @@ async fn a_static_peer_is_connected_before_any_letter_and_again_after_its_restar
     let mut again = far_config.clone();
     again.transport.tcp.listen = vec![at];
     let far = Gateway::open(&again).await.unwrap();
-    let second_life = far.incarnation();
-    assert_ne!(first_life, second_life);
+    let second_incarnation = far.incarnation();
+    assert_ne!(first_incarnation, second_incarnation);
     until("its next incarnation is a neighbor", || {
-        far_is(near.neighbours(), second_life)
+        far_is(near.neighbours(), second_incarnation)
     })
     .await;
 }
@@ -169,10 +169,10 @@ async fn the_later_of_two_registrations_gets_a_failure_and_is_not_announced() {
     knows_both.discovery = config(&[knowing("far", &[&address(&far)])]).discovery;
     let near = Gateway::open(&knows_both).await.unwrap();
 
-    let told = later.receive().await.unwrap().message;
-    assert_eq!(*told.performative(), Performative::Failure);
-    assert_eq!(told.sender().unwrap().name(), near.name());
-    let content = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
+    let failure = later.receive().await.unwrap().message;
+    assert_eq!(*failure.performative(), Performative::Failure);
+    assert_eq!(failure.sender().unwrap().name(), near.name());
+    let content = String::from_utf8(failure.content().unwrap().to_vec()).unwrap();
     assert!(content.contains("registered earlier"), "{content}");
     // A third host does not see the later registration.
     let mut watcher = third_config.clone();

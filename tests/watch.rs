@@ -154,12 +154,12 @@ async fn each_letter_yields_one_event_with_its_outcome() {
         (&*failed.receiver, *reason),
         ("unknown", FailureReason::NoSuchAgent)
     );
-    let told = letter(&mut watcher).await;
+    let failure = letter(&mut watcher).await;
     assert_eq!(
-        *told.message.as_ref().unwrap().performative(),
+        *failure.message.as_ref().unwrap().performative(),
         Performative::Failure
     );
-    assert!(told.from_service && !failed.from_service);
+    assert!(failure.from_service && !failed.from_service);
 
     // A process that joins later is watched, too.
     let late = Domain::open(&config).await.unwrap();
@@ -349,7 +349,10 @@ async fn the_outcome_of_the_only_letter_of_a_process_is_seen() {
         let rover = here.register(&name).unwrap();
         let only = request(&rover, "arm", "only");
         let deliveries = rover.send_within(only, moment).await.unwrap();
-        let Outcome::Failed { reason: told, .. } = deliveries.0[0].outcome else {
+        let Outcome::Failed {
+            reason: expected, ..
+        } = deliveries.0[0].outcome
+        else {
             panic!("{deliveries}");
         };
         drop(rover);
@@ -364,7 +367,7 @@ async fn the_outcome_of_the_only_letter_of_a_process_is_seen() {
         let Fate::Settled(Outcome::Failed { reason, .. }) = &seen.fate else {
             panic!("{seen:?}");
         };
-        assert_eq!((&*seen.receiver, *reason), ("arm", told));
+        assert_eq!((&*seen.receiver, *reason), ("arm", expected));
     }
     drop(arm);
 }
@@ -390,9 +393,9 @@ async fn known(domain: &Domain, name: &str) {
 #[tokio::test(flavor = "multi_thread")]
 async fn between_hosts_each_watcher_sees_a_letter_once_with_its_gateway() {
     let (far, abroad, mut watching_far) = watched(None).await;
-    let mut ways = far.locations().into_iter();
-    let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
-    let at = way.address();
+    let mut locations = far.locations().into_iter();
+    let location = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
+    let at = location.address();
     let (near, at_home, mut watching_near) = watched(Some(at)).await;
     let rover = at_home.register("rover").unwrap();
     let arm = abroad.register("arm").unwrap();

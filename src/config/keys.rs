@@ -23,7 +23,7 @@ pub(super) struct Key {
     pub(super) shape: Shape,
     /// The allowed values; the end of a sentence that begins with "expected".
     pub(super) expected: &'static str,
-    pub(super) write: fn(&mut Config, &Toml) -> Result<(), Wrong>,
+    pub(super) write: fn(&mut Config, &Toml) -> Result<(), InvalidValue>,
     pub(super) read: fn(&Config) -> Value,
 }
 
@@ -32,7 +32,7 @@ pub(super) struct Map {
     pub(super) path: &'static [&'static str],
     pub(super) expected: &'static str,
     /// Adds an entry; the reader calls it once per name.
-    pub(super) write: fn(&mut Config, &str, &Toml) -> Result<(), Wrong>,
+    pub(super) write: fn(&mut Config, &str, &Toml) -> Result<(), InvalidValue>,
     pub(super) read: fn(&Config) -> Vec<(&str, Value)>,
 }
 
@@ -48,7 +48,7 @@ pub(super) enum Shape {
 
 /// The error if a value does not fit its key.
 #[derive(Debug)]
-pub(super) struct Wrong {
+pub(super) struct InvalidValue {
     /// The position in the document, if known more precisely than the position of the key.
     pub(super) span: Option<Range<usize>>,
     pub(super) reason: String,
@@ -300,7 +300,7 @@ pub(super) const MAPS: &[Map] = &[
     },
 ];
 
-fn access(sender: &str, value: &Toml) -> Result<AccessRule, Wrong> {
+fn access(sender: &str, value: &Toml) -> Result<AccessRule, InvalidValue> {
     let receivers = items(value, text)?;
     let sender = sender.to_owned();
     Ok(AccessRule { sender, receivers })
@@ -337,7 +337,7 @@ pub(super) fn quoted(value: &Toml) -> String {
     }
 }
 
-impl Wrong {
+impl InvalidValue {
     fn new(value: &Toml, reason: impl std::fmt::Display) -> Self {
         Self {
             span: value.span(),
@@ -354,84 +354,105 @@ impl Wrong {
     }
 }
 
-fn text(value: &Toml) -> Result<String, Wrong> {
-    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+fn text(value: &Toml) -> Result<String, InvalidValue> {
+    let text = value
+        .as_str()
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
     Ok(text.to_owned())
 }
 
-fn choice(value: &Toml) -> Result<Check, Wrong> {
-    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+fn choice(value: &Toml) -> Result<Check, InvalidValue> {
+    let text = value
+        .as_str()
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
     let mut all = Check::ALL.into_iter();
     all.find(|check| check.as_str() == text)
-        .ok_or_else(|| Wrong::new(value, "unknown choice"))
+        .ok_or_else(|| InvalidValue::new(value, "unknown choice"))
 }
 
-fn truth(value: &Toml) -> Result<bool, Wrong> {
-    value.as_bool().ok_or_else(|| Wrong::kind_of_value(value))
+fn truth(value: &Toml) -> Result<bool, InvalidValue> {
+    value
+        .as_bool()
+        .ok_or_else(|| InvalidValue::kind_of_value(value))
 }
 
-fn number(value: &Toml) -> Result<usize, Wrong> {
+fn number(value: &Toml) -> Result<usize, InvalidValue> {
     let number = value
         .as_integer()
-        .ok_or_else(|| Wrong::kind_of_value(value))?;
-    usize::try_from(number).map_err(|_| Wrong::new(value, "a negative number is not allowed"))
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
+    usize::try_from(number)
+        .map_err(|_| InvalidValue::new(value, "a negative number is not allowed"))
 }
 
 /// Reads a size: text with a unit, or a plain number of bytes.
-fn size(value: &Toml) -> Result<u64, Wrong> {
+fn size(value: &Toml) -> Result<u64, InvalidValue> {
     if let Some(bytes) = value.as_integer() {
-        let negative = |_| Wrong::new(value, "a negative number is not allowed");
+        let negative = |_| InvalidValue::new(value, "a negative number is not allowed");
         return u64::try_from(bytes).map_err(negative);
     }
-    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+    let text = value
+        .as_str()
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
     let size: Result<ByteSize, _> = text.parse();
     size.map(|size| size.as_u64())
-        .map_err(|_| Wrong::new(value, "not a size"))
+        .map_err(|_| InvalidValue::new(value, "not a size"))
 }
 
 /// Reads a duration: text with units, or zero without a unit.
-fn duration(value: &Toml) -> Result<Duration, Wrong> {
+fn duration(value: &Toml) -> Result<Duration, InvalidValue> {
     match value.as_integer() {
         Some(0) => return Ok(Duration::ZERO),
-        Some(_) => return Err(Wrong::new(value, "the unit is missing")),
+        Some(_) => return Err(InvalidValue::new(value, "the unit is missing")),
         None => {}
     }
-    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
-    humantime::parse_duration(text).map_err(|error| Wrong::new(value, error))
+    let text = value
+        .as_str()
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
+    humantime::parse_duration(text).map_err(|error| InvalidValue::new(value, error))
 }
 
-fn items<T>(value: &Toml, one: fn(&Toml) -> Result<T, Wrong>) -> Result<Vec<T>, Wrong> {
+fn items<T>(
+    value: &Toml,
+    one: fn(&Toml) -> Result<T, InvalidValue>,
+) -> Result<Vec<T>, InvalidValue> {
     let list = value
         .as_array()
-        .ok_or_else(|| Wrong::kind_of_value(value))?;
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
     list.iter().map(one).collect()
 }
 
-fn kinds(value: &Toml) -> Result<Vec<Kind>, Wrong> {
+fn kinds(value: &Toml) -> Result<Vec<Kind>, InvalidValue> {
     items(value, |value| {
-        let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+        let text = value
+            .as_str()
+            .ok_or_else(|| InvalidValue::kind_of_value(value))?;
         match text.parse() {
             Ok(kind) if !Kind::is_supported(kind) => {
                 let error = LocationError::UnknownKind(text.to_owned());
-                Err(Wrong::new(value, error))
+                Err(InvalidValue::new(value, error))
             }
-            parsed => parsed.map_err(|error| Wrong::new(value, error)),
+            parsed => parsed.map_err(|error| InvalidValue::new(value, error)),
         }
     })
 }
 
-fn location(value: &Toml) -> Result<Location, Wrong> {
-    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
-    text.parse().map_err(|error| Wrong::new(value, error))
+fn location(value: &Toml) -> Result<Location, InvalidValue> {
+    let text = value
+        .as_str()
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
+    text.parse()
+        .map_err(|error| InvalidValue::new(value, error))
 }
 
-fn addresses(value: &Toml) -> Result<Vec<String>, Wrong> {
+fn addresses(value: &Toml) -> Result<Vec<String>, InvalidValue> {
     items(value, |value| {
-        let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+        let text = value
+            .as_str()
+            .ok_or_else(|| InvalidValue::kind_of_value(value))?;
         if is_numeric_address(text) {
             Ok(text.to_owned())
         } else {
-            Err(Wrong::new(value, "not a numeric address with port"))
+            Err(InvalidValue::new(value, "not a numeric address with port"))
         }
     })
 }
@@ -463,20 +484,25 @@ pub(super) fn is_interface_name(text: &str) -> bool {
             .any(|c| c.is_whitespace() || c.is_control() || matches!(c, '/' | ':'))
 }
 
-fn ip(value: &Toml) -> Result<IpAddr, Wrong> {
-    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
-    text.parse().map_err(|error| Wrong::new(value, error))
+fn ip(value: &Toml) -> Result<IpAddr, InvalidValue> {
+    let text = value
+        .as_str()
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
+    text.parse()
+        .map_err(|error| InvalidValue::new(value, error))
 }
 
-fn interface(value: &Toml) -> Result<Interface, Wrong> {
-    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+fn interface(value: &Toml) -> Result<Interface, InvalidValue> {
+    let text = value
+        .as_str()
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
     if let Ok(address) = text.parse::<IpAddr>() {
         return Ok(Interface::Address(address));
     }
     if is_interface_name(text) {
         return Ok(Interface::Name(text.to_owned()));
     }
-    Err(Wrong::new(
+    Err(InvalidValue::new(
         value,
         "neither an interface name nor an address",
     ))

@@ -8,7 +8,7 @@ use std::path::Path;
 
 use toml_edit::{Array, Document, Item, Value as Toml};
 
-use super::keys::{KEYS, Key, MAPS, Map, Shape, Wrong};
+use super::keys::{InvalidValue, KEYS, Key, MAPS, Map, Shape};
 use super::{Config, Mistake, Origin, check};
 
 /// A configuration that is being read.
@@ -141,7 +141,7 @@ impl Reader {
         span: Option<Range<usize>>,
         item: &Item,
         expected: &str,
-        write: impl FnOnce(&mut Config, &Toml) -> Result<(), Wrong>,
+        write: impl FnOnce(&mut Config, &Toml) -> Result<(), InvalidValue>,
     ) {
         let written = match item.as_value() {
             // A source of higher priority has set the value; this one is only checked for mistakes.
@@ -149,7 +149,7 @@ impl Reader {
                 write(&mut Config::for_host(""), value)
             }
             Some(value) => write(&mut self.config, value),
-            None => Err(Wrong {
+            None => Err(InvalidValue {
                 span: None,
                 reason: "a table is not allowed here (a name with dots needs quotes)".to_owned(),
             }),
@@ -159,9 +159,9 @@ impl Reader {
                 let origin = layer.origin(span);
                 self.origins.entry(path.to_vec()).or_insert(origin);
             }
-            Err(wrong) => self.mistake(
-                layer.origin(wrong.span.or(span)),
-                format!("`{}` is invalid: {}", quoted_path(path), wrong.reason),
+            Err(invalid) => self.mistake(
+                layer.origin(invalid.span.or(span)),
+                format!("`{}` is invalid: {}", quoted_path(path), invalid.reason),
                 format!("expected {expected}"),
             ),
         }

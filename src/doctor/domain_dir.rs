@@ -22,7 +22,7 @@ fn directory(dir: &DomainDir) -> Check {
             );
             AREA.fine(CHECK, found)
         }
-        Err(error) => AREA.wrong(
+        Err(error) => AREA.problem(
             CHECK,
             Verdict::Bad,
             error.to_string(),

@@ -23,7 +23,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         match fipa_transport_net::reachable_at(listen) {
             Ok(addresses) => found.extend(addresses.into_iter().map(|it| (kind, it))),
             Err(error) => {
-                checks.push(AREA.wrong(
+                checks.push(AREA.problem(
                     LOCATIONS,
                     Verdict::Bad,
                     format!("transport.{kind}.listen cannot be used: {error}"),
@@ -52,7 +52,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     checks.push(match (open, has_address) {
         (false, _) => AREA.fine(LOCATIONS, format!("{texts}: reachable from this host only")),
         (true, true) => AREA.fine(LOCATIONS, texts),
-        (true, false) => AREA.wrong(
+        (true, false) => AREA.problem(
             LOCATIONS,
             Verdict::Doubtful,
             format!(

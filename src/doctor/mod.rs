@@ -85,7 +85,7 @@ impl Area {
         }
     }
 
-    pub(crate) fn wrong(
+    pub(crate) fn problem(
         &self,
         check: &'static str,
         verdict: Verdict,

@@ -22,7 +22,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         ..MdnsConfig::new(Mts::new("doctor", Incarnation::random()))
     });
     match probed {
-        Ok(found) if found.is_empty() => checks.push(AREA.wrong(
+        Ok(found) if found.is_empty() => checks.push(AREA.problem(
             MULTICAST,
             Verdict::Doubtful,
             "no interface is up among those that discovery.interfaces allows",
@@ -30,7 +30,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
              interfaces)",
         )),
         Ok(found) => checks.extend(found.iter().map(multicast)),
-        Err(error) => checks.push(AREA.wrong(
+        Err(error) => checks.push(AREA.problem(
             MULTICAST,
             Verdict::Bad,
             format!("cannot list the network interfaces of this machine: {error}"),
@@ -44,12 +44,12 @@ fn multicast(found: &Multicast) -> Check {
         interface, address, ..
     } = found;
     let at = format!("{interface} ({address})");
-    let wrong = |verdict, found: &str, advice: &str| {
-        AREA.wrong(MULTICAST, verdict, format!("{at}: {found}"), advice)
+    let problem = |verdict, found: &str, advice: &str| {
+        AREA.problem(MULTICAST, verdict, format!("{at}: {found}"), advice)
     };
     if let Some(error) = &found.error {
         let found = format!("multicast cannot be used: {error}");
-        return wrong(
+        return problem(
             Verdict::Bad,
             &found,
             "allow UDP port 5353 in the firewall and check the route of the multicast groups (`ip \
@@ -60,12 +60,12 @@ fn multicast(found: &Multicast) -> Check {
         return if found.heard_itself {
             AREA.fine(MULTICAST, format!("{at}: multicast is sent and received"))
         } else {
-            wrong(Verdict::Bad, NOT_EVEN_OWN, FIREWALL)
+            problem(Verdict::Bad, NOT_EVEN_OWN, FIREWALL)
         };
     }
     match (found.heard.len(), found.answered.len()) {
-        (0, 0) if !found.heard_itself => wrong(Verdict::Bad, NOT_EVEN_OWN, FIREWALL),
-        (0, 0) => wrong(
+        (0, 0) if !found.heard_itself => problem(Verdict::Bad, NOT_EVEN_OWN, FIREWALL),
+        (0, 0) => problem(
             Verdict::Doubtful,
             "multicast leaves this host, but no other host answered: none is running, or the network \
              filters multicast, as many Wi-Fi networks do",
@@ -74,7 +74,7 @@ fn multicast(found: &Multicast) -> Check {
                  {USE_STATIC}"
             ),
         ),
-        (0, _) => wrong(
+        (0, _) => problem(
             Verdict::Doubtful,
             &format!(
                 "outgoing multicast works, incoming does not: {} answered by unicast, and no multicast \
@@ -87,7 +87,7 @@ fn multicast(found: &Multicast) -> Check {
                  {USE_STATIC}"
             ),
         ),
-        (_, 0) => wrong(
+        (_, 0) => problem(
             Verdict::Doubtful,
             &format!(
                 "incoming multicast works, outgoing may not: packets of {} arrived, but no host \

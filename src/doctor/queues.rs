@@ -24,7 +24,7 @@ fn queues(config: &Config, available: Option<u64>) -> Check {
         ByteSize::b(bytes)
     );
     match available {
-        Some(available) if available < bytes => AREA.wrong(
+        Some(available) if available < bytes => AREA.problem(
             CHECK,
             Verdict::Doubtful,
             format!(

@@ -10,7 +10,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     if !config.security.keys.is_empty() {
         keys(config, checks);
     } else if config.security.insecure {
-        checks.push(AREA.wrong(
+        checks.push(AREA.problem(
             KEYS,
             Verdict::Doubtful,
             "there are none, and security.insecure is true: the gateway accepts every host that can \
@@ -28,7 +28,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
 
 #[cfg(not(feature = "secure"))]
 fn keys(_config: &Config, checks: &mut Vec<Check>) {
-    checks.push(AREA.wrong(
+    checks.push(AREA.problem(
         KEYS,
         Verdict::Bad,
         "security.keys is set, but this program was built without the feature `secure`",
@@ -50,14 +50,14 @@ fn keys(config: &Config, checks: &mut Vec<Check>) {
                 }
                 _ => "check the directory in security.keys; `fipa keys list` shows its contents",
             };
-            checks.push(AREA.wrong(KEYS, Verdict::Bad, error.to_string(), advice));
+            checks.push(AREA.problem(KEYS, Verdict::Bad, error.to_string(), advice));
             return;
         }
     };
     if credentials.trusted.is_empty() {
         let advice = "trust the certificates of the other hosts: `fipa keys trust FILE`";
         let found = "no other host is trusted, so every connection from another host is refused";
-        checks.push(AREA.wrong(KEYS, Verdict::Doubtful, found, advice));
+        checks.push(AREA.problem(KEYS, Verdict::Doubtful, found, advice));
     }
     let mut ending = |whose: &str, certificate: &Certificate, renew: &str| {
         let holding = Holding::of(certificate);
@@ -69,7 +69,7 @@ fn keys(config: &Config, checks: &mut Vec<Check>) {
             _ => Verdict::Bad,
         };
         let found = format!("the certificate of {whose} {problem}");
-        checks.push(AREA.wrong(KEYS, verdict, found, renew));
+        checks.push(AREA.problem(KEYS, verdict, found, renew));
     };
     ending("this host", &credentials.own, "`fipa keys renew`");
     for trusted in &credentials.trusted {

@@ -44,7 +44,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
             checks.push(leftovers(&found));
             checks.push(exposed(&found));
         }
-        Err(error) => checks.push(AREA.wrong(
+        Err(error) => checks.push(AREA.problem(
             "/dev/shm",
             Verdict::Bad,
             error.to_string(),
@@ -68,9 +68,9 @@ fn size(found: &Inspection, capacity: u64) -> Check {
                   lower transport.shm.capacity";
     // With less space than this no process can start.
     if found.free < 2 << 20 {
-        AREA.wrong(CHECK, Verdict::Bad, text, advice)
+        AREA.problem(CHECK, Verdict::Bad, text, advice)
     } else if found.free.saturating_add(found.used) < capacity {
-        AREA.wrong(CHECK, Verdict::Doubtful, text, advice)
+        AREA.problem(CHECK, Verdict::Doubtful, text, advice)
     } else {
         AREA.fine(CHECK, text)
     }
@@ -94,14 +94,14 @@ fn leftovers(found: &Inspection) -> Check {
     }
     let advice = "start any process of the domain, for example `fipa agents`: it removes the files \
                   within seconds; if they remain, look for processes of the domain that hang";
-    AREA.wrong(CHECK, Verdict::Doubtful, text, advice)
+    AREA.problem(CHECK, Verdict::Doubtful, text, advice)
 }
 
 fn exposed(found: &Inspection) -> Check {
     const CHECK: &str = "permissions in /dev/shm";
     match found.exposed.first() {
         None => AREA.fine(CHECK, "no file of this domain is accessible to other users"),
-        Some(file) => AREA.wrong(
+        Some(file) => AREA.problem(
             CHECK,
             Verdict::Bad,
             format!("{} is accessible to other users", file.display()),
@@ -120,8 +120,8 @@ fn descriptors() -> Check {
          {DESCRIPTORS_PER_PEER} more for each process that it exchanges letters with"
     );
     match peers {
-        0 => AREA.wrong(CHECK, Verdict::Bad, text, advice),
-        few if few < FEW_PEERS => AREA.wrong(CHECK, Verdict::Doubtful, text, advice),
+        0 => AREA.problem(CHECK, Verdict::Bad, text, advice),
+        few if few < FEW_PEERS => AREA.problem(CHECK, Verdict::Doubtful, text, advice),
         _ => AREA.fine(CHECK, text),
     }
 }
@@ -142,13 +142,13 @@ fn instances_left(limit: u64, one_more: bool) -> Check {
             "all {limit} are in use: a process without one polls the directory of the domain every \
              100 ms"
         );
-        return AREA.wrong(CHECK, Verdict::Doubtful, text, advice);
+        return AREA.problem(CHECK, Verdict::Doubtful, text, advice);
     }
     let text = format!("{limit}; every process of this user needs one");
     if limit >= FEW_INSTANCES {
         return AREA.fine(CHECK, text);
     }
-    AREA.wrong(CHECK, Verdict::Doubtful, text, advice)
+    AREA.problem(CHECK, Verdict::Doubtful, text, advice)
 }
 
 /// Checks systemd's RemoveIPC; returns `None` if systemd does not run.
@@ -161,7 +161,7 @@ fn remove_ipc(root: &Path, user: u32) -> Option<Check> {
         if !removes(root) {
             return AREA.fine(CHECK, "off");
         }
-        AREA.wrong(
+        AREA.problem(
             CHECK,
             Verdict::Doubtful,
             "on: systemd removes the shared memory of this user when the last session ends, even while \
