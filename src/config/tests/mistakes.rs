@@ -134,8 +134,8 @@ fn mistakes_are_reported_with_line_and_key() {
         ),
         (
             "[discovery]\ninterfaces = [\"eth0/1\"]\n",
-            "fipa.toml:2: `discovery.interfaces` is invalid: \"eth0/1\": neither the name of an \
-             interface nor an address; expected a list of interface names or addresses such as \
+            "fipa.toml:2: `discovery.interfaces` is invalid: \"eth0/1\": neither an interface \
+             name nor an address; expected a list of interface names or addresses such as \
              [\"wlan0\", \"10.0.0.7\"]",
         ),
         (
