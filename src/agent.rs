@@ -1,5 +1,6 @@
 //! An agent: a name that sends and receives messages.
 
+use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
@@ -16,7 +17,7 @@ use crate::endpoint::Endpoint;
 use crate::error::{ReceiveError, SendError};
 use crate::incoming::Incoming;
 
-/// An agent of this process. Deregistered when dropped.
+/// An agent of this process. Dropping it deregisters the agent.
 pub struct Agent {
     pub(crate) endpoint: Endpoint,
     pub(crate) demultiplexer: Demultiplexer,
@@ -24,7 +25,7 @@ pub struct Agent {
 }
 
 impl Domain {
-    /// Registers an agent with nothing but a name.
+    /// Registers an agent with a name and without further description.
     ///
     /// # Errors
     /// See [`register_with`](Self::register_with).
@@ -32,11 +33,11 @@ impl Domain {
         self.register_with(name, RegisterOptions::default())
     }
 
-    /// Registers an agent. From now on it is found by its name, here and, when a gateway is
-    /// running, on other hosts; its letters wait in its queue until it receives them.
+    /// Registers an agent. Afterwards other agents find it by its name on this host and, if a gateway
+    /// is running, on other hosts. Its letters wait in its queue until it receives them.
     ///
     /// # Errors
-    /// When somebody else has the name, or it is no name.
+    /// If the name is invalid or another agent has it, or if the directory cannot be written.
     pub fn register_with(
         &self,
         name: &str,
@@ -48,7 +49,7 @@ impl Domain {
             .map_err(|error: AgentIdError| RegisterError::Failed(Arc::new(error)))?;
         let incarnation = Incarnation::random();
         let name: Arc<str> = name.into();
-        // The queue first: once the name is known, letters come.
+        // The queue must exist before the name is visible, because letters can arrive from then on.
         service.mts.register(Arc::clone(&name), incarnation);
         let registration = Registration {
             agent_type: options.agent_type,
@@ -65,7 +66,7 @@ impl Domain {
                 })
             }
             Err(error) => {
-                // Nobody can have written to it.
+                // The name was never visible, so the queue holds no letters.
                 drop(service.mts.deregister(incarnation));
                 Err(error)
             }
@@ -74,56 +75,57 @@ impl Domain {
 }
 
 impl Agent {
-    /// The agent's name.
+    /// Returns the name of the agent.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.endpoint.name
     }
 
-    /// The agent identifier under which it sends.
+    /// Returns the agent identifier that the agent's messages have as their sender.
     #[must_use]
     pub fn id(&self) -> &AgentId {
         &self.endpoint.id
     }
 
-    /// This registration.
+    /// Returns the random identifier of this registration.
     #[must_use]
     pub fn incarnation(&self) -> Incarnation {
         self.endpoint.incarnation
     }
 
-    /// The domain it is registered in.
+    /// Returns the domain in which the agent is registered.
     #[must_use]
     pub fn domain(&self) -> &Domain {
         &self.endpoint.domain
     }
 
-    /// A text that nobody has used before, for a `conversation-id` or a `reply-with`: one word, made
-    /// of the random number of this registration and one that rises.
+    /// Returns a unique text for a `conversation-id` or a `reply-with`. It is one word that contains
+    /// the random identifier of this registration and a counter.
     #[must_use]
     pub fn unique_id(&self) -> String {
         self.endpoint.unique_id()
     }
 
-    /// A message from this agent, to be filled in.
+    /// Starts a message with this agent as its sender.
     pub fn message(&self, performative: Performative) -> MessageBuilder {
         Message::builder(performative).sender(self.endpoint.id.clone())
     }
 
-    /// An answer from this agent, as FIPA00037 has it: to whom the message wants answers, in the
-    /// same conversation, with a new `reply-with` of its own.
+    /// Starts an answer to a message, as FIPA00037 defines it: its receivers are the message's
+    /// `reply-to`, or else its sender. It belongs to the same conversation and has a new
+    /// `reply-with`.
     pub fn reply(&self, to: &Message, performative: Performative) -> MessageBuilder {
         self.endpoint.reply(to, performative)
     }
 
-    /// Sends a message to its receivers, each an agent's name or a pattern of names, and waits
-    /// until every receiver has an outcome: within the deadline of the configuration.
+    /// Sends a message to its receivers, each the name of an agent or a pattern of names. Waits until
+    /// every receiver has an outcome, at most for the deadline of the configuration (`mts.deadline`).
     ///
-    /// Letters leave in the order of the calls, whether the futures are awaited in that order or
-    /// not; a future that is dropped does not stop its letter.
+    /// Letters are sent in the order of the calls, independently of the order in which the futures are awaited. Dropping
+    /// the future does not stop the letter.
     ///
     /// # Errors
-    /// When the message cannot be sent at all. What happened on the way is in the outcomes.
+    /// If the message cannot be sent at all. Failures of delivery are in the outcomes.
     pub fn send(
         &self,
         message: Message,
@@ -131,7 +133,7 @@ impl Agent {
         self.send_within(message, self.endpoint.domain.inner.deadline)
     }
 
-    /// Sends a message with a deadline of its own.
+    /// Sends a message with the given deadline instead of the configured one.
     ///
     /// # Errors
     /// See [`send`](Self::send).
@@ -144,19 +146,19 @@ impl Agent {
         self.post(&message, letter, deadline)
     }
 
-    /// Memory for the content of a message to agents of this host, in shared memory where
-    /// possible: the content is written once, by the application, and the receivers read it in
-    /// place. A content of the message itself is ignored.
+    /// Loans memory of `len` bytes for the content of a message, in shared memory where possible. The
+    /// application writes the content once, and receivers on this host read it in place. Content of
+    /// `message` itself is ignored.
     ///
-    /// Where shared memory cannot be used (another host, no room), the memory is on the heap, and
-    /// so is short content for several receivers; [`send_loan`](Self::send_loan) works all the
-    /// same.
+    /// If shared memory cannot be used (a receiver on another host, not enough free memory), the
+    /// memory is on the heap. The same applies to short content for several receivers.
+    /// [`send_loan`](Self::send_loan) works in all cases.
     ///
     /// # Errors
-    /// When the message cannot be sent at all.
+    /// If the message cannot be sent at all.
     pub fn loan(&self, message: Message, len: usize) -> Result<Loan, SendError> {
         self.endpoint.check(&message)?;
-        // The lengths of all that stands around the content do not depend on when it is sent.
+        // The length of everything around the content does not depend on the time of sending.
         let empty = letter_around(&message, Bytes::new(), SystemTime::now())?;
         let (head, tail) = message.around_content(len).map_err(PostError::from)?;
         let receivers: Vec<&str> = message.receivers().iter().map(AgentId::name).collect();
@@ -170,7 +172,7 @@ impl Agent {
         Ok(Loan { message, content })
     }
 
-    /// Sends a message with the content that was filled in.
+    /// Sends the message of a loan with the content written into it.
     ///
     /// # Errors
     /// See [`send`](Self::send).
@@ -183,7 +185,7 @@ impl Agent {
         self.post(&message, letter, self.endpoint.domain.inner.deadline)
     }
 
-    /// The letter is on its way when this returns.
+    /// Sends a letter before it returns; the future yields the outcomes.
     fn post(
         &self,
         message: &Message,
@@ -194,33 +196,34 @@ impl Agent {
         async move { Ok(deliveries(sending?).await) }
     }
 
-    /// The next message for this agent; waits until there is one. Dropping the future loses
-    /// nothing.
+    /// Waits for the next message for this agent. Dropping the future loses no message.
     ///
     /// # Errors
-    /// When the domain was closed, or the letter that came holds no message that can be decoded.
+    /// If the domain is closed, if the message of the received letter cannot be decoded, or if it
+    /// violates its protocol and `monitor.check` is `enforce`.
     pub async fn receive(&self) -> Result<Incoming, ReceiveError> {
         self.endpoint.domain.inner.owner.check()?;
         self.demultiplexer.next_other(&self.endpoint).await
     }
 
-    /// The next message for this agent, if there is one now.
+    /// Returns the next message for this agent, if one is available now.
     ///
     /// # Errors
-    /// When the letter that came holds no message that can be decoded.
+    /// If the message of the received letter cannot be decoded, or if it violates its protocol and
+    /// `monitor.check` is `enforce`.
     pub fn try_receive(&self) -> Result<Option<Incoming>, ReceiveError> {
         self.endpoint.domain.inner.owner.check()?;
         self.endpoint.mts().drive();
         self.demultiplexer.other_now(&self.endpoint)
     }
 
-    /// Takes the name out of the directory, and returns the messages that have been delivered and
-    /// not received yet, in order. The name can be registered anew at once, here or on another
-    /// host: letters on their way follow it there, or fail.
+    /// Removes the name from the directory, and returns the messages that were delivered but not
+    /// received, in order. The name can be registered again at once, here or on another host. Letters
+    /// in transit follow the name there, or fail.
     ///
     /// # Errors
-    /// When the directory cannot be written; the agent receives nothing any more all the same, and
-    /// what was not received is dropped.
+    /// If the directory cannot be written. The agent then receives no further messages either, and
+    /// the messages that were not received are dropped.
     pub fn deregister(mut self) -> Result<Unread, DeregisterError> {
         self.registered = false;
         let unread = self.endpoint.deregister()?;
@@ -231,39 +234,57 @@ impl Agent {
     }
 }
 
-/// What an agent that was deregistered had not received, as [`Agent::receive`] would have told it.
+impl fmt::Debug for Agent {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Agent")
+            .field("name", &self.endpoint.name)
+            .field("incarnation", &self.endpoint.incarnation)
+            .finish_non_exhaustive()
+    }
+}
+
+/// The messages that a deregistered agent had not received, as [`Agent::receive`] would have returned
+/// them.
 pub type Unread = Vec<Result<Incoming, ReceiveError>>;
 
 impl Drop for Agent {
     fn drop(&mut self) {
-        // In a forked child it stays registered for the parent.
+        // In a forked child, the agent stays registered for the parent.
         if self.registered && self.endpoint.domain.inner.owner.is_this() {
             match self.endpoint.deregister() {
-                // The domain was closed before, and has taken the name with it.
+                // Closing the domain has already removed the name.
                 Ok(_) | Err(DeregisterError::Closed) => {}
                 Err(error) => {
-                    tracing::warn!(%error, agent = %self.endpoint.name, "not deregistered")
+                    tracing::warn!(%error, agent = %self.endpoint.name, "cannot deregister an agent")
                 }
             }
         }
     }
 }
 
-/// The digits of the payload's length are the one thing in an envelope that depends on the
-/// content: 20 more are the most there can be, two to a byte.
+/// Returns the length of the longest envelope. Only the digits of the payload length depend on the
+/// content: at most 20 more digits, encoded as two per byte.
 fn longest_envelope(letter: &Letter) -> usize {
     letter.envelope_len() + 10
 }
 
-/// A message whose content is being written in place.
+/// A message with loaned memory for its content.
 pub struct Loan {
     message: Message,
     content: Box<dyn LoanedContent>,
 }
 
 impl Loan {
-    /// The content, to be written. It starts out as anything.
+    /// Returns the memory of the content, to be written. Its initial bytes are arbitrary.
     pub fn content_mut(&mut self) -> &mut [u8] {
         self.content.content_mut()
+    }
+}
+
+impl fmt::Debug for Loan {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Loan")
+            .field("message", &self.message)
+            .finish_non_exhaustive()
     }
 }

@@ -1,7 +1,7 @@
-//! For processes without an async runtime: the same calls, blocking.
+//! Blocking calls for processes without an async runtime.
 //!
-//! A hidden thread takes letters in and answers for them while the application is busy with
-//! something else; it sleeps when there is nothing to do.
+//! A background thread receives and acknowledges letters while the application does other work. It
+//! sleeps when it has nothing to do.
 
 #[cfg(feature = "monitor")]
 mod protocol;
@@ -20,34 +20,35 @@ use crate::{AgentId, Config, Deliveries, Incoming, Loan, ReceiveError, SendError
 #[cfg(feature = "monitor")]
 pub use self::protocol::Side;
 
-/// Why a domain could not be joined.
+/// The error of [`Domain::open`].
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum OpenError {
-    /// The thread in the background could not be started.
-    #[error("cannot start a thread: {0}")]
+    /// The background thread cannot be started.
+    #[error("cannot start the background thread: {0}")]
     Thread(#[from] std::io::Error),
-    /// The domain could not be joined.
+    /// The domain cannot be joined.
     #[error(transparent)]
     Domain(#[from] crate::OpenError),
 }
 
-/// See [`crate::Domain`].
-#[derive(Clone)]
+/// The membership of this process in a domain; see [`crate::Domain`].
+#[derive(Debug, Clone)]
 pub struct Domain {
-    // Dropped before the runtime it needs.
+    // Declared first, because it must be dropped before the runtime that it uses.
     domain: crate::Domain,
     runtime: Background,
 }
 
-/// See [`crate::Agent`].
+/// An agent of this process; see [`crate::Agent`].
+#[derive(Debug)]
 pub struct Agent {
     agent: crate::Agent,
     runtime: Background,
 }
 
-/// The runtime with the hidden thread.
-#[derive(Clone)]
+/// The runtime of the background thread.
+#[derive(Debug, Clone)]
 struct Background {
     runtime: Arc<Runtime>,
     owner: Owner,
@@ -78,24 +79,24 @@ impl Deref for Background {
 impl Drop for Background {
     fn drop(&mut self) {
         if !self.owner.is_this() {
-            // In a forked child the thread is missing, and the runtime would wait for its end.
+            // A forked child does not have the thread, and the runtime would wait for its end forever.
             std::mem::forget(Arc::clone(&self.runtime));
         }
     }
 }
 
 impl Domain {
-    /// Joins the domain that the configuration names.
+    /// Joins the domain that the configuration names; see [`crate::Domain::open`].
     ///
     /// # Errors
-    /// See [`crate::Domain::open`].
+    /// If the background thread cannot be started, or as for [`crate::Domain::open`].
     pub fn open(config: &Config) -> Result<Self, OpenError> {
         let runtime = Background::start()?;
         let domain = runtime.block_on(crate::Domain::open(config))?;
         Ok(Self { domain, runtime })
     }
 
-    /// Registers an agent.
+    /// Registers an agent with a name and without further description.
     ///
     /// # Errors
     /// See [`crate::Domain::register_with`].
@@ -103,7 +104,7 @@ impl Domain {
         self.register_with(name, crate::RegisterOptions::default())
     }
 
-    /// Registers an agent.
+    /// Registers an agent; see [`crate::Domain::register_with`].
     ///
     /// # Errors
     /// See [`crate::Domain::register_with`].
@@ -119,7 +120,7 @@ impl Domain {
         })
     }
 
-    /// Who is there; see [`crate::Domain::directory`].
+    /// Returns the directory; see [`crate::Domain::directory`].
     #[must_use]
     pub fn directory(&self) -> &dyn Directory {
         self.domain.directory()
@@ -132,24 +133,24 @@ impl Domain {
 }
 
 impl Agent {
-    /// The agent's name.
+    /// Returns the name of the agent.
     #[must_use]
     pub fn name(&self) -> &str {
         self.agent.name()
     }
 
-    /// The agent identifier under which it sends.
+    /// Returns the agent identifier that the agent's messages have as their sender.
     #[must_use]
     pub fn id(&self) -> &AgentId {
         self.agent.id()
     }
 
-    /// A message from this agent, to be filled in.
+    /// Starts a message with this agent as its sender.
     pub fn message(&self, performative: Performative) -> MessageBuilder {
         self.agent.message(performative)
     }
 
-    /// An answer from this agent; see [`crate::Agent::reply`].
+    /// Starts an answer to a message; see [`crate::Agent::reply`].
     pub fn reply(&self, to: &Message, performative: Performative) -> MessageBuilder {
         self.agent.reply(to, performative)
     }
@@ -162,7 +163,7 @@ impl Agent {
         self.runtime.block_on(self.agent.send(message))
     }
 
-    /// Sends a message with a deadline of its own; see [`crate::Agent::send_within`].
+    /// Sends a message with the given deadline; see [`crate::Agent::send_within`].
     ///
     /// # Errors
     /// See [`crate::Agent::send`].
@@ -175,7 +176,7 @@ impl Agent {
             .block_on(self.agent.send_within(message, deadline))
     }
 
-    /// Memory for the content of a message; see [`crate::Agent::loan`].
+    /// Loans memory for the content of a message; see [`crate::Agent::loan`].
     ///
     /// # Errors
     /// See [`crate::Agent::loan`].
@@ -183,7 +184,7 @@ impl Agent {
         self.agent.loan(message, len)
     }
 
-    /// Sends a message with the content that was filled in; see [`crate::Agent::send_loan`].
+    /// Sends the message of a loan; see [`crate::Agent::send_loan`].
     ///
     /// # Errors
     /// See [`crate::Agent::send`].
@@ -191,7 +192,7 @@ impl Agent {
         self.runtime.block_on(self.agent.send_loan(loan))
     }
 
-    /// The next message for this agent; waits until there is one.
+    /// Waits for the next message for this agent.
     ///
     /// # Errors
     /// See [`crate::Agent::receive`].
@@ -199,7 +200,7 @@ impl Agent {
         self.runtime.block_on(self.agent.receive())
     }
 
-    /// The next message for this agent, or none when there was none for this long.
+    /// Waits for the next message for this agent; returns `None` if none arrives within `patience`.
     ///
     /// # Errors
     /// See [`crate::Agent::receive`].
@@ -212,7 +213,7 @@ impl Agent {
         })
     }
 
-    /// Takes the name out of the directory; see [`crate::Agent::deregister`].
+    /// Removes the name from the directory; see [`crate::Agent::deregister`].
     ///
     /// # Errors
     /// See [`crate::Agent::deregister`].

@@ -1,7 +1,7 @@
-//! Whether the agents of this process keep to their protocols: each agent's own monitor, and what
-//! the configuration wants done.
+//! Checks the messages of this process's agents against their protocols: one monitor per agent, and
+//! the reaction that the configuration demands.
 //!
-//! What must not live here: what is right and wrong (that is `fipa-monitor`).
+//! Not in this module: the rules of the protocols (`fipa-monitor`).
 
 use std::sync::Arc;
 use std::time::SystemTime;
@@ -14,7 +14,7 @@ use crate::config::{self, Check};
 use crate::error::{ProtocolError, ReceiveError, SendError};
 use crate::incoming::Incoming;
 
-/// What the configuration wants of all agents of this process.
+/// The settings of `[monitor]` and the known protocols, for all agents of this process.
 pub(crate) struct Rules {
     library: Arc<Library>,
     check: Check,
@@ -41,12 +41,12 @@ impl Rules {
         })
     }
 
-    /// The protocols that are known.
+    /// Returns the known protocols.
     pub(crate) fn library(&self) -> &Arc<Library> {
         &self.library
     }
 
-    /// The checks of an agent of this name.
+    /// Creates the checks of an agent.
     pub(crate) fn checks(&self, agent: &str) -> Checks {
         let monitored = (self.check != Check::Off).then(|| Monitored {
             monitor: Mutex::new(Monitor::agent(Arc::clone(&self.library), agent)),
@@ -76,7 +76,7 @@ impl Checks {
         match monitored.violation(message) {
             Some(violation) if monitored.enforce => Err(SendError::Violation(violation)),
             Some(violation) => {
-                tracing::warn!("sent although it breaks the protocol: {violation}");
+                tracing::warn!("sent a message that violates its protocol: {violation}");
                 Ok(())
             }
             None => Ok(()),
@@ -96,13 +96,14 @@ impl Checks {
         let Some(violation) = monitored.violation(&incoming.message) else {
             return Ok(incoming);
         };
-        // Two agents that do not understand each other must not go on answering so.
-        let last_word = [Performative::NotUnderstood, Performative::Failure];
+        // Not-understood and failure are never answered; otherwise two agents could answer each other
+        // without end.
+        let never_answered = [Performative::NotUnderstood, Performative::Failure];
         if monitored.answer
-            && !last_word.contains(incoming.message.performative())
+            && !never_answered.contains(incoming.message.performative())
             && let Some(answer) = answer(&incoming.message, violation.to_string())
         {
-            // For the monitor it ends the conversation, where the sender takes part in one.
+            // The answer ends the conversation in the monitor, if the sender takes part in one.
             let _ = monitored.violation(&answer);
         }
         if monitored.enforce {
@@ -112,7 +113,7 @@ impl Checks {
                 incoming,
             });
         }
-        tracing::warn!("received: {violation}");
+        tracing::warn!("received a message that violates its protocol: {violation}");
         incoming.violation = Some(violation);
         Ok(incoming)
     }

@@ -11,7 +11,9 @@ pub(crate) struct Rules;
 impl Rules {
     pub(crate) fn load(config: &config::Monitor) -> Result<Self, OpenError> {
         if config.check != Check::Off {
-            tracing::warn!("monitor.check does nothing: built without the feature \"monitor\"");
+            tracing::warn!(
+                "monitor.check has no effect: this program was built without the feature `monitor`"
+            );
         }
         Ok(Self)
     }

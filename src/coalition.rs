@@ -10,13 +10,14 @@ use fipa_transport::Incarnation;
 use crate::domain::{Domain, warn_of_name};
 use crate::{AgentId, RegisterOptions};
 
-/// A name of its own for several agents, wherever they are: a message to it reaches all members
-/// but its sender, each with an outcome of its own, or the leader only when there is one.
+/// One name for several agents on any hosts. If the coalition has a leader, a message to it reaches
+/// only the leader. Otherwise it reaches all members except its sender, with one outcome per member.
 ///
-/// Members are named, not held: one that moves to another host stays a member, and one that is
-/// not there fails as an unknown name does. A member may be a coalition itself, up to four deep.
+/// Members are listed by name. An agent that moves to another host stays a member, and a member that
+/// is not registered fails like an unknown name. A member may be a coalition itself, up to four
+/// levels deep.
 ///
-/// The coalition is this process's as long as it is held, and leaves the directory when dropped.
+/// This process owns the coalition. Dropping it removes the name from the directory.
 pub struct Coalition {
     domain: Domain,
     registration: Registration,
@@ -25,10 +26,11 @@ pub struct Coalition {
 }
 
 impl Domain {
-    /// Forms a coalition of these agents under a name of its own.
+    /// Forms a coalition of these agents.
     ///
     /// # Errors
-    /// When somebody else has the name, it is no name, or these cannot be its members.
+    /// If the name is invalid or taken, if the members or the leader are invalid, or if the directory
+    /// cannot be written.
     pub fn form<N: Into<Arc<str>>>(
         &self,
         name: &str,
@@ -57,23 +59,23 @@ impl Domain {
 }
 
 impl Coalition {
-    /// Its name.
+    /// Returns the name of the coalition.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.registration.name
     }
 
-    /// Who belongs to it, and who leads it.
+    /// Returns the members and the leader.
     #[must_use]
     pub fn members(&self) -> &Members {
         &self.members
     }
 
-    /// Has these members and this leader from now on.
+    /// Replaces the members and the leader.
     ///
     /// # Errors
-    /// When these cannot be its members, or the directory cannot be written. Nothing has changed
-    /// then.
+    /// If the members or the leader are invalid, or if the directory cannot be written. The coalition
+    /// is then unchanged.
     pub fn change<N: Into<Arc<str>>>(
         &mut self,
         members: impl IntoIterator<Item = N>,
@@ -83,15 +85,15 @@ impl Coalition {
         self.replace(members, Vec::new(), &[])
     }
 
-    /// Takes in all members of another coalition, whose name is gone. Nobody who watches sees both
-    /// or neither. The leader stays who it is.
+    /// Adds all members of another coalition and removes the name of that coalition, in one atomic
+    /// change of the directory. The leader of this coalition stays.
     ///
     /// # Errors
-    /// When they are too many together, or the directory cannot be written. The other coalition
-    /// comes back with the error, and nothing has changed.
+    /// If there are too many members together, or if the directory cannot be written. The error then
+    /// contains the other coalition, and both are unchanged.
     pub fn merge(&mut self, mut other: Self) -> Result<(), Box<(CoalitionError, Self)>> {
         let names = self.members.names().iter().chain(other.members.names());
-        // One of them may have been a member of the other.
+        // The other coalition may have been a member of this one.
         let gone = Arc::clone(&other.registration.name);
         let names = names.filter(|name| **name != gone).cloned();
         let members = Members::new(names, self.members.leader().cloned());
@@ -108,13 +110,12 @@ impl Coalition {
         }
     }
 
-    /// Makes these members, who belong to this coalition, a coalition with a name of its own.
-    /// Nobody who watches sees them in both or in neither. If the leader goes with them, those who
-    /// stay have none.
+    /// Moves these members to a new coalition, in one atomic change of the directory. If the leader is
+    /// among them, this coalition has no leader afterwards.
     ///
     /// # Errors
-    /// When one of them is no member, nobody would stay, somebody has the name, or the directory
-    /// cannot be written. Nothing has changed then.
+    /// If one of them is not a member, if no member would remain, if the name is invalid or taken, or
+    /// if the directory cannot be written. The coalition is then unchanged.
     pub fn split(
         &mut self,
         name: &str,
@@ -145,15 +146,15 @@ impl Coalition {
         })
     }
 
-    /// Takes the name out of the directory.
+    /// Removes the name from the directory.
     ///
     /// # Errors
-    /// When the directory cannot be written.
+    /// If the directory cannot be written.
     pub fn dissolve(mut self) -> Result<(), DeregisterError> {
         self.leave()
     }
 
-    /// Has these members, while others are formed and dissolved, in one go.
+    /// Replaces the members, and forms and removes other coalitions in the same atomic change.
     fn replace(
         &mut self,
         members: Members,
@@ -186,13 +187,13 @@ impl Coalition {
 
 impl Drop for Coalition {
     fn drop(&mut self) {
-        // In a forked child it stays formed for the parent.
+        // In a forked child, the coalition still belongs to the parent.
         if self.formed && self.domain.inner.owner.is_this() {
             match self.leave() {
-                // The domain was closed before, and has taken the name with it.
+                // Closing the domain has already removed the name.
                 Ok(()) | Err(DeregisterError::Closed) => {}
                 Err(error) => {
-                    tracing::warn!(%error, coalition = self.name(), "not dissolved");
+                    tracing::warn!(%error, coalition = self.name(), "cannot remove a coalition");
                 }
             }
         }
@@ -208,17 +209,17 @@ impl std::fmt::Debug for Coalition {
     }
 }
 
-/// Why a coalition was not formed or changed.
+/// The error of forming or changing a coalition.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CoalitionError {
-    /// These cannot be its members.
+    /// The members or the leader are invalid.
     #[error(transparent)]
     Members(#[from] MembersError),
-    /// Who was to part does not belong to it.
-    #[error("{0:?} is no member of this coalition")]
+    /// An agent to be split off is not a member. Holds its name.
+    #[error("{0:?} is not a member of this coalition")]
     NoMember(String),
-    /// The directory does not take it.
+    /// The directory refuses the coalition.
     #[error(transparent)]
     Register(#[from] RegisterError),
 }

@@ -1,57 +1,57 @@
-//! The configuration: what one TOML file, `--set key=value` and the defaults say together.
+//! The configuration: the values of one TOML file, `--set key=value` arguments and the defaults.
 //!
-//! * [`Sources`] is where it is looked for; [`Config::load`] reads it, checks it and returns the
-//!   values. [`Effective`] is the same with the origin of every value, for `fipa config show`.
-//! * [`ConfigError`] says what is wrong: all mistakes at once, each with file, line and key, what
-//!   is allowed there and, for an unknown key, the nearest known one.
+//! * [`Sources`] are the places to search. [`Config::load`] reads and checks the configuration and
+//!   returns the values. [`Effective`] also has the origin of every value, for `fipa config show`.
+//! * [`ConfigError`] lists all mistakes at once, each with file, line, key and the allowed values. For
+//!   an unknown key it suggests the nearest known one.
 //!
-//! The first of these files counts, and no other is read: the one given with `--config`, the one
-//! named by `$FIPA_CONFIG`, `./fipa.toml`, `~/.config/fipa/fipa.toml`. What no file says has its
-//! default:
+//! Only the first of these files that exists is read: the one given with `--config`, the one named by
+//! `$FIPA_CONFIG`, `./fipa.toml`, `~/.config/fipa/fipa.toml`. A named file that does not exist is an
+//! error. A key that is not set has its default:
 //!
 //! ```toml
-//! domain = "default"                  # processes of one domain on one host see each other
+//! domain = "default"                  # processes of one domain on one host find each other
 //! [mts]
 //! name = "sherpa-mts"                 # default: <host name>-mts
-//! transports = ["shm", "unix", "tcp"] # order of preference; what is not listed is off
-//! deadline = "5s"                     # per letter, unless the letter says otherwise
-//! queue = 256                         # letters waiting per agent before senders are held back
+//! transports = ["shm", "unix", "tcp"] # in order of preference; others are off
+//! deadline = "5s"                     # per letter, unless the call sets another one
+//! queue = 256                         # waiting letters per agent before senders have to wait
 //! queue_bytes = "64MiB"               # the same in bytes; also per sender and receiver at gateways
-//! [routes]                            # exceptions by receiver name or pattern, first match counts
+//! [routes]                            # transports by receiver name or pattern; first match counts
 //! "camera_.*" = ["shm"]               # (none by default)
 //! [transport.shm]
 //! capacity = "256MiB"                 # of this domain on this host
 //! max_letter = "64MiB"
-//! spin = "50us"                       # before blocking; 0 on battery
+//! spin = "50us"                       # time of polling before blocking; 0 saves battery
 //! [transport.tcp]
-//! listen = ["127.0.0.1:0"]            # of the gateway; loopback unless the owner opens it
-//! processes = false                   # true: other processes of the host use TCP, too
+//! listen = ["127.0.0.1:0"]            # of the gateway; other than loopback needs keys or insecure
+//! processes = false                   # true: processes of one host use TCP among each other, too
 //! [transport.udp]
 //! listen = ["127.0.0.1:0"]            # as for tcp; letters that fit one datagram
 //! [transport.quic]
-//! listen = ["127.0.0.1:0"]            # as for tcp; always encrypted, needs security.keys
+//! listen = ["127.0.0.1:0"]            # as for tcp; always encrypted; needs security.keys
 //! [discovery]
 //! mdns = true
-//! interfaces = []                     # empty: all that listen; names or addresses otherwise
+//! interfaces = []                     # names or addresses; empty: all
 //! static = { crex-mts = ["tcp://10.0.0.2:7788"] }   # (none by default)
 //! [security]
-//! keys = ""                           # directory of `fipa keys init`; empty: nothing is encrypted
-//! insecure = false                    # open to the network without keys
-//! loopback = false                    # with keys: peers on this host prove who they are, too
-//! old_peers = []                      # with keys: addresses of old peers, which cannot
+//! keys = ""                           # directory of `fipa keys init`; empty: no encryption
+//! insecure = false                    # true: listen on the network without keys
+//! loopback = false                    # with keys: peers on loopback prove their identity, too
+//! old_peers = []                      # with keys: addresses of legacy peers, which have no keys
 //! [access]
-//! rate = 0                            # letters a second of one sender; 0: any number
-//! allow = { "rover_.*" = ["arm performative=request"] }   # nothing else passes (none by default)
-//! deny = { ".*" = ["brake"] }         # comes before what is allowed (none by default)
+//! rate = 0                            # letters per second of one sender; 0: no limit
+//! allow = { "rover_.*" = ["arm performative=request"] }   # all others are refused (none by default)
+//! deny = { ".*" = ["brake"] }         # takes precedence over `allow` (none by default)
 //! [monitor]
-//! check = "off"                       # or warn, enforce: whether agents keep to their protocols
-//! answer = false                      # whether what breaks one is answered with not-understood
-//! protocols = []                      # SCXML files, beyond the protocols of FIPA
+//! check = "off"                       # or "warn", "enforce": reaction to protocol violations
+//! answer = false                      # true: violations are answered with not-understood
+//! protocols = []                      # SCXML files with further protocols
 //! ```
 //!
-//! What must not live here: opening anything that the configuration names. A transport that this
-//! process was built without (`tcp` without the feature `net`) is no mistake here, because one
-//! file serves all processes of a robot.
+//! Not in this module: opening anything that the configuration names. A transport that this process
+//! was built without (`tcp` without the feature `net`) is not a mistake, because one file serves all
+//! processes of a robot.
 
 mod changes;
 mod check;
@@ -77,29 +77,30 @@ pub use sources::Sources;
 
 use crate::access;
 
-/// What the owner of a robot chooses, complete and checked.
+/// A complete and checked configuration.
 ///
-/// A program that changes a value after loading calls [`Config::check`] before it uses it.
+/// A program that changes a value after loading must call [`Config::check`] before it uses the
+/// configuration.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Config {
-    /// `domain`: processes of one domain on one host see each other. Part of paths and of the
-    /// names of shared memory: 1 to 32 of `A-Z a-z 0-9 _ -`.
+    /// `domain`: the domain. Processes of one domain on one host find each other. Part of paths and of
+    /// the names of shared memory: 1 to 32 of `A-Z a-z 0-9 _ -`.
     pub domain: String,
     /// `[mts]`: the message transport service of this process.
     pub mts: Mts,
-    /// `[routes]`: other orders of transports for some receivers. The first that matches counts;
-    /// those given with `--set` stand before those of the file.
+    /// `[routes]`: the orders of transports for particular receivers. The first match counts; entries
+    /// of `--set` precede those of the file.
     pub routes: Vec<Route>,
-    /// `[transport.*]`: the transports themselves.
+    /// `[transport.*]`: the settings of the transports.
     pub transport: Transports,
-    /// `[discovery]`: how other hosts are found.
+    /// `[discovery]`: the discovery of other hosts.
     pub discovery: Discovery,
-    /// `[security]`: who is let in from other hosts.
+    /// `[security]`: the keys, and the limits for peers on other hosts.
     pub security: Security,
-    /// `[access]`: who may send what to whom.
+    /// `[access]`: the rules for senders and receivers of letters.
     pub access: Access,
-    /// `[monitor]`: whether agents keep to their protocols.
+    /// `[monitor]`: the checks of messages against their protocols.
     pub monitor: Monitor,
 }
 
@@ -109,16 +110,16 @@ pub struct Config {
 pub struct Mts {
     /// `name`: the name of the gateway, 1 to 255 bytes without control characters.
     pub name: String,
-    /// `transports`: in order of preference, none twice; what is not listed is off.
+    /// `transports`: the transports in order of preference, none twice; others are off.
     pub transports: Vec<Kind>,
-    /// `deadline`: of a letter that does not say its own; more than 0, at most 1 hour.
+    /// `deadline`: the deadline of letters that are sent without one; more than 0, at most 1 hour.
     pub deadline: Duration,
-    /// `queue`: letters that wait in the queue of one agent before its senders are held back, 1 to
-    /// 65,536.
+    /// `queue`: maximum number of letters that wait in the queue of one agent, 1 to 65,536. Beyond it
+    /// their senders wait.
     pub queue: usize,
-    /// `queue_bytes`: bytes of letters that wait in the queue of one agent, and of letters from one
-    /// sender to one receiver that wait in a process or gateway, before their senders are held
-    /// back. One letter is always taken. 64 KiB to 1 TiB.
+    /// `queue_bytes`: maximum number of bytes of letters that wait in the queue of one agent, and of
+    /// letters from one sender to one receiver that wait in a process or gateway, 64 KiB to 1 TiB.
+    /// Beyond it their senders wait. An empty queue accepts a letter of any size.
     pub queue_bytes: u64,
 }
 
@@ -126,11 +127,10 @@ pub struct Mts {
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Route {
-    /// A name, or a pattern matched against the whole of a name: a [`fipa_sds::Pattern`] that
-    /// compiles.
+    /// The name of a receiver, or a [`fipa_sds::Pattern`] that is matched against the whole name.
     pub receiver: String,
-    /// The order for these receivers. What [`Mts::transports`] leaves out is off here too; at
-    /// least one of them is on.
+    /// The order of transports for these receivers. Transports that are not in [`Mts::transports`] are
+    /// ignored; at least one must be in it.
     pub transports: Vec<Kind>,
 }
 
@@ -152,12 +152,12 @@ pub struct Transports {
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Shm {
-    /// `capacity`: bytes of shared memory that this domain may take on this host, 1 MiB to 1 TiB.
+    /// `capacity`: maximum number of bytes of shared memory of this domain on this host, 1 MiB to
+    /// 1 TiB.
     pub capacity: u64,
-    /// `max_letter`: bytes of the largest letter, 4 KiB to the capacity.
+    /// `max_letter`: maximum size of a letter in bytes, 4 KiB to the capacity.
     pub max_letter: u64,
-    /// `spin`: how long a receiver spins before it blocks, at most 1 s. Zero: not at
-    /// all.
+    /// `spin`: time that a receiver polls before it blocks, at most 1 s. Zero turns polling off.
     pub spin: Duration,
 }
 
@@ -165,96 +165,98 @@ pub struct Shm {
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Tcp {
-    /// `listen`: where the gateway listens; see [`Listen::listen`].
+    /// `listen`: the addresses on which the gateway listens; see [`Listen::listen`].
     pub listen: Vec<String>,
-    /// `processes`: whether processes that are not the gateway use TCP among each other, too. They
-    /// listen on a port of 127.0.0.1 that the system chooses, where every user of the host can
+    /// `processes`: whether processes other than the gateway use TCP among each other, too. They
+    /// listen on a port of 127.0.0.1 that the system chooses, to which every user of the host can
     /// connect.
     pub processes: bool,
 }
 
-/// `[transport.udp]` and `[transport.quic]`: where a network transport of the gateway listens.
+/// `[transport.udp]` and `[transport.quic]`: a network transport of the gateway.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Listen {
     /// `listen`: numeric addresses with port, for example `127.0.0.1:0`, `[::1]:7788` or
-    /// `[fe80::1%eth0]:7788`. Port 0 lets the system choose. Empty: nothing listens, and peers
-    /// answer over the connections made from here.
+    /// `[fe80::1%eth0]:7788`. Port 0 lets the system choose. If the list is empty, the gateway does
+    /// not listen, and peers send over the connections that the gateway has opened.
     ///
-    /// Text, because the scope of an interface that is not there yet has no number.
+    /// The addresses are text, because an interface that does not exist yet has no numeric scope.
     pub listen: Vec<String>,
 }
 
-/// `[discovery]`: how other hosts are found.
+/// `[discovery]`: the discovery of other hosts.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Discovery {
-    /// `mdns`: whether agents are announced and looked for by multicast DNS.
+    /// `mdns`: whether the gateway announces and discovers agents by multicast DNS.
     pub mdns: bool,
-    /// `interfaces`: where; empty: on all.
+    /// `interfaces`: the network interfaces for multicast DNS; empty: all.
     pub interfaces: Vec<Interface>,
-    /// `static`: gateways, and agents of old peers, known without being found.
+    /// `static`: gateways, and agents of legacy peers, that are known without discovery.
     pub peers: Vec<Peer>,
 }
 
-/// One line of `discovery.static`: who is known without being found. A gateway, or an agent of an
-/// old peer when what is understood at its locations says so.
+/// One line of `discovery.static`: a peer that is known without discovery. It is a gateway, or an
+/// agent of a legacy peer if its locations state the dialect of a legacy peer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Peer {
     /// The name of the gateway, or of the agent.
     pub name: String,
-    /// Where it listens, in order of preference; at least one.
+    /// The locations at which it listens, in order of preference; at least one.
     pub locations: Vec<Location>,
 }
 
-/// `[security]`: who is let in from other hosts. Without keys everybody who can connect is, so
-/// gateways listen on loopback only, unless the owner wants it otherwise.
+/// `[security]`: the keys, and the limits for peers on other hosts. Without keys the gateway accepts
+/// every peer that can connect. It then listens only on loopback addresses, unless `insecure` is true.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Security {
-    /// `keys`: the directory with this host's keys and the certificates that it trusts; empty: none.
+    /// `keys`: the directory with the keys of this host and the certificates that it trusts; empty:
+    /// no keys.
     pub keys: String,
-    /// `insecure`: whether the gateway may be open to the network without keys.
+    /// `insecure`: whether the gateway may listen on the network without keys.
     pub insecure: bool,
-    /// `loopback`: whether peers on loopback addresses have to prove who they are, too.
+    /// `loopback`: whether peers on loopback addresses must prove their identity, too.
     pub loopback: bool,
-    /// `old_peers`: addresses of old peers, which cannot prove who they are; letters in their
-    /// dialects are exchanged with them nevertheless. At most 64.
+    /// `old_peers`: addresses of legacy peers, which cannot prove their identity. The gateway exchanges
+    /// letters in their dialects with them despite its keys. At most 64.
     pub old_peers: Vec<IpAddr>,
-    /// `peer_connections`: how many connections of each transport the peers with one certificate, or the
-    /// peers at one address without keys, may open. This and the next two go for other hosts, and for loopback addresses where those have to prove
-    /// who they are, too.
+    /// `peer_connections`: maximum number of connections of each transport from the peers with one
+    /// certificate or, without keys, from one address. This and the next two limits apply to other
+    /// hosts, and to loopback addresses if those must prove their identity.
     pub peer_connections: usize,
-    /// `peer_letters`: letters a second that each transport takes from one address, as many of which may
-    /// come at once; what is more waits at its sender. 0: any number.
+    /// `peer_letters`: maximum number of letters per second that each transport accepts from one
+    /// address; also the maximum burst. Further letters wait at the sender. 0: no limit.
     pub peer_letters: usize,
-    /// `peer_bytes`: the same of bytes.
+    /// `peer_bytes`: maximum number of bytes per second that each transport accepts from one address;
+    /// also the maximum burst. 0: no limit.
     pub peer_bytes: u64,
 }
 
-/// `[access]`: who may send what to whom. The gateway keeps to it for what it takes, and every process
-/// for what its own agents get. A rule that denies comes before those that allow; when there are any that
-/// allow, nothing else passes.
+/// `[access]`: the rules for senders and receivers of letters. The gateway applies them to the letters
+/// that it accepts, and every process to the letters for its own agents. `deny` takes precedence over
+/// `allow`. If there are `allow` rules, letters that match none of them are refused.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Access {
-    /// `rate`: letters a second that one sender may send, as many of which may come at once; 0: any
-    /// number. At most 1,000,000.
+    /// `rate`: maximum number of letters per second of one sender, at most 1,000,000; also the maximum
+    /// burst. 0: no limit.
     pub rate: usize,
-    /// `allow`: what may be sent, by sender. At most 256 lines.
+    /// `allow`: the allowed letters, by sender. At most 256 lines.
     pub allow: Vec<AccessRule>,
-    /// `deny`: what may not be sent. At most 256 lines.
+    /// `deny`: the refused letters, by sender. At most 256 lines.
     pub deny: Vec<AccessRule>,
 }
 
 /// One line of `access.allow` or `access.deny`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AccessRule {
-    /// The sender's name, or a pattern matched against the whole of it.
+    /// The name of the sender, or a pattern that is matched against the whole name.
     pub sender: String,
-    /// Receivers: a name or pattern each, and behind it perhaps `performative=NAME,…` and
-    /// `protocol=NAME,…`, when the rule is about those only.
+    /// The receivers. Each is a name or pattern, optionally followed by `performative=NAME,…` and
+    /// `protocol=NAME,…`, which restrict the rule to these.
     pub receivers: Vec<String>,
 }
 
@@ -274,37 +276,36 @@ impl Access {
     }
 }
 
-/// `[monitor]`: whether agents keep to their protocols. Without the feature `monitor` nothing is
-/// checked.
+/// `[monitor]`: the checks of messages against their protocols. They need the feature `monitor`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Monitor {
-    /// `check`: what is done about messages that violate their protocol.
+    /// `check`: the reaction to messages that violate their protocol.
     pub check: Check,
-    /// `answer`: whether a message that came and violates its protocol is answered with
+    /// `answer`: whether a received message that violates its protocol is answered with
     /// `not-understood`.
     pub answer: bool,
-    /// `protocols`: paths of SCXML files with protocols beyond FIPA's, or in their place; at most
-    /// 128.
+    /// `protocols`: paths of SCXML files with further protocols, or with replacements for protocols of
+    /// FIPA; at most 128.
     pub protocols: Vec<String>,
 }
 
-/// What is done about messages that violate their protocol.
+/// The reaction to messages that violate their protocol.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Check {
-    /// Nothing is checked.
+    /// Messages are not checked.
     Off,
-    /// They are logged; those that came say so.
+    /// Violations are logged, and received messages carry them (`Incoming::violation`).
     Warn,
-    /// They are not sent; those that came are handed over as errors.
+    /// A message with a violation is not sent, and a received one is returned as an error.
     Enforce,
 }
 
 impl Check {
     pub(crate) const ALL: [Self; 3] = [Self::Off, Self::Warn, Self::Enforce];
 
-    /// As it stands in the file.
+    /// Returns the value as written in the file.
     #[must_use]
     pub fn as_str(self) -> &'static str {
         match self {
@@ -318,9 +319,9 @@ impl Check {
 /// A network interface, as the configuration names it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Interface {
-    /// By its name, for example `wlan0`.
+    /// The name of the interface, for example `wlan0`.
     Name(String),
-    /// By an address it has.
+    /// An address of the interface.
     Address(IpAddr),
 }
 
@@ -337,12 +338,12 @@ impl Config {
     /// Finds, reads and checks the configuration.
     ///
     /// # Errors
-    /// When a file cannot be read, or with all mistakes that were found.
+    /// If a file cannot be read, or if the configuration has mistakes; the error lists all of them.
     pub fn load(sources: &Sources) -> Result<Self, ConfigError> {
         Effective::load(sources).map(Effective::into_config)
     }
 
-    /// The defaults on the host of this name.
+    /// Returns the defaults for a host with this name.
     #[must_use]
     pub fn for_host(host_name: &str) -> Self {
         let loopback = Listen {
@@ -394,11 +395,10 @@ impl Config {
         }
     }
 
-    /// Checks what [`Config::load`] has checked already, for a program that changed something
-    /// since.
+    /// Checks the configuration again, for a program that has changed it since [`Config::load`].
     ///
     /// # Errors
-    /// With all mistakes, by key.
+    /// If the configuration has mistakes; the error lists all of them.
     pub fn check(&self) -> Result<(), ConfigError> {
         let found = check::findings(self);
         if found.is_empty() {

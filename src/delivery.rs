@@ -14,7 +14,7 @@ pub struct Deliveries(pub Vec<Delivery>);
 /// The outcome of a message at one receiver.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Delivery {
-    /// The receiver's name, or the name or pattern that matched no agent.
+    /// The name of the receiver, or the name or pattern that matched no agent.
     pub receiver: Arc<str>,
     /// The outcome.
     pub outcome: Outcome,

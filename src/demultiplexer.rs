@@ -62,7 +62,7 @@ impl Demultiplexer {
         self.next(endpoint, Reader::Others).await
     }
 
-    /// The next message of no led conversation, if there is one now.
+    /// Returns the next message of no led conversation, if one is available now.
     pub(crate) fn other_now(&self, endpoint: &Endpoint) -> Result<Option<Incoming>, ReceiveError> {
         loop {
             if let Some(set_aside) = self.state.lock().take(Reader::Others) {
@@ -85,7 +85,7 @@ impl Demultiplexer {
 
     async fn next(&self, endpoint: &Endpoint, reader: Reader<'_>) -> Received {
         loop {
-            // Before the check, so that a later change is noticed.
+            // Created before the check, so that no change after the check is missed.
             let changed = self.changed.notified();
             let room = {
                 let mut state = self.state.lock();

@@ -1,5 +1,6 @@
-//! A process's membership in a domain.
+//! The membership of a process in a domain.
 
+use std::fmt;
 use std::sync::Arc;
 
 use fipa_acl::{Dialect, Message, Performative, Representation};
@@ -12,15 +13,16 @@ use crate::routes::{self, Report};
 use crate::service::{Role, Service};
 use crate::{AgentId, Config};
 
-/// This process's membership in a domain: processes of one domain on one host see each other.
+/// The membership of this process in a domain. The processes of one domain on one host find each
+/// other.
 ///
-/// Cheap to clone; ends when [`close`](Self::close) is called or the last clone and the last
-/// agent are dropped.
+/// A clone is cheap. The membership ends when [`close`](Self::close) is called, or when the last clone
+/// and the last agent are dropped.
 ///
 /// A child process that is forked without exec cannot use its parent's membership: calls fail with
-/// [`Forked`](crate::Forked), and dropping releases nothing. The child can open a domain of its own,
-/// on a runtime of its own. Until it ends or calls exec, it keeps its parent's locks, so that other
-/// processes notice the parent's end only afterwards.
+/// [`Forked`](crate::Forked), and dropping releases nothing. The child can open a domain of its own
+/// on a runtime of its own. Until it ends or calls exec, it keeps its parent's locks, so other
+/// processes detect the end of the parent only afterwards.
 #[derive(Clone)]
 pub struct Domain {
     pub(crate) inner: Arc<Inner>,
@@ -35,28 +37,37 @@ pub(crate) struct Inner {
 
 impl Drop for Inner {
     fn drop(&mut self) {
-        // In a forked child everything stays the parent's.
+        // In a forked child, everything still belongs to the parent.
         if self.owner.is_this() {
             self.service.abort();
         }
     }
 }
 
-/// What an agent says about itself when registering.
+impl fmt::Debug for Domain {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Domain")
+            .field("mts", &self.inner.service.own)
+            .finish_non_exhaustive()
+    }
+}
+
+/// The description of an agent in the directory.
 #[derive(Debug, Clone, Default)]
 pub struct RegisterOptions {
-    /// What kind of agent it is, for searches; may be empty.
+    /// The kind of agent, for searches; may be empty.
     pub agent_type: String,
     /// Free text; may be empty.
     pub description: String,
 }
 
 impl Domain {
-    /// Joins the domain that the configuration names. Must be called within a tokio runtime,
-    /// which then does the work in the background.
+    /// Joins the domain that the configuration names. Must be called within a tokio runtime, which
+    /// then runs the background tasks.
     ///
     /// # Errors
-    /// When the configuration, the domain's directory or every transport cannot be used.
+    /// If the configuration is invalid, if the directory of the domain cannot be used, or if no
+    /// transport can be used.
     pub async fn open(config: &Config) -> Result<Self, OpenError> {
         let rules = Rules::load(&config.monitor)?;
         let host = gethostname::gethostname();
@@ -66,9 +77,9 @@ impl Domain {
             Role {
                 name: name.into(),
                 gateway: false,
-                // Another way than shared memory between processes of this host; never further.
+                // Letters from other hosts reach this process only through the gateway.
                 contacts: None,
-                // What stays on this host needs no proof.
+                // Connections within this host need no proof of identity.
                 #[cfg(feature = "secure")]
                 security: None,
                 view: &|host, _| Ok(host),
@@ -85,23 +96,24 @@ impl Domain {
         })
     }
 
-    /// Who is there: the agents of this host and, when a gateway is running, those it knows of.
+    /// Returns the directory: the agents of this host and, if a gateway is running, the agents that it
+    /// has discovered on other hosts.
     #[must_use]
     pub fn directory(&self) -> &dyn Directory {
         &*self.inner.service.host
     }
 
-    /// Which way letters from this process to the agents that match would go now, and what has
-    /// happened on each of its ways. For agents of other hosts that is the way to the gateway; see
-    /// [`routes::of_gateway`](crate::routes::of_gateway) for how it goes on from there.
+    /// Reports the routes that letters from this process to the matching agents would take now, and
+    /// the state of each route. For agents on other hosts, the report contains the route to the
+    /// gateway; [`routes::of_gateway`](crate::routes::of_gateway) reports the routes from there.
     #[must_use]
     pub fn routes(&self, to: &Query) -> Report {
         let entries = routes::agents(self.directory(), to);
         self.inner.service.report(&entries)
     }
 
-    /// Leaves the domain: gives letters under way a moment to arrive, then ends. All agents of
-    /// this process are deregistered.
+    /// Leaves the domain. Waits up to one second for letters in transit, and deregisters all agents of
+    /// this process.
     pub async fn close(self) {
         if !self.inner.owner.is_this() {
             return;
@@ -110,7 +122,8 @@ impl Domain {
     }
 }
 
-/// Logs that legacy peers cannot be told this name, if so: their encodings write names as words.
+/// Logs a warning if the encodings of legacy peers, which write names as words, cannot express this
+/// name.
 pub(crate) fn warn_of_name(id: &AgentId) {
     let fails = |dialect| {
         let message = Message::builder(Performative::Inform)
@@ -121,8 +134,8 @@ pub(crate) fn warn_of_name(id: &AgentId) {
     };
     if let Some(error) = fails(Dialect::Standard).or_else(|| fails(Dialect::Jade)) {
         tracing::warn!(
-            "agents of legacy peers (string encoding, JADE) can neither get letters from {:?} nor name it \
-             ({error}); use a name without blanks and parentheses where there are such peers",
+            "agents of legacy peers (string encoding, JADE) can neither receive letters from {:?} nor \
+             address it ({error}); use a name without blanks and parentheses if there are such peers",
             id.name()
         );
     }

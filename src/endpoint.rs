@@ -1,5 +1,5 @@
-//! The sending and receiving end of one registration: what an [`Agent`](crate::Agent) does without
-//! regard to the conversations that its calls lead.
+//! The sending and receiving end of one registration: the part of an [`Agent`](crate::Agent) that is
+//! independent of the conversations that its calls lead.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -22,7 +22,7 @@ pub(crate) struct Endpoint {
     pub(crate) id: AgentId,
     pub(crate) name: Arc<str>,
     pub(crate) incarnation: Incarnation,
-    /// Number of unique texts that were given out.
+    /// Number of unique texts issued so far.
     unique_ids: AtomicU64,
     checks: Checks,
 }
@@ -58,7 +58,8 @@ impl Endpoint {
 
     pub(crate) fn unique_id(&self) -> String {
         let number = self.unique_ids.fetch_add(1, Ordering::Relaxed);
-        // With a letter in front: JADE takes text that begins with a digit for a number.
+        // The letter at the beginning is for JADE, which parses text that begins with a digit as a
+        // number.
         format!("c{}-{number}", self.incarnation)
     }
 
@@ -84,8 +85,7 @@ impl Endpoint {
         }
     }
 
-    /// Sends a message. Its letter is on its way when this returns; dropping the result does not
-    /// stop it.
+    /// Sends a message. The letter is sent before this returns; dropping the result does not stop it.
     pub(crate) fn send(
         &self,
         message: &Message,
@@ -116,7 +116,7 @@ impl Endpoint {
         }))
     }
 
-    /// Waits for the next message, whatever conversation it belongs to.
+    /// Waits for the next message of any conversation.
     pub(crate) async fn next_letter(&self) -> Result<Incoming, ReceiveError> {
         self.domain.inner.owner.check()?;
         match self.mts().receive(self.incarnation).await {
@@ -125,7 +125,7 @@ impl Endpoint {
         }
     }
 
-    /// The next message, if there is one now.
+    /// Returns the next message, if one is available now.
     pub(crate) fn letter_now(&self) -> Option<Result<Incoming, ReceiveError>> {
         let received = self.mts().try_receive(self.incarnation);
         received.map(|received| self.decode(received))
@@ -167,11 +167,11 @@ impl Endpoint {
                 let sending = self
                     .submit(&answer, letter, deadline, Checked::No)
                     .map_err(|error| error.to_string())?;
-                // Its outcomes concern no caller.
+                // No caller waits for its outcomes.
                 drop(sending);
                 Ok(answer)
             });
-        sent.inspect_err(|error| tracing::warn!(%error, "a violation was not answered"))
+        sent.inspect_err(|error| tracing::warn!(%error, "cannot answer a protocol violation"))
             .ok()
     }
 
@@ -179,8 +179,8 @@ impl Endpoint {
     pub(crate) fn deregister(&self) -> Result<Vec<Received>, DeregisterError> {
         self.domain.inner.owner.check()?;
         let service = &self.domain.inner.service;
-        let left = service.host.deregister(&self.name, self.incarnation);
+        let removed = service.host.deregister(&self.name, self.incarnation);
         let unread = service.mts.deregister(self.incarnation);
-        left.map(|()| unread)
+        removed.map(|()| unread)
     }
 }

@@ -13,85 +13,88 @@ use fipa_sds::{HostError, RegisterError};
 use fipa_transport::{Forked, Kind, ListenError};
 
 use crate::config::ConfigError;
+use crate::domain_dir::DomainDirError;
 #[cfg(feature = "monitor")]
 use crate::incoming::Incoming;
-use crate::place::PlaceError;
 
-/// Why a domain could not be joined.
+/// The error of [`Domain::open`](crate::Domain::open) and of opening a gateway or a watcher.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum OpenError {
-    /// The configuration has mistakes.
+    /// The configuration is invalid.
     #[error(transparent)]
     Config(#[from] ConfigError),
-    /// There is no tokio runtime with I/O and time; processes without one use
+    /// The call was made outside a tokio runtime. Processes without a runtime use
     /// [`crate::blocking`].
-    #[error("no tokio runtime is running; call this from one, or use fipa::blocking")]
+    #[error("no tokio runtime is running; call this within one, or use fipa::blocking")]
     NoRuntime,
-    /// The domain's directory cannot be used.
+    /// The directory of the domain cannot be used.
     #[error(transparent)]
-    Place(#[from] PlaceError),
-    /// A protocol that the configuration names cannot be used.
+    DomainDir(#[from] DomainDirError),
+    /// A file in `monitor.protocols` cannot be used.
     #[cfg(feature = "monitor")]
     #[error(transparent)]
     Protocol(#[from] ProtocolError),
-    /// The directory of the host cannot be used.
+    /// The agent directory of the host cannot be used.
     #[error(transparent)]
     Directory(#[from] HostError),
     /// A transport that the gateway needs cannot be opened.
     #[error("{kind}: {source}")]
     Listen {
-        /// Which transport.
+        /// The transport.
         kind: Kind,
-        /// Why.
+        /// The error of the transport.
         source: ListenError,
     },
-    /// None of the configured transports works.
+    /// None of the configured transports can be used. Holds the reason for each.
     #[error("no transport can be used: {0}")]
     NoTransport(String),
-    /// The service's own name is taken, or not a name.
+    /// The name of the gateway (`mts.name`) is taken or invalid.
     #[error("cannot register the gateway: {0}")]
     Name(#[from] RegisterError),
-    /// There can be one gateway only.
-    #[error("the domain has a gateway already, {0:?}; end it, or name another domain")]
+    /// Another gateway is running in the domain. Holds its name.
+    #[error("the gateway {0:?} is already running in this domain; stop it, or use another domain")]
     GatewayRunning(String),
     /// The socket of a watcher cannot be used.
     #[error("cannot listen to the processes of the domain: {0}")]
-    Watch(std::io::Error),
-    /// The rules for who may send to whom cannot be used.
+    Watch(#[source] std::io::Error),
+    /// The access rules of the configuration cannot be used.
     #[error("access: {0}")]
     Access(String),
     /// The keys that the configuration names cannot be used.
     #[error("security.keys: {0}")]
     Keys(String),
-    /// Other hosts cannot be looked for.
+    /// The discovery of other hosts cannot start.
     #[error("discovery: {0}")]
     Discovery(String),
 }
 
-/// Why a message was not sent.
+/// The error if a message is not sent.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum SendError {
-    /// It names no receiver.
-    #[error("the message has no receiver; give it one with MessageBuilder::receiver")]
+    /// The message has no receiver.
+    #[error("the message has no receiver; set one with MessageBuilder::receiver")]
     NoReceiver,
-    /// It names no sender.
-    #[error("the message has no sender; begin it with Agent::message")]
+    /// The message has no sender.
+    #[error("the message has no sender; create it with Agent::message")]
     NoSender,
-    /// It says that it is from somebody else.
-    #[error("the message is from {sender:?}, and {agent:?} sends only its own")]
+    /// The sender in the message is another agent.
+    #[error(
+        "the message names {sender:?} as its sender, but is sent by {agent:?}; create it with \
+         Agent::message of the sending agent"
+    )]
     NotTheSender {
-        /// The agent that was to send it.
+        /// The name of the agent on which the call was made.
         agent: String,
-        /// Whom the message names.
+        /// The name of the sender in the message.
         sender: String,
     },
-    /// It violates its protocol, and the configuration says `enforce`.
+    /// The message violates its protocol, and `monitor.check` is `enforce`.
     #[cfg(feature = "monitor")]
     #[error("not sent: {0}")]
     Violation(Box<fipa_monitor::Violation>),
-    /// It cannot be encoded.
+    /// The message cannot be encoded.
     #[error(transparent)]
     Post(#[from] PostError),
     /// This process is a forked child of the one that registered the agent.
@@ -99,7 +102,7 @@ pub enum SendError {
     Forked(#[from] Forked),
 }
 
-/// Why no message was received.
+/// The error if no message is received.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ReceiveError {
@@ -109,26 +112,26 @@ pub enum ReceiveError {
     /// This process is a forked child of the one that registered the agent.
     #[error(transparent)]
     Forked(#[from] Forked),
-    /// A letter came whose message cannot be decoded. Its sender gets a failure message.
-    #[error("a letter with a message that cannot be decoded: {source}")]
+    /// The message of a received letter cannot be decoded. Its sender gets a failure message.
+    #[error("received a letter with a message that cannot be decoded: {source}")]
     Malformed {
-        /// Why not.
+        /// The error of the decoder.
         source: DecodeError,
         /// The letter.
         letter: Box<Letter>,
     },
-    /// A message came that violates its protocol, and the configuration says `enforce`.
+    /// A received message violates its protocol, and `monitor.check` is `enforce`.
     #[cfg(feature = "monitor")]
     #[error("{violation}")]
     Violation {
-        /// In which way.
+        /// The violation.
         violation: Box<fipa_monitor::Violation>,
         /// The message.
         incoming: Box<Incoming>,
     },
 }
 
-/// Why a protocol that the configuration names cannot be used.
+/// The error if a file in `monitor.protocols` cannot be used.
 #[cfg(feature = "monitor")]
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -138,13 +141,13 @@ pub enum ProtocolError {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why not.
+        /// The error of the operating system.
         source: std::io::Error,
     },
-    /// The file has mistakes.
+    /// The protocol in the file is invalid.
     #[error("monitor.protocols: {0}; see `fipa protocol check`")]
     Scxml(#[from] ScxmlError),
-    /// There are too many.
+    /// The files define too many protocols.
     #[error("monitor.protocols: {0}")]
     Full(#[from] LibraryFull),
 }

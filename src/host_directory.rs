@@ -4,40 +4,40 @@ use std::sync::Arc;
 
 use fipa_sds::{HostConfig, HostDirectory, HostError};
 
+use crate::domain_dir::{DomainDir, RETRIES};
 use crate::error::OpenError;
-use crate::place::{Place, RETRIES};
 
-/// Makes the directory of the domain and joins the directory of the host in it.
+/// Creates the directory of the domain and joins the agent directory of the host in it.
 pub(crate) fn join(
     domain: &str,
     own: &fipa_sds::Mts,
     gateway: bool,
-) -> Result<(Place, Arc<HostDirectory>), OpenError> {
+) -> Result<(DomainDir, Arc<HostDirectory>), OpenError> {
     let mut tries = 0;
     loop {
         tries += 1;
-        let mut place = Place::prepare(domain)?;
+        let mut dir = DomainDir::prepare(domain)?;
         let joined = HostDirectory::open(HostConfig {
-            dir: place.part("directory"),
+            dir: dir.part("directory"),
             mts: own.clone(),
             gateway,
         });
         match joined {
             Ok(host) => {
-                // Only now: a process that leaves may still remove an empty directory.
-                place.hold()?;
-                return Ok((place, Arc::new(host)));
+                // Not earlier, because a leaving process may still remove an empty directory.
+                dir.lock()?;
+                return Ok((dir, Arc::new(host)));
             }
             Err(error) if was_removed(&error) && tries < RETRIES => {}
             Err(error) => {
-                place.leave();
+                dir.leave();
                 return Err(error.into());
             }
         }
     }
 }
 
-/// Whether the last process that left removed the directory between its creation and the join.
+/// Whether the error means that a leaving process removed the directory between creation and join.
 fn was_removed(error: &HostError) -> bool {
     match error {
         HostError::Io { source, .. } => source.kind() == std::io::ErrorKind::NotFound,

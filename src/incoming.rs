@@ -7,8 +7,8 @@ use fipa_transport::Kind;
 #[derive(Debug, Clone)]
 #[non_exhaustive]
 pub struct Incoming {
-    /// The message. Its content may be in the sender's shared memory: it stays readable as long as
-    /// it is held, and another process of the same user can change it.
+    /// The message. Its content may be in shared memory of the sender: it stays readable as long as
+    /// this value exists, but another process of the same user can change it.
     pub message: Message,
     /// The letter that carried the message.
     pub letter: Letter,

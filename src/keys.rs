@@ -1,18 +1,17 @@
 //! The keys of a host and the certificates of the peers it trusts, as files in one directory.
 //!
-//! | file | what it is |
+//! | file | contents |
 //! |---|---|
-//! | `own.pem` | this host's certificate, for the owners of its peers |
-//! | `own.key` | the private key that belongs to it; nobody else may read it |
-//! | `next.pem`, `next.key` | those that will take their place |
+//! | `own.pem` | the certificate of this host, for its peers |
+//! | `own.key` | the private key of that certificate; only its owner may read it |
+//! | `next.pem`, `next.key` | the certificate and private key that will replace them |
 //! | `trusted/<fingerprint>.pem` | a certificate of a trusted peer |
-//! | `revoked/<fingerprint>.pem` | one that is never to be trusted again |
+//! | `revoked/<fingerprint>.pem` | a certificate that must never be trusted again |
 //!
-//! All are PEM (RFC 7468). Only their owner may write to the directory and to the certificates of
-//! others. A gateway looks after it
-//! while it runs: what is changed here counts within seconds, without a new start.
+//! All are PEM (RFC 7468). Only their owner and root may write to the directories and to the
+//! certificates of peers. A running gateway applies changes within seconds, without a restart.
 //!
-//! What must not live here: what is done with keys on connections (`fipa_transport_net::secure`).
+//! Not in this module: the use of keys on connections (`fipa_transport_net::secure`).
 
 mod error;
 #[cfg(test)]
@@ -32,19 +31,19 @@ use rustls_pki_types::{CertificateDer, PrivateKeyDer};
 
 pub use self::error::KeysError;
 
-/// Longest file that is read, in bytes.
+/// Maximum size of a file, in bytes.
 const MAX_FILE: u64 = 1 << 20;
 
-/// Most certificates that are trusted, or revoked.
+/// Maximum number of trusted certificates, and of revoked ones.
 const MAX_PEERS: usize = 4096;
 
-/// How long a certificate holds unless something else is wished: ten years of 365 days.
+/// The default validity of a certificate: ten years of 365 days.
 pub const VALID: Duration = Duration::from_secs(10 * 365 * 86_400);
 
-/// How far clocks of two robots may differ.
+/// The tolerated difference between the clocks of two robots: certificates begin this much earlier.
 const SKEW: Duration = Duration::from_secs(86_400);
 
-/// The last second that a certificate can name: of the year 9999 (RFC 5280 clause 4.1.2.5), since 1970.
+/// The latest end of a certificate, at the end of the year 9999 (RFC 5280 clause 4.1.2.5), since 1970.
 const LAST: Duration = Duration::from_secs(253_402_300_799);
 
 /// A directory with keys.
@@ -53,12 +52,12 @@ pub struct Keys {
     dir: PathBuf,
 }
 
-/// What is in the directory at one time, as far as that is seen without reading it.
+/// The change times of the files at one time, which show a change without reading the files.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Stamp([Option<(i64, i64, u64)>; 3]);
 
 impl Stamp {
-    /// Whether something was changed so recently that another change may bear the same time.
+    /// Whether a file was changed so recently that another change may get the same time.
     pub(crate) fn is_fresh(&self) -> bool {
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
         let now = now.map_or(i64::MAX, |now| {
@@ -69,25 +68,25 @@ impl Stamp {
     }
 }
 
-/// How long before a certificate ends that is told: 30 days.
+/// Time before the end of a certificate from which a warning is shown: 30 days, in seconds.
 const SOON: i64 = 30 * 86_400;
 
-/// Whether a certificate holds at a time.
+/// The validity of a certificate at a time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Holding {
-    /// It does, for more than a month.
+    /// The certificate is valid for at least 30 more days.
     Well,
-    /// It ends within 30 days.
+    /// The certificate expires within 30 days.
     EndsSoon,
-    /// It has ended, and is refused.
+    /// The certificate has expired and is refused.
     Ended,
-    /// It has not begun, and is refused.
+    /// The certificate is not valid yet and is refused.
     NotYet,
 }
 
 impl Holding {
-    /// Of this certificate now.
+    /// Returns the validity of a certificate now.
     #[must_use]
     pub fn of(certificate: &Certificate) -> Self {
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
@@ -102,52 +101,54 @@ impl Holding {
         }
     }
 
-    /// What is to be told of it, where something is.
+    /// Returns the end of a sentence about the certificate, for example `has expired`; `None` for
+    /// [`Holding::Well`].
     #[must_use]
     pub fn told(self) -> Option<&'static str> {
         match self {
             Self::Well => None,
-            Self::EndsSoon => Some("ends within 30 days"),
-            Self::Ended => Some("has ended"),
+            Self::EndsSoon => Some("expires within 30 days"),
+            Self::Ended => Some("has expired"),
             Self::NotYet => Some(
-                "begins later than now: the clock of this host is before its making; set the clock",
+                "is not valid yet: the clock of this host is before the start of its validity; set the \
+                 clock",
             ),
         }
     }
 }
 
 impl Keys {
-    /// The keys in this directory, which need not be there.
+    /// Returns the keys in this directory, which need not exist.
     #[must_use]
     pub fn at(dir: impl Into<PathBuf>) -> Self {
         Self { dir: dir.into() }
     }
 
-    /// The directory.
+    /// Returns the directory.
     #[must_use]
     pub fn dir(&self) -> &Path {
         &self.dir
     }
 
-    /// The file with this host's certificate, for the owners of its peers.
+    /// Returns the path of this host's certificate, which peers must trust.
     #[must_use]
     pub fn own_file(&self) -> PathBuf {
         self.dir.join("own.pem")
     }
 
-    /// The file with the certificate that will be this host's next.
+    /// Returns the path of this host's next certificate.
     #[must_use]
     pub fn next_file(&self) -> PathBuf {
         self.dir.join("next.pem")
     }
 
-    /// Makes a key, and a certificate that says for which service it stands and for which agents
-    /// that may speak (all when there are none; one that ends with `*` stands for all that begin
-    /// so).
+    /// Makes a private key and a self-signed certificate for the service `mts`. `agents` are the names
+    /// of the agents that the service may represent: empty means all, and a name that ends with `*`
+    /// means all names with that prefix.
     ///
     /// # Errors
-    /// When there are keys already, the directory cannot be written, or no certificate can be valid
-    /// for so long.
+    /// If keys exist already, if the directory cannot be written, or if `valid` is zero or reaches
+    /// beyond the year 9999.
     pub fn init(
         &self,
         mts: &str,
@@ -157,28 +158,28 @@ impl Keys {
         self.make("own", mts, agents, valid)
     }
 
-    /// Makes the key and the certificate that will be this host's next, for the same service and
-    /// agents. They are used from [`switch`](Self::switch) on, when all peers trust them.
+    /// Makes the next key and certificate for the same service and agents. Call
+    /// [`switch`](Self::switch) to use them, once all peers trust the certificate.
     ///
     /// # Errors
-    /// As for [`init`](Self::init), and when there are no keys yet.
+    /// As for [`init`](Self::init), and if there are no keys yet.
     pub fn renew(&self, valid: Duration) -> Result<Certificate, KeysError> {
         let own = self.own()?;
         let certified = own.certified();
         self.make("next", certified.mts(), certified.agents(), valid)
     }
 
-    /// Uses the next key and certificate from now on. Those before are gone.
+    /// Replaces this host's key and certificate by the next ones. The former ones are deleted.
     ///
     /// # Errors
-    /// When there are none, or the directory cannot be written.
+    /// If there are no next ones, or the directory cannot be written.
     pub fn switch(&self) -> Result<Certificate, KeysError> {
         let (key, certificate) = (self.dir.join("next.key"), self.next_file());
         if !key.exists() || !certificate.exists() {
             return Err(KeysError::NoNext(self.dir.clone()));
         }
-        // Who reads in between finds a key and a certificate that do not belong together, and
-        // looks again.
+        // A gateway that reads between the two renames finds a key that does not belong to the
+        // certificate, and reads again.
         rename(&key, &self.dir.join("own.key"))?;
         rename(&certificate, &self.own_file())?;
         self.own()
@@ -221,28 +222,28 @@ impl Keys {
         Ok(certificate)
     }
 
-    /// This host's certificate.
+    /// Reads this host's certificate.
     ///
     /// # Errors
-    /// When there is none, or it cannot be read.
+    /// If there is none, or it cannot be read.
     pub fn own(&self) -> Result<Certificate, KeysError> {
         let own = certificate_in(&self.own_file())?;
         own.ok_or_else(|| KeysError::Missing(self.dir.clone()))
     }
 
-    /// The certificate that will be this host's next, if one has been made.
+    /// Reads this host's next certificate, if one exists.
     ///
     /// # Errors
-    /// When it cannot be read.
+    /// If it cannot be read.
     pub fn next(&self) -> Result<Option<Certificate>, KeysError> {
         certificate_in(&self.next_file())
     }
 
-    /// Trusts the certificates in this PEM text, and returns them.
+    /// Adds the certificates in this PEM text to the trusted ones, and returns them.
     ///
     /// # Errors
-    /// When there is none in it, one of them cannot be used, was revoked or is this host's own: then
-    /// none is trusted.
+    /// If the text has no certificate, or if one of them is invalid, was revoked or is this host's
+    /// own. None is added then.
     pub fn trust(&self, pem: &[u8]) -> Result<Vec<Certificate>, KeysError> {
         let certificates = certificates(pem)?;
         if certificates.is_empty() {
@@ -274,10 +275,10 @@ impl Keys {
         Ok(certificates)
     }
 
-    /// The certificates of trusted peers, ordered by the names of their services.
+    /// Reads the certificates of trusted peers, ordered by the names of their services.
     ///
     /// # Errors
-    /// When one cannot be read, or is revoked as well.
+    /// If one cannot be read, or is also revoked.
     pub fn trusted(&self) -> Result<Vec<Certificate>, KeysError> {
         let (confirmed, mut doubtful) = self.confirmed();
         match doubtful.pop() {
@@ -286,8 +287,8 @@ impl Keys {
         }
     }
 
-    /// The certificates of trusted peers that can be read, in that order, and why others cannot:
-    /// those are not to be trusted, as their owner may have meant to revoke them.
+    /// Reads the certificates of trusted peers, in that order, and collects the errors of those that
+    /// cannot be read. Those must not be trusted, because they may be revoked ones.
     pub(crate) fn confirmed(&self) -> (Vec<Certificate>, Vec<KeysError>) {
         let (all, mut doubtful) = self.all("trusted");
         let (revoked, confirmed) = all
@@ -298,10 +299,10 @@ impl Keys {
         (confirmed, doubtful)
     }
 
-    /// The certificates that are not to be trusted again.
+    /// Reads the revoked certificates.
     ///
     /// # Errors
-    /// When one cannot be read.
+    /// If one cannot be read.
     pub fn revoked(&self) -> Result<Vec<Certificate>, KeysError> {
         let (revoked, mut doubtful) = self.all("revoked");
         match doubtful.pop() {
@@ -310,11 +311,12 @@ impl Keys {
         }
     }
 
-    /// Withdraws trust for good: from the certificate whose fingerprint begins so, or from all of the
-    /// service with this name. Others that cannot be read do not keep anybody from it.
+    /// Revokes trusted certificates permanently: all certificates of the service with this name or, if
+    /// there are none, the one whose fingerprint starts with this text of at least 8 characters.
+    /// Other certificates that cannot be read do not prevent it.
     ///
     /// # Errors
-    /// When nothing is meant, or two by a fingerprint.
+    /// If no certificate matches, or if several match a fingerprint.
     pub fn revoke(&self, which: &str) -> Result<Vec<Certificate>, KeysError> {
         let (trusted, mut doubtful) = self.confirmed();
         let begins = |certificate: &Certificate| {
@@ -330,7 +332,7 @@ impl Keys {
             meant.extend(trusted.into_iter().filter(begins));
             if meant.len() != 1 {
                 let (which, found) = (which.to_owned(), meant.len());
-                // It may be that one.
+                // The certificate that cannot be read may be the one to revoke.
                 let unread = doubtful.pop().filter(|_| found == 0);
                 return Err(unread.unwrap_or(KeysError::Which { which, found }));
             }
@@ -347,10 +349,12 @@ impl Keys {
         Ok(meant)
     }
 
-    /// What the gateway with this name needs of all this.
+    /// Reads the credentials of the gateway with this name: its certificate and private key, and the
+    /// trusted certificates.
     ///
     /// # Errors
-    /// When there are no keys, they are of another service, or something cannot be read.
+    /// If there are no keys, if they belong to another service, or if a file cannot be read or has
+    /// unsafe permissions.
     pub fn credentials_of(&self, mts: &str) -> Result<Credentials, KeysError> {
         let credentials = self.credentials()?;
         let certified = credentials.own.certified().mts();
@@ -364,10 +368,10 @@ impl Keys {
         Ok(credentials)
     }
 
-    /// This host's certificate and key, and whom it trusts, whatever the service is called.
+    /// Reads the credentials without checking the name of the service.
     ///
     /// # Errors
-    /// When there are no keys, something cannot be read, or others could read or write it.
+    /// If there are no keys, or if a file cannot be read or has unsafe permissions.
     fn credentials(&self) -> Result<Credentials, KeysError> {
         let own = self.own()?;
         let user = rustix::process::geteuid().as_raw();
@@ -378,7 +382,7 @@ impl Keys {
         }
         let folders = ["trusted", "revoked"].map(|folder| self.dir.join(folder));
         for dir in std::iter::once(self.dir.clone()).chain(folders) {
-            // What is not there nobody can write to, or it is told where it is read.
+            // A missing directory needs no check; reading reports other errors.
             let Ok(meta) = fs::metadata(&dir) else {
                 continue;
             };
@@ -392,7 +396,7 @@ impl Keys {
         Ok(Credentials { own, key, trusted })
     }
 
-    /// To see whether anything has changed.
+    /// Returns the change times of the files, to detect changes.
     pub(crate) fn stamp(&self) -> Stamp {
         let parts = [
             self.own_file(),
@@ -401,7 +405,7 @@ impl Keys {
         ];
         Stamp(parts.map(|path| {
             let meta = fs::metadata(path).ok()?;
-            // Also counts up when rights change.
+            // The change time also changes with the permissions.
             Some((meta.ctime(), meta.ctime_nsec(), meta.ino()))
         }))
     }
@@ -410,8 +414,8 @@ impl Keys {
         self.dir.join(folder).join(format!("{fingerprint}.pem"))
     }
 
-    /// The certificates in this folder that can be read, ordered by the names of their services,
-    /// and why others cannot.
+    /// Reads the certificates in a folder, ordered by the names of their services, and collects the
+    /// errors of those that cannot be read.
     fn all(&self, folder: &str) -> (Vec<Certificate>, Vec<KeysError>) {
         let dir = self.dir.join(folder);
         let listed = match fs::read_dir(&dir) {
@@ -422,7 +426,7 @@ impl Keys {
         let (mut all, mut unread) = (Vec::new(), Vec::new());
         for (number, entry) in listed.take(MAX_PEERS + 1).enumerate() {
             if number == MAX_PEERS {
-                let what = format!("more than {MAX_PEERS} certificates; the others are left out");
+                let what = format!("more than {MAX_PEERS} files; the others are ignored");
                 unread.push(contents(&dir, &what));
                 break;
             }
@@ -448,7 +452,7 @@ impl Keys {
     }
 }
 
-/// Whether others than this user and root can change the file or directory.
+/// Whether users other than this one and root can change the file or directory.
 fn can_be_written_by_others(meta: &Metadata) -> bool {
     let user = rustix::process::geteuid().as_raw();
     meta.mode() & 0o022 != 0 || ![0, user].contains(&meta.uid())
@@ -501,20 +505,20 @@ fn rename(from: &Path, to: &Path) -> Result<(), KeysError> {
 fn read(file: &Path) -> Result<Vec<u8>, KeysError> {
     let metadata = fs::metadata(file).map_err(|source| io_error(file, source))?;
     if !metadata.is_file() {
-        // A pipe would be waited for.
-        return Err(contents(file, &"it is no file"));
+        // Reading a pipe would block.
+        return Err(contents(file, &"not a regular file"));
     }
     let len = metadata.len();
     if len > MAX_FILE {
         return Err(contents(
             file,
-            &format_args!("{len} bytes; at most {MAX_FILE} are read"),
+            &format_args!("larger than the maximum of {MAX_FILE} bytes: {len} bytes"),
         ));
     }
     fs::read(file).map_err(|source| io_error(file, source))
 }
 
-/// The certificates in PEM text.
+/// Parses the certificates in PEM text.
 fn certificates(pem: &[u8]) -> Result<Vec<Certificate>, KeysError> {
     let mut all = Vec::new();
     for der in CertificateDer::pem_slice_iter(pem) {
@@ -524,7 +528,7 @@ fn certificates(pem: &[u8]) -> Result<Vec<Certificate>, KeysError> {
     Ok(all)
 }
 
-/// The certificate in a file of ours, which need not be there.
+/// Reads a file with one certificate; returns `None` if it does not exist.
 fn certificate_in(file: &Path) -> Result<Option<Certificate>, KeysError> {
     match read(file) {
         Ok(pem) => only(file, &pem).map(Some),
@@ -533,12 +537,18 @@ fn certificate_in(file: &Path) -> Result<Option<Certificate>, KeysError> {
     }
 }
 
-/// The one certificate in a file of ours.
+/// Parses PEM text that must hold exactly one certificate.
 fn only(file: &Path, pem: &[u8]) -> Result<Certificate, KeysError> {
     let found = certificates(pem).map_err(|error| contents(file, &error))?;
     <[Certificate; 1]>::try_from(found)
         .map(|[only]| only)
-        .map_err(|found| contents(file, &format_args!("{} certificates, not one", found.len())))
+        .map_err(|found| {
+            let count = found.len();
+            contents(
+                file,
+                &format_args!("holds {count} certificates instead of one"),
+            )
+        })
 }
 
 fn to_pem(certificate: &Certificate) -> String {

@@ -1,8 +1,8 @@
-//! Agent communication for robots, to the FIPA standards: what a robot process embeds.
+//! Agent communication for robots after the FIPA standards, as a library for robot processes.
 //!
-//! A process joins a [`Domain`], registers [`Agent`]s in it, and these exchange FIPA messages with
-//! all agents of the domain: through shared memory or Unix domain sockets on one host, and through
-//! the host's gateway with those of other hosts.
+//! A process joins a [`Domain`] and registers [`Agent`]s in it. The agents exchange FIPA messages
+//! with all agents of the domain: through shared memory or Unix domain sockets on one host, and
+//! through the gateway of the host with agents on other hosts.
 //!
 //! ```no_run
 //! use fipa::{AgentId, Config, Domain, Performative};
@@ -23,17 +23,17 @@
 //! # }
 //! ```
 //!
-//! * [`Domain`] is this process's membership, [`Agent`] one name in it, [`Coalition`] a name for
-//!   several.
-//! * [`watch`] sees the letters of all processes of a domain on this host pass.
-//! * [`config`] is what the owner of a robot chooses, in one TOML file.
-//! * [`blocking`] is for processes without an async runtime.
-//! * [`routes`] tells which way letters would go now, and why.
-//! * [`doctor`] says what is wrong with a machine.
-//! * [`keys`] (feature `secure`) is who may speak with this host from others.
-//! * [`Gateway`] (feature `net`) is what `fipa up` runs; robot processes do not need it.
+//! * [`Domain`] is the membership of this process in a domain. [`Agent`] is a registered name,
+//!   [`Coalition`] a name for several agents.
+//! * [`watch`] observes the letters of all processes of a domain on this host.
+//! * [`config`] is the configuration, one TOML file.
+//! * [`blocking`] has the same calls for processes without an async runtime.
+//! * [`routes`] reports the routes that letters would take now, and the reasons.
+//! * [`doctor`] checks whether a machine meets the requirements.
+//! * [`keys`] (feature `secure`) manages the keys of this host and the certificates of its peers.
+//! * [`Gateway`] (feature `net`) is the gateway that `fipa up` runs; robot processes do not need it.
 //!
-//! What must not live here: delivery (that is `fipa-mts`), transports, terminals.
+//! Not in this crate: delivery (`fipa-mts`), the transports, and terminal output (`fipa-cli`).
 
 mod access;
 mod agent;
@@ -51,8 +51,10 @@ mod demultiplexer;
 #[cfg(not(feature = "monitor"))]
 #[path = "demultiplexer_disabled.rs"]
 mod demultiplexer;
+mod dir_maintenance;
 pub mod doctor;
 mod domain;
+mod domain_dir;
 mod endpoint;
 mod error;
 #[cfg(feature = "fuzzing")]
@@ -63,11 +65,9 @@ mod gate;
 mod gateway;
 mod host_directory;
 mod incoming;
-mod keeper;
 #[cfg(feature = "secure")]
 pub mod keys;
 mod owner;
-mod place;
 #[cfg(feature = "monitor")]
 pub mod protocol;
 pub mod routes;
@@ -79,19 +79,20 @@ pub use coalition::{Coalition, CoalitionError};
 pub use config::Config;
 pub use delivery::{Deliveries, Delivery};
 pub use domain::{Domain, RegisterOptions};
+pub use domain_dir::DomainDirError;
 #[cfg(feature = "monitor")]
 pub use error::ProtocolError;
 pub use error::{OpenError, ReceiveError, SendError};
 pub use fipa_acl::{
-    AgentId, AgentIdError, BuildError, DecodeError, Envelope, EnvelopeParams, Letter, Message,
-    MessageBuilder, Payload, Performative, Time,
+    AgentId, AgentIdError, BuildError, DecodeError, EncodeError, Envelope, EnvelopeParams, Letter,
+    Message, MessageBuilder, Payload, Performative, Time, TimeError,
 };
 #[cfg(feature = "monitor")]
 pub use fipa_monitor as monitor;
-pub use fipa_mts::DeliveryFailure;
+pub use fipa_mts::{DeliveryFailure, PostError};
 pub use fipa_sds::{
-    Change, Directory, Entry, Matcher, Members, MembersError, Pattern, PatternError, Query, Reach,
-    RegisterError, Role, Source, Watch, is_pattern,
+    Change, DeregisterError, Directory, Entry, HostError, Matcher, Members, MembersError, Pattern,
+    PatternError, Query, Reach, RegisterError, Role, Source, Watch, is_pattern,
 };
 pub use fipa_transport::{
     Attempt, FailureReason, Forked, Incarnation, Kind, ListenError, Location, Outcome, Signature,
@@ -100,4 +101,3 @@ pub use fipa_transport::{
 #[cfg(feature = "net")]
 pub use gateway::{Gateway, Neighbour};
 pub use incoming::Incoming;
-pub use place::PlaceError;

@@ -1,18 +1,18 @@
-//! Which process owns a membership: its forked children may not use it.
+//! The process that owns a membership. Its forked children must not use the membership.
 
 use fipa_transport::{Forked, OwnerProcess};
 
-/// The process that joined a domain. Cheap enough to be asked for every letter.
+/// The process that joined a domain. The check is cheap enough to run for every letter.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Owner {
     process: OwnerProcess,
-    /// Asking it costs no system call.
+    /// Its check costs no system call.
     #[cfg(feature = "shm")]
     mark: fipa_transport_shm::Owner,
 }
 
 impl Owner {
-    /// The running process.
+    /// Returns the running process.
     pub(crate) fn this() -> Self {
         Self {
             process: OwnerProcess::this(),
@@ -21,7 +21,7 @@ impl Owner {
         }
     }
 
-    /// Whether this is the running process, and no forked child of it.
+    /// Whether the calling process is the owner and not a forked child of it.
     pub(crate) fn is_this(self) -> bool {
         #[cfg(feature = "shm")]
         return self.mark.is_this();
@@ -29,7 +29,7 @@ impl Owner {
         self.process.is_this()
     }
 
-    /// Refuses the use in a forked child.
+    /// Returns an error in a forked child.
     pub(crate) fn check(self) -> Result<(), Forked> {
         match self.is_this() {
             true => Ok(()),

@@ -1,9 +1,9 @@
-//! Which way letters would go now, and why; what has happened on each way.
+//! The routes that letters would take now, the reasons, and the state of each route.
 //!
-//! A robot process tells it of itself ([`Domain::routes`](crate::Domain::routes)), and its host's
-//! gateway when it is asked by letter: [`of_gateway`]. The letter is a `request` to the gateway
-//! with the [`ONTOLOGY`] and the name or pattern of the receivers as its content, or none for all;
-//! the answer is an `inform` in the language `json`, a [`Report`].
+//! A process reports its own routes with [`Domain::routes`](crate::Domain::routes), and queries those
+//! of the gateway on its host with [`of_gateway`]. The query is a `request` to the gateway with the
+//! [`ONTOLOGY`]; its content is the name or pattern of the receivers, or empty for all. The answer is
+//! an `inform` in the language `json` whose content is a [`Report`].
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -19,86 +19,92 @@ use crate::{Agent, Deliveries, ReceiveError, SendError};
 /// The ontology of a request for routes.
 pub const ONTOLOGY: &str = "fipa-mts-routes";
 
-/// What one message transport service does with letters now.
+/// The routes of one message transport service.
+///
+/// Serialized as a JSON object with the names of the fields.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct Report {
-    /// Its name.
+    /// The name of the service.
     pub mts: String,
-    /// This life of it.
+    /// The incarnation of the service: a random number per start.
     pub incarnation: Incarnation,
-    /// Where it takes letters.
+    /// The locations at which the service accepts letters.
     pub locations: Vec<Location>,
-    /// How letters to each agent would go.
+    /// The route to each agent.
     pub routes: Vec<Route>,
-    /// What has happened on each way.
+    /// The state of each route.
     pub ways: Vec<WayState>,
-    /// The static peers, and how it stands with them; a gateway's only.
+    /// The static peers; empty unless the service is a gateway.
     pub peers: Vec<StaticPeer>,
-    /// The gateways that a connection is open with; a gateway's only.
+    /// The gateways with an open connection; empty unless the service is a gateway.
     pub neighbours: Vec<Connected>,
 }
 
-/// A line of `discovery.static`, and how it stands with that peer.
+/// A peer in `discovery.static` and its state.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct StaticPeer {
-    /// Its name in the configuration.
+    /// The name of the peer in the configuration.
     pub name: String,
-    /// Where it answers, if it does.
+    /// The location at which the peer answers; `None` if it does not answer.
     pub answers: Option<Location>,
-    /// Where it did not answer when it was last asked, and why.
+    /// The locations that failed in the last attempt, with the reasons.
     pub failures: Vec<(Location, String)>,
-    /// In how many milliseconds it is asked again; none while an answer is awaited.
+    /// Milliseconds until the next attempt; `None` during an attempt.
     pub asked_again_in: Option<u64>,
 }
 
-/// A gateway that a connection is open with.
+/// A gateway with an open connection.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct Connected {
-    /// Its name.
+    /// The name of the gateway.
     pub name: String,
-    /// This life of it.
+    /// The incarnation of the gateway: a random number per start.
     pub incarnation: Incarnation,
-    /// Where it takes letters, as far as is known.
+    /// The known locations at which the gateway accepts letters.
     pub locations: Vec<Location>,
-    /// How many connections are open.
+    /// The number of open connections.
     pub connections: usize,
-    /// For how many seconds.
+    /// Seconds since the connection was opened.
     pub seconds: u64,
 }
 
-/// Why a gateway did not tell its routes.
+/// The error of [`of_gateway`].
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum AskError {
-    /// The request cannot be written.
-    #[error("the request cannot be written: {0}")]
+    /// The request cannot be built.
+    #[error("cannot build the request to the gateway: {0}")]
     Build(#[from] fipa_acl::BuildError),
-    /// Nor sent.
-    #[error("the request cannot be sent: {0}")]
+    /// The request cannot be sent.
+    #[error("cannot send the request to the gateway: {0}")]
     Send(#[from] SendError),
-    /// It did not reach the gateway.
+    /// The request was not delivered to the gateway.
     #[error("the request did not reach the gateway: {0}")]
     NotDelivered(Deliveries),
-    /// No answer came.
-    #[error("the gateway did not answer within {0:?}; see its log")]
+    /// The gateway did not answer in time.
+    #[error("the gateway did not answer within {0:?}; see the log of the gateway")]
     Silence(Duration),
-    /// Nothing can be received any more.
+    /// No message can be received.
     #[error(transparent)]
     Receive(#[from] ReceiveError),
-    /// What came is no report.
-    #[error("the gateway's answer is not understood: {}; is it of another version?", escape(.0))]
+    /// The answer is not a report.
+    #[error(
+        "the answer of the gateway is not a report of routes: {}; check that the gateway has the same \
+         version as this program",
+        escape(.0)
+    )]
     NotUnderstood(String),
 }
 
-/// Asks the gateway of this agent's host which way it would send letters to the receivers with
-/// this name or pattern, or to all it knows. Whatever else comes to the agent meanwhile is lost:
-/// use one that is there for this only.
+/// Queries the gateway of this agent's host for its routes to the receivers with this name or pattern,
+/// or to all agents in its directory. Other messages that reach the agent in the meantime are lost, so
+/// use an agent that serves no other purpose.
 ///
 /// # Errors
-/// When the gateway cannot be asked, or does not answer in time.
+/// If the request cannot be sent or delivered, or if no report arrives within `patience`.
 pub async fn of_gateway(
     agent: &Agent,
     gateway: &Entry,
@@ -151,7 +157,7 @@ impl From<fipa_mts::core::PeerState> for StaticPeer {
     }
 }
 
-/// The agents that letters can be for, of a search.
+/// Returns the agents among the results of a search, without services and coalitions.
 pub(crate) fn agents(directory: &dyn Directory, query: &Query) -> Vec<Arc<Entry>> {
     let mut found = directory.search(query);
     found.retain(|entry| entry.role == Role::Agent);

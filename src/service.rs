@@ -1,5 +1,5 @@
-//! Puts a message transport service together: the transports that the configuration wants, the
-//! directory of the host, and the runtime over both.
+//! Assembles a message transport service: the transports of the configuration, the agent directory
+//! of the host, and the runtime over both.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,52 +13,52 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 use crate::Config;
+use crate::dir_maintenance::DirMaintenance;
+use crate::domain_dir::DomainDir;
 use crate::error::OpenError;
 use crate::gate::{Door, Of};
 use crate::host_directory;
-use crate::keeper::Keeper;
-use crate::place::Place;
 use crate::routes::Report;
-use crate::watch::Taps;
+use crate::watch::Watchers;
 
-/// How often the other end of a quiet connection is asked for a sign of life. One that leads
-/// nowhere any more, because an address has changed, is found out after twice this long, which
-/// has to be less than the usual deadline of a letter.
+/// Interval of keep-alive messages on an idle connection. A broken connection, for example after a
+/// change of address, is detected after twice this time, which must be less than the default deadline
+/// of a letter.
 const KEEP_ALIVE: Duration = Duration::from_secs(2);
 
-/// How long a service that ends waits for what is under way.
+/// Time that a closing service waits for letters in transit.
 pub(crate) const CLOSING_PATIENCE: Duration = Duration::from_secs(1);
 
 /// A message transport service in one of its two roles.
 pub(crate) struct Service {
     pub(crate) mts: Mts,
     pub(crate) host: Arc<HostDirectory>,
-    /// Where the service is reached at present.
+    /// The current locations of the service.
     locations: watch::Receiver<Arc<[Location]>>,
-    /// The service as the directory names it.
+    /// The entry of the service in the directory.
     pub(crate) own: fipa_sds::Mts,
-    place: Place,
-    /// Serves those who watch.
-    tapped: JoinHandle<()>,
-    keeper: JoinHandle<()>,
+    dir: DomainDir,
+    /// The task that serves the watchers.
+    watching: JoinHandle<()>,
+    maintenance: JoinHandle<()>,
 }
 
-/// What differs between a robot process and the gateway.
+/// The differences between a robot process and the gateway.
 pub(crate) struct Role<'a> {
     /// The name of the service.
     pub(crate) name: Arc<str>,
-    /// Leave to forward.
+    /// Whether the service is the gateway, which forwards letters.
     pub(crate) gateway: bool,
-    /// Who is told of agents of other hosts that have written.
+    /// The recipient of notifications about agents of other hosts that have sent letters.
     pub(crate) contacts: Option<Arc<dyn Contacts>>,
-    /// What peers have to prove to it.
+    /// The proofs of identity that peers must give.
     #[cfg(feature = "secure")]
     pub(crate) security: Option<fipa_transport_net::secure::Security>,
-    /// Makes the view of the directory in which receivers are looked up.
+    /// Creates the view of the directory in which receivers are looked up.
     pub(crate) view: &'a View<'a>,
 }
 
-/// From the directory of this host, and the service that looks up receivers, to its view.
+/// Creates a view from the directory of this host and the service that looks up receivers.
 pub(crate) type View<'a> =
     dyn Fn(Arc<HostDirectory>, &fipa_sds::Mts) -> Result<Arc<dyn Directory>, OpenError> + 'a;
 
@@ -68,16 +68,16 @@ impl Service {
         let handle = Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
         let incarnation = Incarnation::random();
         let own = fipa_sds::Mts::new(Arc::clone(&role.name), incarnation);
-        let (place, host) = host_directory::join(&config.domain, &own, role.gateway)?;
-        let view = (role.view)(Arc::clone(&host), &own).inspect_err(|_| place.leave())?;
-        let gate = gate(config, &role, &host).inspect_err(|_| place.leave())?;
-        let taps = Arc::new(Taps::new(&own, role.gateway));
+        let (dir, host) = host_directory::join(&config.domain, &own, role.gateway)?;
+        let view = (role.view)(Arc::clone(&host), &own).inspect_err(|_| dir.leave())?;
+        let gate = gate(config, &role, &host).inspect_err(|_| dir.leave())?;
+        let watchers = Arc::new(Watchers::new(&own, role.gateway));
         let mut refused = Vec::new();
-        let mut keeper = Keeper::new(place.clone(), Arc::clone(&host));
+        let mut maintenance = DirMaintenance::new(dir.clone(), Arc::clone(&host));
         let transports = transports(
             config,
             &role,
-            &mut keeper,
+            &mut maintenance,
             incarnation,
             &handle,
             &mut refused,
@@ -88,26 +88,26 @@ impl Service {
                 spin: config.transport.shm.spin,
                 unframed_deadline: config.mts.deadline,
                 contacts: role.contacts.clone(),
-                tap: Some(Arc::clone(&taps) as Arc<dyn fipa_mts::Tap>),
+                tap: Some(Arc::clone(&watchers) as Arc<dyn fipa_mts::Tap>),
                 gate,
             },
             view,
             transports,
             &handle,
         );
-        let begun = taps.begin(&host, &mts);
-        let tapped = handle.spawn(taps.run(Arc::clone(&host), mts.clone(), begun));
+        let connected = watchers.connect_all(&host, &mts);
+        let watching = handle.spawn(watchers.run(Arc::clone(&host), mts.clone(), connected));
         let service = Self {
-            tapped,
+            watching,
             locations: mts.locations(),
-            keeper: handle.spawn(keeper.run()),
+            maintenance: handle.spawn(maintenance.run()),
             mts,
             host,
             own,
-            place,
+            dir,
         };
         for (kind, error) in failed {
-            // Without a route within the host there may be another one.
+            // A gateway needs all its network transports; within the host another one may do.
             if role.gateway && !kind.is_host_local() {
                 service.abort();
                 return Err(OpenError::Listen {
@@ -119,15 +119,15 @@ impl Service {
         }
         if service.locations().is_empty() {
             service.abort();
-            return Err(OpenError::NoTransport(told(config, &refused)));
+            return Err(OpenError::NoTransport(reasons(config, &refused)));
         }
         for (kind, error) in &refused {
-            tracing::warn!(%kind, error, "a transport cannot be used; going on without it");
+            tracing::warn!(%kind, error, "a transport cannot be used; continuing without it");
         }
         Ok(service)
     }
 
-    /// Where the service is reached at present: as many locations as an entry of the directory has.
+    /// Returns the current locations of the service, at most as many as a directory entry can have.
     pub(crate) fn locations(&self) -> Vec<Location> {
         let locations = self.locations.borrow();
         locations
@@ -137,13 +137,13 @@ impl Service {
             .collect()
     }
 
-    /// Tells of changes of the locations since the service has started.
+    /// Returns a receiver that is notified of changes of the locations.
     #[cfg(feature = "net")]
     pub(crate) fn follow_locations(&self) -> watch::Receiver<Arc<[Location]>> {
         self.locations.clone()
     }
 
-    /// What this service does with letters to these agents now.
+    /// Reports the routes that letters to these agents would take now.
     pub(crate) fn report(&self, to: &[Arc<Entry>]) -> Report {
         Report {
             mts: self.own.name.to_string(),
@@ -156,7 +156,7 @@ impl Service {
         }
     }
 
-    /// Uses the orders and the deadline of this configuration from now on. Of the gateway.
+    /// Applies the orders of transports and the deadline of this configuration. For the gateway only.
     #[cfg(feature = "net")]
     pub(crate) fn reorder(&self, config: &Config) {
         let mut order = config.mts.transports.clone();
@@ -166,25 +166,25 @@ impl Service {
         self.mts.reorder(order, routes, config.mts.deadline);
     }
 
-    /// Gives what is under way a moment to end, then ends.
+    /// Waits for letters in transit, at most [`CLOSING_PATIENCE`], and ends the service.
     pub(crate) async fn close(&self) {
         self.mts.close(CLOSING_PATIENCE).await;
         self.abort();
     }
 
-    /// Ends at once and leaves nothing behind.
+    /// Ends the service at once and removes its files.
     pub(crate) fn abort(&self) {
-        self.tapped.abort();
-        self.keeper.abort();
+        self.watching.abort();
+        self.maintenance.abort();
         self.mts.abort();
         if let Err(error) = self.host.close() {
-            tracing::warn!(%error, "could not leave the directory of this host in order");
+            tracing::warn!(%error, "cannot remove this process from the directory of this host");
         }
-        self.place.leave();
+        self.dir.leave();
     }
 }
 
-/// Who says which letters are taken, when the configuration has rules for that.
+/// Creates the access gate, if the configuration has access rules.
 fn gate(
     config: &Config,
     role: &Role<'_>,
@@ -194,7 +194,7 @@ fn gate(
         true => Of::Gateway(Arc::clone(&role.name)),
         false => Of::Process(Arc::clone(host)),
     };
-    // What the configuration's check has passed can be understood.
+    // Cannot fail, because the check of the configuration has parsed the rules.
     let access = config
         .access
         .rules()
@@ -202,14 +202,15 @@ fn gate(
     Ok(access.map(|access| Arc::new(Door::new(access, of)) as Arc<dyn Gate>))
 }
 
-fn told(config: &Config, refused: &[(Kind, String)]) -> String {
+/// Joins the reasons why no transport can be used.
+fn reasons(config: &Config, refused: &[(Kind, String)]) -> String {
     let refused = refused.iter();
     let mut texts: Vec<String> = refused
         .map(|(kind, error)| format!("{kind}: {error}"))
         .collect();
     if !config.mts.transports.iter().any(|it| it.is_host_local()) {
-        let unused = "within a host, list shm or unix in mts.transports, or set \
-                      transport.tcp.processes for tcp";
+        let unused = "mts.transports has none for processes of one host: list shm or unix, or set \
+                      transport.tcp.processes = true to use tcp";
         texts.push(unused.to_owned());
     }
     texts.join("; ")
@@ -227,11 +228,11 @@ fn core_config(config: &Config, role: &Role<'_>, incarnation: Incarnation) -> Co
     }
 }
 
-/// The exceptions of the configuration, cut to the transports that are used. Those that list
-/// transports between hosts only are for the gateway.
+/// Returns `[routes]` of the configuration, restricted to the transports in use. Lines that list only
+/// transports between hosts apply to the gateway.
 fn routes(config: &Config, order: &[Kind], gateway: bool) -> Vec<(Pattern, Vec<Kind>)> {
     let routes = config.routes.iter().filter_map(|route| {
-        // Checked when the configuration was: what does not compile cannot be here.
+        // Always compiles, because the check of the configuration has compiled it.
         let pattern = Pattern::new(&route.receiver).ok()?;
         let used = route.transports.iter().copied();
         let used: Vec<Kind> = used.filter(|kind| order.contains(kind)).collect();
@@ -241,9 +242,9 @@ fn routes(config: &Config, order: &[Kind], gateway: bool) -> Vec<(Pattern, Vec<K
     routes.collect()
 }
 
-/// The kinds of transport that are wanted in this role, in order of preference. One configuration
-/// serves the gateway and all other processes of a host; only the gateway uses the network, unless
-/// the owner wants TCP within the host, too.
+/// Returns the kinds of transport for this role, in order of preference. One configuration serves the
+/// gateway and all other processes of a host. Only the gateway uses the network, unless
+/// `transport.tcp.processes` turns on TCP within the host.
 fn used<'a>(config: &'a Config, role: &Role<'_>) -> impl Iterator<Item = Kind> + use<'a> {
     let gateway = role.gateway;
     let kinds = config.mts.transports.iter().copied();
@@ -253,11 +254,12 @@ fn used<'a>(config: &'a Config, role: &Role<'_>) -> impl Iterator<Item = Kind> +
     })
 }
 
-/// The transports that are wanted, built in, and work here.
+/// Creates the transports for this role that are built in. Adds the reason of each failure to
+/// `refused`.
 fn transports(
     config: &Config,
     role: &Role<'_>,
-    keeper: &mut Keeper,
+    maintenance: &mut DirMaintenance,
     incarnation: Incarnation,
     handle: &Handle,
     refused: &mut Vec<(Kind, String)>,
@@ -266,21 +268,28 @@ fn transports(
     for kind in used(config, role) {
         let made = match kind {
             #[cfg(feature = "shm")]
-            Kind::Shm => shm(config, keeper, incarnation, handle),
-            Kind::Unix => unix(config, role, keeper, incarnation, handle),
+            Kind::Shm => shm(config, maintenance, incarnation, handle),
+            Kind::Unix => unix(config, role, maintenance, incarnation, handle),
             #[cfg(feature = "net")]
-            Kind::Tcp => tcp(config, role, &keeper.place, incarnation, handle),
+            Kind::Tcp => tcp(config, role, &maintenance.dir, incarnation, handle),
             #[cfg(feature = "net")]
-            Kind::Udp => udp(config, role, &keeper.place, incarnation, handle),
+            Kind::Udp => udp(config, role, &maintenance.dir, incarnation, handle),
             #[cfg(feature = "quic")]
             Kind::Quic => match &role.security {
-                Some(security) => quic(config, role, security, &keeper.place, incarnation, handle),
-                // The check of the configuration does not let this happen.
+                Some(security) => quic(
+                    config,
+                    role,
+                    security,
+                    &maintenance.dir,
+                    incarnation,
+                    handle,
+                ),
+                // Cannot happen: the check of the configuration demands keys for QUIC.
                 None => continue,
             },
-            // One configuration serves all processes of a robot, whatever they were built with.
+            // One configuration serves all processes of a robot, with whatever features they were built.
             other => {
-                tracing::debug!(kind = %other, "this program was built without it");
+                tracing::debug!(kind = %other, "this program was built without a transport");
                 continue;
             }
         };
@@ -295,7 +304,7 @@ fn transports(
 #[cfg(feature = "shm")]
 fn shm(
     config: &Config,
-    keeper: &mut Keeper,
+    maintenance: &mut DirMaintenance,
     incarnation: Incarnation,
     handle: &Handle,
 ) -> Result<Arc<dyn Transport>, String> {
@@ -304,46 +313,50 @@ fn shm(
     let config = ShmConfig {
         capacity: settings.capacity,
         max_letter: usize::try_from(settings.max_letter).unwrap_or(usize::MAX),
-        ..ShmConfig::new(keeper.place.part("shm"), keeper.place.prefix(), incarnation)
+        ..ShmConfig::new(
+            maintenance.dir.part("shm"),
+            maintenance.dir.prefix(),
+            incarnation,
+        )
     };
     let transport = ShmTransport::new(config, handle.clone()).map_err(|error| error.to_string())?;
     let transport = Arc::new(transport);
-    keeper.shm = Some(Arc::downgrade(&transport));
-    tidy(handle, keeper, &transport, ShmTransport::tidy);
+    maintenance.shm = Some(Arc::downgrade(&transport));
+    tidy(handle, maintenance, &transport, ShmTransport::tidy);
     Ok(transport)
 }
 
 fn unix(
     config: &Config,
     role: &Role<'_>,
-    keeper: &mut Keeper,
+    maintenance: &mut DirMaintenance,
     incarnation: Incarnation,
     handle: &Handle,
 ) -> Result<Arc<dyn Transport>, String> {
     use fipa_transport_net::{UnixConfig, UnixTransport};
     let config = UnixConfig {
-        directory: keeper.place.part("unix"),
-        identity: identity(config, role, &keeper.place, incarnation)?,
+        directory: maintenance.dir.part("unix"),
+        identity: identity(config, role, &maintenance.dir, incarnation)?,
         limits: stream_limits(config),
     };
     let transport = Arc::new(UnixTransport::new(config, handle.clone()));
-    keeper.unix = Some(Arc::downgrade(&transport));
-    tidy(handle, keeper, &transport, UnixTransport::tidy);
+    maintenance.unix = Some(Arc::downgrade(&transport));
+    tidy(handle, maintenance, &transport, UnixTransport::tidy);
     Ok(transport)
 }
 
-/// Has a transport remove what processes have left that ended. The directory notices the end of
-/// every process, a transport only of those that it talks to.
+/// Starts a task that removes a transport's leftovers of processes that have ended. The directory
+/// detects the end of every process, a transport only of those that it has connections with.
 fn tidy<T: Transport>(
     handle: &Handle,
-    keeper: &Keeper,
+    maintenance: &DirMaintenance,
     transport: &Arc<T>,
     tidy: impl Fn(&T) + Send + 'static,
 ) {
-    let (mut departures, there) = (keeper.host.departures(), Arc::downgrade(transport));
+    let (mut departures, weak) = (maintenance.host.departures(), Arc::downgrade(transport));
     handle.spawn(async move {
         while departures.next().await {
-            match there.upgrade() {
+            match weak.upgrade() {
                 Some(transport) => tidy(&transport),
                 None => return,
             }
@@ -355,14 +368,14 @@ fn tidy<T: Transport>(
 fn tcp(
     config: &Config,
     role: &Role<'_>,
-    place: &Place,
+    dir: &DomainDir,
     incarnation: Incarnation,
     handle: &Handle,
 ) -> Result<Arc<dyn Transport>, String> {
     use fipa_transport_net::{TcpConfig, TcpTransport};
     let config = TcpConfig {
         listen: listen(&config.transport.tcp.listen, role),
-        identity: identity(config, role, place, incarnation)?,
+        identity: identity(config, role, dir, incarnation)?,
         limits: stream_limits(config),
         processes: config.transport.tcp.processes,
         #[cfg(feature = "secure")]
@@ -375,14 +388,14 @@ fn tcp(
 fn udp(
     config: &Config,
     role: &Role<'_>,
-    place: &Place,
+    dir: &DomainDir,
     incarnation: Incarnation,
     handle: &Handle,
 ) -> Result<Arc<dyn Transport>, String> {
     use fipa_transport_net::{UdpConfig, UdpTransport};
     let config = UdpConfig {
         listen: config.transport.udp.listen.clone(),
-        identity: identity(config, role, place, incarnation)?,
+        identity: identity(config, role, dir, incarnation)?,
         limits: datagram_limits(config),
     };
     Ok(Arc::new(UdpTransport::new(config, handle.clone())))
@@ -393,21 +406,21 @@ fn quic(
     config: &Config,
     role: &Role<'_>,
     security: &fipa_transport_net::secure::Security,
-    place: &Place,
+    dir: &DomainDir,
     incarnation: Incarnation,
     handle: &Handle,
 ) -> Result<Arc<dyn Transport>, String> {
     use fipa_transport_net::{QuicConfig, QuicTransport};
     let config = QuicConfig {
         listen: config.transport.quic.listen.clone(),
-        identity: identity(config, role, place, incarnation)?,
+        identity: identity(config, role, dir, incarnation)?,
         limits: stream_limits(config),
         security: security.clone(),
     };
     Ok(Arc::new(QuicTransport::new(config, handle.clone())))
 }
 
-/// The limits of transports that carry letters of any size.
+/// Returns the limits of the transports that carry letters of any size.
 fn stream_limits(config: &Config) -> fipa_transport_net::Limits {
     fipa_transport_net::Limits {
         max_letter: usize::try_from(config.transport.shm.max_letter).unwrap_or(usize::MAX),
@@ -419,7 +432,7 @@ fn stream_limits(config: &Config) -> fipa_transport_net::Limits {
     }
 }
 
-/// The limits of the one whose letters fit datagrams.
+/// Returns the limits of UDP, whose letters fit datagrams.
 #[cfg(feature = "net")]
 fn datagram_limits(config: &Config) -> fipa_transport_net::UdpLimits {
     fipa_transport_net::UdpLimits {
@@ -430,7 +443,8 @@ fn datagram_limits(config: &Config) -> fipa_transport_net::UdpLimits {
     }
 }
 
-/// A gateway listens where its owner wants it, other processes for their own host.
+/// Returns the addresses to listen on: those of the configuration for the gateway, loopback for other
+/// processes.
 #[cfg(feature = "net")]
 fn listen(addresses: &[String], role: &Role<'_>) -> Vec<String> {
     if role.gateway {
@@ -443,16 +457,16 @@ fn listen(addresses: &[String], role: &Role<'_>) -> Vec<String> {
 fn identity(
     config: &Config,
     role: &Role<'_>,
-    place: &Place,
+    dir: &DomainDir,
     incarnation: Incarnation,
 ) -> Result<fipa_transport_net::Identity, String> {
     Ok(fipa_transport_net::Identity {
         name: role.name.to_string(),
         incarnation,
         domain: config.domain.clone(),
-        host: place
+        host: dir
             .host_id()
-            .map_err(|error| format!("cannot tell this host: {error}"))?,
+            .map_err(|error| format!("cannot identify this host: {error}"))?,
     })
 }
 
@@ -462,7 +476,7 @@ mod tests {
     use crate::config::Sources;
 
     #[test]
-    fn what_one_peer_may_have_is_what_the_configuration_says_over_every_transport() {
+    fn limits_per_peer_of_the_configuration_apply_to_every_transport() {
         let set = ["connections=3", "letters=5", "bytes=70KiB"];
         let sources = Sources {
             set: set.map(|it| format!("security.peer_{it}")).into(),

@@ -1,5 +1,5 @@
-//! The rules of `[access]` between agents of one host, which have no gateway between them: who gets
-//! a letter holds its sender to them.
+//! The rules of `[access]` between agents of one host, without a gateway: the process of the receiver
+//! applies them.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -19,7 +19,7 @@ use fipa_transport::{
 };
 use fipa_transport_net::{Identity, Limits, TcpConfig, TcpTransport};
 
-/// Two processes' memberships in a domain of their own: one without rules, and one with these.
+/// Opens two memberships in a new domain: one without rules, and one with these rules.
 async fn host(kind: Kind, rules: &str) -> (Domain, Domain) {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     let number = NEXT.fetch_add(1, Ordering::Relaxed);
@@ -50,7 +50,7 @@ async fn send(from: &Agent, to: &str, performative: Performative) -> Outcome {
     delivery.outcome
 }
 
-/// Why it was refused, if it was.
+/// Returns the reason of a refusal.
 fn refused(outcome: &Outcome) -> Option<String> {
     match outcome {
         Outcome::Failed {
@@ -85,7 +85,7 @@ async fn rules_are_kept(kind: Kind) {
         (&rover, "arm", Performative::Inform),
         (&rover, "leg", Performative::Request),
         (&crex, "arm", Performative::Request),
-        // Nobody is refused what is sent, but what comes.
+        // A process applies its rules to received letters, not to sent ones.
         (&arm, "rover", Performative::Request),
     ] {
         let outcome = send(from, to, performative).await;
@@ -94,12 +94,12 @@ async fn rules_are_kept(kind: Kind) {
     let outcome = send(&rover, "arm", Performative::Request).await;
     let why = refused(&outcome).unwrap_or_else(|| panic!("{outcome}"));
     assert!(why.contains("a rule denies it (access.deny)"), "{why}");
-    // Its sender is told in FIPA's words, too, and nothing has come.
+    // Its sender also gets a failure message, and the receiver gets no letter.
     assert_eq!(next(&rover).await.sender().unwrap().name(), "arm");
     let failure = next(&rover).await;
     assert_eq!(*failure.performative(), Performative::Failure);
-    let told = String::from_utf8_lossy(failure.content().unwrap()).into_owned();
-    assert!(told.contains("refused"), "{told}");
+    let text = String::from_utf8_lossy(failure.content().unwrap()).into_owned();
+    assert!(text.contains("refused"), "{text}");
     assert_eq!(*next(&arm).await.performative(), Performative::Inform);
     assert_eq!(*next(&arm).await.performative(), Performative::Request);
     assert!(arm.try_receive().unwrap().is_none());
@@ -125,7 +125,7 @@ async fn rules_are_kept_over_tcp() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn who_sends_too_much_is_refused_and_others_are_not() {
+async fn a_sender_beyond_its_rate_is_refused_and_others_are_not() {
     const RATE: usize = 5;
     let (lax, strict) = host(Kind::Shm, "access.rate=5").await;
     let (rover, crex) = (
@@ -138,7 +138,7 @@ async fn who_sends_too_much_is_refused_and_others_are_not() {
         let outcome = send(&rover, "arm", Performative::Inform).await;
         last = refused(&outcome);
         taken += usize::from(outcome.is_success());
-        // Sent more slowly than that, a letter is never too many.
+        // A slow machine may send fewer letters than the rate, and then none is refused.
         assert!(begun.elapsed() < Duration::from_secs(60), "never refused");
     }
     assert!(last.unwrap().contains("access.rate"));
@@ -150,11 +150,11 @@ async fn who_sends_too_much_is_refused_and_others_are_not() {
     strict.close().await;
 }
 
-/// What the sink of a peer that lies is told.
+/// Stores the conclusion that the forging peer gets.
 #[derive(Default)]
-struct Told(parking_lot::Mutex<Option<Conclusion>>);
+struct StoredConclusion(parking_lot::Mutex<Option<Conclusion>>);
 
-impl Sink for Told {
+impl Sink for StoredConclusion {
     fn arrived(&self, _: Arrival) -> Verdict {
         Verdict::Now(Answer::Accepted)
     }
@@ -166,8 +166,8 @@ impl Sink for Told {
     }
 }
 
-/// Hands a letter in the gateway's name, over TCP and with the gateway's incarnation, to an agent of
-/// a process, and returns what that process says.
+/// Sends a forged letter to an agent of a process over TCP, with the name and incarnation of the
+/// gateway. Returns the answer of that process.
 async fn hand_over(gateway: &Gateway, to: &Entry) -> Conclusion {
     let config = TcpConfig {
         processes: true,
@@ -183,8 +183,8 @@ async fn hand_over(gateway: &Gateway, to: &Entry) -> Conclusion {
         security: None,
     };
     let transport = TcpTransport::new(config, tokio::runtime::Handle::current());
-    let told = Arc::new(Told::default());
-    transport.listen(told.clone()).unwrap();
+    let stored = Arc::new(StoredConclusion::default());
+    transport.listen(stored.clone()).unwrap();
     let message = Message::builder(Performative::Request)
         .sender(AgentId::new(gateway.name()).unwrap())
         .receiver(AgentId::new(&*to.name).unwrap())
@@ -209,7 +209,7 @@ async fn hand_over(gateway: &Gateway, to: &Entry) -> Conclusion {
         .unwrap();
     let began = Instant::now();
     loop {
-        if let Some(conclusion) = told.0.lock().take() {
+        if let Some(conclusion) = stored.0.lock().take() {
             return conclusion;
         }
         assert!(began.elapsed() < Duration::from_secs(60));
@@ -218,7 +218,7 @@ async fn hand_over(gateway: &Gateway, to: &Entry) -> Conclusion {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_name_of_the_gateway_opens_no_door_over_tcp() {
+async fn a_forged_name_of_the_gateway_is_refused_over_tcp() {
     let domain = format!("domain=acc-{}-gateway", std::process::id());
     let config = |more: &[&str]| {
         let set = [&*domain, "discovery.mdns=false", "mts.name=door-mts"];
@@ -244,7 +244,7 @@ async fn the_name_of_the_gateway_opens_no_door_over_tcp() {
     assert_eq!(*reason, FailureReason::Refused);
     assert!(detail.contains("access.deny"), "{detail}");
     assert!(arm.try_receive().unwrap().is_none());
-    // Without the owner's leave a process is not there at all.
+    // A process listens on TCP only if transport.tcp.processes is true.
     let quiet = Domain::open(&config(&[])).await.unwrap();
     let leg = quiet.register("leg").unwrap();
     let entry = gateway.directory().lookup("leg").unwrap();

@@ -1,5 +1,5 @@
-//! A service with several addresses of one kind is reached at whichever answers, without its letters
-//! being tried twice.
+//! A service with several addresses of one kind is reached at the address that answers, without a
+//! second attempt for its letters.
 
 use std::net::{Ipv4Addr, SocketAddr, TcpStream};
 use std::sync::Arc;
@@ -17,7 +17,8 @@ use tokio::runtime::Handle;
 const ROVER: Incarnation = Incarnation::from_u64(0x50e4);
 const ARM: Incarnation = Incarnation::from_u64(0xa53);
 
-/// A service with TCP and a patience beyond this test's, and where it is.
+/// Starts a service with TCP and timeouts longer than this test. Returns also its directory and
+/// location.
 fn service(name: &str) -> (Mts, Arc<MemoryDirectory>, Location) {
     let incarnation = Incarnation::random();
     let patient = Duration::from_secs(60);
@@ -62,7 +63,7 @@ fn service(name: &str) -> (Mts, Arc<MemoryDirectory>, Location) {
 async fn an_address_that_does_not_answer_costs_no_attempt() {
     let (rovers, known, _) = service("rovers");
     let (arms, there, location) = service("arms");
-    // A queue of one, and it is taken: the system answers no more.
+    // The only slot of the accept queue is taken, so the system does not answer further connections.
     let full = TcpSocket::new_v4().unwrap();
     full.bind(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))
         .unwrap();

@@ -1,4 +1,4 @@
-//! Programs that clean `/tmp`: the runtime directory is passed over, or joined again.
+//! Programs that clean `/tmp`: they skip the runtime directory, or the processes join it again.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
 #![allow(clippy::print_stderr, reason = "a skipped test says so")]
@@ -13,7 +13,7 @@ use fipa::{AgentId, Config, Performative};
 
 const WATCHDOG: Duration = Duration::from_secs(60);
 
-/// Content that is copied, and content that is read in the sender's memory.
+/// Lengths of content that is copied, and of content that is read in the sender's memory.
 const LENGTHS: [usize; 2] = [10, 100_000];
 
 /// Runs one of the ignored tests in a process of its own, with this runtime directory.
@@ -53,8 +53,8 @@ fn is_delivered(from: &Agent, to: &Agent, len: usize) -> bool {
     delivered
 }
 
-/// Waits until letters of all sizes arrive both ways.
-fn until_they_talk(one: &Agent, other: &Agent) {
+/// Waits until letters of all sizes arrive in both directions.
+fn until_letters_arrive(one: &Agent, other: &Agent) {
     let began = Instant::now();
     for (from, to) in [(one, other), (other, one)] {
         for len in LENGTHS {
@@ -86,21 +86,21 @@ fn inside_a_directory_that_is_removed() {
             domains[0].register("arm").unwrap(),
             domains[1].register("leg").unwrap(),
         );
-        until_they_talk(&arm, &leg);
+        until_letters_arrive(&arm, &leg);
         for moved in [false, true] {
             let away = run.with_extension("away");
             match moved {
-                // An error is that the processes are back before all is removed.
+                // Fails if the processes join again before all files are removed.
                 false => drop(std::fs::remove_dir_all(&run)),
-                // Which the kernel does not report.
+                // The kernel does not report this.
                 true => std::fs::rename(&run, &away).unwrap(),
             }
-            // Until all have joined again, a name may be unknown to the others.
-            until_they_talk(&arm, &leg);
+            // A name may be unknown until all processes have joined again.
+            until_letters_arrive(&arm, &leg);
             let newcomer = Domain::open(&config).unwrap();
             let foot = newcomer.register("foot").unwrap();
-            until_they_talk(&foot, &arm);
-            until_they_talk(&foot, &leg);
+            until_letters_arrive(&foot, &arm);
+            until_letters_arrive(&foot, &leg);
             drop(foot);
             newcomer.close();
             let _ = std::fs::remove_dir_all(away);
@@ -113,7 +113,7 @@ fn inside_a_directory_that_is_removed() {
 }
 
 #[test]
-fn systemd_tmpfiles_passes_over_a_directory_in_use() {
+fn systemd_tmpfiles_skips_a_directory_in_use() {
     let home = tempfile::tempdir().unwrap();
     let version = Command::new("systemd-tmpfiles").arg("--version").output();
     if version.is_err() {
@@ -151,7 +151,7 @@ fn inside_a_cleaned_directory() {
     };
     let before = files();
     assert!(before.len() > 10, "{before:?}");
-    // As `/tmp` is cleaned, and as if the runtime directory itself had a line. Everything is old.
+    // Cleans the parent, as for `/tmp`, and the runtime directory itself. With age 0, all files are old.
     for line in [cleaned, &run] {
         let idle = line.join("idle");
         std::fs::create_dir(&idle).unwrap();
@@ -168,7 +168,7 @@ fn inside_a_cleaned_directory() {
         assert!(!idle.exists(), "{} was not cleaned", line.display());
         assert_eq!(files(), before);
     }
-    until_they_talk(&arm, &leg);
+    until_letters_arrive(&arm, &leg);
     drop((arm, leg));
     domain.close();
 }

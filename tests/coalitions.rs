@@ -30,9 +30,9 @@ impl Host {
             "discovery.mdns=false".to_owned(),
         ];
         if let Some(peer) = peer {
-            let mut ways = peer.gateway.locations().into_iter();
-            let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
-            let address = way.address();
+            let mut locations = peer.gateway.locations().into_iter();
+            let location = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
+            let address = location.address();
             set.push(format!(
                 "discovery.static={{ peer = [\"tcp://{address}\"] }}"
             ));
@@ -57,7 +57,7 @@ impl Host {
         formed.unwrap()
     }
 
-    async fn knows(&self, names: &[&str]) {
+    async fn until_known(&self, names: &[&str]) {
         let directory = self.domain.directory();
         until(&format!("{names:?} are known"), || {
             names.iter().all(|name| directory.known(name).is_some())
@@ -74,7 +74,7 @@ async fn until(what: &str, condition: impl Fn() -> bool) {
     }
 }
 
-async fn tell(from: &Agent, to: &str, content: &str) -> Deliveries {
+async fn send(from: &Agent, to: &str, content: &str) -> Deliveries {
     let message = from
         .message(Performative::Inform)
         .receiver(AgentId::new(to).unwrap())
@@ -84,7 +84,7 @@ async fn tell(from: &Agent, to: &str, content: &str) -> Deliveries {
     from.send(message).await.unwrap()
 }
 
-async fn hears(agent: &Agent, content: &str) {
+async fn receives(agent: &Agent, content: &str) {
     let received = agent.receive().await.unwrap();
     assert_eq!(received.message.content().unwrap(), content);
 }
@@ -101,26 +101,26 @@ async fn a_letter_to_a_coalition_reaches_its_members_or_its_leader() {
     let arm = far.domain.register("arm").unwrap();
     let camera = far.domain.register("camera").unwrap();
     let mut team = near.form("team", &["rover", "arm", "camera"], None);
-    far.knows(&["team", "rover"]).await;
-    near.knows(&["arm", "camera"]).await;
+    far.until_known(&["team", "rover"]).await;
+    near.until_known(&["arm", "camera"]).await;
 
-    // From a member, on the other host than who has formed it.
-    let sent = tell(&camera, "team", "all").await;
+    // The sender is a member on another host than the owner of the coalition.
+    let sent = send(&camera, "team", "all").await;
     assert!(sent.all_succeeded(), "{sent}");
     assert_eq!(to(&sent), BTreeSet::from(["arm", "rover"]));
-    hears(&rover, "all").await;
-    hears(&arm, "all").await;
+    receives(&rover, "all").await;
+    receives(&arm, "all").await;
     assert!(camera.try_receive().unwrap().is_none());
 
-    // Its leader is on the other host.
+    // The leader is on the other host.
     team.change(["rover", "arm", "camera"], Some("arm"))
         .unwrap();
-    let sent = tell(&rover, "team", "lead").await;
+    let sent = send(&rover, "team", "lead").await;
     assert_eq!(to(&sent), BTreeSet::from(["arm"]), "{sent}");
     assert!(sent.all_succeeded());
-    hears(&arm, "lead").await;
+    receives(&arm, "lead").await;
 
-    // A loan works, although nobody can lend for several.
+    // A loan works although its memory cannot be shared by several receivers.
     team.change(["arm", "camera"], None).unwrap();
     let message = rover
         .message(Performative::Inform)
@@ -131,12 +131,12 @@ async fn a_letter_to_a_coalition_reaches_its_members_or_its_leader() {
     loan.content_mut().copy_from_slice(b"large");
     let sent = rover.send_loan(loan).await.unwrap();
     assert!(sent.all_succeeded(), "{sent}");
-    hears(&arm, "large").await;
-    hears(&camera, "large").await;
+    receives(&arm, "large").await;
+    receives(&camera, "large").await;
 
-    // Who is not there has an outcome, too.
+    // A member that is not registered has an outcome, too.
     team.change(["arm", "leg"], None).unwrap();
-    let sent = tell(&rover, "team", "who").await;
+    let sent = send(&rover, "team", "unregistered").await;
     assert_eq!(to(&sent), BTreeSet::from(["arm", "leg"]));
     let leg = sent.0.iter().find(|one| &*one.receiver == "leg").unwrap();
     assert!(matches!(
@@ -146,16 +146,16 @@ async fn a_letter_to_a_coalition_reaches_its_members_or_its_leader() {
             ..
         }
     ));
-    hears(&arm, "who").await;
+    receives(&arm, "unregistered").await;
     team.dissolve().unwrap();
-    assert!(!tell(&rover, "team", "nobody").await.all_succeeded());
+    assert!(!send(&rover, "team", "dissolved").await.all_succeeded());
     for host in [near, far] {
         host.gateway.close().await;
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_cannot_be_is_refused_and_changes_nothing() {
+async fn refused_changes_leave_a_coalition_as_it_was() {
     let host = Host::start(None).await;
     let mut team = host.form("team", &["a", "b"], Some("b"));
     let options = RegisterOptions::default;
@@ -177,7 +177,7 @@ async fn what_cannot_be_is_refused_and_changes_nothing() {
     let many = host.domain.form("many", many, None, options()).unwrap();
     let (error, many) = *team.merge(many).unwrap_err();
     assert!(matches!(error, CoalitionError::Members(_)));
-    // One that was formed in another domain is not removed here.
+    // A coalition of another domain cannot be merged.
     let elsewhere = Host::start(None).await;
     let foreign = elsewhere.form("foreign", &["q"], None);
     let (error, foreign) = *team.merge(foreign).unwrap_err();
@@ -191,14 +191,14 @@ async fn what_cannot_be_is_refused_and_changes_nothing() {
     assert_eq!(names, ["a", "b"]);
     let seen = host.domain.directory().lookup("team").unwrap();
     assert_eq!(seen.role, Role::Coalition(team.members().clone()));
-    // Who leads goes with the part that has the leader.
+    // If the leader is split off, the rest has no leader.
     let part = team.split("part", &["b"], Some("b"), options()).unwrap();
     assert_eq!(team.members().leader(), None);
     team.merge(part).unwrap();
     drop((taken, many, foreign));
 }
 
-/// Who is in which coalition, as it is told to somebody who only watches.
+/// The members of each coalition, as a watcher of the directory sees them.
 #[derive(Default)]
 struct Seen(BTreeMap<Arc<str>, Members>);
 
@@ -219,7 +219,7 @@ impl Seen {
         }
     }
 
-    /// Each module is in one coalition: never in two, never in none.
+    /// Checks that each module is in exactly one coalition.
     fn check(&self) {
         let mut all: Vec<&str> = self
             .0
@@ -238,31 +238,31 @@ async fn watch(domain: Domain, over: Arc<AtomicBool>) -> usize {
         seen.put(entry);
     }
     seen.check();
-    let mut told = 0;
+    let mut changed = 0;
     while !over.load(Ordering::Relaxed) {
         let waited = tokio::time::timeout(Duration::from_millis(20), changes.next()).await;
         if let Ok(Some(change)) = waited {
             seen.take(&change);
             seen.check();
-            told += 1;
+            changed += 1;
         }
-        // Who looks sees no half state either.
-        let mut looked = Seen::default();
+        // A lookup sees no intermediate state either.
+        let mut current = Seen::default();
         for entry in domain.directory().entries().iter() {
-            looked.put(entry);
+            current.put(entry);
         }
-        looked.check();
+        current.check();
     }
-    told
+    changed
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn nobody_sees_a_merger_or_a_split_half_done() {
+async fn a_merger_or_split_is_atomic_for_watchers() {
     let near = Host::start(None).await;
     let far = Host::start(Some(&near)).await;
     let modules = ["m0", "m1", "m2", "m3", "m4", "m5"];
     let mut whole = near.form("whole", &modules, Some("m0"));
-    far.knows(&["whole"]).await;
+    far.until_known(&["whole"]).await;
     let over = Arc::new(AtomicBool::new(false));
     let beside = Domain::open(&near.config).await.unwrap();
     until("it is known beside", || {
@@ -288,10 +288,10 @@ async fn nobody_sees_a_merger_or_a_split_half_done() {
     let last = whole
         .split("last", &["m5"], None, RegisterOptions::default())
         .unwrap();
-    far.knows(&["last"]).await;
+    far.until_known(&["last"]).await;
     over.store(true, Ordering::Relaxed);
     for watching in watching {
-        assert!(watching.await.unwrap() > 0, "nothing was told");
+        assert!(watching.await.unwrap() > 0, "no change was reported");
     }
     drop((whole, last));
     for host in [near, far] {

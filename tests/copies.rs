@@ -1,6 +1,6 @@
-//! Between two hosts, nobody but the kernel touches large content: it is written into shared memory
-//! by its author, goes from there to the socket, and from the socket into the shared memory that
-//! its receiver reads it in. Every way there is to copy it on the way is counted, and stays at zero.
+//! Between two hosts, only the kernel copies large content. The sender writes it into shared memory;
+//! from there it goes to the socket, and from the socket into the shared memory in which the receiver
+//! reads it. Counters of all other copies stay at zero.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -15,14 +15,14 @@ use fipa_transport_net::Counters;
 use fipa_transport_shm::ShmCounters;
 use tokio::time::timeout;
 
-use services::{ARM, Place, ROVER, host};
+use services::{ARM, ROVER, TestService, host};
 
 const BOTH: [Kind; 2] = [Kind::Shm, Kind::Tcp];
 const LETTERS: usize = 24;
-/// With every letter of another length.
+/// Length of the first content, in bytes; each further one is a byte longer.
 const LEN: usize = 1 << 20;
 
-/// What is sent; the content is filled in place.
+/// Makes the message; its content is written in service.
 fn message() -> Message {
     Message::builder(Performative::Inform)
         .sender(AgentId::new("rover").unwrap())
@@ -31,26 +31,26 @@ fn message() -> Message {
         .unwrap()
 }
 
-async fn received(place: &Place) -> Received {
-    let letter = timeout(Duration::from_secs(60), place.mts.receive(ARM)).await;
+async fn received(service: &TestService) -> Received {
+    let letter = timeout(Duration::from_secs(60), service.mts.receive(ARM)).await;
     letter.unwrap().unwrap()
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn large_content_is_touched_by_the_kernel_alone() {
+async fn only_the_kernel_copies_large_content() {
     let (here, there) = (host(), host());
     let (rovers, near) = (
-        Place::start(here.path(), "rovers", &[Kind::Shm], false),
-        Place::start(here.path(), "near", &BOTH, true),
+        TestService::start(here.path(), "rovers", &[Kind::Shm], false),
+        TestService::start(here.path(), "near", &BOTH, true),
     );
     let (far, arms) = (
-        Place::start(there.path(), "far", &BOTH, true),
-        Place::start(there.path(), "arms", &[Kind::Shm], false),
+        TestService::start(there.path(), "far", &BOTH, true),
+        TestService::start(there.path(), "arms", &[Kind::Shm], false),
     );
-    rovers.knows_arm_at(vec![near.at(Kind::Shm)]);
-    near.knows_arm_at(vec![far.at(Kind::Tcp)]);
-    far.knows_arm_at(vec![arms.at(Kind::Shm)]);
-    arms.knows_arm_at(vec![arms.at(Kind::Shm)]);
+    rovers.register_arm_at(vec![near.at(Kind::Shm)]);
+    near.register_arm_at(vec![far.at(Kind::Tcp)]);
+    far.register_arm_at(vec![arms.at(Kind::Shm)]);
+    arms.register_arm_at(vec![arms.at(Kind::Shm)]);
     rovers.mts.register("rover".into(), ROVER);
     arms.mts.register("arm".into(), ARM);
 
@@ -76,7 +76,7 @@ async fn large_content_is_touched_by_the_kernel_alone() {
     }
 
     let all = LETTERS as u64;
-    // From its author's hands into shared memory, and held there by the gateway.
+    // The sender writes into shared memory, and the gateway reads it in service.
     let ShmCounters {
         loans_sent,
         loans_copied,
@@ -89,15 +89,15 @@ async fn large_content_is_touched_by_the_kernel_alone() {
         ..
     } = near.shm();
     assert_eq!((in_place, copied_full), (all, 0));
-    // From there to the socket in pieces, which `transport-net` has tests for: a frame is written
-    // from the letter's own memory. From the socket to where the receiver reads it:
+    // The gateway writes the frame to the socket from the letter's own memory, which `transport-net`
+    // tests. The other gateway reads from the socket into the memory of the receiver.
     let Counters {
         placed,
         placed_moved_bytes,
         ..
     } = far.tcp();
     assert_eq!(placed, all);
-    // Of the first one, what the hello before it was read together with.
+    // Only bytes of the first letter that were read together with the hello are moved.
     assert!(
         placed_moved_bytes < 16 << 10,
         "{placed_moved_bytes} bytes were moved"
@@ -115,7 +115,7 @@ async fn large_content_is_touched_by_the_kernel_alone() {
     } = arms.shm();
     assert_eq!((in_place, copied_full), (all, 0));
 
-    for place in [&rovers, &near, &far, &arms] {
-        place.mts.close(Duration::from_secs(1)).await;
+    for service in [&rovers, &near, &far, &arms] {
+        service.mts.close(Duration::from_secs(1)).await;
     }
 }

@@ -1,5 +1,5 @@
-//! What a robot process can rely on: agents of several processes of one host (each with a
-//! membership of its own, here in one test process) exchange letters.
+//! The guarantees for robot processes: agents of several processes of one host exchange letters. Each
+//! process is a membership of its own, here in one test process.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -13,7 +13,7 @@ use fipa::{
     Performative, RegisterError,
 };
 
-/// A configuration for a domain that no other test has.
+/// Makes a configuration for a domain that no other test uses.
 fn config(set: &[&str]) -> Config {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     let number = NEXT.fetch_add(1, Ordering::Relaxed);
@@ -29,7 +29,7 @@ fn config(set: &[&str]) -> Config {
     .unwrap()
 }
 
-/// Two members of one domain, which stand for two processes.
+/// Opens two memberships in one domain, which represent two processes.
 async fn two(config: &Config) -> (Domain, Domain) {
     let member = || async { Domain::open(config).await.unwrap() };
     (member().await, member().await)
@@ -56,12 +56,12 @@ fn reason(deliveries: &Deliveries) -> FailureReason {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn letters_go_both_ways_and_say_by_which_way() {
+async fn letters_arrive_in_both_directions_and_report_their_transport() {
     for (transports, via) in [
         ("shm,unix,tcp", Kind::Shm),
         ("unix", Kind::Unix),
         ("unix,shm", Kind::Unix),
-        // Not without the owner's leave.
+        // Processes do not use TCP unless transport.tcp.processes is true.
         ("tcp,unix", Kind::Unix),
     ] {
         let config = config(&[&format!("mts.transports={transports}")]);
@@ -107,7 +107,7 @@ async fn letters_go_both_ways_and_say_by_which_way() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_name_belongs_to_one_at_a_time() {
+async fn a_name_belongs_to_one_agent_at_a_time() {
     let config = config(&[]);
     let (here, there) = two(&config).await;
     let first = here.register("arm").unwrap();
@@ -145,7 +145,7 @@ async fn a_thousand_letters_arrive_in_order_and_once() {
     let rover = std::sync::Arc::new(rover);
     let mut sending = Vec::new();
     for number in 0..total {
-        // Polled once here, so that the letters leave in this order; awaited later.
+        // Polled once here, so that the letters are sent in this order; awaited later.
         let rover = std::sync::Arc::clone(&rover);
         let message = inform(&rover, "arm", number.to_le_bytes());
         let mut send = Box::pin(async move { rover.send(message).await.unwrap() });
@@ -174,7 +174,7 @@ async fn futures_poll_once<T>(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_full_queue_fails_late_and_harms_nobody_else() {
+async fn a_full_queue_fails_at_the_deadline_and_does_not_block_other_receivers() {
     let config = config(&["mts.queue=2"]);
     let (here, there) = two(&config).await;
     let rover = here.register("rover").unwrap();
@@ -207,9 +207,9 @@ async fn a_full_queue_fails_late_and_harms_nobody_else() {
     };
     let (blocked, ()) = tokio::join!(blocked, meanwhile);
     assert_eq!(reason(&blocked.unwrap()), FailureReason::QueueFull);
-    // The sender reads its failure message; the next letter waits for the reader, not in vain.
-    let told = rover.receive().await.unwrap();
-    assert_eq!(*told.message.performative(), Performative::Failure);
+    // The sender gets a failure message. The next letter waits until the receiver reads.
+    let failure = rover.receive().await.unwrap();
+    assert_eq!(*failure.message.performative(), Performative::Failure);
     let waiting = rover.send(inform(&rover, "slow", "in time"));
     let reading = async {
         let mut seen = Vec::new();
@@ -262,16 +262,16 @@ async fn a_pattern_reaches_all_but_the_sender() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn nobody_of_that_name_is_a_failure_told_once() {
+async fn an_unknown_name_yields_one_failure_message() {
     let domain = Domain::open(&config(&[])).await.unwrap();
     let rover = domain.register("rover").unwrap();
-    for to in ["nobody", "nobody_.*", "broken("] {
+    for to in ["unknown", "unknown_.*", "broken("] {
         let deliveries = rover.send(inform(&rover, to, "hello")).await.unwrap();
         assert_eq!(reason(&deliveries), FailureReason::NoSuchAgent);
-        let told = rover.receive().await.unwrap().message;
-        assert_eq!(*told.performative(), Performative::Failure);
-        assert_eq!(told.ontology(), Some("fipa-agent-management"));
-        let content = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
+        let failure = rover.receive().await.unwrap().message;
+        assert_eq!(*failure.performative(), Performative::Failure);
+        assert_eq!(failure.ontology(), Some("fipa-agent-management"));
+        let content = String::from_utf8(failure.content().unwrap().to_vec()).unwrap();
         assert!(
             content.contains("no such agent") && content.contains(to),
             "{content}"
@@ -315,7 +315,7 @@ async fn loaned_content_is_not_copied() {
         );
         assert!(is_shared_memory(content), "{len} bytes were copied");
     }
-    // Short content for several receivers is copied for each, and everything else is the same.
+    // Short content for several receivers is copied for each of them.
     let other = there.register("arm_2").unwrap();
     for len in [5000, 1 << 20] {
         let mut loan = rover.loan(inform(&rover, "arm.*", []), len).unwrap();
@@ -364,19 +364,19 @@ async fn large_content_for_several_receivers_is_in_memory_once() {
             assert!(is_shared_memory(content));
             places.insert(content.as_ptr());
         }
-        // All of one process read the same bytes, which are not those of the sender's mapping.
+        // All agents of one process read the same bytes, in a mapping other than the sender's.
         assert_eq!(places.len(), 1);
         assert!(!places.contains(&content));
     }
-    // To one there is nothing to be saved, and who is not reached that way has a copy.
-    let sent = rover.send(message(&["arm_0", "nobody"])).await.unwrap();
+    // An unknown receiver does not affect the delivery to the other one.
+    let sent = rover.send(message(&["arm_0", "unknown"])).await.unwrap();
     assert_eq!(sent.0.len(), 2, "{sent}");
     let incoming = arms[0].receive().await.unwrap();
     assert_eq!(incoming.message.content().unwrap(), &vec![7; 1 << 20]);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn large_content_for_several_receivers_goes_to_those_without_shared_memory_too() {
+async fn large_content_for_several_receivers_also_reaches_those_without_shared_memory() {
     let config = config(&["mts.transports=shm,unix"]);
     let domain = format!("domain={}", config.domain);
     let plain = Config::load(&Sources {
@@ -424,7 +424,7 @@ fn is_shared_memory(bytes: &[u8]) -> bool {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_too_large_says_so() {
+async fn a_letter_that_is_too_large_fails_with_that_reason() {
     let config = config(&["transport.shm.max_letter=64KiB"]);
     let domain = Domain::open(&config).await.unwrap();
     let (rover, arm) = (
@@ -451,14 +451,14 @@ async fn what_is_too_large_says_so() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_agent_that_left_is_gone_and_its_successor_is_reached() {
+async fn a_deregistered_agent_is_unknown_and_its_successor_is_reached() {
     let config = config(&[]);
     let (here, there) = two(&config).await;
     let rover = here.register("rover").unwrap();
     let arm = there.register("arm").unwrap();
     assert!(
         rover
-            .send(inform(&rover, "arm", "first life"))
+            .send(inform(&rover, "arm", "first"))
             .await
             .unwrap()
             .all_succeeded()
@@ -467,20 +467,20 @@ async fn an_agent_that_left_is_gone_and_its_successor_is_reached() {
     let [Ok(unread)] = &unread[..] else {
         panic!("one message waited: {unread:?}");
     };
-    assert_eq!(unread.message.content().unwrap(), "first life");
+    assert_eq!(unread.message.content().unwrap(), "first");
     let gone = rover.send(inform(&rover, "arm", "between")).await.unwrap();
     assert_eq!(reason(&gone), FailureReason::NoSuchAgent);
     let arm = there.register("arm").unwrap();
     assert!(
         rover
-            .send(inform(&rover, "arm", "second life"))
+            .send(inform(&rover, "arm", "second"))
             .await
             .unwrap()
             .all_succeeded()
     );
     assert_eq!(
         arm.receive().await.unwrap().message.content().unwrap(),
-        "second life"
+        "second"
     );
 }
 
@@ -503,7 +503,7 @@ fn processes_without_a_runtime_have_the_same_calls() {
         .message(Performative::Inform)
         .receiver(arm.id().clone())
         .content("hello");
-    // Nobody is receiving yet: the letter is taken in all the same.
+    // The letter is delivered although no call receives yet.
     assert!(
         rover
             .send(message.build().unwrap())
@@ -517,7 +517,7 @@ fn processes_without_a_runtime_have_the_same_calls() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn nothing_is_left_behind() {
+async fn closing_a_domain_removes_its_files_and_shared_memory() {
     let config = config(&[]);
     let names = || {
         let shm = std::fs::read_dir("/dev/shm").unwrap();
@@ -527,7 +527,7 @@ async fn nothing_is_left_behind() {
             .collect::<Vec<_>>()
     };
     let user = std::os::unix::fs::MetadataExt::uid(&std::fs::metadata("/proc/self").unwrap());
-    let place = format!("/tmp/fipa-{user}/{}", config.domain);
+    let dir = format!("/tmp/fipa-{user}/{}", config.domain);
     let domain = Domain::open(&config).await.unwrap();
     let (rover, arm) = (
         domain.register("rover").unwrap(),
@@ -545,11 +545,11 @@ async fn nothing_is_left_behind() {
     drop((held, rover, arm));
     domain.close().await;
     assert_eq!(names(), Vec::<String>::new());
-    assert!(!std::path::Path::new(&place).exists());
+    assert!(!std::path::Path::new(&dir).exists());
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn after_the_end_nothing_hangs() {
+async fn calls_after_closing_the_domain_fail_and_do_not_hang() {
     let (here, there) = two(&config(&[])).await;
     let (rover, arm) = (
         here.register("rover").unwrap(),
@@ -561,7 +561,7 @@ async fn after_the_end_nothing_hangs() {
     assert!(!deliveries.all_succeeded(), "{deliveries}");
     let ended = loop {
         match rover.receive().await {
-            // What was told before the end may still be read.
+            // Failure messages from before the end may still be read.
             Ok(incoming) => assert_eq!(*incoming.message.performative(), Performative::Failure),
             Err(error) => break error,
         }
@@ -570,7 +570,7 @@ async fn after_the_end_nothing_hangs() {
 }
 
 #[test]
-fn members_may_come_and_go_all_at_once() {
+fn processes_may_join_and_leave_concurrently() {
     let config = config(&[]);
     std::thread::scope(|scope| {
         for member in 0..6 {
@@ -590,7 +590,7 @@ fn members_may_come_and_go_all_at_once() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_process_does_not_take_to_the_network_and_says_what_to_list_instead() {
+async fn a_process_does_not_use_the_network_and_its_error_names_the_transports_to_list() {
     let config = config(&["mts.transports=tcp"]);
     let error = Domain::open(&config).await.err().unwrap().to_string();
     assert!(error.contains("list shm or unix"), "{error}");
@@ -598,8 +598,9 @@ async fn a_process_does_not_take_to_the_network_and_says_what_to_list_instead() 
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn routes_between_hosts_leave_those_within_a_host_alone() {
-    // Of the gateway, which passes on by TCP what processes hand it by the usual order.
+async fn routes_between_hosts_do_not_change_those_within_a_host() {
+    // The routes are for the gateway, which forwards by TCP the letters that it gets from processes by
+    // the usual order.
     let config = config(&["routes={ \"arm\" = [\"tcp\"], \"leg\" = [\"unix\"] }"]);
     let (here, there) = two(&config).await;
     let rover = here.register("rover").unwrap();

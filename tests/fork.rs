@@ -1,9 +1,9 @@
-//! A process that forks without exec: its child can neither use nor release what is its own.
+//! A process that forks without exec: its child can neither use nor release the parent's membership.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on ends")]
 #![allow(
     clippy::print_stderr,
-    reason = "the child has no other way to say what is wrong"
+    reason = "the child has no other way to report a failure"
 )]
 
 use std::process::Command;
@@ -17,10 +17,11 @@ use fipa::{
 };
 use fork::{Fork, fork, waitpid};
 
-/// Large enough to be read in the sender's memory.
+/// Content that is large enough to be read in the sender's memory.
 static CONTENT: [u8; 100_000] = [7; 100_000];
 
-/// What the child exits with, instead of a panic, whose report may need a lock of another thread.
+/// Exit code of a successful child. The child does not panic, because the report of a panic may need a
+/// lock that another thread held at the fork.
 const PASSED: i32 = 7;
 
 fn config(domain: &str) -> Config {
@@ -39,8 +40,8 @@ fn config(domain: &str) -> Config {
 /// Runs one of the ignored tests in a process of its own, because a child has only the thread
 /// that forked.
 fn in_a_process(name: &str) {
-    let place = tempfile::tempdir().unwrap();
-    let run = place.path().join("run");
+    let home = tempfile::tempdir().unwrap();
+    let run = home.path().join("run");
     let status = Command::new("timeout")
         .args(["--signal=KILL", "120"])
         .arg(std::env::current_exe().unwrap())
@@ -59,7 +60,7 @@ fn in_a_process(name: &str) {
     assert!(!run.exists(), "files are left in {}", run.display());
 }
 
-/// The domain of this process, which no other process has.
+/// Returns the domain of this process, which no other process uses.
 fn domain_name() -> String {
     assert!(std::env::var_os("FIPA_FORK_TEST").is_some());
     format!("fork-{}", std::process::id())
@@ -81,10 +82,10 @@ fn is_whole(incoming: &Incoming) -> bool {
     content.is_some_and(|content| content[..] == CONTENT)
 }
 
-/// The outcome of the child, as an exit code.
+/// Ends the child with an exit code that depends on the checks.
 fn exit(checks: &[(&str, bool)]) -> ! {
     let failed = checks.iter().filter(|(_, passed)| !passed);
-    let failed: Vec<&str> = failed.map(|(what, _)| *what).collect();
+    let failed: Vec<&str> = failed.map(|(name, _)| *name).collect();
     if !failed.is_empty() {
         eprintln!("in the child: {failed:?}");
     }
@@ -94,7 +95,7 @@ fn exit(checks: &[(&str, bool)]) -> ! {
 #[track_caller]
 fn wait_for(child: i32) {
     let status = waitpid(child).unwrap();
-    // The code is in the second byte.
+    // The exit code is in the second byte.
     assert_eq!(status, PASSED << 8, "the child failed");
 }
 
@@ -152,12 +153,12 @@ fn parent_of_a_child_that_drops() {
         Fork::Parent(child) => wait_for(child),
     }
 
-    // The parent has everything that it had.
+    // The parent still has its letters and registrations.
     assert!(is_whole(&held));
     for name in team {
         assert!(here.directory().lookup(name).is_some(), "{name}");
     }
-    // More than there are slots: none was given back twice.
+    // More letters than slots, to show that no slot was returned twice.
     for _ in 0..40 {
         assert!(is_delivered(&leg, "arm"));
         assert!(is_delivered(&arm, "leg"));
@@ -177,14 +178,14 @@ fn parent_of_a_child_that_drops() {
     for domain in [newcomer, here, there] {
         domain.close();
     }
-    let traces = std::fs::read_dir("/dev/shm").unwrap().flatten();
+    let files = std::fs::read_dir("/dev/shm").unwrap().flatten();
     let prefix = format!("fipa_{}_", domain_name());
-    let mut ours = traces.filter(|file| file.file_name().to_string_lossy().starts_with(&prefix));
+    let mut ours = files.filter(|file| file.file_name().to_string_lossy().starts_with(&prefix));
     assert!(ours.next().is_none(), "shared memory is left");
 }
 
 #[test]
-fn a_child_can_join_the_domain_for_itself() {
+fn a_child_can_join_the_domain_with_a_membership_of_its_own() {
     in_a_process("parent_of_a_child_that_joins");
 }
 

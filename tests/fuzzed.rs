@@ -1,8 +1,7 @@
-//! The bodies of the fuzz targets with drawn inputs: what libFuzzer finds in seconds is found here too,
-//! where it is not at hand.
+//! Runs the bodies of the fuzz targets with random inputs, on machines without libFuzzer.
 //!
-//! `FIPA_FUZZ_SECONDS` is how long each goes on (by default, a number of inputs); `FIPA_FUZZ_SEED` repeats
-//! the inputs of an earlier run.
+//! `FIPA_FUZZ_SECONDS` is the time per target; by default each runs a fixed number of inputs.
+//! `FIPA_FUZZ_SEED` repeats the inputs of an earlier run.
 
 #![allow(
     dead_code,
@@ -45,14 +44,14 @@ use std::time::{Duration, Instant};
 
 use fastrand::Rng;
 
-/// Inputs of each body, unless a time is set.
+/// Number of inputs per target, unless a time is set.
 const INPUTS: usize = 150;
 
 fn number(variable: &str) -> Option<u64> {
     std::env::var(variable).ok()?.parse().ok()
 }
 
-/// Runs a body with its seeds, and with what a few changes make of them.
+/// Runs a target with its seeds, and with random mutations of them.
 fn plays(target: &str, play: fn(&[u8])) {
     let seed = number("FIPA_FUZZ_SEED").unwrap_or_else(|| fastrand::u64(..));
     println!("{target}: FIPA_FUZZ_SEED={seed}");
@@ -105,7 +104,7 @@ macro_rules! bodies {
     };
 }
 
-/// One test for each body.
+/// One test per target.
 mod bodies {
     use super::*;
 

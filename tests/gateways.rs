@@ -1,4 +1,4 @@
-//! Two domains, standing for two hosts, and their gateways, which find each other by mDNS on the
+//! Two domains that represent two hosts, with gateways that discover each other by mDNS on the
 //! loopback interface.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
@@ -14,7 +14,7 @@ use fipa::{
     Outcome, Performative, Query, WayFault,
 };
 
-/// A host that no other test has, and names that nobody else announces.
+/// A simulated host with a domain and names that no other test uses.
 struct Host {
     config: Config,
     set: Vec<String>,
@@ -41,7 +41,7 @@ impl Host {
         host
     }
 
-    /// Its configuration, with something else set.
+    /// Returns its configuration with further settings.
     fn configured(&self, set: &[&str]) -> Config {
         let set = set.iter().map(|setting| (*setting).to_owned());
         Config::load(&Sources {
@@ -51,8 +51,8 @@ impl Host {
         .unwrap()
     }
 
-    /// The host's gateway, and a process on it.
-    async fn occupied(&self) -> (Gateway, Domain) {
+    /// Starts the gateway of the host and a process on it.
+    async fn start(&self) -> (Gateway, Domain) {
         let gateway = Gateway::open(&self.config).await.unwrap();
         (gateway, Domain::open(&self.config).await.unwrap())
     }
@@ -109,11 +109,11 @@ fn reason(deliveries: &Deliveries) -> FailureReason {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn small_letters_go_by_udp_and_what_is_too_large_by_tcp() {
+async fn small_letters_use_udp_and_letters_too_large_for_it_use_tcp() {
     let order = ["mts.transports=shm,udp,tcp"];
     let (here, there) = (Host::new(&order), Host::new(&order));
-    let (_near, at_home) = here.occupied().await;
-    let (_far, abroad) = there.occupied().await;
+    let (_near, at_home) = here.start().await;
+    let (_far, abroad) = there.start().await;
     let rover = at_home.register(&here.name("rover")).unwrap();
     let arm = abroad.register(&there.name("arm")).unwrap();
     known(&at_home, arm.name()).await;
@@ -141,10 +141,10 @@ async fn small_letters_go_by_udp_and_what_is_too_large_by_tcp() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn hosts_find_each_other_and_exchange_letters() {
+async fn hosts_discover_each_other_and_exchange_letters() {
     let (here, there) = (Host::new(&[]), Host::new(&[]));
-    let (_near, at_home) = here.occupied().await;
-    let (_far, abroad) = there.occupied().await;
+    let (_near, at_home) = here.start().await;
+    let (_far, abroad) = there.start().await;
     let rover = at_home.register(&here.name("rover")).unwrap();
     let arm = abroad.register(&there.name("arm")).unwrap();
     known(&at_home, arm.name()).await;
@@ -165,7 +165,7 @@ async fn hosts_find_each_other_and_exchange_letters() {
             "two stamps"
         );
     }
-    // Through both gateways at once, loaned content included.
+    // Loaned content passes through both gateways.
     let message = inform(&arm, rover.name(), "");
     let mut loan = arm.loan(message, 1 << 20).unwrap();
     loan.content_mut().fill(3);
@@ -175,7 +175,7 @@ async fn hosts_find_each_other_and_exchange_letters() {
         &vec![3; 1 << 20]
     );
 
-    // What happens to the agent there is known here.
+    // The deregistration of the remote agent becomes known here.
     drop(arm.deregister().unwrap());
     forgotten(&at_home, &there.name("arm")).await;
     let gone = rover
@@ -186,10 +186,10 @@ async fn hosts_find_each_other_and_exchange_letters() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_slow_agent_abroad_holds_its_sender_back() {
+async fn a_slow_agent_on_another_host_holds_its_sender_back() {
     let (here, there) = (Host::new(&[]), Host::new(&["mts.queue=2"]));
-    let (_near, at_home) = here.occupied().await;
-    let (_far, abroad) = there.occupied().await;
+    let (_near, at_home) = here.start().await;
+    let (_far, abroad) = there.start().await;
     let rover = at_home.register(&here.name("rover")).unwrap();
     let arm = abroad.register(&there.name("arm")).unwrap();
     known(&at_home, arm.name()).await;
@@ -213,7 +213,7 @@ async fn a_slow_agent_abroad_holds_its_sender_back() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn without_its_gateway_a_host_still_talks_to_itself() {
+async fn agents_of_one_host_exchange_letters_without_their_gateway() {
     let (here, there) = (Host::new(&["mts.deadline=2s"]), Host::new(&[]));
     let near = Gateway::open(&here.config).await.unwrap();
     let _far = Gateway::open(&there.config).await.unwrap();
@@ -234,12 +234,12 @@ async fn without_its_gateway_a_host_still_talks_to_itself() {
     near.close().await;
     forgotten(&at_home, arm.name()).await;
     let lost = rover
-        .send(inform(&rover, arm.name(), "while it is gone"))
+        .send(inform(&rover, arm.name(), "without the gateway"))
         .await
         .unwrap();
     assert_eq!(reason(&lost), FailureReason::NoSuchAgent);
     let sent = rover
-        .send(inform(&rover, camera.name(), "we two"))
+        .send(inform(&rover, camera.name(), "on this host"))
         .await
         .unwrap();
     assert_eq!(via(&sent), Some(Kind::Shm));
@@ -253,7 +253,7 @@ async fn without_its_gateway_a_host_still_talks_to_itself() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_domain_has_one_gateway_and_a_port_one_owner() {
+async fn a_second_gateway_of_a_domain_or_on_a_port_is_refused() {
     let host = Host::new(&["discovery.mdns=false"]);
     let gateway = Gateway::open(&host.config).await.unwrap();
     match Gateway::open(&host.config).await {
@@ -261,20 +261,20 @@ async fn a_domain_has_one_gateway_and_a_port_one_owner() {
         Err(other) => panic!("{other}"),
         Ok(_) => panic!("two gateways"),
     }
-    // Whatever it would be called.
+    // A gateway with another name is refused, too.
     let mut another = host.config.clone();
     another.mts.name = "another-gateway".to_owned();
     assert!(matches!(
         Gateway::open(&another).await,
         Err(OpenError::GatewayRunning(name)) if name == gateway.name()
     ));
-    let mut ways = gateway.locations().into_iter();
-    let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
-    let taken = format!("transport.tcp.listen={}", way.address());
+    let mut locations = gateway.locations().into_iter();
+    let location = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
+    let taken = format!("transport.tcp.listen={}", location.address());
     let other = Host::new(&["discovery.mdns=false", &taken]);
     match Gateway::open(&other.config).await {
         Err(error @ OpenError::Listen { .. }) => {
-            assert!(error.to_string().contains(way.address()), "{error}");
+            assert!(error.to_string().contains(location.address()), "{error}");
         }
         Err(other) => panic!("{other}"),
         Ok(_) => panic!("two on one port"),
@@ -283,14 +283,14 @@ async fn a_domain_has_one_gateway_and_a_port_one_owner() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_newcomer_that_writes_can_be_answered_at_once() {
+async fn a_new_agent_that_sends_a_letter_can_be_answered_at_once() {
     let (here, there) = (Host::new(&[]), Host::new(&[]));
-    let (_near, at_home) = here.occupied().await;
-    let (_far, abroad) = there.occupied().await;
+    let (_near, at_home) = here.start().await;
+    let (_far, abroad) = there.start().await;
     let arm = abroad.register(&there.name("arm")).unwrap();
     known(&at_home, arm.name()).await;
     for round in 0..5 {
-        // Its letter is faster than the news of it.
+        // Its letter may arrive before its announcement.
         let newcomer = at_home
             .register(&here.name(&format!("newcomer-{round}")))
             .unwrap();
@@ -312,14 +312,14 @@ async fn a_newcomer_that_writes_can_be_answered_at_once() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_gateway_tells_which_way_letters_go_and_what_became_of_them() {
+async fn the_gateway_reports_the_routes_of_letters_and_their_state() {
     let here = Host::new(&[
         "mts.deadline=1s",
         "routes={ \"arm.*\" = [\"tcp\", \"unix\"] }",
     ]);
     let there = Host::new(&[]);
-    let (near, at_home) = here.occupied().await;
-    let (far, abroad) = there.occupied().await;
+    let (near, at_home) = here.start().await;
+    let (far, abroad) = there.start().await;
     let rover = at_home.register(&here.name("rover")).unwrap();
     let arm = abroad.register(&there.name("arm")).unwrap();
     known(&at_home, arm.name()).await;
@@ -341,14 +341,18 @@ async fn the_gateway_tells_which_way_letters_go_and_what_became_of_them() {
     assert_eq!(route.exception.as_deref(), Some("arm.*"));
     assert_eq!(route.ways[0].location.incarnation(), far.incarnation());
     assert_eq!(route.ways[0].standing, Standing::Ready);
-    let way = &route.ways[0].location;
-    let counted = report.ways.iter().find(|it| it.location == *way).unwrap();
-    // What the gateways tell each other goes the same way.
+    let location = &route.ways[0].location;
+    let counted = report
+        .ways
+        .iter()
+        .find(|it| it.location == *location)
+        .unwrap();
+    // The messages between the gateways use the same route, and count as well.
     assert!(counted.taken >= 5 && counted.failed == 0, "{counted:?}");
     let mut connected = report.neighbours.iter();
     assert!(connected.any(|it| it.incarnation == far.incarnation()));
 
-    // What this process does itself: its letters go to the gateway, by the same exception.
+    // The letters of this process go to the gateway, by the same entry of `[routes]`.
     let own = at_home.routes(&Query::all());
     let mut routes = own.routes.iter();
     let to_arm = routes.find(|it| it.receiver == arm.name()).unwrap();
@@ -356,13 +360,13 @@ async fn the_gateway_tells_which_way_letters_go_and_what_became_of_them() {
     assert_eq!(to_arm.exception.as_deref(), Some("arm.*"));
     assert_eq!(to_arm.ways[0].location.kind(), Kind::Unix);
 
-    // A gateway that is killed says no goodbye: what is tried fails, and that is told.
+    // A killed gateway sends no goodbye: attempts fail, and the report counts them.
     let mut killed = Some(far);
     drop(killed.take());
     let lost = rover.send(inform(&rover, arm.name(), "?")).await.unwrap();
     assert!(!lost.all_succeeded(), "{lost}");
     let report = ask().await.unwrap();
-    let counted = report.ways.iter().find(|it| it.location == *way);
+    let counted = report.ways.iter().find(|it| it.location == *location);
     let counted = counted.unwrap();
     assert!(counted.failed > 0, "{counted:?}");
     assert!(counted.last_error.is_some(), "{counted:?}");
@@ -370,7 +374,7 @@ async fn the_gateway_tells_which_way_letters_go_and_what_became_of_them() {
     assert!(ended <= counted.tried, "{counted:?}");
 }
 
-/// Numbered letters under way at a time, and one after another: what became of each.
+/// Sends numbered letters, two at a time, and returns their outcomes.
 async fn numbered(from: Arc<Agent>, to: String, numbers: std::ops::Range<u32>) -> Vec<Deliveries> {
     let sending = |number: u32| {
         let message = inform(&from, &to, &number.to_string());
@@ -398,11 +402,11 @@ async fn numbers(agent: &Agent, count: u32) -> Vec<u32> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn another_configuration_loses_no_letter() {
+async fn reloading_the_configuration_loses_no_letter() {
     const LETTERS: u32 = 2000;
     let (here, there) = (Host::new(&[]), Host::new(&[]));
-    let (mut near, at_home) = here.occupied().await;
-    let (_far, abroad) = there.occupied().await;
+    let (mut near, at_home) = here.start().await;
+    let (_far, abroad) = there.start().await;
     let rover = Arc::new(at_home.register(&here.name("rover")).unwrap());
     let arm = abroad.register(&there.name("arm")).unwrap();
     known(&at_home, arm.name()).await;
@@ -435,7 +439,7 @@ async fn another_configuration_loses_no_letter() {
         config.mts.queue = 0;
         assert!(
             near.reload(&config).is_err(),
-            "a mistake is no configuration"
+            "a configuration with mistakes is refused"
         );
         config.mts.queue = 7;
         let later = near.reload(&config).unwrap();
@@ -448,11 +452,11 @@ async fn another_configuration_loses_no_letter() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_under_way_when_the_gateway_ends_has_an_outcome() {
+async fn letters_in_transit_when_the_gateway_ends_have_an_outcome() {
     const LETTERS: u32 = 600;
     let (here, there) = (Host::new(&["mts.deadline=3s"]), Host::new(&[]));
-    let (near, at_home) = here.occupied().await;
-    let (_far, abroad) = there.occupied().await;
+    let (near, at_home) = here.start().await;
+    let (_far, abroad) = there.start().await;
     let rover = Arc::new(at_home.register(&here.name("rover")).unwrap());
     let arm = Arc::new(abroad.register(&there.name("arm")).unwrap());
     known(&at_home, arm.name()).await;
@@ -467,7 +471,7 @@ async fn what_is_under_way_when_the_gateway_ends_has_an_outcome() {
         delivered += u32::from(deliveries.all_succeeded());
     }
     assert!(delivered < LETTERS, "the gateway has not ended");
-    // What was delivered is there, in order; what was not known to be may be.
+    // Delivered letters have arrived in order. Letters with an unknown outcome may have arrived, too.
     let mut rest = numbers(&arm, delivered.saturating_sub(50)).await;
     rest.splice(0..0, first);
     assert!(rest.is_sorted_by(|a, b| a < b), "{rest:?}");

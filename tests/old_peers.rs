@@ -1,6 +1,6 @@
-//! Conversations with peers that know nothing of us, over real sockets: what fipa_services and
-//! JADE's proxy were recorded to write comes to an agent, and the agent's answer comes to them in
-//! their own hand. The peers are small: a port on which each connection is one letter.
+//! Conversations with legacy peers over real sockets. Recorded letters of fipa_services and of JADE's
+//! proxy reach an agent, and its answers reach the peers in their own dialects. A peer is a listening
+//! port on which each connection carries one letter.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -26,7 +26,7 @@ macro_rules! recorded {
     };
 }
 
-/// Agents on a host with a gateway, which knows one old peer.
+/// Agents on a host with a gateway that knows one legacy peer.
 struct Host {
     gateway: Gateway,
     domain: Domain,
@@ -34,12 +34,13 @@ struct Host {
 }
 
 impl Host {
-    /// `understands` is what the configuration says of the peer, whose agent has this name.
+    /// Starts a host. `understands` is the dialect of the peer in the configuration, and `name` is the
+    /// name of its agent.
     async fn new(name: &str, understands: &str) -> Self {
         Self::with(name, understands, &[]).await
     }
 
-    /// The same, with something else set.
+    /// Starts a host with further settings.
     async fn with(name: &str, understands: &str, settings: &[&str]) -> Self {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let number = NEXT.fetch_add(1, Ordering::Relaxed);
@@ -75,12 +76,12 @@ impl Host {
     }
 
     fn address(&self) -> String {
-        let mut ways = self.gateway.locations().into_iter();
-        let tcp = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
+        let mut locations = self.gateway.locations().into_iter();
+        let tcp = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
         tcp.address().to_owned()
     }
 
-    /// The next letter that the peer gets, to the end of its connection.
+    /// Reads the next letter to the peer, until the end of the connection.
     async fn read_by_peer(&self) -> Vec<u8> {
         let read = async {
             let (mut stream, _) = self.peer.accept().await.unwrap();
@@ -92,8 +93,8 @@ impl Host {
     }
 }
 
-/// A letter as an old peer sends it: all of it, and the end.
-async fn throw(letter: &[u8], at: &str) {
+/// Sends a letter as a legacy peer does: on a connection of its own that ends with the letter.
+async fn send_as_peer(letter: &[u8], at: &str) {
     let mut stream = TcpStream::connect(at).await.unwrap();
     stream.write_all(letter).await.unwrap();
     stream.shutdown().await.unwrap();
@@ -111,7 +112,7 @@ fn read(letter: &[u8]) -> (Envelope, Letter, Message) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_fipa_services_wrote_is_taken_and_answered_in_its_hand() {
+async fn letters_of_fipa_services_are_received_and_answered_in_its_dialect() {
     let host = Host::new("alice", "fipa-services").await;
     let [bob, carol, dave] = ["bob", "carol", "dave"].map(|it| host.domain.register(it).unwrap());
     let letters = recorded![
@@ -132,7 +133,7 @@ async fn what_fipa_services_wrote_is_taken_and_answered_in_its_hand() {
         "e19_base_over_64k.be",
     ];
     for (file, bytes) in letters {
-        throw(bytes, &host.address()).await;
+        send_as_peer(bytes, &host.address()).await;
         let (envelope, _, sent) = read(bytes);
         for to in envelope.effective().intended_receivers {
             let agent = [&bob, &carol, &dave].into_iter();
@@ -161,7 +162,7 @@ async fn what_fipa_services_wrote_is_taken_and_answered_in_its_hand() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_letter_that_fipa_services_cannot_read_fails_at_once_with_its_reason() {
+async fn a_letter_that_fipa_services_cannot_decode_fails_at_once_with_the_reason() {
     let host = Host::new("alice", "fipa-services").await;
     let [rover, my_arm] = ["rover", "my arm"].map(|it| host.domain.register(it).unwrap());
     let letter = |from: &Agent| {
@@ -187,7 +188,7 @@ async fn a_letter_that_fipa_services_cannot_read_fails_at_once_with_its_reason()
             other => panic!("{other}"),
         }
     }
-    // Nothing was opened for them: the next connection carries the next letter.
+    // No connection was opened for them: the next connection carries the next letter.
     let plain = letter(&rover).content("plain").build().unwrap();
     let (delivered, read_by_peer) = tokio::join!(rover.send(plain), host.read_by_peer());
     assert!(delivered.unwrap().all_succeeded());
@@ -196,34 +197,34 @@ async fn a_letter_that_fipa_services_cannot_read_fails_at_once_with_its_reason()
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn fipa_services_is_told_that_its_letter_cannot_be_decoded() {
+async fn fipa_services_gets_a_failure_for_a_letter_that_cannot_be_decoded() {
     let host = Host::new("alice", "fipa-services").await;
     let bob = host.domain.register("bob").unwrap();
     let [(_, recorded)] = recorded!["e01_simple.be"];
-    throw(&recorded[..recorded.len() - 3], &host.address()).await;
+    send_as_peer(&recorded[..recorded.len() - 3], &host.address()).await;
     let (_, letter, failure) = read(&host.read_by_peer().await);
     assert_eq!(*failure.performative(), Performative::Failure);
     assert_eq!(failure.receivers()[0].name(), "alice");
     let theirs = failure.encode(Representation::BitEfficient, Dialect::FipaServices);
     assert_eq!(letter.payload().to_bytes(), theirs.unwrap());
-    let told = String::from_utf8_lossy(failure.content().unwrap()).into_owned();
+    let text = String::from_utf8_lossy(failure.content().unwrap()).into_owned();
     assert!(
-        told.contains("cannot be decoded") && told.contains("bob"),
-        "{told}"
+        text.contains("cannot be decoded") && text.contains("bob"),
+        "{text}"
     );
-    // A whole letter comes afterwards, and is the first that the agent gets.
-    throw(recorded, &host.address()).await;
+    // A complete letter follows, and is the first that the agent receives.
+    send_as_peer(recorded, &host.address()).await;
     assert_eq!(receive(&bob).await, read(recorded).2);
     host.gateway.close().await;
 }
 
-/// A letter of an agent of fipa_services to bob, which gives this address as its own. Envelope and
-/// message are encoded so.
+/// Makes a letter to bob from an agent of fipa_services with this address, in these encodings of
+/// envelope and message.
 fn letter_from(name: &str, address: &str, encoded: [Representation; 2]) -> Vec<u8> {
     letter_to("bob", name, address, encoded)
 }
 
-/// The same to another agent.
+/// Makes a letter like [`letter_from`] to this receiver.
 fn letter_to(
     receiver: &str,
     name: &str,
@@ -258,7 +259,7 @@ fn letter_to(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_agent_that_nothing_announces_is_answered_in_its_hand_however_it_encodes() {
+async fn an_unannounced_agent_is_answered_in_its_dialect_for_all_encodings() {
     use Representation::{BitEfficient, String, Xml};
     let host = Host::new("alice", "fipa-services").await;
     let bob = host.domain.register("bob").unwrap();
@@ -271,7 +272,7 @@ async fn an_agent_that_nothing_announces_is_answered_in_its_hand_however_it_enco
     ];
     for (number, encoded) in encodings.into_iter().enumerate() {
         let name = format!("carol-{number}");
-        throw(&letter_from(&name, &at, encoded), &host.address()).await;
+        send_as_peer(&letter_from(&name, &at, encoded), &host.address()).await;
         let asked = receive(&bob).await;
         let answer = bob.reply(&asked, Performative::Agree).build().unwrap();
         let (delivered, answer) =
@@ -280,10 +281,10 @@ async fn an_agent_that_nothing_announces_is_answered_in_its_hand_however_it_enco
         let (_, letter, message) = read(&answer.unwrap());
         let theirs = message.encode(BitEfficient, Dialect::FipaServices);
         assert_eq!(letter.payload().to_bytes(), theirs.unwrap(), "{encoded:?}");
-        // The failure message about a letter to an agent that does not exist, too.
+        // The failure message for a letter to an unknown agent is in its dialect, too.
         let stranger = format!("dave-{number}");
-        let lost = letter_to("nobody", &stranger, &at, encoded);
-        throw(&lost, &host.address()).await;
+        let lost = letter_to("unknown", &stranger, &at, encoded);
+        send_as_peer(&lost, &host.address()).await;
         let (_, letter, failure) = read(&timeout(PATIENCE, host.read_by_peer()).await.unwrap());
         assert_eq!(*failure.performative(), Performative::Failure);
         assert_eq!(failure.receivers()[0].name(), stranger);
@@ -294,13 +295,13 @@ async fn an_agent_that_nothing_announces_is_answered_in_its_hand_however_it_enco
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_agent_that_nothing_announces_is_answered_where_its_letter_says() {
+async fn an_unannounced_agent_is_answered_at_the_address_in_its_letter() {
     let plain = [Representation::BitEfficient; 2];
     // The directory knows another agent at the peer only.
     let host = Host::new("alice", "fipa-services").await;
     let bob = host.domain.register("bob").unwrap();
     let at = format!("tcp://{}", host.peer.local_addr().unwrap());
-    throw(&letter_from("carol", &at, plain), &host.address()).await;
+    send_as_peer(&letter_from("carol", &at, plain), &host.address()).await;
     let asked = receive(&bob).await;
     assert_eq!(asked.content().unwrap(), "lift");
     let answer = bob.reply(&asked, Performative::Agree).content("done");
@@ -318,8 +319,8 @@ async fn an_agent_that_nothing_announces_is_answered_where_its_letter_says() {
     let theirs = message.encode(Representation::BitEfficient, Dialect::FipaServices);
     assert_eq!(letter.payload().to_bytes(), theirs.unwrap());
 
-    // The address of another host is never dialled.
-    throw(
+    // The gateway does not connect to an address of another host.
+    send_as_peer(
         &letter_from("mallory", "tcp://192.0.2.66:6789", plain),
         &host.address(),
     )
@@ -335,7 +336,7 @@ async fn an_agent_that_nothing_announces_is_answered_where_its_letter_says() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn jades_proxy_is_asked_and_answers_where_the_letter_says() {
+async fn jades_proxy_gets_a_request_and_answers_at_the_address_in_the_letter() {
     let host = Host::new("echo@jadetest", "jade").await;
     let rusty = host.domain.register("rusty@rustap").unwrap();
     let question = rusty
@@ -354,10 +355,10 @@ async fn jades_proxy_is_asked_and_answers_where_the_letter_says() {
     let representation = Representation::detect(&letter.payload().head);
     assert_eq!(representation, Some(Representation::String));
     assert_eq!(message.content().unwrap(), "(hello)");
-    // It answers as it was recorded to, where its letter says.
+    // It answers with the recorded letter, at the address in the request.
     let back = message.sender().unwrap().addresses()[0].clone();
     let [(_, recorded)] = recorded!["jade_tcp_reply.xml"];
-    throw(recorded, back.strip_prefix("tcp://").unwrap()).await;
+    send_as_peer(recorded, back.strip_prefix("tcp://").unwrap()).await;
     let answer = receive(&rusty).await;
     assert_eq!(answer, read(recorded).2);
     assert_eq!(answer.sender().unwrap().name(), "echo@jadetest");
@@ -365,19 +366,19 @@ async fn jades_proxy_is_asked_and_answers_where_the_letter_says() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn fipa_services_is_told_in_its_hand_that_a_rule_refuses_its_letter() {
+async fn fipa_services_gets_a_failure_in_its_dialect_for_a_letter_that_a_rule_refuses() {
     let deny = "access.deny={ alice = [\"bob\"] }";
     let host = Host::with("alice", "fipa-services", &[deny]).await;
     let [bob, carol] = ["bob", "carol"].map(|it| host.domain.register(it).unwrap());
     let [(_, recorded)] = recorded!["e01_simple.be"];
-    throw(recorded, &host.address()).await;
+    send_as_peer(recorded, &host.address()).await;
     let (_, letter, failure) = read(&host.read_by_peer().await);
     assert_eq!(*failure.performative(), Performative::Failure);
     assert_eq!(failure.receivers()[0].name(), "alice");
     let theirs = failure.encode(Representation::BitEfficient, Dialect::FipaServices);
     assert_eq!(letter.payload().to_bytes(), theirs.unwrap());
-    let told = String::from_utf8_lossy(failure.content().unwrap()).into_owned();
-    assert!(told.contains("refused") && told.contains("bob"), "{told}");
+    let text = String::from_utf8_lossy(failure.content().unwrap()).into_owned();
+    assert!(text.contains("refused") && text.contains("bob"), "{text}");
     assert!(bob.try_receive().unwrap().is_none());
     drop(carol);
     host.gateway.close().await;

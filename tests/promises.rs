@@ -1,12 +1,12 @@
-//! The promises of the delivery simulation, on real sockets with QUIC in the order: links between two
-//! gateways are cut and transports stopped at random moments while letters of two streams go from a
-//! process through both gateways to another process. Their deadlines lie between 10 ms and 60 s, some
-//! are large, and the far gateway refuses some. Each letter has one outcome, which says the way; what
-//! was delivered is taken, and nothing else; nothing is taken twice or out of order. After the last
-//! fault, every stream delivers everything.
+//! The guarantees that the simulation checks, on real sockets with QUIC among the transports. Letters
+//! of two streams go from a process through two gateways to another process, while links between the
+//! gateways are cut and transports closed at random moments. The deadlines lie between 10 ms and 60 s,
+//! some letters are large, and the far gateway refuses some. Each letter has one outcome with its
+//! transport. The receiver gets the delivered letters and no failed ones, none twice or out of order.
+//! After the last fault, every stream delivers all letters.
 //!
-//! `FIPA_PROMISES_SEED` repeats the decisions of a run, which a failing one prints, and
-//! `FIPA_PROMISES_SEEDS` is the number of runs.
+//! A run prints its `FIPA_PROMISES_SEED`, which repeats its decisions. `FIPA_PROMISES_SEEDS` is the
+//! number of runs.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -27,29 +27,29 @@ use fipa_transport::{
 };
 use fipa_transport_net::{Identity, Limits, QuicConfig, QuicTransport, TcpConfig, TcpTransport};
 use parking_lot::Mutex;
-use services::weather::{Link, Sky};
-use services::{ARM, Place, ROVER, Security, friends, host, letter, number};
+use services::links::{Link, LinkState};
+use services::{ARM, ROVER, Security, TestService, host, letter, mutual_keys, number};
 use tokio::runtime::Handle;
 use tokio::task::spawn_blocking;
 use tokio::time::{sleep, timeout};
 
 const ORDER: [Kind; 4] = [Kind::Shm, Kind::Unix, Kind::Quic, Kind::Tcp];
-/// Between the gateways.
+/// The transports between the gateways.
 const OUTSIDE: [Kind; 2] = [Kind::Quic, Kind::Tcp];
-/// The agents that send, each a stream of its own to the arm.
+/// The agents that send, each on a stream of its own to the arm.
 const SENDERS: [(&str, Incarnation); 2] =
     [("rover", ROVER), ("scout", Incarnation::from_u64(0x5c0))];
-/// Letters of a stream under way.
+/// Maximum number of letters of a stream without an outcome.
 const WINDOW: usize = 8;
-/// Deadlines that are longer than any cut lasts.
+/// Deadline from which a letter survives every cut.
 const AMPLE: Duration = Duration::from_secs(10);
-/// Changes of the weather.
+/// Number of changes of a link.
 const CHANGES: usize = 12;
-/// Letters of each stream delivered in a row that count as traffic that goes on.
+/// Number of letters of each stream delivered in a row that count as recovered traffic.
 const IN_A_ROW: usize = 20;
-/// Letters of each stream after the last fault, all of which are delivered or refused.
+/// Number of letters of each stream after the last fault, all of which are delivered or refused.
 const LAST: usize = 100;
-/// Failed attempts of such a letter.
+/// Maximum number of failed attempts of such a letter.
 const RETRIES: usize = 8;
 const WATCHDOG: Duration = Duration::from_secs(120);
 
@@ -64,7 +64,7 @@ struct Draft {
 
 impl Draft {
     fn new(random: &mut Rng) -> Self {
-        // As many between 10 and 100 ms as between 1 and 10 s.
+        // Log-uniform: as many between 10 and 100 ms as between 1 and 10 s.
         let milliseconds = 10.0 * 6000_f64.powf(random.f64());
         Self {
             deadline: Duration::from_millis(milliseconds as u64),
@@ -82,7 +82,7 @@ impl Draft {
             true => Performative::Cancel,
             false => Performative::Inform,
         };
-        // The number can be read from any length.
+        // Leading zeros make the content large; it still parses as the number.
         let content = format!("{}{number}", "0".repeat(self.size));
         let message = Message::builder(performative)
             .sender(AgentId::new(sender).unwrap())
@@ -93,7 +93,7 @@ impl Draft {
     }
 }
 
-/// Access rules of the far gateway.
+/// The access rule of the far gateway: it refuses `cancel`.
 struct NoCancel;
 
 impl Gate for NoCancel {
@@ -112,16 +112,16 @@ impl Gate for NoCancel {
     }
 }
 
-/// What happened to the letters of one stream.
+/// The outcomes and received letters of one stream.
 #[derive(Default)]
-struct Account {
+struct StreamRecord {
     outcomes: BTreeMap<usize, Outcome>,
     taken: Vec<usize>,
     refused: usize,
     in_a_row: usize,
 }
 
-impl Account {
+impl StreamRecord {
     fn note(&mut self, number: usize, draft: Draft, outcome: Outcome) {
         self.in_a_row = match outcome {
             Outcome::Delivered { .. } => self.in_a_row + 1,
@@ -135,25 +135,28 @@ impl Account {
     fn check(&self) {
         let mut pairs = self.taken.windows(2);
         let wrong = pairs.find(|two| two[0] >= two[1]);
-        assert_eq!(wrong, None, "twice, or out of order");
+        assert_eq!(wrong, None, "received twice or out of order");
         for (number, outcome) in &self.outcomes {
             let taken = self.taken.binary_search(number).is_ok();
             match outcome {
                 Outcome::Delivered { via, attempts } => {
-                    assert!(taken, "{number}: lost, and said to be delivered");
-                    let mut ways = attempts.iter().map(|it| it.via).chain([*via]);
-                    assert!(ways.all(|way| ORDER.contains(&way)), "{number}: {outcome}");
+                    assert!(taken, "{number}: lost, but reported as delivered");
+                    let mut kinds = attempts.iter().map(|it| it.via).chain([*via]);
+                    assert!(
+                        kinds.all(|kind| ORDER.contains(&kind)),
+                        "{number}: {outcome}"
+                    );
                 }
                 Outcome::Failed {
                     reason: FailureReason::Unconfirmed,
                     ..
                 } => {}
-                other => assert!(!taken, "{number} was taken, but {other}"),
+                other => assert!(!taken, "{number} was received, but {other}"),
             }
         }
     }
 
-    /// Whether everything that was delivered is taken.
+    /// Whether all delivered letters are received.
     fn is_taken(&self) -> bool {
         let delivered = self.outcomes.iter();
         let mut delivered = delivered.filter(|(_, it)| matches!(it, Outcome::Delivered { .. }));
@@ -171,16 +174,16 @@ fn is_refusal(outcome: &Outcome) -> bool {
     matches!(outcome, Outcome::Failed { reason, .. } if *reason == refused)
 }
 
-/// The streams' accounts, in the order of [`SENDERS`].
-type Accounts = Arc<Mutex<[Account; SENDERS.len()]>>;
+/// The streams' records, in the order of [`SENDERS`].
+type StreamRecords = Arc<Mutex<[StreamRecord; SENDERS.len()]>>;
 
-/// Sends letters of one stream until told to stop.
+/// Sends letters of one stream until `stop` is set, and then the last ones.
 async fn send_all(
     mts: fipa_mts::Mts,
     stream: usize,
     mut random: Rng,
     stop: Arc<AtomicBool>,
-    accounts: Accounts,
+    records: StreamRecords,
 ) {
     let mut under_way = VecDeque::new();
     let mut last = LAST;
@@ -198,12 +201,12 @@ async fn send_all(
         if under_way.len() >= WINDOW
             && let Some(oldest) = under_way.pop_front()
         {
-            note(&accounts, stream, oldest).await;
+            note(&records, stream, oldest).await;
         }
         sleep(Duration::from_millis(1)).await;
     }
     for sent in under_way {
-        note(&accounts, stream, sent).await;
+        note(&records, stream, sent).await;
     }
 }
 
@@ -218,7 +221,7 @@ fn send(mts: &fipa_mts::Mts, stream: usize, number: usize, draft: Draft) -> Send
 }
 
 async fn note(
-    accounts: &Accounts,
+    records: &StreamRecords,
     stream: usize,
     (number, draft, last, sending): (usize, Draft, bool, Sending),
 ) {
@@ -232,7 +235,7 @@ async fn note(
             "{number}, after the last fault: {outcome}"
         );
     }
-    accounts.lock()[stream].note(number, draft, outcome);
+    records.lock()[stream].note(number, draft, outcome);
 }
 
 async fn until(what: &str, condition: impl Fn() -> bool) {
@@ -249,28 +252,28 @@ async fn outcome(sending: Sending) -> Outcome {
     outcome
 }
 
-/// Sends letters through this weather; says how many went which way.
-async fn through(seed: u64) -> String {
+/// Runs one seed. Returns a summary with the number of letters per transport.
+async fn run(seed: u64) -> String {
     let mut random = Rng::with_seed(seed);
     let (here, there) = (host(), host());
-    let [near_keys, far_keys] = friends(here.path(), ["near", "far"]);
-    let rovers = Place::start(here.path(), "rovers", &[Kind::Shm], false);
-    let near = Place::with_keys(here.path(), "near", &ORDER, true, Some(near_keys));
-    let far = Place::with_gate(there.path(), "far", &ORDER, far_keys, Arc::new(NoCancel));
-    let arms = Place::start(there.path(), "arms", &[Kind::Shm, Kind::Unix], false);
+    let [near_keys, far_keys] = mutual_keys(here.path(), ["near", "far"]);
+    let rovers = TestService::start(here.path(), "rovers", &[Kind::Shm], false);
+    let near = TestService::with_keys(here.path(), "near", &ORDER, true, Some(near_keys));
+    let far = TestService::with_gate(there.path(), "far", &ORDER, far_keys, Arc::new(NoCancel));
+    let arms = TestService::start(there.path(), "arms", &[Kind::Shm, Kind::Unix], false);
     let quic = Link::before(&far.at(Kind::Quic)).await;
     let tcp = Link::before(&far.at(Kind::Tcp)).await;
-    rovers.knows_arm_at(vec![near.at(Kind::Shm)]);
-    near.knows_arm_at(vec![quic.location.clone(), tcp.location.clone()]);
-    far.knows_arm_at(arms.everywhere());
-    arms.knows_arm_at(arms.everywhere());
+    rovers.register_arm_at(vec![near.at(Kind::Shm)]);
+    near.register_arm_at(vec![quic.location.clone(), tcp.location.clone()]);
+    far.register_arm_at(arms.all_locations());
+    arms.register_arm_at(arms.all_locations());
     for (name, sender) in SENDERS {
         rovers.mts.register(name.into(), sender);
     }
     arms.mts.register("arm".into(), ARM);
 
-    let accounts = Accounts::default();
-    let (receiver, taken) = (arms.mts.clone(), accounts.clone());
+    let records = StreamRecords::default();
+    let (receiver, taken) = (arms.mts.clone(), records.clone());
     let receiving = tokio::spawn(async move {
         while let Some(letter) = receiver.receive(ARM).await {
             let message = Message::decode(letter.letter.payload()).unwrap();
@@ -285,27 +288,27 @@ async fn through(seed: u64) -> String {
     let sending: Vec<_> = (0..SENDERS.len())
         .map(|stream| {
             let (mts, random) = (rovers.mts.clone(), random.fork());
-            let sending = send_all(mts, stream, random, stop.clone(), accounts.clone());
+            let sending = send_all(mts, stream, random, stop.clone(), records.clone());
             tokio::spawn(sending)
         })
         .collect();
     let goes_on = async || {
-        for account in &mut *accounts.lock() {
-            account.in_a_row = 0;
+        for record in &mut *records.lock() {
+            record.in_a_row = 0;
         }
         until("letters arrive", || {
             let ended = sending.iter().any(|it| it.is_finished());
             assert!(!ended, "a sender has failed; see above");
-            let accounts = accounts.lock();
-            accounts.iter().all(|account| account.in_a_row >= IN_A_ROW)
+            let records = records.lock();
+            records.iter().all(|record| record.in_a_row >= IN_A_ROW)
         })
         .await;
     };
     let went_by = |kind: Kind| {
-        let accounts = accounts.lock();
-        accounts
+        let records = records.lock();
+        records
             .iter()
-            .map(|account| account.went_by(kind))
+            .map(|record| record.went_by(kind))
             .sum::<usize>()
     };
     let goes_by = async |kind: Kind| {
@@ -327,63 +330,66 @@ async fn through(seed: u64) -> String {
             closing.push(spawn_blocking(move || shm.close()));
         }
         let link = if random.bool() { &quic } else { &tcp };
-        let skies = [Sky::Clear, Sky::Silent, Sky::Unanswered, Sky::Broken];
-        link.turn(skies[random.usize(..skies.len())]);
+        let states = [
+            LinkState::Up,
+            LinkState::Stalled,
+            LinkState::OneWay,
+            LinkState::Closed,
+        ];
+        link.set(states[random.usize(..states.len())]);
     }
     for link in [&quic, &tcp] {
-        link.turn(Sky::Clear);
+        link.set(LinkState::Up);
     }
     goes_on().await;
-    // Letters arrive by TCP and their answers do not, then it breaks: they go again, by QUIC.
-    quic.turn(Sky::Silent);
+    // Letters arrive by TCP but their answers do not. Then the link closes, and QUIC repeats them.
+    quic.set(LinkState::Stalled);
     goes_by(Kind::Tcp).await;
-    quic.turn(Sky::Clear);
-    tcp.turn(Sky::Unanswered);
+    quic.set(LinkState::Up);
+    tcp.set(LinkState::OneWay);
     sleep(Duration::from_millis(random.u64(1..100))).await;
-    tcp.turn(Sky::Broken);
+    tcp.set(LinkState::Closed);
     sleep(Duration::from_millis(random.u64(100..600))).await;
-    tcp.turn(Sky::Clear);
+    tcp.set(LinkState::Up);
     goes_on().await;
-    // Until QUIC has been tried again.
+    // Waits until QUIC is used again.
     goes_by(Kind::Quic).await;
-    let plug = far.transport(Kind::Quic);
-    closing.push(spawn_blocking(move || plug.close()));
+    let transport = far.transport(Kind::Quic);
+    closing.push(spawn_blocking(move || transport.close()));
     goes_on().await;
     stop.store(true, Ordering::Release);
     for sending in sending {
         timeout(WATCHDOG, sending).await.unwrap().unwrap();
     }
-    until("what was delivered is taken", || {
-        accounts.lock().iter().all(Account::is_taken)
+    until("the delivered letters are received", || {
+        records.lock().iter().all(StreamRecord::is_taken)
     })
     .await;
     receiving.abort();
-    let told = {
-        let accounts = accounts.lock();
-        for account in &*accounts {
-            account.check();
-            assert!(account.refused > 0, "nothing was refused");
+    let summary = {
+        let records = records.lock();
+        for record in &*records {
+            record.check();
+            assert!(record.refused > 0, "nothing was refused");
         }
-        let outcomes = accounts
-            .iter()
-            .flat_map(|account| account.outcomes.values());
+        let outcomes = records.iter().flat_map(|record| record.outcomes.values());
         let failed = outcomes.clone().filter(|it| !it.is_success()).count();
         let sent = outcomes.count();
-        let refused: usize = accounts.iter().map(|account| account.refused).sum();
-        drop(accounts);
+        let refused: usize = records.iter().map(|record| record.refused).sum();
+        drop(records);
         let by = OUTSIDE.map(|kind| (kind, went_by(kind)));
         format!("{sent} letters, {by:?}, {failed} failed, {refused} of them refused")
     };
     for closing in closing {
         timeout(WATCHDOG, closing).await.unwrap().unwrap();
     }
-    for place in [&rovers, &near, &far, &arms] {
-        place.mts.close(Duration::from_secs(1)).await;
+    for service in [&rovers, &near, &far, &arms] {
+        service.mts.close(Duration::from_secs(1)).await;
     }
     for kind in OUTSIDE {
-        assert!(went_by(kind) > 0, "nothing went by {kind}");
+        assert!(went_by(kind) > 0, "no letter used {kind}");
     }
-    told
+    summary
 }
 
 fn asked(variable: &str) -> Option<u64> {
@@ -403,33 +409,37 @@ async fn promises_hold_on_real_sockets_with_quic_in_the_order() {
     };
     for seed in seeds {
         println!("FIPA_PROMISES_SEED={seed}");
-        println!("  {}", through(seed).await);
+        println!("  {}", run(seed).await);
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_letter_does_not_go_in_the_clear_and_its_sender_is_told() {
+async fn a_letter_is_not_sent_unencrypted_and_its_outcome_has_the_failed_attempt() {
     let here = host();
-    let [ours, theirs] = friends(here.path(), ["rovers", "arms"]);
+    let [ours, theirs] = mutual_keys(here.path(), ["rovers", "arms"]);
     let order = [Kind::Tcp, Kind::Quic];
     let start = |name, keys: &Security| {
-        Place::with_keys(here.path(), name, &order, false, Some(keys.clone()))
+        TestService::with_keys(here.path(), name, &order, false, Some(keys.clone()))
     };
     let arms = start("arms", &theirs);
-    // Somebody in the clear, where the arm was by TCP, or so it is said; he would take the letter.
-    let plain = Place::start(here.path(), "plain", &[Kind::Tcp], false);
-    for place in [&arms, &plain] {
-        place.knows_arm_at(place.everywhere());
-        place.mts.register("arm".into(), ARM);
+    // A service without keys at the TCP location that the directory has for the arm. It would accept
+    // the letter.
+    let plain = TestService::start(here.path(), "plain", &[Kind::Tcp], false);
+    for service in [&arms, &plain] {
+        service.register_arm_at(service.all_locations());
+        service.mts.register("arm".into(), ARM);
     }
-    let life = arms.at(Kind::Quic).incarnation();
-    let said = plain.at(Kind::Tcp).with_incarnation(life);
-    for (ways, by) in [
-        (vec![said.clone(), arms.at(Kind::Quic)], Some(Kind::Quic)),
-        (vec![said], None),
+    let incarnation = arms.at(Kind::Quic).incarnation();
+    let false_location = plain.at(Kind::Tcp).with_incarnation(incarnation);
+    for (locations, by) in [
+        (
+            vec![false_location.clone(), arms.at(Kind::Quic)],
+            Some(Kind::Quic),
+        ),
+        (vec![false_location], None),
     ] {
         let rovers = start("rovers", &ours);
-        rovers.knows_arm_at(ways);
+        rovers.register_arm_at(locations);
         rovers.mts.register("rover".into(), ROVER);
         let sending = rovers.mts.send(Submission {
             sender: ROVER,
@@ -441,18 +451,18 @@ async fn a_letter_does_not_go_in_the_clear_and_its_sender_is_told() {
         assert_eq!(outcome.via(), by, "{outcome}");
         let tried = outcome.attempts().iter();
         let tried = tried.filter(|attempt| attempt.via == Kind::Tcp);
-        assert!(tried.count() > 0, "nothing is told of TCP: {outcome}");
+        assert!(tried.count() > 0, "no attempt by TCP: {outcome}");
         rovers.mts.close(Duration::from_secs(1)).await;
     }
     let taken = timeout(WATCHDOG, arms.mts.receive(ARM)).await.unwrap();
     assert_eq!(number(&taken.unwrap().letter), 1);
-    assert!(plain.mts.try_receive(ARM).is_none(), "it went in the clear");
-    for place in [&arms, &plain] {
-        place.mts.close(Duration::from_secs(1)).await;
+    assert!(plain.mts.try_receive(ARM).is_none(), "sent unencrypted");
+    for service in [&arms, &plain] {
+        service.mts.close(Duration::from_secs(1)).await;
     }
 }
 
-/// Notes how attempts were concluded.
+/// Stores the conclusions of attempts.
 #[derive(Default)]
 struct Conclusions(Mutex<HashMap<AttemptId, Conclusion>>);
 
@@ -468,13 +478,13 @@ impl Sink for Conclusions {
     }
 }
 
-/// A service that is trusted and says again what it said before.
-struct Parrot {
+/// A trusted service that repeats parcels.
+struct RepeatingPeer {
     transport: Arc<dyn Transport>,
-    told: Arc<Conclusions>,
+    conclusions: Arc<Conclusions>,
 }
 
-impl Parrot {
+impl RepeatingPeer {
     fn over(kind: Kind, security: Security) -> Self {
         let identity = Identity {
             name: "rovers".into(),
@@ -504,13 +514,16 @@ impl Parrot {
                 Arc::new(TcpTransport::new(config, Handle::current()))
             }
         };
-        let told = Arc::new(Conclusions::default());
-        transport.listen(told.clone()).unwrap();
-        Self { transport, told }
+        let conclusions = Arc::new(Conclusions::default());
+        transport.listen(conclusions.clone()).unwrap();
+        Self {
+            transport,
+            conclusions,
+        }
     }
 
-    /// Sends the letter with this number, again if it was sent before; waits for the answer.
-    async fn say(&self, attempt: u64, to: &Place, kind: Kind, sequence: u64) {
+    /// Sends the letter with this number, also if it was sent before, and waits for the answer.
+    async fn send(&self, attempt: u64, to: &TestService, kind: Kind, sequence: u64) {
         let parcel = Parcel {
             receiver: "arm".into(),
             stream: Stream {
@@ -527,32 +540,38 @@ impl Parrot {
         self.transport
             .dispatch(attempt, &to.at(kind), parcel)
             .unwrap();
-        until("an answer", || self.told.0.lock().contains_key(&attempt)).await;
-        let told = self.told.0.lock()[&attempt].clone();
-        assert!(matches!(told, Conclusion::Answered(_)), "{told:?}");
+        until("an answer", || {
+            self.conclusions.0.lock().contains_key(&attempt)
+        })
+        .await;
+        let conclusion = self.conclusions.0.lock()[&attempt].clone();
+        assert!(
+            matches!(conclusion, Conclusion::Answered(_)),
+            "{conclusion:?}"
+        );
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_a_trusted_peer_says_again_is_taken_once() {
+async fn a_letter_that_a_trusted_peer_repeats_is_received_once() {
     let here = host();
-    let [ours, theirs] = friends(here.path(), ["rovers", "arms"]);
+    let [ours, theirs] = mutual_keys(here.path(), ["rovers", "arms"]);
     let order = [Kind::Quic, Kind::Tcp];
-    let arms = Place::with_keys(here.path(), "arms", &order, false, Some(theirs));
-    arms.knows_arm_at(arms.everywhere());
+    let arms = TestService::with_keys(here.path(), "arms", &order, false, Some(theirs));
+    arms.register_arm_at(arms.all_locations());
     arms.mts.register("arm".into(), ARM);
-    // On one connection, on a new one of the same kind, and on one of the other kind.
-    for (life, kind) in [Kind::Quic, Kind::Quic, Kind::Tcp, Kind::Tcp]
+    // Repeats on one connection, on a new one of the same kind, and on one of the other kind.
+    for (round, kind) in [Kind::Quic, Kind::Quic, Kind::Tcp, Kind::Tcp]
         .into_iter()
         .enumerate()
     {
-        let parrot = Parrot::over(kind, ours.clone());
+        let peer = RepeatingPeer::over(kind, ours.clone());
         for (attempt, sequence) in [1, 2, 1, 2, 2].into_iter().enumerate() {
-            parrot.say(attempt as u64, &arms, kind, sequence).await;
+            peer.send(attempt as u64, &arms, kind, sequence).await;
         }
-        let next = life as u64 + 3;
-        parrot.say(99, &arms, kind, next).await;
-        if life == 0 {
+        let next = round as u64 + 3;
+        peer.send(99, &arms, kind, next).await;
+        if round == 0 {
             for expected in [1, 2] {
                 let taken = timeout(WATCHDOG, arms.mts.receive(ARM)).await.unwrap();
                 assert_eq!(number(&taken.unwrap().letter), expected);
@@ -560,7 +579,7 @@ async fn what_a_trusted_peer_says_again_is_taken_once() {
         }
         let taken = timeout(WATCHDOG, arms.mts.receive(ARM)).await.unwrap();
         assert_eq!(number(&taken.unwrap().letter) as u64, next);
-        parrot.transport.close();
+        peer.transport.close();
     }
     assert!(arms.mts.try_receive(ARM).is_none(), "a letter twice");
     arms.mts.close(Duration::from_secs(1)).await;

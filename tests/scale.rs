@@ -1,6 +1,5 @@
-//! A thousand agents in fifty processes of one host: all are found, and no process takes more than
-//! its share of descriptors and memory. How long that took and what they take is printed
-//! (`--nocapture`).
+//! A thousand agents in fifty processes of one host: all are found, and no process exceeds its limits
+//! of descriptors and memory. With `--nocapture` the test prints the times and the usage.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -14,8 +13,9 @@ use fipa::{Config, Domain, Matcher, Query};
 const PROCESSES: usize = 50;
 const AGENTS: usize = 20;
 
-/// What a process may take that talks to nobody.
+/// Maximum number of descriptors of a process without peers.
 const DESCRIPTORS: usize = 60;
+/// Maximum memory of a process without peers, in bytes.
 const MEMORY: u64 = 4 << 20;
 
 const DOMAIN: &str = "FIPA_SCALE_DOMAIN";
@@ -30,7 +30,7 @@ fn config(domain: &str) -> Config {
     .unwrap()
 }
 
-/// Registers agents, says so, and leaves when its input ends.
+/// Registers agents, prints `ready`, and leaves when its input ends.
 #[tokio::test]
 #[ignore = "started by the other test"]
 async fn a_process_of_its_own() {
@@ -54,7 +54,7 @@ async fn a_process_of_its_own() {
     domain.close().await;
 }
 
-/// Memory of a process that is its own and written to, in bytes.
+/// Returns the private anonymous memory of a process, in bytes.
 fn private_memory(pid: u32) -> u64 {
     let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
     let line = status
@@ -71,13 +71,13 @@ fn private_memory(pid: u32) -> u64 {
 
 struct Process {
     child: Child,
-    /// What it took before it joined.
+    /// Private memory before it joined the domain, in bytes.
     before: u64,
 }
 
 impl Drop for Process {
     fn drop(&mut self) {
-        // Has left already, or the test has failed.
+        // The process has ended already, or the test has failed.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
@@ -106,8 +106,8 @@ fn start(domain: &str, directory: &std::path::Path) -> Vec<Process> {
         let lines = BufReader::new(child.stdout.take().unwrap()).lines();
         let mut lines = lines.map_while(Result::ok);
         let before = lines.find_map(|line| line.split_once("ready ")?.1.parse().ok());
-        let before = before.expect("a process that says that it is ready");
-        // The test harness in it says more at its end, and would fail if nobody read that.
+        let before = before.expect("the process prints that it is ready");
+        // Reads the rest: the test harness of the process prints more, and fails if the pipe is closed.
         std::thread::spawn(move || lines.for_each(drop));
         Process { child, before }
     };
@@ -118,21 +118,26 @@ fn start(domain: &str, directory: &std::path::Path) -> Vec<Process> {
 fn a_thousand_agents_in_fifty_processes() {
     let directory = tempfile::tempdir().unwrap();
     let domain = format!("scale-{}", std::process::id());
-    let place = directory.path().join("run");
+    let run = directory.path().join("run");
     let began = Instant::now();
-    let mut processes = start(&domain, &place);
+    let mut processes = start(&domain, &run);
     let registered = began.elapsed();
 
-    // A process like the others, that looks for all of them.
-    let looking = Command::new(std::env::current_exe().unwrap())
-        .args(["--ignored", "--exact", "--nocapture", "one_who_looks"])
+    // Another process looks up all agents.
+    let lookup = Command::new(std::env::current_exe().unwrap())
+        .args([
+            "--ignored",
+            "--exact",
+            "--nocapture",
+            "a_process_that_looks_up_all_agents",
+        ])
         .env(DOMAIN, &domain)
-        .env("FIPA_RUNTIME_DIR", &place)
+        .env("FIPA_RUNTIME_DIR", &run)
         .output()
         .unwrap();
-    let said = String::from_utf8_lossy(&looking.stdout).into_owned();
-    assert!(looking.status.success(), "{said}");
-    assert!(said.contains("found 1000 of 1000"), "{said}");
+    let output = String::from_utf8_lossy(&lookup.stdout).into_owned();
+    assert!(lookup.status.success(), "{output}");
+    assert!(output.contains("found 1000 of 1000"), "{output}");
     let found = began.elapsed();
 
     let (mut most_open, mut most_taken) = (0, 0);
@@ -176,7 +181,7 @@ fn a_thousand_agents_in_fifty_processes() {
 
 #[tokio::test]
 #[ignore = "started by the other test"]
-async fn one_who_looks() {
+async fn a_process_that_looks_up_all_agents() {
     let Ok(name) = std::env::var(DOMAIN) else {
         return;
     };

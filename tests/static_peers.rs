@@ -1,4 +1,4 @@
-//! Gateways that know each other from their configuration, where nobody can be discovered.
+//! Gateways that know each other from their configuration, without discovery.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -28,9 +28,9 @@ fn config(set: &[String]) -> Config {
 }
 
 fn address(gateway: &Gateway) -> String {
-    let mut ways = gateway.locations().into_iter();
-    let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
-    way.address().to_owned()
+    let mut locations = gateway.locations().into_iter();
+    let location = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
+    location.address().to_owned()
 }
 
 fn knowing(name: &str, addresses: &[&str]) -> String {
@@ -50,43 +50,43 @@ async fn until(what: &str, condition: impl Fn() -> bool) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_static_peer_is_connected_before_any_letter_and_again_when_it_comes_back() {
+async fn a_static_peer_is_connected_before_any_letter_and_again_after_its_restart() {
     let far_config = config(&[]);
     let far = Gateway::open(&far_config).await.unwrap();
     let at = address(&far);
-    // Nobody is at the first address.
+    // No process listens on the first address.
     let near = config(&[knowing("far", &["127.0.0.1:9", &at])]);
     let near = Gateway::open(&near).await.unwrap();
-    let far_is = |neighbours: Vec<Neighbour>, life| {
+    let far_is = |neighbours: Vec<Neighbour>, incarnation| {
         let mut all = neighbours.into_iter();
-        all.any(|it| it.entry.incarnation == life && it.peer.as_deref() == Some("far"))
+        all.any(|it| it.entry.incarnation == incarnation && it.peer.as_deref() == Some("far"))
     };
-    let first_life = far.incarnation();
-    until("the far gateway is a neighbour", || {
-        far_is(near.neighbours(), first_life)
+    let first_incarnation = far.incarnation();
+    until("the far gateway is a neighbor", || {
+        far_is(near.neighbours(), first_incarnation)
     })
     .await;
-    // It need not have been told of those who call.
-    until("the near gateway is a neighbour", || {
+    // It accepts gateways that are not in its configuration.
+    until("the near gateway is a neighbor", || {
         let mut all = far.neighbours().into_iter();
         all.any(|it| it.entry.incarnation == near.incarnation())
     })
     .await;
     far.close().await;
-    until("nobody is there", || near.neighbours().is_empty()).await;
+    until("the connection has ended", || near.neighbours().is_empty()).await;
     let mut again = far_config.clone();
     again.transport.tcp.listen = vec![at];
     let far = Gateway::open(&again).await.unwrap();
-    let second_life = far.incarnation();
-    assert_ne!(first_life, second_life);
-    until("its next life is a neighbour", || {
-        far_is(near.neighbours(), second_life)
+    let second_incarnation = far.incarnation();
+    assert_ne!(first_incarnation, second_incarnation);
+    until("its next incarnation is a neighbor", || {
+        far_is(near.neighbours(), second_incarnation)
     })
     .await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_gateway_says_what_it_does_not_understand() {
+async fn the_gateway_answers_an_unknown_ontology_with_not_understood() {
     let config = config(&[]);
     let gateway = Gateway::open(&config).await.unwrap();
     let domain = Domain::open(&config).await.unwrap();
@@ -106,14 +106,14 @@ async fn the_gateway_says_what_it_does_not_understand() {
     assert_eq!(answer.sender().unwrap().name(), gateway.name());
 }
 
-/// The agents of the other host that a process of this one sees.
+/// Returns the entry of an agent of another host in the directory of a process.
 fn seen(domain: &Domain, name: &str) -> Option<std::sync::Arc<fipa::Entry>> {
     let found = domain.directory().known(name)?;
     matches!(found.reach, fipa::Reach::Remote { .. }).then_some(found)
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn one_static_peer_is_enough_to_learn_each_others_agents() {
+async fn gateways_exchange_their_agents_if_one_is_a_static_peer_of_the_other() {
     let far_config = config(&[]);
     let far = Gateway::open(&far_config).await.unwrap();
     let far_host = Domain::open(&far_config).await.unwrap();
@@ -129,7 +129,7 @@ async fn one_static_peer_is_enough_to_learn_each_others_agents() {
     let entry = near.directory().known("arm").unwrap();
     assert_eq!(entry.source, fipa::Source::Exchange);
     assert_eq!(entry.mts.incarnation, far.incarnation());
-    // Both can write first.
+    // Both agents can send the first letter.
     for (from, to) in [(&rover, &arm), (&arm, &rover)] {
         let message = from
             .message(Performative::Inform)
@@ -142,12 +142,12 @@ async fn one_static_peer_is_enough_to_learn_each_others_agents() {
         assert_eq!(received.content().unwrap().as_ref(), b"hello");
     }
 
-    // What changes is told.
+    // Changes are exchanged.
     let leg = far_host.register("leg").unwrap();
     until("the leg is known", || seen(&near_host, "leg").is_some()).await;
     drop(leg);
     until("the leg is gone", || seen(&near_host, "leg").is_none()).await;
-    // They leave with their gateway.
+    // The entries are removed with their gateway.
     far.close().await;
     until("the arm is gone", || seen(&near_host, "arm").is_none()).await;
     assert!(seen(&near_host, "rover").is_none());
@@ -155,36 +155,36 @@ async fn one_static_peer_is_enough_to_learn_each_others_agents() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_later_of_two_registrations_is_told_and_not_announced() {
+async fn the_later_of_two_registrations_gets_a_failure_and_is_not_announced() {
     let (far_config, third_config) = (config(&[]), config(&[]));
     let far = Gateway::open(&far_config).await.unwrap();
     let far_host = Domain::open(&far_config).await.unwrap();
     let earlier = far_host.register("arm").unwrap();
     let near_config = config(&[]);
     let near_host = Domain::open(&near_config).await.unwrap();
-    // Registered while nobody knows of the other.
+    // Registered while neither gateway knows the other registration.
     tokio::time::sleep(Duration::from_millis(5)).await;
     let later = near_host.register("arm").unwrap();
     let mut knows_both = near_config.clone();
     knows_both.discovery = config(&[knowing("far", &[&address(&far)])]).discovery;
     let near = Gateway::open(&knows_both).await.unwrap();
 
-    let told = later.receive().await.unwrap().message;
-    assert_eq!(*told.performative(), Performative::Failure);
-    assert_eq!(told.sender().unwrap().name(), near.name());
-    let content = String::from_utf8(told.content().unwrap().to_vec()).unwrap();
+    let failure = later.receive().await.unwrap().message;
+    assert_eq!(*failure.performative(), Performative::Failure);
+    assert_eq!(failure.sender().unwrap().name(), near.name());
+    let content = String::from_utf8(failure.content().unwrap().to_vec()).unwrap();
     assert!(content.contains("registered earlier"), "{content}");
-    // Who looks from elsewhere sees the earlier one only.
+    // A third host does not see the later registration.
     let mut watcher = third_config.clone();
     watcher.discovery = config(&[knowing("near", &[&address(&near)])]).discovery;
     let third = Gateway::open(&watcher).await.unwrap();
     let here = near_host.register("only here").unwrap();
-    until("the third host is told", || {
+    until("the third host has the directory", || {
         third.directory().known("only here").is_some()
     })
     .await;
     assert!(third.directory().known("arm").is_none());
-    // When the earlier one leaves, the name is free.
+    // After the earlier agent leaves, the name is free.
     drop(earlier);
     until("the later has the name", || {
         third.directory().known("arm").is_some()
@@ -194,7 +194,7 @@ async fn the_later_of_two_registrations_is_told_and_not_announced() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_static_old_peer_gets_its_letters_in_its_dialect() {
+async fn a_static_legacy_peer_gets_its_letters_in_its_dialect() {
     // It reads one letter per connection, to the end of the stream.
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let at = format!("{};fipa-services", listener.local_addr().unwrap());
@@ -202,7 +202,7 @@ async fn a_static_old_peer_gets_its_letters_in_its_dialect() {
     let gateway = Gateway::open(&config).await.unwrap();
     let host = Domain::open(&config).await.unwrap();
     let rover = host.register("rover").unwrap();
-    until("the old peer is known", || {
+    until("the legacy peer is known", || {
         host.directory().lookup("old_arm").is_some()
     })
     .await;

@@ -1,5 +1,5 @@
-//! Streams between two hosts: a letter that fails behind a gateway delays no other, and a closed
-//! domain says so.
+//! Streams between two hosts: a letter that fails behind a gateway delays no other letter, and letters
+//! sent after closing the domain fail as closed.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -12,7 +12,7 @@ use fipa::{
     Agent, AgentId, Config, Domain, FailureReason, Gateway, Kind, Message, Outcome, Performative,
 };
 
-/// A host of its own: a gateway and one process.
+/// A simulated host: a gateway and one process.
 struct Host {
     gateway: Gateway,
     domain: Domain,
@@ -40,7 +40,7 @@ impl Host {
         }
     }
 
-    /// The configuration of another host that knows this one.
+    /// Returns the setting by which another host knows this one.
     fn as_peer(&self) -> String {
         let locations = self.gateway.locations();
         let mut tcp = locations.iter().filter(|it| it.kind() == Kind::Tcp);
@@ -59,8 +59,7 @@ fn was_refused(outcome: &Outcome) -> bool {
     matches!(outcome, Outcome::Failed { reason, .. } if *reason == refused)
 }
 
-/// Sends letters to an agent behind a gateway with these rules, all at once, and returns what became
-/// of each.
+/// Sends letters concurrently to an agent behind a gateway with these rules, and returns the outcomes.
 async fn outcomes(rules: &str, performatives: &[Performative]) -> Vec<Outcome> {
     let far = Host::open(&[rules]).await;
     let near = Host::open(&[&far.as_peer()]).await;
@@ -123,7 +122,7 @@ async fn letters_beyond_the_rate_of_a_gateway_delay_no_others() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_sent_after_the_end_fails_as_closed() {
+async fn a_letter_sent_after_closing_the_domain_fails_as_closed() {
     let host = Host::open(&[]).await;
     let rover = host.domain.register("rover").unwrap();
     let arm = host.domain.register("arm").unwrap();

@@ -1,4 +1,4 @@
-//! What somebody who watches a domain sees, and that agents do not notice.
+//! The events that a watcher of a domain gets, and that watching does not affect agents.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -18,7 +18,7 @@ use rustix::net::{AddressFamily, SendFlags, SocketAddrUnix, SocketType};
 /// Ends a test that hangs.
 const WATCHDOG: Duration = Duration::from_secs(60);
 
-/// A configuration for a domain that no other test has.
+/// Makes a configuration for a domain that no other test uses.
 fn config() -> Config {
     config_with(&[])
 }
@@ -39,8 +39,8 @@ fn config_with(set: &[String]) -> Config {
     .unwrap()
 }
 
-/// Where the processes of the domain meet.
-fn place(config: &Config) -> PathBuf {
+/// Returns the directory with the entries of the domain.
+fn directory(config: &Config) -> PathBuf {
     let base = std::env::var_os("FIPA_RUNTIME_DIR").map_or_else(
         || format!("/tmp/fipa-{}", rustix::process::geteuid().as_raw()).into(),
         PathBuf::from,
@@ -48,9 +48,9 @@ fn place(config: &Config) -> PathBuf {
     base.join(&config.domain).join("directory")
 }
 
-/// The socket of the watcher.
+/// Returns the socket of the watcher.
 fn socket(config: &Config) -> Option<PathBuf> {
-    let files = std::fs::read_dir(place(config)).ok()?;
+    let files = std::fs::read_dir(directory(config)).ok()?;
     let mut files = files.map(|file| file.unwrap().path());
     files.find(|path| path.extension().is_some_and(|it| it == "socket"))
 }
@@ -67,7 +67,7 @@ fn request(from: &Agent, to: &str, content: &str) -> Message {
 
 async fn next(watcher: &mut Watcher) -> Event {
     let next = tokio::time::timeout(WATCHDOG, watcher.next()).await;
-    next.expect("something is seen")
+    next.expect("an event arrives")
 }
 
 async fn letter(watcher: &mut Watcher) -> Arc<Passage> {
@@ -77,7 +77,7 @@ async fn letter(watcher: &mut Watcher) -> Arc<Passage> {
     }
 }
 
-/// Sends until the watcher sees something: processes learn of it in their own time.
+/// Sends letters until the watcher gets an event, because processes connect to it asynchronously.
 async fn until_seen(watcher: &mut Watcher, from: &Agent, to: &str) {
     loop {
         from.send(request(from, to, "are you watched?"))
@@ -90,13 +90,13 @@ async fn until_seen(watcher: &mut Watcher, from: &Agent, to: &str) {
             break;
         }
     }
-    // Everything before this has been seen then.
+    // Skips all events before this letter.
     from.send(request(from, to, "yes")).await.unwrap();
     while letter(watcher).await.content_len != Some(3) {}
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn each_letter_is_seen_once_with_its_outcome() {
+async fn each_letter_yields_one_event_with_its_outcome() {
     let config = config();
     let (here, there) = (
         Domain::open(&config).await.unwrap(),
@@ -125,7 +125,7 @@ async fn each_letter_is_seen_once_with_its_outcome() {
     assert_eq!(
         (seen.content_len, seen.content.len()),
         (Some(13), 0),
-        "content is not told"
+        "content is not included by default"
     );
     let envelope = seen.envelope.as_ref().unwrap();
     assert_eq!(envelope.base.from.as_ref().unwrap().name(), "rover");
@@ -135,15 +135,15 @@ async fn each_letter_is_seen_once_with_its_outcome() {
         Fate::Settled(Outcome::Delivered { via: Kind::Shm, .. })
     ));
 
-    // One message to several: the letters say that they are one.
+    // The letters of one message to several receivers have the same send number.
     rover.send(request(&rover, "arm_.*", "all")).await.unwrap();
     let (one, two) = (letter(&mut watcher).await, letter(&mut watcher).await);
     assert_ne!(one.receiver, two.receiver);
     assert!(one.send.is_some() && one.send == two.send);
 
-    // One that fails, and what its sender is told.
+    // A letter that fails, and the failure message to its sender.
     rover
-        .send(request(&rover, "nobody", "hello?"))
+        .send(request(&rover, "unknown", "hello?"))
         .await
         .unwrap();
     let failed = letter(&mut watcher).await;
@@ -152,16 +152,16 @@ async fn each_letter_is_seen_once_with_its_outcome() {
     };
     assert_eq!(
         (&*failed.receiver, *reason),
-        ("nobody", FailureReason::NoSuchAgent)
+        ("unknown", FailureReason::NoSuchAgent)
     );
-    let told = letter(&mut watcher).await;
+    let failure = letter(&mut watcher).await;
     assert_eq!(
-        *told.message.as_ref().unwrap().performative(),
+        *failure.message.as_ref().unwrap().performative(),
         Performative::Failure
     );
-    assert!(told.from_service && !failed.from_service);
+    assert!(failure.from_service && !failed.from_service);
 
-    // Whoever joins later is watched, too.
+    // A process that joins later is watched, too.
     let late = Domain::open(&config).await.unwrap();
     let late = late.register("late").unwrap();
     until_seen(&mut watcher, &late, "rover").await;
@@ -169,7 +169,7 @@ async fn each_letter_is_seen_once_with_its_outcome() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn content_is_seen_by_who_asks_for_it() {
+async fn only_a_watcher_that_requests_content_gets_it() {
     let config = config();
     let domain = Domain::open(&config).await.unwrap();
     let (rover, _arm) = (
@@ -177,33 +177,33 @@ async fn content_is_seen_by_who_asks_for_it() {
         domain.register("arm").unwrap(),
     );
     let options = WatchOptions { content: 4 };
-    let (mut curious, mut discreet) = (
+    let (mut with_content, mut without_content) = (
         Watcher::open(&config, options).await.unwrap(),
         Watcher::open(&config, WatchOptions::default())
             .await
             .unwrap(),
     );
-    until_seen(&mut curious, &rover, "arm").await;
-    until_seen(&mut discreet, &rover, "arm").await;
-    while tokio::time::timeout(Duration::from_millis(300), curious.next())
+    until_seen(&mut with_content, &rover, "arm").await;
+    until_seen(&mut without_content, &rover, "arm").await;
+    while tokio::time::timeout(Duration::from_millis(300), with_content.next())
         .await
         .is_ok()
     {}
     rover.send(request(&rover, "arm", "secret")).await.unwrap();
-    let seen = letter(&mut curious).await;
+    let seen = letter(&mut with_content).await;
     assert_eq!(
         (&seen.content[..], seen.content_len),
         (&b"secr"[..], Some(6))
     );
-    let mut seen = letter(&mut discreet).await;
+    let mut seen = letter(&mut without_content).await;
     while seen.content_len != Some(6) {
-        seen = letter(&mut discreet).await;
+        seen = letter(&mut without_content).await;
     }
     assert!(seen.content.is_empty());
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_watcher_leaves_nothing_behind() {
+async fn a_dropped_watcher_removes_its_files() {
     let config = config();
     let domain = Domain::open(&config).await.unwrap();
     let (rover, arm) = (
@@ -225,11 +225,11 @@ async fn a_watcher_leaves_nothing_behind() {
     }
     drop((rover, arm));
     domain.close().await;
-    assert!(!place(&config).exists());
+    assert!(!directory(&config).exists());
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_watcher_that_does_not_look_slows_nobody_and_is_told_what_it_missed() {
+async fn a_watcher_that_does_not_read_delays_no_agent_and_gets_the_count_of_lost_records() {
     const LETTERS: u64 = 12_000;
     let config = config();
     let (here, there) = (
@@ -264,7 +264,7 @@ async fn a_watcher_that_does_not_look_slows_nobody_and_is_told_what_it_missed() 
         .unwrap();
 
     let (mut seen, mut lost) = (0, BTreeMap::new());
-    // Until everything that was kept has come: a process that lost something says so last.
+    // Reads all queued records; the last one of a process has the count of lost ones.
     loop {
         match tokio::time::timeout(Duration::from_secs(2), watcher.next()).await {
             Ok(Event::Letter(_)) => seen += 1,
@@ -278,7 +278,7 @@ async fn a_watcher_that_does_not_look_slows_nobody_and_is_told_what_it_missed() 
     }
     let all: u64 = lost.values().sum();
     assert!(seen > 0 && seen < LETTERS, "{seen} seen");
-    // Two records are the sender's, one the receiver's.
+    // Per letter, the sender sends two records and the receiver one.
     assert!(all > 0 && all <= 3 * (LETTERS + 1), "{lost:?}");
     assert!(seen + all >= LETTERS, "{seen} seen, {lost:?}");
     assert!(
@@ -286,12 +286,12 @@ async fn a_watcher_that_does_not_look_slows_nobody_and_is_told_what_it_missed() 
             .all(|name| name.contains(&std::process::id().to_string())),
         "{lost:?}"
     );
-    // And goes on from there.
+    // Later letters are seen again.
     until_seen(&mut watcher, &rover, "arm").await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn nonsense_is_refused_and_nobody_else_notices() {
+async fn invalid_records_are_refused_without_effect_on_others() {
     let config = config();
     let domain = Domain::open(&config).await.unwrap();
     let (rover, _arm) = (
@@ -308,12 +308,12 @@ async fn nonsense_is_refused_and_nobody_else_notices() {
         rustix::net::connect(&socket, &address).unwrap();
         rustix::net::send(&socket, nonsense, SendFlags::empty()).unwrap();
         let Event::Refused { process, why } = next(&mut watcher).await else {
-            panic!("{nonsense:?} was taken for something else");
+            panic!("{nonsense:?} was not refused");
         };
         assert_eq!(&*process, format!("process {}", std::process::id()));
         assert!(why.to_string().starts_with("not a record"), "{why}");
     }
-    // One who connects and says nothing, and one who goes at once.
+    // A process that connects and sends nothing, and one that disconnects at once.
     let silent = rustix::net::socket(AddressFamily::UNIX, SocketType::SEQPACKET, None).unwrap();
     rustix::net::connect(&silent, &address).unwrap();
     let gone = rustix::net::socket(AddressFamily::UNIX, SocketType::SEQPACKET, None).unwrap();
@@ -327,7 +327,7 @@ async fn nonsense_is_refused_and_nobody_else_notices() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_becomes_of_the_only_letter_of_a_process_is_seen() {
+async fn the_outcome_of_the_only_letter_of_a_process_is_seen() {
     let config = config();
     let there = Domain::open(&config).await.unwrap();
     let arm = there.register("arm").unwrap();
@@ -336,7 +336,7 @@ async fn what_becomes_of_the_only_letter_of_a_process_is_seen() {
         .unwrap();
     let own = there.register("own").unwrap();
     until_seen(&mut watcher, &own, "own").await;
-    // The arm's queue is filled.
+    // Fills the queue of the arm.
     let moment = Duration::from_millis(200);
     let mut filling = true;
     while filling {
@@ -349,14 +349,17 @@ async fn what_becomes_of_the_only_letter_of_a_process_is_seen() {
         let rover = here.register(&name).unwrap();
         let only = request(&rover, "arm", "only");
         let deliveries = rover.send_within(only, moment).await.unwrap();
-        let Outcome::Failed { reason: told, .. } = deliveries.0[0].outcome else {
+        let Outcome::Failed {
+            reason: expected, ..
+        } = deliveries.0[0].outcome
+        else {
             panic!("{deliveries}");
         };
         drop(rover);
         here.close().await;
         let seen = loop {
             let seen = letter(&mut watcher).await;
-            // What the service tells the sender of the failure is a letter, too.
+            // The failure message to the sender is a letter, too.
             if seen.sender() == Some(&name) {
                 break seen;
             }
@@ -364,12 +367,12 @@ async fn what_becomes_of_the_only_letter_of_a_process_is_seen() {
         let Fate::Settled(Outcome::Failed { reason, .. }) = &seen.fate else {
             panic!("{seen:?}");
         };
-        assert_eq!((&*seen.receiver, *reason), ("arm", told));
+        assert_eq!((&*seen.receiver, *reason), ("arm", expected));
     }
     drop(arm);
 }
 
-/// A host with a gateway, which knows the one at this address, and somebody who watches it.
+/// Starts a host with a gateway that knows the gateway at this address, and a watcher.
 async fn watched(peer: Option<&str>) -> (Gateway, Domain, Watcher) {
     let known = peer.map(|address| format!("discovery.static={{ far = [\"tcp://{address}\"] }}"));
     let config = config_with(known.as_slice());
@@ -390,15 +393,15 @@ async fn known(domain: &Domain, name: &str) {
 #[tokio::test(flavor = "multi_thread")]
 async fn between_hosts_each_watcher_sees_a_letter_once_with_its_gateway() {
     let (far, abroad, mut watching_far) = watched(None).await;
-    let mut ways = far.locations().into_iter();
-    let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
-    let at = way.address();
+    let mut locations = far.locations().into_iter();
+    let location = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
+    let at = location.address();
     let (near, at_home, mut watching_near) = watched(Some(at)).await;
     let rover = at_home.register("rover").unwrap();
     let arm = abroad.register("arm").unwrap();
     known(&at_home, "arm").await;
     known(&abroad, "rover").await;
-    // Both processes, and both gateways, know that they are watched.
+    // Waits until both processes have connected to their watchers.
     for (watcher, from) in [(&mut watching_near, &rover), (&mut watching_far, &arm)] {
         until_seen(watcher, from, from.name()).await;
     }
@@ -408,7 +411,7 @@ async fn between_hosts_each_watcher_sees_a_letter_once_with_its_gateway() {
             return seen;
         }
     };
-    // Until the gateways, too, are told: they learn of watchers in their own time.
+    // Waits until both gateways have connected to their watchers, too.
     loop {
         let sent = rover.send(request(&rover, "arm", "known?")).await.unwrap();
         assert!(sent.all_succeeded(), "{sent}");
@@ -433,7 +436,7 @@ async fn between_hosts_each_watcher_sees_a_letter_once_with_its_gateway() {
             (at_near.via, at_far.via),
             (Some(Kind::Tcp), Some(Kind::Tcp))
         );
-        // Its sender was told on its own host; on the other it was taken.
+        // The sender's host reports the outcome; the other host reports that the letter was received.
         let (own, other) = if leaves_near {
             (&at_near.fate, &at_far.fate)
         } else {
@@ -450,7 +453,7 @@ async fn between_hosts_each_watcher_sees_a_letter_once_with_its_gateway() {
         assert_eq!(at_near.sequence, at_far.sequence);
         assert_eq!(at_near.stream, at_far.stream);
     }
-    // Nothing in between: each was told once. The gateways' own letters are between gateways.
+    // There are no further events of these letters; letters between the gateways are ignored.
     let mut others = Vec::new();
     while let Ok(Event::Letter(seen)) =
         tokio::time::timeout(Duration::from_millis(500), watching_near.next()).await

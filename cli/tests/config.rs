@@ -229,7 +229,7 @@ fn errors_are_reported_with_place_and_help() {
 error: unknown key `mts.deadlin`
 where: fipa.toml:2
  help: did you mean `mts.deadline`? (known in [mts]: name, transports, deadline, queue, queue_bytes)
-error: `mts.queue` is wrong: \"x\": a string cannot stand here
+error: `mts.queue` is invalid: \"x\": a string is not allowed here
 where: fipa.toml:3
  help: expected a number of letters such as 256
 ";
@@ -245,7 +245,7 @@ where: fipa.toml:3
               "help": "did you mean `mts.deadline`? \
                        (known in [mts]: name, transports, deadline, queue, queue_bytes)",
               "place": { "from": "file", "path": "fipa.toml", "line": 2 } },
-            { "what": "`mts.queue` is wrong: \"x\": a string cannot stand here",
+            { "what": "`mts.queue` is invalid: \"x\": a string is not allowed here",
               "help": "expected a number of letters such as 256",
               "place": { "from": "file", "path": "fipa.toml", "line": 3 } },
         ] })

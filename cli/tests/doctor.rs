@@ -37,7 +37,7 @@ fn a_machine_without_problems_is_fine_and_is_not_changed() {
     for name in [
         "directory of the domain",
         "size of /dev/shm",
-        "traces of the dead",
+        "leftovers of ended processes",
         "permissions in /dev/shm",
         "memory of waiting letters",
     ] {
@@ -59,9 +59,9 @@ fn files_of_a_killed_process_are_reported_until_the_next_process_removes_them() 
     let parrot = host.echo("parrot");
     let running = host.run(&["doctor", "--json"]).done_json();
     assert!(
-        check(&running, "traces of the dead")
+        check(&running, "leftovers of ended processes")
             .1
-            .starts_with("1 processes are there, 0 have")
+            .starts_with("processes that run: 1; ended processes that left files behind: 0;")
     );
     assert_eq!(
         check(&running, "permissions in /dev/shm").0,
@@ -70,15 +70,15 @@ fn files_of_a_killed_process_are_reported_until_the_next_process_removes_them() 
     );
     parrot.signal("-KILL");
     let dead = host.run(&["doctor", "--json"]).done_json();
-    let (verdict, found) = check(&dead, "traces of the dead");
+    let (verdict, found) = check(&dead, "leftovers of ended processes");
     assert_eq!(verdict, "doubtful", "{found}");
     assert!(
-        found.starts_with("0 processes are there, 1 have died"),
+        found.starts_with("processes that run: 0; ended processes that left files behind: 1;"),
         "{found}"
     );
     host.run(&["agents"]).done();
     let after = host.run(&["doctor", "--json"]).done_json();
-    assert_eq!(check(&after, "traces of the dead").0, "fine");
+    assert_eq!(check(&after, "leftovers of ended processes").0, "fine");
 }
 
 #[test]
@@ -137,7 +137,7 @@ fn without_inotify_letters_are_delivered_and_the_doctor_names_the_sysctl() {
     let report: Value = serde_json::from_slice(&report).unwrap();
     let (verdict, found) = check(&report, "inotify instances");
     assert_eq!(verdict, "doubtful", "{found}");
-    assert!(found.contains("poll the directory"), "{found}");
+    assert!(found.contains("polls the directory"), "{found}");
     assert!(report.to_string().contains("fs.inotify.max_user_instances"));
     let (code, log) = parrot.signal("-INT");
     assert_eq!(code, Some(0), "{log}");

@@ -27,7 +27,7 @@ fn inside_the_doctor_reports_multicast_faults_of_the_network() {
 
     let (verdict, found) = multicast(here);
     assert_eq!(verdict, "doubtful", "{found}");
-    assert!(found.contains("nobody answered"), "{found}");
+    assert!(found.contains("no other host answered"), "{found}");
 
     let mut up = fipa(there, "there");
     let _gateway = Running::until_ready(up.arg("up"));
@@ -42,20 +42,26 @@ fn inside_the_doctor_reports_multicast_faults_of_the_network() {
         }
         assert!(Instant::now() < deadline, "{found}");
     };
-    assert!(found.contains("goes both ways, with 10.99.0.2"), "{found}");
+    assert!(
+        found.contains("works in both directions, with 10.99.0.2"),
+        "{found}"
+    );
 
     // The switch does not forward multicast to this host; the other host receives it.
     here.forward_multicast(false);
     let (verdict, found) = multicast(here);
     assert_eq!(verdict, "doubtful", "{found}");
-    assert!(found.contains("does not come in: 10.99.0.2"), "{found}");
+    assert!(found.contains("incoming does not: 10.99.0.2"), "{found}");
     here.forward_multicast(true);
 
     // The switch does not forward multicast to the other host.
     there.forward_multicast(false);
     let (verdict, found) = multicast(here);
     assert_eq!(verdict, "doubtful", "{found}");
-    assert!(found.contains("may not get out: 10.99.0.2"), "{found}");
+    assert!(
+        found.contains("outgoing may not: packets of 10.99.0.2"),
+        "{found}"
+    );
     there.forward_multicast(true);
 
     here.ip("link set eth0 down");

@@ -1,4 +1,4 @@
-//! Protocols as calls, blocking: every call of [`crate::protocol`] under the same name.
+//! The calls of [`crate::protocol`] under the same names, blocking.
 
 use std::ops::Deref;
 use std::time::Duration;
@@ -14,9 +14,10 @@ use crate::protocol::{
     Subscription, Task,
 };
 
-/// A side of a conversation, whose calls block: a [`Request`], [`Subscription`], [`ContractNet`],
-/// [`Auction`], [`Proxied`] or [`Task`]. What does not wait is called on that itself.
-#[must_use = "see the type within"]
+/// One side of a conversation with blocking calls: a [`Request`], [`Subscription`], [`ContractNet`],
+/// [`Auction`], [`Proxied`] or [`Task`]. Dereferences to that type for the calls that do not wait.
+#[derive(Debug)]
+#[must_use = "the conversation goes on with the calls of the inner type"]
 pub struct Side<'a, T> {
     inner: T,
     runtime: &'a Runtime,
@@ -58,7 +59,7 @@ impl Agent {
     /// ```
     ///
     /// # Errors
-    /// See there.
+    /// As for the async call.
     pub fn request(
         &self,
         request: MessageBuilder,
@@ -70,7 +71,7 @@ impl Agent {
     /// See [`crate::Agent::query`].
     ///
     /// # Errors
-    /// See there.
+    /// As for the async call.
     pub fn query(
         &self,
         query: MessageBuilder,
@@ -82,7 +83,7 @@ impl Agent {
     /// See [`crate::Agent::request_when`].
     ///
     /// # Errors
-    /// See there.
+    /// As for the async call.
     pub fn request_when(
         &self,
         request: MessageBuilder,
@@ -94,7 +95,7 @@ impl Agent {
     /// See [`crate::Agent::propose`].
     ///
     /// # Errors
-    /// See there.
+    /// As for the async call.
     pub fn propose(
         &self,
         proposal: MessageBuilder,
@@ -107,7 +108,7 @@ impl Agent {
     /// See [`crate::Agent::subscribe`].
     ///
     /// # Errors
-    /// See there.
+    /// As for the async call.
     pub fn subscribe(
         &self,
         subscribe: MessageBuilder,
@@ -119,7 +120,7 @@ impl Agent {
     /// See [`crate::Agent::contract_net`].
     ///
     /// # Errors
-    /// See there.
+    /// As for the async call.
     pub fn contract_net(
         &self,
         call: MessageBuilder,
@@ -132,7 +133,7 @@ impl Agent {
     /// See [`crate::Agent::iterated_contract_net`].
     ///
     /// # Errors
-    /// See there.
+    /// As for the async call.
     pub fn iterated_contract_net(
         &self,
         call: MessageBuilder,
@@ -145,7 +146,7 @@ impl Agent {
     /// See [`crate::Agent::english_auction`].
     ///
     /// # Errors
-    /// See there.
+    /// As for the async call.
     pub fn english_auction(
         &self,
         opening: MessageBuilder,
@@ -157,7 +158,7 @@ impl Agent {
     /// See [`crate::Agent::dutch_auction`].
     ///
     /// # Errors
-    /// See there.
+    /// As for the async call.
     pub fn dutch_auction(
         &self,
         opening: MessageBuilder,
@@ -169,7 +170,7 @@ impl Agent {
     /// See [`crate::Agent::brokering`].
     ///
     /// # Errors
-    /// See there.
+    /// As for the async call.
     pub fn brokering(
         &self,
         proxy: MessageBuilder,
@@ -181,7 +182,7 @@ impl Agent {
     /// See [`crate::Agent::recruiting`].
     ///
     /// # Errors
-    /// See there.
+    /// As for the async call.
     pub fn recruiting(
         &self,
         proxy: MessageBuilder,
@@ -193,7 +194,7 @@ impl Agent {
     /// See [`crate::Agent::take_part`].
     ///
     /// # Errors
-    /// See there.
+    /// As for the async call.
     pub fn take_part(&self, first: &Message) -> Result<Side<'_, Task<'_>>, DialogueError> {
         Ok(Side {
             inner: self.agent.take_part(first)?,
@@ -202,26 +203,26 @@ impl Agent {
     }
 }
 
-/// The waiting calls of one type, each with the documentation and the errors of its namesake.
+/// Defines the blocking calls of one type, each with a link to the documentation of the async call.
 macro_rules! blocking {
     ($side:ident: $(
         $(#[$kind:ident])? fn $name:ident($($argument:ident: $type:ty),*) -> $output:ty;
     )*) => {
-        #[allow(clippy::should_implement_trait, reason = "an error is not the end, as with Iterator")]
+        #[allow(clippy::should_implement_trait, reason = "unlike an iterator, it goes on after an error")]
         impl Side<'_, $side<'_>> {
             $(blocking!(@ $($kind)? $side $name ($($argument: $type),*) $output);)*
         }
     };
     (@ last $side:ident $name:ident ($($argument:ident: $type:ty),*) $output:ty) => {
         #[doc = concat!("See [`", stringify!($side), "::", stringify!($name), "`].\n\n")]
-        #[doc = "# Errors\nSee there."]
+        #[doc = "# Errors\nAs for the async call."]
         pub fn $name(self, $($argument: $type),*) -> Result<$output, DialogueError> {
             self.runtime.block_on(self.inner.$name($($argument),*))
         }
     };
     (@ $side:ident $name:ident ($($argument:ident: $type:ty),*) $output:ty) => {
         #[doc = concat!("See [`", stringify!($side), "::", stringify!($name), "`].\n\n")]
-        #[doc = "# Errors\nSee there."]
+        #[doc = "# Errors\nAs for the async call."]
         pub fn $name(&mut self, $($argument: $type),*) -> Result<$output, DialogueError> {
             self.runtime.block_on(self.inner.$name($($argument),*))
         }
@@ -277,11 +278,11 @@ blocking! { Task:
 }
 
 impl Side<'_, Task<'_>> {
-    /// Whether the initiator cancels within that time, for those who ask between two pieces of their
-    /// work; see [`Task::cancelled`].
+    /// Waits up to `patience` for a cancel of the initiator, and returns whether it came. For a
+    /// participant that checks between two steps of its work; see [`Task::cancelled`].
     ///
     /// # Errors
-    /// See there.
+    /// As for the async call.
     pub fn cancelled(&mut self, patience: Duration) -> Result<bool, DialogueError> {
         self.runtime.block_on(async {
             match tokio::time::timeout(patience, self.inner.cancelled()).await {

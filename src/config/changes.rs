@@ -1,10 +1,10 @@
-//! What differs between two configurations, by key.
+//! The keys by which two configurations differ.
 
 use super::Config;
 use super::keys::{KEYS, MAPS};
 
 impl Config {
-    /// The keys whose values differ, as they are written with `--set`.
+    /// Returns the keys whose values differ, as they are written with `--set`.
     #[must_use]
     pub fn differences(&self, other: &Self) -> Vec<String> {
         let keys = KEYS

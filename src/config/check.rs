@@ -1,4 +1,4 @@
-//! What values are allowed, alone and together.
+//! Checks of values, alone and in combination.
 
 use std::collections::HashSet;
 use std::fmt::Display;
@@ -15,46 +15,46 @@ use super::keys::{is_interface_name, is_numeric_address};
 use super::reader::dotted;
 use super::{Access, Config, Interface, Mistake, Origin, Peer, Route, Shm};
 
-/// Longest name of a domain, in bytes.
+/// Maximum length of the name of a domain, in bytes.
 const MAX_DOMAIN: usize = 32;
-/// Longest name of a message transport service, in bytes.
+/// Maximum length of the name of a message transport service, in bytes.
 const MAX_MTS_NAME: usize = 255;
-/// Longest deadline of a letter.
+/// Upper bound of `mts.deadline`.
 const MAX_DEADLINE: Duration = MAX_REMAINING;
-/// Most letters in the queue of one agent.
+/// Upper bound of `mts.queue`, in letters.
 const MAX_QUEUE: usize = 65_536;
-/// Bytes in the queue of one agent.
+/// Bounds of `mts.queue_bytes`.
 const QUEUE_BYTES: RangeInclusive<u64> = 64 << 10..=1 << 40;
-/// Most lines of `[routes]`, `access.allow` and `access.deny`.
+/// Maximum number of lines of each of `[routes]`, `access.allow` and `access.deny`.
 const MAX_ROUTES: usize = 256;
-/// Most letters a second.
+/// Upper bound of `access.rate`, in letters per second.
 const MAX_RATE: usize = 1_000_000;
-/// Shared memory of a domain, in bytes.
+/// Bounds of `transport.shm.capacity`, in bytes.
 const CAPACITY: RangeInclusive<u64> = 1 << 20..=1 << 40;
-/// Smallest largest letter, in bytes.
+/// Lower bound of `transport.shm.max_letter`, in bytes.
 const MIN_LETTER: u64 = 4 << 10;
-/// Longest spinning.
+/// Upper bound of `transport.shm.spin`.
 const MAX_SPIN: Duration = Duration::from_secs(1);
-/// Most addresses a transport listens on, and most locations of a static gateway.
+/// Maximum number of addresses that a transport listens on, and of locations of a static peer.
 const MAX_ADDRESSES: usize = 16;
-/// Most interfaces listed.
+/// Maximum number of entries of `discovery.interfaces`.
 const MAX_INTERFACES: usize = 64;
-/// Most static gateways.
+/// Maximum number of static peers.
 const MAX_PEERS: usize = 1024;
 
-/// Most addresses of old peers that need not prove who they are.
+/// Maximum number of addresses in `security.old_peers`.
 const MAX_OLD_PEERS: usize = 64;
 
-/// Least bytes a second that a peer may be held to: connections need some to stay alive.
+/// Lower bound of `security.peer_bytes`, in bytes per second: idle connections need some to stay open.
 const MIN_PEER_BYTES: u64 = 64 << 10;
 
-/// Most files with protocols.
+/// Maximum number of entries of `monitor.protocols`.
 const MAX_PROTOCOLS: usize = 128;
 
 /// A value that is not allowed.
 #[derive(Debug)]
 pub(super) struct Finding {
-    /// The key it is about.
+    /// The path of the key.
     pub(super) path: Vec<String>,
     what: String,
     help: String,
@@ -70,7 +70,7 @@ impl Finding {
     }
 }
 
-/// Everything that is not allowed in a configuration whose values have the right types.
+/// Returns the values that are not allowed in a configuration whose values have the right types.
 pub(super) fn findings(config: &Config) -> Vec<Finding> {
     let mut found = Findings(Vec::new());
     found.domain(&config.domain);
@@ -100,7 +100,7 @@ pub(super) fn findings(config: &Config) -> Vec<Finding> {
 struct Findings(Vec<Finding>);
 
 impl Findings {
-    /// Adds a finding. `what` follows the name of the key in a sentence.
+    /// Adds a finding. `what` continues a sentence that begins with the key.
     fn add(&mut self, path: &[&str], what: impl Display, help: impl Into<String>) {
         self.0.push(Finding {
             path: path.iter().map(|&part| part.to_owned()).collect(),
@@ -130,8 +130,8 @@ impl Findings {
         if security.keys == "~" || security.keys.starts_with("~/") {
             self.add(
                 &["security", "keys"],
-                "begins with ~, which only shells understand",
-                "write the directory out, such as /home/robot/.config/fipa/keys",
+                "begins with ~, which only shells expand",
+                "write the full path, for example /home/robot/.config/fipa/keys",
             );
         }
         if security.old_peers.len() > MAX_OLD_PEERS {
@@ -141,36 +141,36 @@ impl Findings {
         if security.peer_connections == 0 {
             self.add(
                 &["security", "peer_connections"],
-                "cannot be 0",
-                "nobody could come in: use 1 or more",
+                "cannot be 0, which would refuse every connection",
+                "use 1 or more",
             );
         }
         if (1..MIN_PEER_BYTES).contains(&security.peer_bytes) {
             self.add(
                 &["security", "peer_bytes"],
                 format_args!("cannot be {} bytes", security.peer_bytes),
-                "use at least 64KiB a second, or 0 for any number",
+                "use at least 64KiB per second, or 0 for no limit",
             );
         }
         if has_keys && security.insecure {
             self.add(
                 &["security", "insecure"],
-                "is true, and there are keys",
-                "take one of them out: with keys nothing else is spoken to other hosts",
+                "is true, but security.keys is set, and with keys every connection is encrypted",
+                "remove one of the two",
             );
         }
         if has_keys && config.mts.transports.contains(&Kind::Udp) {
             self.add(
                 &["mts", "transports"],
-                "lists udp, which is not encrypted, and there are keys",
-                "take udp out; tcp and quic are encrypted when there are keys",
+                "lists udp, which is not encrypted, but security.keys is set",
+                "remove udp; tcp and quic are encrypted if security.keys is set",
             );
         }
         if !has_keys && config.mts.transports.contains(&Kind::Quic) {
             self.add(
                 &["mts", "transports"],
-                "lists quic, which is never spoken without keys",
-                "make keys (`fipa keys init`) and set security.keys, or take quic out",
+                "lists quic, which needs keys",
+                "make keys (`fipa keys init`) and set security.keys, or remove quic",
             );
         }
         if has_keys || security.insecure {
@@ -180,14 +180,15 @@ impl Findings {
             (Kind::Tcp, &config.transport.tcp.listen),
             (Kind::Udp, &config.transport.udp.listen),
         ] {
-            // What is no address is told elsewhere.
+            // `listen` reports entries that are not addresses.
             let mut addresses = listen.iter().filter(|text| is_numeric_address(text));
             let open = addresses.find(|text| !is_on_loopback(text));
             if let Some(open) = open.filter(|_| config.mts.transports.contains(&kind)) {
                 self.add(
                     &["transport", kind.name(), "listen"],
-                    format_args!("lists {open}, where everybody would be let in"),
-                    "make keys (`fipa keys init`), or accept it with `security.insecure = true`",
+                    format_args!("lists {open}, where the gateway would accept every host"),
+                    "make keys (`fipa keys init`) and set security.keys, or accept the risk with \
+                     `security.insecure = true`",
                 );
             }
         }
@@ -196,7 +197,7 @@ impl Findings {
     fn access(&mut self, access: &Access) {
         if access.rate > MAX_RATE {
             let what = format_args!("cannot be {}", access.rate);
-            let help = format!("use 0 to {MAX_RATE} letters a second");
+            let help = format!("use 0 to {MAX_RATE} letters per second");
             self.add(&["access", "rate"], what, help);
         }
         for (name, lines) in [("allow", &access.allow), ("deny", &access.deny)] {
@@ -222,11 +223,11 @@ impl Findings {
             self.add(
                 &path,
                 format_args!("lists {} files", files.len()),
-                format!("at most {MAX_PROTOCOLS} are read"),
+                format!("use at most {MAX_PROTOCOLS}"),
             );
         }
         if files.iter().any(String::is_empty) {
-            self.add(&path, "lists a file without a name", "name an SCXML file");
+            self.add(&path, "lists an empty path", "list paths of SCXML files");
         }
     }
 
@@ -239,7 +240,7 @@ impl Findings {
                 &["mts", "deadline"],
                 format_args!("cannot be {}", humantime::format_duration(mts.deadline)),
                 format!(
-                    "a letter needs time to arrive: more than 0, at most {}",
+                    "use more than 0, at most {}",
                     humantime::format_duration(MAX_DEADLINE)
                 ),
             );
@@ -274,7 +275,7 @@ impl Findings {
         }
     }
 
-    /// A list of transports; returns whether it is good.
+    /// Checks a list of transports. Returns whether it is valid.
     fn kinds(&mut self, path: &[&str], kinds: &[Kind]) -> bool {
         let before = self.0.len();
         if kinds.is_empty() {
@@ -296,7 +297,7 @@ impl Findings {
     fn routes(&mut self, config: &Config) {
         let on = &config.mts.transports;
         if config.routes.len() > MAX_ROUTES {
-            // Each costs compiling a pattern.
+            // Checking a line compiles a pattern, so the lines beyond the maximum are not checked.
             self.too_many(&["routes"], config.routes.len(), MAX_ROUTES);
             return;
         }
@@ -315,15 +316,15 @@ impl Findings {
             } else if let Err(error) = Pattern::new(receiver) {
                 self.add(
                     &path,
-                    format_args!("cannot be matched: {}", one_line(&error.to_string())),
-                    "write the name of an agent, or a regular expression for whole names",
+                    format_args!("is not a valid pattern: {}", one_line(&error.to_string())),
+                    "write the name of an agent, or a regular expression that matches whole names",
                 );
             }
             if self.kinds(&path, transports) && !transports.iter().any(|kind| on.contains(kind)) {
                 self.add(
                     &path,
                     "lists only transports that are off",
-                    "list one of `mts.transports`, or turn one of these on there",
+                    "list one that is in `mts.transports`, or add one of these to `mts.transports`",
                 );
             }
         }
@@ -334,7 +335,7 @@ impl Findings {
             self.add(
                 &["transport", "shm", "capacity"],
                 format_args!("cannot be {} bytes", shm.capacity),
-                "use 1MiB to 1TiB, and what fits /dev/shm",
+                "use 1MiB to 1TiB, and at most the size of /dev/shm",
             );
         } else if shm.max_letter > shm.capacity {
             self.add(
@@ -343,7 +344,7 @@ impl Findings {
                     "is {} bytes, more than the {} of `transport.shm.capacity`",
                     shm.max_letter, shm.capacity
                 ),
-                "make it smaller, or the capacity larger",
+                "lower it, or raise the capacity",
             );
         }
         if shm.max_letter < MIN_LETTER {
@@ -393,7 +394,7 @@ impl Findings {
             {
                 self.add(
                     &path,
-                    format_args!("lists {name:?}, which no interface can be called"),
+                    format_args!("lists {name:?}, which is not a possible name of an interface"),
                     "`ip link` lists the names",
                 );
             }
@@ -416,11 +417,7 @@ impl Findings {
             let path = ["discovery", "static", name.as_str()];
             self.name(&path, name);
             if locations.is_empty() {
-                self.add(
-                    &path,
-                    "is empty",
-                    "list at least one location of this gateway",
-                );
+                self.add(&path, "is empty", "list at least one location of this peer");
             }
             if locations.len() > MAX_ADDRESSES {
                 self.too_many(&path, locations.len(), MAX_ADDRESSES);
@@ -429,7 +426,7 @@ impl Findings {
                 self.add(
                     &path,
                     format_args!("lists {location} twice"),
-                    "list each once",
+                    "list each location once",
                 );
             }
             for location in locations {
@@ -443,7 +440,7 @@ impl Findings {
         if kind.is_host_local() {
             self.add(
                 path,
-                format_args!("lists {location}, which leads to no other host"),
+                format_args!("lists {location}, which works only within one host"),
                 "write for example tcp://10.0.0.2:7788",
             );
         } else if !has_port(location.address()) {
@@ -464,13 +461,13 @@ impl Findings {
     }
 }
 
-/// Whether an address with port, as text, is one of this host only.
+/// Whether the text is a loopback address with port.
 pub(crate) fn is_on_loopback(text: &str) -> bool {
     let address = text.parse::<SocketAddr>();
     address.is_ok_and(|address| address.ip().to_canonical().is_loopback())
 }
 
-/// Whether this is `host:port` with a port one can connect to.
+/// Whether the text is `host:port` with a port other than 0.
 fn has_port(address: &str) -> bool {
     if is_numeric_address(address) {
         return !address.ends_with(":0");
@@ -488,7 +485,8 @@ fn repeated<T: Eq + Hash + Clone>(all: impl IntoIterator<Item = T>) -> Option<T>
     all.into_iter().find(|one| !seen.insert(one.clone()))
 }
 
-/// Errors of `regex` draw a picture over several lines; the last line says what is wrong.
+/// Returns the last line of an error of `regex`, which holds the reason; the lines before show the
+/// position.
 fn one_line(text: &str) -> String {
     let last = text.lines().last().unwrap_or_default().trim();
     last.trim_start_matches("error: ").to_owned()

@@ -12,7 +12,7 @@ use super::reader::{Reader, bare_or_quoted, dotted};
 use super::sources::Found;
 use super::{Config, ConfigError, Origin, Sources};
 
-/// The configuration that counts, with the origin of every value.
+/// The configuration with the origin of every value.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Effective {
     config: Config,
@@ -26,13 +26,13 @@ pub struct Effective {
 pub struct Setting {
     /// The path to it, for example `["mts", "deadline"]` or `["routes", "camera_.*"]`.
     pub path: Vec<String>,
-    /// What it is.
+    /// The value.
     pub value: Value,
-    /// Where it comes from.
+    /// The origin of the value.
     pub origin: Origin,
 }
 
-/// A value as it is written in the file. Sizes, durations and addresses are texts.
+/// A value as it is written in the file. Sizes, durations and addresses are text.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[serde(untagged)]
 #[non_exhaustive]
@@ -48,26 +48,26 @@ pub enum Value {
 }
 
 impl Effective {
-    /// Finds, reads and checks the configuration.
+    /// Finds, reads and checks the configuration, and records the origin of every value.
     ///
     /// # Errors
-    /// When a file cannot be read, or with all mistakes that were found.
+    /// If a file cannot be read, or if the configuration has mistakes; the error lists all of them.
     pub fn load(sources: &Sources) -> Result<Self, ConfigError> {
         Self::of(sources, sources.read()?)
     }
 
-    /// Reads and checks what was found, and what overrides it.
+    /// Reads and checks the file that was found and the `--set` arguments.
     fn of(sources: &Sources, found: Option<Found>) -> Result<Self, ConfigError> {
         let mut reader = Reader::new(&sources.host_name);
         for assignment in sources.set.iter().rev() {
             reader.set(assignment);
         }
-        // So far from the last to the first, as the last one counts.
+        // The arguments were read in reverse, because the last one for a key counts.
         reader.mistakes.reverse();
         if let Some(found) = &found {
             reader.file(&found.path, &found.text);
         }
-        // A value that could not be read has left its default, about which there is nothing to say.
+        // A value that could not be read leaves its default in place, which needs no check.
         if reader.mistakes.is_empty() {
             reader.check();
         }
@@ -92,25 +92,25 @@ impl Effective {
         }
     }
 
-    /// The configuration.
+    /// Returns the configuration.
     #[must_use]
     pub fn config(&self) -> &Config {
         &self.config
     }
 
-    /// The configuration, without where it comes from.
+    /// Returns the configuration without the origins.
     #[must_use]
     pub fn into_config(self) -> Config {
         self.config
     }
 
-    /// The file that was read, if any, as it was named.
+    /// Returns the path of the file that was read, as it was given; `None` if no file was found.
     #[must_use]
     pub fn file(&self) -> Option<&Path> {
         self.file.as_deref()
     }
 
-    /// Every value, in the order of the file that [`Effective::render`] writes.
+    /// Returns every value, in the order of [`Effective::render`].
     #[must_use]
     pub fn settings(&self) -> Vec<Setting> {
         let setting = |path: Vec<String>, value| {
@@ -135,8 +135,8 @@ impl Effective {
         settings
     }
 
-    /// The file that says all this by itself, every value followed by where it comes from:
-    /// `# default`, `# fipa.toml:12` or `# --set`.
+    /// Renders the configuration as one complete TOML file. A comment after every value states its
+    /// origin: `# default`, `# fipa.toml:12` or `# --set`.
     #[must_use]
     pub fn render(&self) -> String {
         // Writing to a string cannot fail.
@@ -168,7 +168,7 @@ impl Effective {
 }
 
 impl Value {
-    /// A list of things that are written as texts.
+    /// Creates a list of items that are written as text.
     pub(super) fn list(items: &[impl Display]) -> Self {
         Self::List(items.iter().map(ToString::to_string).collect())
     }

@@ -1,4 +1,4 @@
-//! What can be wrong with a configuration, and where.
+//! Errors in a configuration, and the origins of values.
 
 use std::fmt;
 use std::io;
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use fipa_acl::escape;
 use serde::{Serialize, Serializer};
 
-/// Why there is no configuration.
+/// The error if a configuration cannot be loaded.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ConfigError {
@@ -16,12 +16,12 @@ pub enum ConfigError {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why this file: `--config`, `$FIPA_CONFIG`, or where it was found.
+        /// The reason for this file, for example `named by --config`.
         named_by: &'static str,
-        /// What the system said.
+        /// The error of the operating system.
         source: io::Error,
     },
-    /// The configuration was read and has mistakes: at least one, in the order they stand.
+    /// The configuration was read and has mistakes: at least one, in the order of the sources.
     #[error("{}", listed(.0))]
     Mistakes(Vec<Mistake>),
 }
@@ -38,11 +38,11 @@ fn listed(mistakes: &[Mistake]) -> String {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct Mistake {
-    /// Where it stands; `None` for a value that a program set itself.
+    /// The origin of the value; `None` for a value that a program set itself.
     pub place: Option<Origin>,
-    /// What is wrong. Names the key.
+    /// The problem, with the name of the key.
     pub what: String,
-    /// What is allowed there, or what to do.
+    /// The allowed values, or the remedy.
     pub help: String,
 }
 
@@ -55,7 +55,7 @@ impl fmt::Display for Mistake {
     }
 }
 
-/// Where a value comes from.
+/// The origin of a value.
 ///
 /// Displayed as `default`, `fipa.toml:12` or `--set mts.deadline=9s`, without control characters.
 ///
@@ -65,19 +65,19 @@ impl fmt::Display for Mistake {
 #[serde(tag = "from", rename_all = "lowercase")]
 #[non_exhaustive]
 pub enum Origin {
-    /// Nobody said anything.
+    /// The default.
     Default,
-    /// It stands in a file.
+    /// A line of a file.
     File {
-        /// The file, as it was named.
+        /// The path of the file, as it was given.
         #[serde(serialize_with = "lossily")]
         path: PathBuf,
         /// The line, counted from 1.
         line: usize,
     },
-    /// It was given with `--set`.
+    /// A `--set` argument.
     Set {
-        /// What stood behind `--set`.
+        /// The text after `--set`.
         assignment: String,
     },
 }
@@ -92,13 +92,12 @@ impl fmt::Display for Origin {
     }
 }
 
-/// A path as it is shown to people: a file name may contain anything, and this goes to terminals and
-/// into comments of a TOML file.
+/// Escapes a path for terminals and for comments of a TOML file.
 fn shown(path: &Path) -> String {
     escape(&path.to_string_lossy()).into_owned()
 }
 
-/// A path that is not UTF-8 is still worth showing.
+/// Serializes a path; invalid UTF-8 becomes the replacement character.
 fn lossily<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_str(&path.to_string_lossy())
 }

@@ -1,7 +1,7 @@
-//! The keys: how each is written in TOML, and where its value belongs.
+//! The keys: the TOML form of each and the field that holds its value.
 //!
-//! A new key is a field of [`Config`], its default, and one entry here. Bounds and everything that
-//! concerns several keys are the business of [`super::check`].
+//! A new key needs a field of [`Config`], its default, and one entry here. [`super::check`] checks
+//! bounds and conditions on several keys.
 
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 use std::ops::Range;
@@ -16,40 +16,40 @@ use toml_edit::Value as Toml;
 use super::effective::Value;
 use super::{AccessRule, Check, Config, Interface, Peer, Route};
 
-/// A key with one place in the configuration.
+/// A key with a fixed path.
 pub(super) struct Key {
     pub(super) path: &'static [&'static str],
-    /// What stands there, as `--set` needs to know.
+    /// The kind of value, which decides how `--set` arguments are parsed.
     pub(super) shape: Shape,
-    /// What is allowed, to end a sentence that begins with "expected".
+    /// The allowed values; the end of a sentence that begins with "expected".
     pub(super) expected: &'static str,
-    pub(super) write: fn(&mut Config, &Toml) -> Result<(), Wrong>,
+    pub(super) write: fn(&mut Config, &Toml) -> Result<(), InvalidValue>,
     pub(super) read: fn(&Config) -> Value,
 }
 
-/// A table whose keys are names that the owner chooses; its values are lists.
+/// A table whose keys are names that the user chooses, and whose values are lists.
 pub(super) struct Map {
     pub(super) path: &'static [&'static str],
     pub(super) expected: &'static str,
-    /// Adds an entry; the reader asks once per name.
-    pub(super) write: fn(&mut Config, &str, &Toml) -> Result<(), Wrong>,
+    /// Adds an entry; the reader calls it once per name.
+    pub(super) write: fn(&mut Config, &str, &Toml) -> Result<(), InvalidValue>,
     pub(super) read: fn(&Config) -> Vec<(&str, Value)>,
 }
 
-/// What kind of value a key has.
+/// The kind of value of a key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Shape {
-    /// Text, also where it means a size or a duration.
+    /// Text, including sizes and durations.
     Text,
-    /// A Boolean or a number.
+    /// A boolean or a number.
     Plain,
     List,
 }
 
-/// A value that is not what its key wants.
+/// The error if a value does not fit its key.
 #[derive(Debug)]
-pub(super) struct Wrong {
-    /// Where in the document, when that is known better than by the key.
+pub(super) struct InvalidValue {
+    /// The position in the document, if known more precisely than the position of the key.
     pub(super) span: Option<Range<usize>>,
     pub(super) reason: String,
 }
@@ -204,21 +204,21 @@ pub(super) const KEYS: &[Key] = &[
     Key {
         path: &["security", "peer_letters"],
         shape: Shape::Plain,
-        expected: "a number of letters a second such as 20000, or 0 for any number",
+        expected: "a number of letters per second such as 20000, or 0 for no limit",
         write: |config, value| number(value).map(|most| config.security.peer_letters = most),
         read: |config| Value::Number(config.security.peer_letters),
     },
     Key {
         path: &["security", "peer_bytes"],
         shape: Shape::Text,
-        expected: r#"a size for each second such as "256MiB", or 0 for any"#,
+        expected: r#"a size per second such as "256MiB", or 0 for no limit"#,
         write: |config, value| size(value).map(|most| config.security.peer_bytes = most),
         read: |config| size_text(config.security.peer_bytes),
     },
     Key {
         path: &["access", "rate"],
         shape: Shape::Plain,
-        expected: "a number of letters a second such as 100, or 0 for any number",
+        expected: "a number of letters per second such as 100, or 0 for no limit",
         write: |config, value| number(value).map(|rate| config.access.rate = rate),
         read: |config| Value::Number(config.access.rate),
     },
@@ -300,7 +300,7 @@ pub(super) const MAPS: &[Map] = &[
     },
 ];
 
-fn access(sender: &str, value: &Toml) -> Result<AccessRule, Wrong> {
+fn access(sender: &str, value: &Toml) -> Result<AccessRule, InvalidValue> {
     let receivers = items(value, text)?;
     let sender = sender.to_owned();
     Ok(AccessRule { sender, receivers })
@@ -313,7 +313,7 @@ fn shown(rules: &[AccessRule]) -> Vec<(&str, Value)> {
         .collect()
 }
 
-/// The default of `mts.name`: the host's name, with what a name cannot have replaced.
+/// Returns the default of `mts.name`: the host name with its invalid characters replaced, and `-mts`.
 pub(super) fn default_mts_name(host_name: &str) -> String {
     let start: String = host_name.chars().take(60).collect();
     let is_left_out =
@@ -327,7 +327,7 @@ pub(super) fn default_mts_name(host_name: &str) -> String {
     format!("{host}-mts")
 }
 
-/// `value` in a message: as it stands in TOML, shortened.
+/// Formats a value for a message: as written in TOML, at most 80 characters.
 pub(super) fn quoted(value: &Toml) -> String {
     let text = value.to_string();
     let text = text.trim();
@@ -337,7 +337,7 @@ pub(super) fn quoted(value: &Toml) -> String {
     }
 }
 
-impl Wrong {
+impl InvalidValue {
     fn new(value: &Toml, reason: impl std::fmt::Display) -> Self {
         Self {
             span: value.span(),
@@ -350,94 +350,115 @@ impl Wrong {
             name @ ("array" | "integer" | "inline table") => format!("an {name}"),
             name => format!("a {name}"),
         };
-        Self::new(value, format_args!("{article} cannot stand here"))
+        Self::new(value, format_args!("{article} is not allowed here"))
     }
 }
 
-fn text(value: &Toml) -> Result<String, Wrong> {
-    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+fn text(value: &Toml) -> Result<String, InvalidValue> {
+    let text = value
+        .as_str()
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
     Ok(text.to_owned())
 }
 
-fn choice(value: &Toml) -> Result<Check, Wrong> {
-    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+fn choice(value: &Toml) -> Result<Check, InvalidValue> {
+    let text = value
+        .as_str()
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
     let mut all = Check::ALL.into_iter();
     all.find(|check| check.as_str() == text)
-        .ok_or_else(|| Wrong::new(value, "no such choice"))
+        .ok_or_else(|| InvalidValue::new(value, "unknown choice"))
 }
 
-fn truth(value: &Toml) -> Result<bool, Wrong> {
-    value.as_bool().ok_or_else(|| Wrong::kind_of_value(value))
+fn truth(value: &Toml) -> Result<bool, InvalidValue> {
+    value
+        .as_bool()
+        .ok_or_else(|| InvalidValue::kind_of_value(value))
 }
 
-fn number(value: &Toml) -> Result<usize, Wrong> {
+fn number(value: &Toml) -> Result<usize, InvalidValue> {
     let number = value
         .as_integer()
-        .ok_or_else(|| Wrong::kind_of_value(value))?;
-    usize::try_from(number).map_err(|_| Wrong::new(value, "a negative number cannot stand here"))
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
+    usize::try_from(number)
+        .map_err(|_| InvalidValue::new(value, "a negative number is not allowed"))
 }
 
-/// Text with a unit, or a plain number of bytes.
-fn size(value: &Toml) -> Result<u64, Wrong> {
+/// Reads a size: text with a unit, or a plain number of bytes.
+fn size(value: &Toml) -> Result<u64, InvalidValue> {
     if let Some(bytes) = value.as_integer() {
-        let negative = |_| Wrong::new(value, "a negative number cannot stand here");
+        let negative = |_| InvalidValue::new(value, "a negative number is not allowed");
         return u64::try_from(bytes).map_err(negative);
     }
-    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+    let text = value
+        .as_str()
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
     let size: Result<ByteSize, _> = text.parse();
     size.map(|size| size.as_u64())
-        .map_err(|_| Wrong::new(value, "not a size"))
+        .map_err(|_| InvalidValue::new(value, "not a size"))
 }
 
-/// Text with units, or zero, which needs none.
-fn duration(value: &Toml) -> Result<Duration, Wrong> {
+/// Reads a duration: text with units, or zero without a unit.
+fn duration(value: &Toml) -> Result<Duration, InvalidValue> {
     match value.as_integer() {
         Some(0) => return Ok(Duration::ZERO),
-        Some(_) => return Err(Wrong::new(value, "the unit is missing")),
+        Some(_) => return Err(InvalidValue::new(value, "the unit is missing")),
         None => {}
     }
-    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
-    humantime::parse_duration(text).map_err(|error| Wrong::new(value, error))
+    let text = value
+        .as_str()
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
+    humantime::parse_duration(text).map_err(|error| InvalidValue::new(value, error))
 }
 
-fn items<T>(value: &Toml, one: fn(&Toml) -> Result<T, Wrong>) -> Result<Vec<T>, Wrong> {
+fn items<T>(
+    value: &Toml,
+    one: fn(&Toml) -> Result<T, InvalidValue>,
+) -> Result<Vec<T>, InvalidValue> {
     let list = value
         .as_array()
-        .ok_or_else(|| Wrong::kind_of_value(value))?;
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
     list.iter().map(one).collect()
 }
 
-fn kinds(value: &Toml) -> Result<Vec<Kind>, Wrong> {
+fn kinds(value: &Toml) -> Result<Vec<Kind>, InvalidValue> {
     items(value, |value| {
-        let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+        let text = value
+            .as_str()
+            .ok_or_else(|| InvalidValue::kind_of_value(value))?;
         match text.parse() {
             Ok(kind) if !Kind::is_supported(kind) => {
                 let error = LocationError::UnknownKind(text.to_owned());
-                Err(Wrong::new(value, error))
+                Err(InvalidValue::new(value, error))
             }
-            parsed => parsed.map_err(|error| Wrong::new(value, error)),
+            parsed => parsed.map_err(|error| InvalidValue::new(value, error)),
         }
     })
 }
 
-fn location(value: &Toml) -> Result<Location, Wrong> {
-    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
-    text.parse().map_err(|error| Wrong::new(value, error))
+fn location(value: &Toml) -> Result<Location, InvalidValue> {
+    let text = value
+        .as_str()
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
+    text.parse()
+        .map_err(|error| InvalidValue::new(value, error))
 }
 
-fn addresses(value: &Toml) -> Result<Vec<String>, Wrong> {
+fn addresses(value: &Toml) -> Result<Vec<String>, InvalidValue> {
     items(value, |value| {
-        let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+        let text = value
+            .as_str()
+            .ok_or_else(|| InvalidValue::kind_of_value(value))?;
         if is_numeric_address(text) {
             Ok(text.to_owned())
         } else {
-            Err(Wrong::new(value, "not a numeric address with port"))
+            Err(InvalidValue::new(value, "not a numeric address with port"))
         }
     })
 }
 
-/// Whether this is `address:port`, where the scope of an IPv6 address may be the name of an
-/// interface (RFC 4007 section 11.2), which `std` does not read.
+/// Whether the text is `address:port`. The scope of an IPv6 address may be the name of an interface
+/// (RFC 4007 section 11.2), which `std` does not parse.
 pub(super) fn is_numeric_address(text: &str) -> bool {
     if text.parse::<SocketAddr>().is_ok() {
         return true;
@@ -453,8 +474,8 @@ pub(super) fn is_numeric_address(text: &str) -> bool {
     })
 }
 
-/// Whether the kernel would allow this name: 1 to 15 bytes, no white space, no `/`
-/// (`dev_valid_name` of Linux). Nothing else is known about interfaces that may come later.
+/// Whether the kernel allows this name for an interface: 1 to 15 bytes, no white space, no `/` and no
+/// `:` (`dev_valid_name` of Linux). The interface need not exist yet.
 pub(super) fn is_interface_name(text: &str) -> bool {
     (1..=15).contains(&text.len())
         && !matches!(text, "." | "..")
@@ -463,22 +484,27 @@ pub(super) fn is_interface_name(text: &str) -> bool {
             .any(|c| c.is_whitespace() || c.is_control() || matches!(c, '/' | ':'))
 }
 
-fn ip(value: &Toml) -> Result<IpAddr, Wrong> {
-    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
-    text.parse().map_err(|error| Wrong::new(value, error))
+fn ip(value: &Toml) -> Result<IpAddr, InvalidValue> {
+    let text = value
+        .as_str()
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
+    text.parse()
+        .map_err(|error| InvalidValue::new(value, error))
 }
 
-fn interface(value: &Toml) -> Result<Interface, Wrong> {
-    let text = value.as_str().ok_or_else(|| Wrong::kind_of_value(value))?;
+fn interface(value: &Toml) -> Result<Interface, InvalidValue> {
+    let text = value
+        .as_str()
+        .ok_or_else(|| InvalidValue::kind_of_value(value))?;
     if let Ok(address) = text.parse::<IpAddr>() {
         return Ok(Interface::Address(address));
     }
     if is_interface_name(text) {
         return Ok(Interface::Name(text.to_owned()));
     }
-    Err(Wrong::new(
+    Err(InvalidValue::new(
         value,
-        "neither the name of an interface nor an address",
+        "neither an interface name nor an address",
     ))
 }
 
@@ -486,7 +512,7 @@ fn duration_text(duration: Duration) -> Value {
     Value::Text(humantime::format_duration(duration).to_string())
 }
 
-/// The size in the largest unit that loses nothing. (`bytesize` rounds what it displays.)
+/// Formats a size in the largest unit that represents it exactly (`bytesize` rounds).
 fn size_text(bytes: u64) -> Value {
     let units = [(30, "GiB"), (20, "MiB"), (10, "KiB")];
     let exact = units

@@ -1,6 +1,6 @@
-//! Reads a document, or what stands behind `--set`, into a configuration.
+//! Reads a TOML document, or a `--set` argument, into a configuration.
 //!
-//! Sources are read from the strongest to the weakest: a value that is there already stays.
+//! Sources are read from the highest to the lowest priority: a value that is already set stays.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -8,10 +8,10 @@ use std::path::Path;
 
 use toml_edit::{Array, Document, Item, Value as Toml};
 
-use super::keys::{KEYS, Key, MAPS, Map, Shape, Wrong};
+use super::keys::{InvalidValue, KEYS, Key, MAPS, Map, Shape};
 use super::{Config, Mistake, Origin, check};
 
-/// A configuration while it is read.
+/// A configuration that is being read.
 #[derive(Debug)]
 pub(super) struct Reader {
     pub(super) config: Config,
@@ -20,7 +20,7 @@ pub(super) struct Reader {
 }
 
 impl Reader {
-    /// With nothing read yet: the defaults.
+    /// Creates a reader that holds the defaults.
     pub(super) fn new(host_name: &str) -> Self {
         Self {
             config: Config::for_host(host_name),
@@ -42,14 +42,14 @@ impl Reader {
                 self.mistake(
                     layer.origin(error.span()),
                     format!("not TOML: {}", error.message().replace('\n', ", ")),
-                    format!("look at the line {:?}", shortened(line.trim())),
+                    format!("correct the line {:?}", shortened(line.trim())),
                 );
             }
         }
     }
 
-    /// Reads what stands behind `--set`: a key as in TOML, `=`, and a value as in TOML. Text needs
-    /// no quotes, and a list no brackets.
+    /// Reads a `--set` argument: a key as in TOML, `=`, and a value as in TOML. Text needs no quotes,
+    /// and a list needs no brackets.
     pub(super) fn set(&mut self, assignment: &str) {
         let layer = Layer::Set(assignment);
         let Some((path, raw)) = split(assignment) else {
@@ -69,7 +69,7 @@ impl Reader {
         self.item(&layer, path, None, &Item::Value(set_value(shape, raw)));
     }
 
-    /// Adds what is wrong with values that could be read.
+    /// Checks the values that could be read, and adds the mistakes.
     pub(super) fn check(&mut self) {
         for finding in check::findings(&self.config) {
             let place = self.origin(&finding.path);
@@ -77,7 +77,7 @@ impl Reader {
         }
     }
 
-    /// Where the value at this path comes from; of a table, where its first entry does.
+    /// Returns the origin of the value at this path; for a table, that of its first entry.
     pub(super) fn origin(&self, path: &[String]) -> Origin {
         let from_here = self.origins.range(path.to_vec()..);
         let inside = from_here
@@ -92,7 +92,10 @@ impl Reader {
             self.mistake(
                 layer.origin(item.span()),
                 format!("`{name}` is a section, not a value"),
-                format!("write [{name}], and below it its keys: {}", children(path)),
+                format!(
+                    "write [{name}] and below it some of its keys: {}",
+                    children(path)
+                ),
             );
             return;
         };
@@ -138,17 +141,17 @@ impl Reader {
         span: Option<Range<usize>>,
         item: &Item,
         expected: &str,
-        write: impl FnOnce(&mut Config, &Toml) -> Result<(), Wrong>,
+        write: impl FnOnce(&mut Config, &Toml) -> Result<(), InvalidValue>,
     ) {
         let written = match item.as_value() {
-            // What a stronger source has said stays, but a mistake here is still one.
+            // A source of higher priority has set the value; this one is only checked for mistakes.
             Some(value) if self.origins.contains_key(path) => {
                 write(&mut Config::for_host(""), value)
             }
             Some(value) => write(&mut self.config, value),
-            None => Err(Wrong {
+            None => Err(InvalidValue {
                 span: None,
-                reason: "a table cannot stand here (a name with dots needs quotes)".to_owned(),
+                reason: "a table is not allowed here (a name with dots needs quotes)".to_owned(),
             }),
         };
         match written {
@@ -156,9 +159,9 @@ impl Reader {
                 let origin = layer.origin(span);
                 self.origins.entry(path.to_vec()).or_insert(origin);
             }
-            Err(wrong) => self.mistake(
-                layer.origin(wrong.span.or(span)),
-                format!("`{}` is wrong: {}", quoted_path(path), wrong.reason),
+            Err(invalid) => self.mistake(
+                layer.origin(invalid.span.or(span)),
+                format!("`{}` is invalid: {}", quoted_path(path), invalid.reason),
                 format!("expected {expected}"),
             ),
         }
@@ -170,7 +173,7 @@ impl Reader {
     }
 }
 
-/// What is being read.
+/// The source that is being read.
 enum Layer<'a> {
     File { path: &'a Path, text: &'a str },
     Set(&'a str),
@@ -197,7 +200,7 @@ fn newlines(text: &str) -> usize {
     text.bytes().filter(|byte| *byte == b'\n').count()
 }
 
-/// What a path leads to.
+/// The element of the configuration at a path.
 enum Node<'a> {
     Section,
     Key(&'static Key),
@@ -227,7 +230,7 @@ fn known() -> impl Iterator<Item = &'static [&'static str]> {
     keys.chain(MAPS.iter().map(|map| map.path))
 }
 
-/// The keys and sections directly in a section, in their order.
+/// Lists the keys and sections directly in a section, in their order.
 fn children<T: AsRef<str>>(section: &[T]) -> String {
     let mut names: Vec<&str> = Vec::new();
     for path in known().filter(|path| path.len() > section.len()) {
@@ -247,16 +250,16 @@ fn children<T: AsRef<str>>(section: &[T]) -> String {
     }
 }
 
-/// What to write instead of a key that nobody knows.
+/// Suggests a replacement for an unknown key.
 fn suggestion(path: &[&str]) -> String {
     let text = path.join(".");
     let last = path.last().copied().unwrap_or_default();
-    // Sections count as well: `[discover]` is nearer to `discovery` than to any key in it.
+    // Sections are candidates, too: `[discover]` is nearer to `discovery` than to any key in it.
     let candidates = known().flat_map(|path| (1..=path.len()).filter_map(|end| path.get(..end)));
     let nearest = candidates
         .map(|candidate| {
             let whole = strsim::damerau_levenshtein(&text, &candidate.join("."));
-            // The right key in the wrong section.
+            // The distance of the right key in the wrong section.
             let moved = candidate.last().map_or(usize::MAX, |name| {
                 strsim::damerau_levenshtein(last, name).saturating_add(1)
             });
@@ -268,8 +271,8 @@ fn suggestion(path: &[&str]) -> String {
         top if top.is_empty() => "at the top".to_owned(),
         name => format!("in [{name}]"),
     };
-    let is_there = |path: &[&str]| path.starts_with(section) || section.starts_with(path);
-    let listed = match known().any(is_there) {
+    let is_related = |path: &[&str]| path.starts_with(section) || section.starts_with(path);
+    let listed = match known().any(is_related) {
         true => format!("known {place}: {}", children(section)),
         false => format!("known at the top: {}", children::<&str>(&[])),
     };
@@ -281,7 +284,7 @@ fn suggestion(path: &[&str]) -> String {
     }
 }
 
-/// A path as one writes it in TOML.
+/// Writes a path as a dotted key of TOML.
 pub(super) fn dotted(path: &[&str]) -> String {
     let keys: Vec<String> = path.iter().map(|&part| bare_or_quoted(part)).collect();
     keys.join(".")
@@ -292,12 +295,12 @@ fn quoted_path(path: &[String]) -> String {
     dotted(&parts)
 }
 
-/// A key as one writes it in TOML.
+/// Writes a key of TOML, quoted if necessary.
 pub(super) fn bare_or_quoted(key: &str) -> String {
     toml_edit::Key::new(key).display_repr().into_owned()
 }
 
-/// Splits at the first `=` that does not stand in a quoted key.
+/// Splits an assignment at the first `=` outside of a quoted key.
 fn split(assignment: &str) -> Option<(Vec<String>, &str)> {
     assignment.match_indices('=').find_map(|(at, _)| {
         let (key, value) = assignment.split_at_checked(at)?;
@@ -307,7 +310,7 @@ fn split(assignment: &str) -> Option<(Vec<String>, &str)> {
     })
 }
 
-/// The value behind `--set`, read as the key wants it.
+/// Parses the value of a `--set` argument according to the kind of value that the key has.
 fn set_value(shape: Option<Shape>, raw: &str) -> Toml {
     let parsed: Option<Toml> = raw.parse().ok();
     match (shape, parsed) {

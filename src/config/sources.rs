@@ -1,4 +1,4 @@
-//! Where the configuration is looked for.
+//! The search for the configuration file.
 
 use std::env;
 use std::fs::File;
@@ -7,32 +7,33 @@ use std::path::{Path, PathBuf};
 
 use super::ConfigError;
 
-/// The largest configuration file, in bytes. Far above what anybody writes; below what hurts when
-/// `--config` names a wrong file.
+/// Maximum size of a configuration file, in bytes: far more than a configuration needs, and little
+/// enough to read if `--config` names a wrong file.
 const MAX_FILE: u64 = 1 << 20;
 
-/// Where the configuration is looked for, and what overrides it.
+/// The sources of a configuration: the paths to search, and the `--set` arguments that override the
+/// file.
 ///
-/// Everything the search depends on is a field, so that it can be repeated; the default looks
-/// nowhere and yields the defaults.
+/// The search depends on these fields only. The default value has no paths and yields the default
+/// configuration.
 #[derive(Debug, Clone, Default)]
 pub struct Sources {
-    /// `--config`: the file to read, and no other.
+    /// `--config`: the file to read instead of all others.
     pub file: Option<PathBuf>,
-    /// `--set`: `key=value`, of which the last for a key counts.
+    /// `--set`: texts of the form `key=value`. The last one for a key counts.
     pub set: Vec<String>,
-    /// `$FIPA_CONFIG`: the file to read unless `file` is given. Empty is as good as not set.
+    /// `$FIPA_CONFIG`: the file to read unless `file` is given. An empty path counts as not set.
     pub variable: Option<PathBuf>,
-    /// The current directory, which may have a `fipa.toml` and in which relative paths start.
+    /// The current directory: may contain `fipa.toml`, and relative paths start there.
     pub current_dir: Option<PathBuf>,
-    /// The home directory, which may have a `.config/fipa/fipa.toml`.
+    /// The home directory: may contain `.config/fipa/fipa.toml`.
     pub home: Option<PathBuf>,
     /// The name of this host, for the default of `mts.name`.
     pub host_name: String,
 }
 
 impl Sources {
-    /// The environment of this process, without `--config` and `--set`.
+    /// Returns the sources of this process's environment, without `--config` and `--set`.
     #[must_use]
     pub fn from_environment() -> Self {
         Self {
@@ -45,7 +46,7 @@ impl Sources {
         }
     }
 
-    /// The file that counts, with its name as shown to people, if there is any.
+    /// Reads the first file that exists, if any.
     pub(super) fn read(&self) -> Result<Option<Found>, ConfigError> {
         let variable = self
             .variable
@@ -106,7 +107,7 @@ impl Sources {
 /// A file that was read.
 #[derive(Debug)]
 pub(super) struct Found {
-    /// Its name, as shown to people.
+    /// Its path as it is displayed, before it is made absolute.
     pub(super) path: PathBuf,
     pub(super) text: String,
 }
@@ -124,7 +125,7 @@ fn read(path: &Path) -> io::Result<String> {
         .take(MAX_FILE + 1)
         .read_to_end(&mut bytes)?;
     if bytes.len() as u64 > MAX_FILE {
-        let message = format!("larger than {MAX_FILE} bytes, so it is no configuration");
+        let message = format!("larger than {MAX_FILE} bytes, the maximum for a configuration");
         return Err(io::Error::new(io::ErrorKind::FileTooLarge, message));
     }
     String::from_utf8(bytes).map_err(|error| {

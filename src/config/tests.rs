@@ -1,4 +1,4 @@
-//! What is read, from where, and what is shown.
+//! Reading configurations, the search for the file, and rendering.
 
 mod mistakes;
 
@@ -33,7 +33,7 @@ fn error(text: &str, set: &[&str]) -> String {
 }
 
 #[test]
-fn nothing_said_gives_the_defaults() {
+fn an_empty_configuration_yields_the_defaults() {
     let sources = Sources {
         host_name: "sherpa".to_owned(),
         ..Sources::default()
@@ -50,13 +50,13 @@ fn nothing_said_gives_the_defaults() {
 }
 
 #[test]
-fn odd_host_names_still_give_a_name() {
+fn unusual_host_names_yield_a_valid_name() {
     for host in ["", "a b\n", &"é".repeat(300)] {
         Config::for_host(host).check().unwrap();
     }
 }
 
-/// The file in the documentation says what the defaults are, but for the two that have none.
+/// The file in the documentation contains the defaults, except for tables that are empty by default.
 #[test]
 fn the_documented_file_is_the_default() {
     let documentation = include_str!("../config.rs");
@@ -188,7 +188,6 @@ fn set_overrides_the_file() {
         "routes.c.d=shm",
         "routes.x=tcp",
     ];
-    // The last line of each source has a mistake of its own.
     let file = "domain = \"file\"\n[routes]\nx = [\"shm\"]\ny = [\"shm\"]\n";
     assert_eq!(
         error(file, &set),
@@ -335,9 +334,9 @@ crex-mts = ["tcp://10.0.0.2:7788"]   # fipa.toml:12
     assert_eq!(config(expected, &[]), effective.into_config());
 }
 
-/// A comment ends at the end of the line, and a file name may have one.
+/// A comment ends at the end of the line, and a file name may contain a newline.
 #[test]
-fn no_file_name_breaks_what_is_shown() {
+fn a_file_name_with_newlines_is_escaped_in_rendered_comments() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("x\ndomain = \"evil\"\r.toml");
     fs::write(&path, "mts.queue = 7\n").unwrap();
@@ -386,7 +385,7 @@ prop_compose! {
             .into_iter()
             .map(|(receiver, transports)| Route { receiver, transports })
             .collect();
-        // As the text is checked with the transports that are on.
+        // A route needs at least one transport that is on.
         config.routes.retain(|route| {
             route.transports.iter().any(|kind| config.mts.transports.contains(kind))
         });
@@ -411,7 +410,7 @@ prop_compose! {
     }
 }
 
-/// Names that agents and gateways can have.
+/// Valid names of agents and gateways.
 fn names() -> impl Strategy<Value = String> {
     let is_name = |name: &String| fipa_sds::check_name(name).is_ok();
     "\\PC{1,20}".prop_filter("a name", is_name)
@@ -423,7 +422,7 @@ fn kinds() -> impl Strategy<Value = Vec<Kind>> {
 
 proptest! {
     #[test]
-    fn what_is_shown_says_the_same(config in configs()) {
+    fn a_rendered_configuration_reads_back_the_same(config in configs()) {
         config.check().unwrap();
         let mut reader = Reader::new("");
         reader.config = config.clone();
@@ -436,7 +435,7 @@ proptest! {
     }
 
     #[test]
-    fn no_text_is_too_much(text in "\\PC*|([a-z.]{1,9}( = |=)[\\[\\]{}a-z0-9\", .]*\n){0,9}") {
+    fn every_text_yields_one_line_mistakes(text in "\\PC*|([a-z.]{1,9}( = |=)[\\[\\]{}a-z0-9\", .]*\n){0,9}") {
         let mut reader = Reader::new("");
         reader.set(&text);
         reader.file(Path::new("x"), &text);
@@ -448,7 +447,7 @@ proptest! {
 }
 
 #[test]
-fn a_gateway_is_open_to_the_network_with_keys_or_by_its_owners_word() {
+fn a_gateway_listens_on_the_network_only_with_keys_or_with_insecure() {
     let open = "transport.tcp.listen=0.0.0.0:7788";
     let mistakes = |set: &[&str]| {
         let sources = Sources {
@@ -476,13 +475,13 @@ fn a_gateway_is_open_to_the_network_with_keys_or_by_its_owners_word() {
         "nothing listens"
     );
     assert_eq!(mistakes(&["transport.tcp.listen=[::1]:7788"]), "");
-    // What does not go together.
-    for nobody in ["security.peer_connections=0", "security.peer_bytes=1KiB"] {
-        let key = nobody.split('=').next().unwrap();
-        assert!(mistakes(&[nobody]).contains(key), "{nobody}");
+    // Limits that are too low.
+    for too_low in ["security.peer_connections=0", "security.peer_bytes=1KiB"] {
+        let key = too_low.split('=').next().unwrap();
+        assert!(mistakes(&[too_low]).contains(key), "{too_low}");
     }
     assert_eq!(mistakes(&["security.peer_bytes=0"]), "");
-    assert!(mistakes(&["security.keys=~/keys"]).contains("only shells understand"));
+    assert!(mistakes(&["security.keys=~/keys"]).contains("only shells expand"));
     let keys = "security.keys=/etc/fipa/keys";
     assert!(mistakes(&[keys, "security.insecure=true"]).contains("`security.insecure`"));
     assert!(mistakes(&[keys, "mts.transports=shm,udp,tcp"]).contains("not encrypted"));

@@ -1,4 +1,4 @@
-//! Where other hosts reach the gateway at present.
+//! Checks the locations at which other hosts reach the gateway.
 
 use super::{Area, Check, Verdict};
 use crate::{Config, Kind};
@@ -23,11 +23,11 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         match fipa_transport_net::reachable_at(listen) {
             Ok(addresses) => found.extend(addresses.into_iter().map(|it| (kind, it))),
             Err(error) => {
-                checks.push(AREA.wrong(
+                checks.push(AREA.problem(
                     LOCATIONS,
                     Verdict::Bad,
                     format!("transport.{kind}.listen cannot be used: {error}"),
-                    "see `ip address` for the addresses of this host",
+                    "use an address of this host; `ip address` lists them",
                 ));
                 return;
             }
@@ -41,7 +41,7 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         .filter(|(kind, _)| used(*kind))
         .flat_map(|(_, listen)| *listen)
         .any(|text| !crate::config::is_on_loopback(text));
-    let leads_here = found
+    let has_address = found
         .iter()
         .any(|(_, address)| !address.ip().to_canonical().is_loopback());
     let texts: Vec<String> = found
@@ -49,14 +49,17 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         .map(|(kind, address)| format!("{kind}://{address}"))
         .collect();
     let texts = texts.join(", ");
-    checks.push(match (open, leads_here) {
-        (false, _) => AREA.fine(LOCATIONS, format!("{texts}: this host only")),
+    checks.push(match (open, has_address) {
+        (false, _) => AREA.fine(LOCATIONS, format!("{texts}: reachable from this host only")),
         (true, true) => AREA.fine(LOCATIONS, texts),
-        (true, false) => AREA.wrong(
+        (true, false) => AREA.problem(
             LOCATIONS,
             Verdict::Doubtful,
-            format!("{texts}: no interface has an address, so other hosts are told of nothing"),
-            "connect this host, or see `ip address`; a running gateway follows by itself",
+            format!(
+                "{texts}: no network interface has an address, so the gateway announces no location"
+            ),
+            "connect this host to the network (`ip address` lists the interfaces); a running gateway \
+             then announces its new addresses without a restart",
         ),
     });
 }

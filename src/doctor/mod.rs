@@ -1,14 +1,14 @@
-//! What a machine needs for all this to work, and what is wrong with it.
+//! Checks whether this machine meets the requirements of the configuration.
 //!
-//! Each area has a file with one function that examines it and adds its [`Check`]s; a new area is
-//! a file here and a line in [`examine`]. Examining changes nothing; the
-//! network is asked who is there.
+//! Each area has a file with one function that examines it and adds its [`Check`]s. A new area is
+//! a file here and a line in [`examine`]. The checks change nothing on the machine; the check of
+//! multicast sends mDNS queries.
 
+mod domain_dir;
 #[cfg(feature = "net")]
 mod locations;
 #[cfg(feature = "mdns")]
 mod network;
-mod place;
 mod queues;
 #[cfg(feature = "net")]
 mod security;
@@ -19,42 +19,42 @@ use serde::Serialize;
 
 use crate::Config;
 
-/// One thing that was looked at.
+/// The result of one check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct Check {
-    /// What it matters for, for example `shared memory`.
+    /// The area, for example `shared memory`.
     pub area: &'static str,
-    /// What was looked at, for example `size of /dev/shm`.
+    /// The name of the check, for example `size of /dev/shm`.
     pub check: &'static str,
-    /// Whether it is as it should be.
+    /// The verdict.
     pub verdict: Verdict,
-    /// What was found.
+    /// The state that was found, as text.
     pub found: String,
-    /// What to do about it; none when it is fine.
+    /// The remedy; `None` if the verdict is [`Verdict::Fine`].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub advice: Option<String>,
 }
 
-/// Whether something is as it should be, from best to worst.
+/// The verdict of a check, ordered from best to worst.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
 pub enum Verdict {
-    /// It is.
+    /// The requirement is met.
     Fine,
-    /// It works, and may fail under load, or later.
+    /// The requirement is met now, but may fail under load or later.
     Doubtful,
-    /// Something does not work.
+    /// The requirement is not met: a part of the configuration does not work.
     Bad,
 }
 
-/// Examines everything that the configuration makes use of. Blocks for some milliseconds; for three
-/// seconds when `discovery.mdns` is on, while it listens to the network.
+/// Examines all areas that the configuration uses. Blocks for some milliseconds, or for three
+/// seconds if `discovery.mdns` is on, because the check of multicast waits for answers.
 #[must_use]
 pub fn examine(config: &Config) -> Vec<Check> {
     let mut checks = Vec::new();
-    place::examine(config, &mut checks);
+    domain_dir::examine(config, &mut checks);
     #[cfg(feature = "shm")]
     if config.mts.transports.contains(&crate::Kind::Shm) {
         shm::examine(config, &mut checks);
@@ -71,7 +71,7 @@ pub fn examine(config: &Config) -> Vec<Check> {
     checks
 }
 
-/// Makes the checks of one area.
+/// Builds the [`Check`]s of one area.
 pub(crate) struct Area(pub(crate) &'static str);
 
 impl Area {
@@ -85,7 +85,7 @@ impl Area {
         }
     }
 
-    pub(crate) fn wrong(
+    pub(crate) fn problem(
         &self,
         check: &'static str,
         verdict: Verdict,

@@ -1,4 +1,4 @@
-//! What finding other hosts needs: multicast, out and in.
+//! Checks multicast in both directions, which the discovery of other hosts needs.
 
 use std::net::IpAddr;
 
@@ -11,9 +11,9 @@ use crate::Config;
 const AREA: Area = Area("network");
 const MULTICAST: &str = "multicast";
 
-/// The way that needs no multicast.
-const NAME_THEM: &str = "name a gateway of each other host in discovery.static; gateways tell \
-                         each other the rest";
+/// The remedy that works without multicast.
+const USE_STATIC: &str = "list one gateway of each other host in discovery.static; the gateways then \
+                          exchange their directories directly";
 
 pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     let interfaces = config.discovery.interfaces.iter().map(ToString::to_string);
@@ -22,18 +22,19 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
         ..MdnsConfig::new(Mts::new("doctor", Incarnation::random()))
     });
     match probed {
-        Ok(found) if found.is_empty() => checks.push(AREA.wrong(
+        Ok(found) if found.is_empty() => checks.push(AREA.problem(
             MULTICAST,
             Verdict::Doubtful,
-            "no interface is up that discovery.interfaces allows",
-            "connect this host, or see `ip address` and discovery.interfaces",
+            "no interface is up among those that discovery.interfaces allows",
+            "connect this host to the network, or change discovery.interfaces (`ip address` lists the \
+             interfaces)",
         )),
         Ok(found) => checks.extend(found.iter().map(multicast)),
-        Err(error) => checks.push(AREA.wrong(
+        Err(error) => checks.push(AREA.problem(
             MULTICAST,
             Verdict::Bad,
-            format!("the interfaces of this machine cannot be listed: {error}"),
-            NAME_THEM,
+            format!("cannot list the network interfaces of this machine: {error}"),
+            USE_STATIC,
         )),
     }
 }
@@ -43,84 +44,85 @@ fn multicast(found: &Multicast) -> Check {
         interface, address, ..
     } = found;
     let at = format!("{interface} ({address})");
-    let wrong = |verdict, what: &str, advice: &str| {
-        AREA.wrong(MULTICAST, verdict, format!("{at}: {what}"), advice)
+    let problem = |verdict, found: &str, advice: &str| {
+        AREA.problem(MULTICAST, verdict, format!("{at}: {found}"), advice)
     };
     if let Some(error) = &found.error {
-        let what = format!("cannot be used: {error}");
-        return wrong(
+        let found = format!("multicast cannot be used: {error}");
+        return problem(
             Verdict::Bad,
-            &what,
-            "let UDP port 5353 through the firewall, and see `ip route` for the multicast groups; \
-             or name other interfaces in discovery.interfaces",
+            &found,
+            "allow UDP port 5353 in the firewall and check the route of the multicast groups (`ip \
+             route`), or list other interfaces in discovery.interfaces",
         );
     }
     if address.is_loopback() {
         return if found.heard_itself {
-            AREA.fine(MULTICAST, format!("{at}: goes out and comes in"))
+            AREA.fine(MULTICAST, format!("{at}: multicast is sent and received"))
         } else {
-            wrong(Verdict::Bad, "this host does not hear itself", FIREWALL)
+            problem(Verdict::Bad, NOT_EVEN_OWN, FIREWALL)
         };
     }
     match (found.heard.len(), found.answered.len()) {
-        (0, 0) if !found.heard_itself => wrong(
-            Verdict::Bad,
-            "this host does not even hear itself",
-            FIREWALL,
-        ),
-        (0, 0) => wrong(
+        (0, 0) if !found.heard_itself => problem(Verdict::Bad, NOT_EVEN_OWN, FIREWALL),
+        (0, 0) => problem(
             Verdict::Doubtful,
-            "goes out of this host, and nobody answered: nobody is there, or the network filters \
-             multicast, as much Wi-Fi does",
-            &format!("start `fipa up` on another host and look again; if it stays so, {NAME_THEM}"),
+            "multicast leaves this host, but no other host answered: none is running, or the network \
+             filters multicast, as many Wi-Fi networks do",
+            &format!(
+                "start `fipa up` on another host and repeat this check; if no host answers then, \
+                 {USE_STATIC}"
+            ),
         ),
-        (0, _) => wrong(
+        (0, _) => problem(
             Verdict::Doubtful,
             &format!(
-                "gets out, and does not come in: {} answered directly, and nobody was heard by \
-                 multicast",
+                "outgoing multicast works, incoming does not: {} answered by unicast, and no multicast \
+                 packet of another host arrived",
                 hosts(found.answered.iter())
             ),
             &format!(
-                "let UDP port 5353 in through the firewall of this host, and turn off multicast \
+                "allow incoming UDP port 5353 in the firewall of this host, and turn off multicast \
                  filtering (IGMP snooping without a querier, client isolation) in the network; or \
-                 {NAME_THEM}"
+                 {USE_STATIC}"
             ),
         ),
-        (_, 0) => wrong(
+        (_, 0) => problem(
             Verdict::Doubtful,
             &format!(
-                "comes in, and may not get out: {} was heard, and nobody answered (who has no agents \
-                 to announce has nothing to answer)",
+                "incoming multicast works, outgoing may not: packets of {} arrived, but no host \
+                 answered (a host without agents has nothing to answer)",
                 hosts(found.heard.iter())
             ),
             &format!(
-                "let UDP port 5353 out through the firewall of this host, and direct answers in; \
-                 or {NAME_THEM}"
+                "allow outgoing UDP port 5353, and unicast answers to it, in the firewall of this \
+                 host; or {USE_STATIC}"
             ),
         ),
         (_, _) => AREA.fine(
             MULTICAST,
             format!(
-                "{at}: goes both ways, with {}",
+                "{at}: multicast works in both directions, with {}",
                 hosts(found.heard.iter().chain(&found.answered))
             ),
         ),
     }
 }
 
-const FIREWALL: &str = "let UDP port 5353 to 224.0.0.251 and ff02::fb out and in through the \
-                        firewall of this host (`nft list ruleset` shows it)";
+const NOT_EVEN_OWN: &str = "this host does not receive its own multicast packets";
 
-/// Some of them by address, and how many there are.
+const FIREWALL: &str = "allow UDP port 5353 to 224.0.0.251 and ff02::fb in both directions in the \
+                        firewall of this host (`nft list ruleset` shows its rules)";
+
+/// Lists the first three addresses and the number of the others.
 fn hosts<'a>(all: impl Iterator<Item = &'a IpAddr>) -> String {
     let mut all: Vec<&IpAddr> = all.collect();
     all.sort_unstable();
     all.dedup();
-    let some: Vec<String> = all.iter().take(3).map(ToString::to_string).collect();
-    let more = match all.len().saturating_sub(some.len()) {
+    let first: Vec<String> = all.iter().take(3).map(ToString::to_string).collect();
+    let more = match all.len().saturating_sub(first.len()) {
         0 => String::new(),
         more => format!(" and {more} more"),
     };
-    format!("{}{more}", some.join(", "))
+    format!("{}{more}", first.join(", "))
 }

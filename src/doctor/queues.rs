@@ -1,4 +1,4 @@
-//! What letters that wait may take of memory.
+//! Checks the memory that waiting letters can take.
 
 use std::fs;
 
@@ -18,23 +18,26 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
 fn queues(config: &Config, available: Option<u64>) -> Check {
     const CHECK: &str = "memory of waiting letters";
     let bytes = config.mts.queue_bytes;
-    let each = format!(
+    let per_agent = format!(
         "up to {} letters or {} wait for each agent",
         config.mts.queue,
         ByteSize::b(bytes)
     );
     match available {
-        Some(available) if available < bytes => AREA.wrong(
+        Some(available) if available < bytes => AREA.problem(
             CHECK,
             Verdict::Doubtful,
-            format!("{each}, and {} of memory is free", ByteSize::b(available)),
-            "make mts.queue_bytes smaller, so that one slow agent cannot take all memory",
+            format!(
+                "{per_agent}, but only {} of memory is available",
+                ByteSize::b(available)
+            ),
+            "lower mts.queue_bytes, so that the queue of one slow agent cannot take all memory",
         ),
-        _ => AREA.fine(CHECK, each),
+        _ => AREA.fine(CHECK, per_agent),
     }
 }
 
-/// Bytes of memory that are available, as `/proc/meminfo` says.
+/// Returns the bytes of available memory from the text of `/proc/meminfo`.
 fn available_in(meminfo: &str) -> Option<u64> {
     let line = meminfo
         .lines()
@@ -48,7 +51,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_queue_larger_than_free_memory_is_doubtful() {
+    fn a_queue_larger_than_available_memory_is_doubtful() {
         let config = Config::for_host("sherpa");
         assert_eq!(queues(&config, None).verdict, Verdict::Fine);
         assert_eq!(queues(&config, Some(1 << 30)).verdict, Verdict::Fine);

@@ -1,4 +1,4 @@
-//! Who is let in from other hosts, and whether the keys that decide it can be used.
+//! Checks the keys that decide which peers on other hosts are accepted.
 
 use super::{Area, Check, Verdict};
 use crate::Config;
@@ -10,25 +10,29 @@ pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
     if !config.security.keys.is_empty() {
         keys(config, checks);
     } else if config.security.insecure {
-        checks.push(AREA.wrong(
+        checks.push(AREA.problem(
             KEYS,
             Verdict::Doubtful,
-            "there are none, and security.insecure = true: whoever reaches the gateway is let in, and \
-             can read everything",
-            "make keys (`fipa keys init`), unless everybody on this network may",
+            "there are none, and security.insecure is true: the gateway accepts every host that can \
+             reach it, and letters are not encrypted",
+            "make keys (`fipa keys init`) and set security.keys, unless every host on this network is \
+             trusted",
         ));
     } else {
-        checks.push(AREA.fine(KEYS, "there are none: the gateway stays on loopback"));
+        checks.push(AREA.fine(
+            KEYS,
+            "there are none: the gateway listens on loopback addresses only",
+        ));
     }
 }
 
 #[cfg(not(feature = "secure"))]
 fn keys(_config: &Config, checks: &mut Vec<Check>) {
-    checks.push(AREA.wrong(
+    checks.push(AREA.problem(
         KEYS,
         Verdict::Bad,
-        "security.keys is set, and this program was built without the feature `secure`",
-        "build it with the feature, or take security.keys out",
+        "security.keys is set, but this program was built without the feature `secure`",
+        "build it with the feature, or remove security.keys",
     ));
 }
 
@@ -42,28 +46,30 @@ fn keys(config: &Config, checks: &mut Vec<Check>) {
         Err(error) => {
             let advice = match error {
                 KeysError::Name { .. } => {
-                    "set mts.name to it, or make keys anew in an empty directory"
+                    "set mts.name to the name in the certificate, or make new keys in an empty directory"
                 }
-                _ => "see `fipa keys list`, and security.keys",
+                _ => "check the directory in security.keys; `fipa keys list` shows its contents",
             };
-            checks.push(AREA.wrong(KEYS, Verdict::Bad, error.to_string(), advice));
+            checks.push(AREA.problem(KEYS, Verdict::Bad, error.to_string(), advice));
             return;
         }
     };
     if credentials.trusted.is_empty() {
-        let advice = "trust the certificates of the others: `fipa keys trust FILE`";
-        let found = "no other host is trusted, so none gets in";
-        checks.push(AREA.wrong(KEYS, Verdict::Doubtful, found, advice));
+        let advice = "trust the certificates of the other hosts: `fipa keys trust FILE`";
+        let found = "no other host is trusted, so every connection from another host is refused";
+        checks.push(AREA.problem(KEYS, Verdict::Doubtful, found, advice));
     }
     let mut ending = |whose: &str, certificate: &Certificate, renew: &str| {
         let holding = Holding::of(certificate);
-        let Some(what) = holding.told() else { return };
+        let Some(problem) = holding.told() else {
+            return;
+        };
         let verdict = match holding {
             Holding::EndsSoon => Verdict::Doubtful,
             _ => Verdict::Bad,
         };
-        let found = format!("the certificate of {whose} {what}");
-        checks.push(AREA.wrong(KEYS, verdict, found, renew));
+        let found = format!("the certificate of {whose} {problem}");
+        checks.push(AREA.problem(KEYS, verdict, found, renew));
     };
     ending("this host", &credentials.own, "`fipa keys renew`");
     for trusted in &credentials.trusted {
@@ -71,12 +77,12 @@ fn keys(config: &Config, checks: &mut Vec<Check>) {
         ending(
             &whose,
             trusted,
-            "ask its owner for a new one (`fipa keys renew` there)",
+            "ask the owner of that host for a new certificate (`fipa keys renew` there)",
         );
     }
     if checks.iter().all(|check| check.area != AREA.0) {
         let count = credentials.trusted.len();
-        checks.push(AREA.fine(KEYS, format!("other hosts that are trusted: {count}")));
+        checks.push(AREA.fine(KEYS, format!("trusted other hosts: {count}")));
     }
 }
 
@@ -88,12 +94,12 @@ mod tests {
     fn verdicts(config: &Config) -> Vec<(Verdict, String)> {
         let mut checks = Vec::new();
         examine(config, &mut checks);
-        let told = checks.into_iter().map(|check| (check.verdict, check.found));
-        told.collect()
+        let verdicts = checks.into_iter().map(|check| (check.verdict, check.found));
+        verdicts.collect()
     }
 
     #[test]
-    fn what_lets_nobody_in_or_everybody_is_told() {
+    fn configurations_that_accept_no_host_or_every_host_are_reported() {
         let mut config = Config::for_host("sherpa");
         assert_eq!(verdicts(&config)[0].0, Verdict::Fine);
         config.security.insecure = true;
@@ -116,7 +122,7 @@ mod tests {
         assert_eq!(found.len(), 1);
         assert_eq!(found[0].0, Verdict::Doubtful);
         assert!(
-            found[0].1.contains("crex-mts ends within"),
+            found[0].1.contains("crex-mts expires within"),
             "{}",
             found[0].1
         );

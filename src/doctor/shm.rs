@@ -1,4 +1,4 @@
-//! What shared memory needs.
+//! Checks the requirements of shared memory.
 
 use std::path::Path;
 
@@ -10,43 +10,45 @@ use rustix::process::{Resource, geteuid, getrlimit};
 
 use super::{Area, Check, Verdict};
 use crate::Config;
-use crate::place::Place;
+use crate::domain_dir::DomainDir;
 
 const AREA: Area = Area("shared memory");
 
-/// What a process needs of descriptors: some of its own, and some per process it talks to.
+/// Number of file descriptors that a process needs without peers.
 const OWN_DESCRIPTORS: u64 = 40;
+
+/// Number of file descriptors that a process needs for each process it exchanges letters with.
 const DESCRIPTORS_PER_PEER: u64 = 10;
 
-/// Bytes of shared memory that must be free for a process to talk to another one for the first time.
+/// Bytes of shared memory that a connection between two processes takes.
 const PER_CONNECTION: u64 = 1 << 20;
 
-/// With fewer processes to talk to than this, the limit of descriptors is doubtful.
+/// Number of peer processes below which the limit of descriptors is doubtful.
 const FEW_PEERS: u64 = 32;
 
-/// With fewer inotify instances than this (one per process), their number is doubtful.
+/// Number of inotify instances (one per process) below which the limit is doubtful.
 const FEW_INSTANCES: u64 = 64;
 
-/// User identifiers from here on are of people, whose shared memory systemd may remove.
-const FIRST_PERSON: u32 = 1000;
+/// The lowest user identifier that is not of a system user; systemd's RemoveIPC applies from here on.
+const FIRST_REGULAR_USER: u32 = 1000;
 
 pub(super) fn examine(config: &Config, checks: &mut Vec<Check>) {
-    let place = Place::of(&config.domain);
+    let dir = DomainDir::of(&config.domain);
     let settings = ShmConfig {
         capacity: config.transport.shm.capacity,
-        ..ShmConfig::new(place.part("shm"), place.prefix(), Incarnation::random())
+        ..ShmConfig::new(dir.part("shm"), dir.prefix(), Incarnation::random())
     };
     match inspect(&settings) {
         Ok(found) => {
             checks.push(size(&found, config.transport.shm.capacity));
-            checks.push(traces(&found));
+            checks.push(leftovers(&found));
             checks.push(exposed(&found));
         }
-        Err(error) => checks.push(AREA.wrong(
+        Err(error) => checks.push(AREA.problem(
             "/dev/shm",
             Verdict::Bad,
             error.to_string(),
-            "mount it (mount -t tmpfs tmpfs /dev/shm), or take shm out of mts.transports",
+            "mount it (mount -t tmpfs tmpfs /dev/shm), or remove shm from mts.transports",
         )),
     }
     checks.push(descriptors());
@@ -59,30 +61,30 @@ fn size(found: &Inspection, capacity: u64) -> Check {
     let [total, free, need] = [found.total, found.free, capacity].map(ByteSize::b);
     let connections = room(found, capacity) / PER_CONNECTION;
     let text = format!(
-        "{total}, of which {free} are free; capacity of the domain: {need}; room for {connections} more \
-         connections, beyond which letters take the next route"
+        "{total}, of which {free} are free; capacity of the domain: {need}; space for {connections} more \
+         connections, after which letters use the next transport"
     );
     let advice = "enlarge it (mount -o remount,size=512M /dev/shm; for containers --shm-size=512m), or \
                   lower transport.shm.capacity";
-    // Less than this and no process can start.
+    // With less space than this no process can start.
     if found.free < 2 << 20 {
-        AREA.wrong(CHECK, Verdict::Bad, text, advice)
+        AREA.problem(CHECK, Verdict::Bad, text, advice)
     } else if found.free.saturating_add(found.used) < capacity {
-        AREA.wrong(CHECK, Verdict::Doubtful, text, advice)
+        AREA.problem(CHECK, Verdict::Doubtful, text, advice)
     } else {
         AREA.fine(CHECK, text)
     }
 }
 
-/// Returns the bytes that the domain can still take.
+/// Returns the number of bytes that the domain can still take.
 fn room(found: &Inspection, capacity: u64) -> u64 {
     found.free.min(capacity.saturating_sub(found.used))
 }
 
-fn traces(found: &Inspection) -> Check {
-    const CHECK: &str = "traces of the dead";
+fn leftovers(found: &Inspection) -> Check {
+    const CHECK: &str = "leftovers of ended processes";
     let text = format!(
-        "{} processes are there, {} have died and left traces; {} of shared memory in use",
+        "processes that run: {}; ended processes that left files behind: {}; shared memory in use: {}",
         found.alive,
         found.dead,
         ByteSize::b(found.used)
@@ -90,19 +92,19 @@ fn traces(found: &Inspection) -> Check {
     if found.dead == 0 {
         return AREA.fine(CHECK, text);
     }
-    let advice = "any process that joins the domain removes them within seconds, for example \
-                  `fipa agents`; if they stay, look for processes of the domain that hang";
-    AREA.wrong(CHECK, Verdict::Doubtful, text, advice)
+    let advice = "start any process of the domain, for example `fipa agents`: it removes the files \
+                  within seconds; if they remain, look for processes of the domain that hang";
+    AREA.problem(CHECK, Verdict::Doubtful, text, advice)
 }
 
 fn exposed(found: &Inspection) -> Check {
     const CHECK: &str = "permissions in /dev/shm";
     match found.exposed.first() {
-        None => AREA.fine(CHECK, "nothing of this domain is open to other users"),
-        Some(file) => AREA.wrong(
+        None => AREA.fine(CHECK, "no file of this domain is accessible to other users"),
+        Some(file) => AREA.problem(
             CHECK,
             Verdict::Bad,
-            format!("{} is open to other users", file.display()),
+            format!("{} is accessible to other users", file.display()),
             format!("chmod 600 {}", file.display()),
         ),
     }
@@ -114,12 +116,12 @@ fn descriptors() -> Check {
     let peers = limit.saturating_sub(OWN_DESCRIPTORS) / DESCRIPTORS_PER_PEER;
     let text = format!("{limit}: enough to exchange letters with {peers} processes");
     let advice = format!(
-        "raise it (ulimit -n, or LimitNOFILE= of the service): {OWN_DESCRIPTORS} are needed per process, \
-         and {DESCRIPTORS_PER_PEER} for each that it talks to"
+        "raise it (ulimit -n, or LimitNOFILE= of the service): a process needs {OWN_DESCRIPTORS}, and \
+         {DESCRIPTORS_PER_PEER} more for each process that it exchanges letters with"
     );
     match peers {
-        0 => AREA.wrong(CHECK, Verdict::Bad, text, advice),
-        few if few < FEW_PEERS => AREA.wrong(CHECK, Verdict::Doubtful, text, advice),
+        0 => AREA.problem(CHECK, Verdict::Bad, text, advice),
+        few if few < FEW_PEERS => AREA.problem(CHECK, Verdict::Doubtful, text, advice),
         _ => AREA.fine(CHECK, text),
     }
 }
@@ -127,47 +129,50 @@ fn descriptors() -> Check {
 fn instances() -> Option<Check> {
     const FILE: &str = "/proc/sys/fs/inotify/max_user_instances";
     let limit: u64 = std::fs::read_to_string(FILE).ok()?.trim().parse().ok()?;
-    // Of this process, which gives it back at once.
+    // A trial, closed at the end of this function.
     let one_more = inotify::init(inotify::CreateFlags::CLOEXEC);
     Some(instances_left(limit, one_more.is_ok()))
 }
 
 fn instances_left(limit: u64, one_more: bool) -> Check {
     const CHECK: &str = "inotify instances";
-    let advice = "sysctl fs.inotify.max_user_instances=512";
+    let advice = "raise the limit: sysctl fs.inotify.max_user_instances=512";
     if !one_more {
         let text = format!(
-            "all {limit} are in use: processes without one poll the directory of the domain every 100 ms"
+            "all {limit} are in use: a process without one polls the directory of the domain every \
+             100 ms"
         );
-        return AREA.wrong(CHECK, Verdict::Doubtful, text, advice);
+        return AREA.problem(CHECK, Verdict::Doubtful, text, advice);
     }
-    let text = format!("{limit}, and every process of this user needs one");
+    let text = format!("{limit}; every process of this user needs one");
     if limit >= FEW_INSTANCES {
         return AREA.fine(CHECK, text);
     }
-    AREA.wrong(CHECK, Verdict::Doubtful, text, advice)
+    AREA.problem(CHECK, Verdict::Doubtful, text, advice)
 }
 
-/// None where systemd does not run.
+/// Checks systemd's RemoveIPC; returns `None` if systemd does not run.
 fn remove_ipc(root: &Path, user: u32) -> Option<Check> {
     const CHECK: &str = "systemd's RemoveIPC";
     root.join("run/systemd/system").exists().then(|| {
-        if user < FIRST_PERSON {
-            return AREA.fine(CHECK, "does not concern this user, who is a system user");
+        if user < FIRST_REGULAR_USER {
+            return AREA.fine(CHECK, "does not apply to system users such as this one");
         }
         if !removes(root) {
             return AREA.fine(CHECK, "off");
         }
-        AREA.wrong(
+        AREA.problem(
             CHECK,
             Verdict::Doubtful,
-            "on: shared memory vanishes when this user's last session ends, also under running processes",
+            "on: systemd removes the shared memory of this user when the last session ends, even while \
+             processes use it",
             "set RemoveIPC=no in /etc/systemd/logind.conf, or run the processes as a system user",
         )
     })
 }
 
-/// What logind is told: the last word counts, and nothing said means yes (logind.conf(5)).
+/// Whether logind removes shared memory. The last assignment counts; the default is yes
+/// (logind.conf(5)).
 fn removes(root: &Path) -> bool {
     let mut files = vec![
         root.join("usr/lib/systemd/logind.conf"),
@@ -179,21 +184,21 @@ fn removes(root: &Path) -> bool {
         let found = std::fs::read_dir(directory).into_iter().flatten().flatten();
         later.extend(found.map(|file| file.path()));
     }
-    // By name, wherever they are.
+    // Drop-ins are applied in the order of their names, whatever their directory.
     later.sort_by_key(|path| path.file_name().map(ToOwned::to_owned));
     files.extend(later);
     let texts = files
         .iter()
         .filter_map(|file| std::fs::read_to_string(file).ok());
-    let mut answer = true;
+    let mut enabled = true;
     for text in texts {
         for line in text.lines() {
             if let Some(value) = line.trim().strip_prefix("RemoveIPC=") {
-                answer = !matches!(value.trim(), "no" | "false" | "0" | "off" | "n" | "f");
+                enabled = !matches!(value.trim(), "no" | "false" | "0" | "off" | "n" | "f");
             }
         }
     }
-    answer
+    enabled
 }
 
 #[cfg(test)]
@@ -203,7 +208,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_last_word_about_remove_ipc_counts() {
+    fn the_last_assignment_of_remove_ipc_counts() {
         let root = tempfile::tempdir().unwrap();
         let root = root.path();
         assert_eq!(remove_ipc(root, 1000), None);
@@ -231,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn a_small_or_full_file_system_is_told() {
+    fn a_small_or_full_file_system_is_reported() {
         let found = |total, free, used| Inspection {
             total,
             free,
@@ -242,7 +247,7 @@ mod tests {
         assert_eq!(verdict(found(1 << 30, 1 << 29, 0)), Verdict::Fine);
         assert_eq!(verdict(found(64 << 20, 64 << 20, 0)), Verdict::Doubtful);
         assert_eq!(verdict(found(1 << 30, 1 << 20, 0)), Verdict::Bad);
-        // What the domain has taken already counts.
+        // Memory that the domain has taken already counts as usable by it.
         assert_eq!(
             verdict(found(300 << 20, 100 << 20, 200 << 20)),
             Verdict::Fine
@@ -250,10 +255,10 @@ mod tests {
     }
 
     #[test]
-    fn what_others_can_open_and_the_dead_are_told() {
+    fn files_open_to_other_users_and_leftovers_are_reported() {
         let fine = Inspection::default();
         assert_eq!(
-            (traces(&fine).verdict, exposed(&fine).verdict),
+            (leftovers(&fine).verdict, exposed(&fine).verdict),
             (Verdict::Fine, Verdict::Fine)
         );
         let found = Inspection {
@@ -262,7 +267,7 @@ mod tests {
             ..Inspection::default()
         };
         assert_eq!(
-            (traces(&found).verdict, exposed(&found).verdict),
+            (leftovers(&found).verdict, exposed(&found).verdict),
             (Verdict::Doubtful, Verdict::Bad)
         );
         assert!(

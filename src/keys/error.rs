@@ -1,4 +1,4 @@
-//! Why something cannot be done with keys.
+//! The errors of operations on keys.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -7,100 +7,100 @@ use std::time::Duration;
 use fipa_acl::escape;
 use fipa_transport_net::secure::{CertificateError, Fingerprint};
 
-/// Why something cannot be done with keys.
+/// The error of an operation on [`Keys`](super::Keys).
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum KeysError {
     /// A file or directory cannot be used.
     #[error("{}: {source}", shown(path))]
     Io {
-        /// Which one.
+        /// The file or directory.
         path: PathBuf,
-        /// What the operating system said.
+        /// The error of the operating system.
         source: io::Error,
     },
-    /// There are keys already.
-    #[error("{} is there already; nothing was changed", shown(.0))]
+    /// The directory has keys already. Holds the existing file.
+    #[error("{} exists already; nothing was changed", shown(.0))]
     Exists(PathBuf),
-    /// There are none.
+    /// The directory has no keys. Holds the directory.
     #[error("there are no keys in {}; make them with `fipa keys init`", shown(.0))]
     Missing(PathBuf),
-    /// No keys have been made that could take the place of these.
+    /// The directory has no next keys. Holds the directory.
     #[error("there are no next keys in {}; make them with `fipa keys renew`", shown(.0))]
     NoNext(PathBuf),
-    /// A certificate would hold for no time, or beyond the year 9999.
-    #[error("a certificate cannot hold for {}", humantime::format_duration(*.0))]
+    /// The validity of the certificate would be zero, or end after the year 9999.
+    #[error("a certificate cannot be valid for {}", humantime::format_duration(*.0))]
     Validity(Duration),
-    /// Others could read the private key.
+    /// Other users could read the private key. Holds its file.
     #[error(
-        "{} can be read by others than its owner, or is not this user's; `chmod 600` it, and make new \
-         keys if somebody may have read it",
+        "{} belongs to another user, or other users can read it; run `chmod 600` on it, and make new \
+         keys if another user may have read it",
         shown(.0)
     )]
     Readable(PathBuf),
-    /// Others could give trust, or withdraw it.
+    /// Other users could add or remove trusted certificates. Holds the file or directory.
     #[error(
-        "{} can be written by others than its owner, or is not this user's: they could trust whom they \
-         like; `chmod go-w` it, and look whom it trusts (`fipa keys list`)",
+        "{} belongs to another user, or other users can write to it and so add trusted certificates; \
+         run `chmod go-w` on it, and check the trusted certificates (`fipa keys list`)",
         shown(.0)
     )]
     Writable(PathBuf),
-    /// A file is not what its name says.
+    /// A file has unexpected contents.
     #[error("{}: {}", shown(path), escape(what))]
     Contents {
-        /// Which one.
+        /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The problem.
         what: String,
     },
-    /// What was given has no certificate in it.
-    #[error("no certificate in it (PEM, -----BEGIN CERTIFICATE-----)")]
+    /// The given text has no certificate.
+    #[error("no certificate in the file (expected PEM, -----BEGIN CERTIFICATE-----)")]
     NoCertificate,
-    /// What was given is a private key.
+    /// The given text is a private key.
     #[error(
-        "a private key, which nobody but its owner may have; if it came from another host, that one has \
-         to make new ones"
+        "the file is a private key, which must stay on its host; if it is of another host, make new keys \
+         there"
     )]
     PrivateKey,
-    /// What was given is this host's own.
-    #[error("this host's own certificate, which the owners of other hosts are to trust")]
+    /// The given certificate is this host's own.
+    #[error("the file is this host's own certificate; other hosts must trust it, not this one")]
     Own,
-    /// A certificate that cannot be used.
+    /// A certificate cannot be used.
     #[error(transparent)]
     Certificate(#[from] CertificateError),
-    /// The certificate is of another service.
+    /// The certificate is for another service than `mts.name`.
     #[error(
-        "the certificate in {} is of {certified:?}, and mts.name is {name:?}: peers would refuse this \
-         gateway",
+        "the certificate in {} is for {certified:?}, but mts.name is {name:?}, so peers would refuse \
+         this gateway",
         shown(dir)
     )]
     Name {
-        /// Where the certificate is.
+        /// The directory with the certificate.
         dir: PathBuf,
-        /// Whose it is.
+        /// The name of the service in the certificate.
         certified: String,
-        /// Who wants to use it.
+        /// The name of the gateway (`mts.name`).
         name: String,
     },
-    /// It was revoked once.
-    #[error("the certificate {0} was revoked; its owner has to make a new one")]
+    /// The certificate was revoked.
+    #[error("the certificate {0} was revoked; its host needs a new one (`fipa keys renew` there)")]
     Revoked(Fingerprint),
-    /// None of the trusted certificates is meant, or several are.
+    /// No trusted certificate matches, or several do.
     #[error(
-        "{found} of the trusted certificates are meant by {which:?}; `fipa keys list` shows them"
+        "{which:?} matches {found} trusted certificates instead of one; `fipa keys list` shows them"
     )]
     Which {
-        /// What was asked for.
+        /// The given name or prefix of a fingerprint.
         which: String,
-        /// How many there are.
+        /// The number of matching certificates.
         found: usize,
     },
-    /// A key or certificate could not be made.
-    #[error("could not make a key: {0}")]
+    /// A key or certificate cannot be made.
+    #[error("cannot make a key: {0}")]
     Make(String),
 }
 
-/// A path as it is shown to people: a file name may contain anything.
+/// Escapes a path for terminals and logs.
 fn shown(path: &Path) -> String {
     escape(&path.to_string_lossy()).into_owned()
 }

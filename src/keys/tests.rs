@@ -1,4 +1,4 @@
-//! Keys, in directories of their own.
+//! Tests of keys in temporary directories.
 
 use super::*;
 
@@ -9,7 +9,7 @@ fn keys() -> (tempfile::TempDir, Keys) {
 }
 
 #[test]
-fn what_a_certificate_says_is_what_was_asked_for() {
+fn a_certificate_has_the_given_names_and_validity() {
     let (_dir, keys) = keys();
     let agents = ["arm_1".to_owned(), "Käptn *".to_owned()];
     let made = keys.init("crex mts/1", &agents, VALID).unwrap();
@@ -26,7 +26,7 @@ fn what_a_certificate_says_is_what_was_asked_for() {
 }
 
 #[test]
-fn trust_is_given_and_withdrawn_for_good() {
+fn a_revoked_certificate_cannot_be_trusted_again() {
     let ((_a, crex), (_b, rover)) = (keys(), keys());
     let made = crex.init("crex-mts", &[], VALID).unwrap();
     rover.init("rover-mts", &[], VALID).unwrap();
@@ -37,7 +37,7 @@ fn trust_is_given_and_withdrawn_for_good() {
     assert_ne!(rover.stamp(), before);
     assert_eq!(rover.credentials().unwrap().trusted.len(), 1);
     assert!(matches!(
-        rover.revoke("nobody"),
+        rover.revoke("unknown"),
         Err(KeysError::Which { found: 0, .. })
     ));
     let fingerprint = made.fingerprint().to_string();
@@ -48,7 +48,7 @@ fn trust_is_given_and_withdrawn_for_good() {
 }
 
 #[test]
-fn a_renewed_key_is_used_when_it_is_switched_to() {
+fn a_renewed_key_is_used_after_the_switch() {
     let (_dir, keys) = keys();
     assert!(matches!(keys.renew(VALID), Err(KeysError::Missing(_))));
     let first = keys.init("crex", &["crex".to_owned()], VALID).unwrap();
@@ -64,19 +64,19 @@ fn a_renewed_key_is_used_when_it_is_switched_to() {
 }
 
 #[test]
-fn no_certificate_holds_for_no_time_or_beyond_all_calendars() {
+fn a_validity_of_zero_or_beyond_the_year_9999_is_refused() {
     let (_dir, keys) = keys();
     let beyond = Duration::from_secs(8000 * 365 * 86_400);
     for valid in [Duration::ZERO, beyond, Duration::MAX] {
         let refused = keys.init("crex", &[], valid);
         assert!(matches!(refused, Err(KeysError::Validity(it)) if it == valid));
     }
-    assert!(!keys.dir().exists(), "nothing was begun");
+    assert!(!keys.dir().exists(), "a refused call creates nothing");
     keys.init("crex", &[], beyond / 2).unwrap();
 }
 
 #[test]
-fn what_cannot_be_read_keeps_nobody_from_revoking() {
+fn an_unreadable_certificate_does_not_prevent_revoking_another() {
     let ((_a, crex), (_b, rover)) = (keys(), keys());
     crex.init("crex-mts", &[], VALID).unwrap();
     rover.trust(&fs::read(crex.own_file()).unwrap()).unwrap();
@@ -88,7 +88,7 @@ fn what_cannot_be_read_keeps_nobody_from_revoking() {
 }
 
 #[test]
-fn a_directory_in_which_others_could_give_trust_is_refused() {
+fn a_directory_that_other_users_can_write_is_refused() {
     use std::os::unix::fs::PermissionsExt as _;
     let ((_a, crex), (_b, rover)) = (keys(), keys());
     crex.init("crex", &[], VALID).unwrap();
@@ -105,7 +105,7 @@ fn a_directory_in_which_others_could_give_trust_is_refused() {
 }
 
 #[test]
-fn a_key_that_others_can_read_is_refused() {
+fn a_key_that_other_users_can_read_is_refused() {
     use std::os::unix::fs::PermissionsExt as _;
     let (_dir, keys) = keys();
     keys.init("crex", &[], VALID).unwrap();
@@ -116,7 +116,7 @@ fn a_key_that_others_can_read_is_refused() {
 }
 
 #[test]
-fn what_is_no_certificate_is_told() {
+fn text_that_is_not_a_certificate_is_refused() {
     let (_dir, keys) = keys();
     for wrong in [
         &b""[..],
@@ -131,7 +131,7 @@ fn what_is_no_certificate_is_told() {
     assert!(matches!(keys.own(), Err(KeysError::Contents { .. })));
 }
 
-/// The PEM text of a certificate with these alternative names.
+/// Makes the PEM text of a certificate with these alternative names.
 fn named(uris: &[&str]) -> Vec<u8> {
     let mut params = CertificateParams::default();
     for uri in uris {
@@ -143,7 +143,7 @@ fn named(uris: &[&str]) -> Vec<u8> {
 }
 
 #[test]
-fn a_name_that_draws_lines_is_no_name() {
+fn a_name_with_control_characters_is_refused() {
     let (_dir, keys) = keys();
     let forged = "urn:fipa:mts:crex%0A%20%20fingerprint%20";
     for uris in [
@@ -170,7 +170,7 @@ fn a_name_that_draws_lines_is_no_name() {
 }
 
 #[test]
-fn a_certificate_that_others_can_write_is_not_trusted() {
+fn a_certificate_that_other_users_can_write_is_not_trusted() {
     use std::os::unix::fs::PermissionsExt as _;
     let ((_a, crex), (_b, rover)) = (keys(), keys());
     let made = crex.init("crex-mts", &[], VALID).unwrap();

@@ -1,4 +1,4 @@
-//! Selling: the English auction (FIPA00031) and the Dutch one (FIPA00032).
+//! The auctioneer's side of the English auction (FIPA00031) and the Dutch auction (FIPA00032).
 
 use std::time::Duration;
 
@@ -11,8 +11,8 @@ use super::dialogue::{Dialogue, DialogueError, after, name_of, settle, unreached
 use crate::agent::Agent;
 
 impl Agent {
-    /// Opens an English auction (FIPA00031), in which the price rises: the message, an `inform`, tells
-    /// the bidders so. Bidders that cannot be reached are left out.
+    /// Opens an English auction (FIPA00031), in which the price rises. The message, an `inform`,
+    /// announces it to the bidders. Bidders that cannot be reached are left out.
     ///
     /// ```no_run
     /// # async fn example(agent: fipa::Agent) -> Result<(), Box<dyn std::error::Error>> {
@@ -37,7 +37,7 @@ impl Agent {
     /// ```
     ///
     /// # Errors
-    /// When the message is none that begins the protocol, or cannot be sent.
+    /// If the message does not begin the protocol, or cannot be sent.
     pub async fn english_auction(
         &self,
         opening: MessageBuilder,
@@ -46,8 +46,8 @@ impl Agent {
         Auction::open(self, "fipa-auction-english", opening, bidders).await
     }
 
-    /// Opens a Dutch auction (FIPA00032), in which the price falls until somebody bids, and goes on
-    /// while something is left; see [`english_auction`](Self::english_auction).
+    /// Opens a Dutch auction (FIPA00032), in which the price falls until an agent bids, and which
+    /// continues while goods are left; see [`english_auction`](Self::english_auction).
     ///
     /// # Errors
     /// See [`english_auction`](Self::english_auction).
@@ -60,15 +60,17 @@ impl Agent {
     }
 }
 
-/// An auction, as the auctioneer has it. Dropped, it is not closed: the bidders are told nothing.
+/// The auctioneer's side of an auction. Dropping it does not close the auction, and sends nothing to
+/// the bidders.
 ///
-/// FIPA defines no cancelling of auctions.
+/// FIPA defines no cancel for auctions.
+#[derive(Debug)]
 #[must_use = "an auction goes on until it is closed"]
 pub struct Auction<'a> {
     dialogue: Dialogue<'a>,
-    /// Who can be called.
+    /// The bidders that can be called.
     bidders: Vec<AgentId>,
-    /// Bids that are not decided upon.
+    /// Bids of the last call without a decision.
     undecided: Vec<Message>,
     /// The last bid that was accepted.
     leader: Option<Message>,
@@ -82,42 +84,41 @@ impl<'a> Auction<'a> {
         bidders: &[AgentId],
     ) -> Result<Self, DialogueError> {
         let opening = opening.receivers(bidders.to_vec());
-        let (dialogue, told) = Dialogue::open(agent, protocol, opening, None).await?;
+        let (dialogue, sent) = Dialogue::open(agent, protocol, opening, None).await?;
         let mut auction = Self {
             dialogue,
             bidders: bidders.to_vec(),
             undecided: Vec::new(),
             leader: None,
         };
-        auction.lose(unreached(&told));
+        auction.lose(unreached(&sent));
         Ok(auction)
     }
 
-    /// The conversation's id.
+    /// Returns the conversation id.
     #[must_use]
     pub fn conversation_id(&self) -> &str {
         self.dialogue.id()
     }
 
-    /// Who can still be called.
+    /// Returns the bidders that can still be called.
     #[must_use]
     pub fn bidders(&self) -> &[AgentId] {
         &self.bidders
     }
 
-    /// Who bid last of those whose bid was accepted.
+    /// Returns the bidder of the last accepted bid.
     #[must_use]
     pub fn leader(&self) -> Option<&AgentId> {
         self.leader.as_ref()?.sender()
     }
 
-    /// Calls a price to all bidders (`cfp`) and collects the bids that come within `patience`; it does
-    /// not wait longer than until all have bid. Bids of the call before that were not accepted are
-    /// rejected first. What is bid too late for its call does not count: its bidder has been
-    /// called anew.
+    /// Calls a price to all bidders (`cfp`) and collects the bids until all have bid, at most for
+    /// `patience`. Undecided bids of the previous call are rejected first. A bid that arrives after the
+    /// time of its call is ignored, because its bidder has been called again.
     ///
     /// # Errors
-    /// When the call cannot be sent.
+    /// If the call cannot be sent.
     pub async fn call(
         &mut self,
         price: impl Into<Bytes>,
@@ -131,9 +132,9 @@ impl<'a> Auction<'a> {
             return Ok(bids);
         }
         let call = self.message(Performative::Cfp, price);
-        let told = self.dialogue.tell(call, due).await?;
-        bids.silent.extend(unreached(&told).map(str::to_owned));
-        self.lose(unreached(&told));
+        let sent = self.dialogue.send(call, due).await?;
+        bids.silent.extend(unreached(&sent).map(str::to_owned));
+        self.lose(unreached(&sent));
         let names = self.bidders.iter().map(|bidder| bidder.name().to_owned());
         let mut called: Vec<String> = names.collect();
         while !called.is_empty() {
@@ -155,10 +156,10 @@ impl<'a> Auction<'a> {
         Ok(bids)
     }
 
-    /// Accepts a bid of the last call. `content` says for what price, for example.
+    /// Accepts a bid of the last call. `content` is the content of the acceptance, for example the price.
     ///
     /// # Errors
-    /// When it is none of the last call, was decided upon before, or the answer does not arrive.
+    /// If the bid is not of the last call or already decided on, or if the answer is not delivered.
     pub async fn accept(
         &mut self,
         bid: &Message,
@@ -174,28 +175,27 @@ impl<'a> Auction<'a> {
         Ok(())
     }
 
-    /// Ends the auction and tells all bidders so (`inform`); bids that were not accepted are rejected
-    /// first.
+    /// Ends the auction and informs all bidders (`inform`). Undecided bids are rejected first.
     ///
     /// # Errors
-    /// When it was closed before, or the message cannot be sent.
+    /// If the auction is closed already, or the message cannot be sent.
     pub async fn close(&mut self, content: impl Into<Bytes>) -> Result<(), DialogueError> {
         let rejections = self.reject_undecided()?;
         if !self.bidders.is_empty() {
             let end = self.message(Performative::Inform, content);
-            let told = self.dialogue.tell(end, None).await?;
-            self.lose(unreached(&told));
+            let sent = self.dialogue.send(end, None).await?;
+            self.lose(unreached(&sent));
         }
         settle(rejections, None).await;
         Ok(())
     }
 
-    /// Asks the winner of an English auction that is closed to take what was sold (`request`); where
-    /// the reserve was not met, it is not asked. There is no more to be said in the auction then.
+    /// Requests the winner of a closed English auction to take the goods (`request`), the last message
+    /// of the auction. Do not call it if the reserve price was not met.
     ///
     /// # Errors
-    /// When the auction is not closed, nobody has won it ([`DialogueError::NoWinner`]), or the
-    /// message does not arrive.
+    /// If the auction is not closed, if it has no winner ([`DialogueError::NoWinner`]), or if the
+    /// message is not delivered.
     pub async fn ask_winner(self, content: impl Into<Bytes>) -> Result<(), DialogueError> {
         let Self {
             mut dialogue,
@@ -212,7 +212,8 @@ impl<'a> Auction<'a> {
         message.receivers(self.bidders.clone()).content(content)
     }
 
-    /// All at once, so that nobody waits for who cannot be reached any more.
+    /// Rejects the undecided bids without waiting for the outcomes, so that an unreachable bidder does
+    /// not delay the others.
     fn reject_undecided(&mut self) -> Result<Vec<Sending>, DialogueError> {
         let mut rejections = Vec::new();
         while let Some(bid) = self.undecided.pop() {
@@ -222,7 +223,7 @@ impl<'a> Auction<'a> {
         Ok(rejections)
     }
 
-    /// These cannot be called any more.
+    /// Removes bidders that cannot be called any more.
     fn lose<'n>(&mut self, names: impl Iterator<Item = &'n str>) {
         for name in names {
             self.bidders.retain(|bidder| bidder.name() != name);

@@ -1,4 +1,4 @@
-//! What comes of a call for proposals.
+//! The answers to a call for proposals.
 
 use std::time::Instant;
 
@@ -7,38 +7,40 @@ use fipa_monitor::Violation;
 
 use super::dialogue::{Dialogue, DialogueError};
 
-/// Most violations that are told of one call.
+/// Maximum number of violations that are kept per call.
 const MAX_VIOLATIONS: usize = 64;
 
-/// What came of a call.
+/// The answers to a call for proposals.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Bids {
-    /// The proposals, in the order in which they came.
+    /// The proposals, in the order of their arrival.
     pub proposals: Vec<Message>,
-    /// Who refused, or did not understand.
+    /// The `refuse` and `not-understood` messages.
     pub refusals: Vec<Message>,
-    /// Who did not answer in time, or could not be reached.
+    /// The names of the agents that did not answer in time or could not be reached.
     pub silent: Vec<String>,
-    /// What broke the protocol, the first 64: who did so can still bid. Nobody else is concerned.
+    /// The first 64 violations of the protocol. An agent that violates it can still make a proposal,
+    /// and other agents are not affected.
     pub violations: Vec<Violation>,
 }
 
 impl Bids {
-    /// The next answer, and whether nothing more can come from its sender; none when time is up.
+    /// Waits for the next answer. Returns it with whether its sender can send nothing more, or `None`
+    /// at the time limit.
     pub(super) async fn next(
         &mut self,
         dialogue: &mut Dialogue<'_>,
         due: Option<Instant>,
     ) -> Result<Option<(Message, bool)>, DialogueError> {
         loop {
-            return match dialogue.hear(due).await {
-                // It answers an earlier call.
-                Ok(heard) if heard.meaning.void => continue,
-                Ok(heard) => Ok(Some((heard.message, heard.meaning.over))),
+            return match dialogue.receive(due).await {
+                // An answer to an earlier call.
+                Ok(received) if received.meaning.void => continue,
+                Ok(received) => Ok(Some((received.message, received.meaning.over))),
                 Err(DialogueError::NotUnderstood(message)) => Ok(Some((*message, true))),
                 Err(DialogueError::TimedOut) => Ok(None),
-                // Who it is about is in the outcomes already.
+                // The outcomes of the call already have its receiver.
                 Err(DialogueError::Undelivered(_)) => continue,
                 Err(DialogueError::Violation { violation, .. }) => {
                     if self.violations.len() < MAX_VIOLATIONS {

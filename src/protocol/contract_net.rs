@@ -1,5 +1,6 @@
-//! Calling for proposals and accepting some (FIPA00029), in several rounds if need be (FIPA00030).
+//! The initiator's side of the contract net (FIPA00029) and the iterated contract net (FIPA00030).
 
+use std::fmt;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
@@ -11,9 +12,8 @@ use crate::agent::Agent;
 use crate::delivery::deliveries;
 
 impl Agent {
-    /// Calls for proposals (`cfp`, FIPA00029) and collects those that come within `patience`; it
-    /// does not wait longer than until all have answered. Receivers that cannot be reached count
-    /// as silent.
+    /// Calls for proposals (`cfp`, FIPA00029) and collects the answers until all receivers have
+    /// answered, at most for `patience`. Receivers that cannot be reached count as silent.
     ///
     /// ```no_run
     /// # async fn example(agent: fipa::Agent) -> Result<(), Box<dyn std::error::Error>> {
@@ -33,7 +33,7 @@ impl Agent {
     /// ```
     ///
     /// # Errors
-    /// When the message is none that begins the protocol, or cannot be sent.
+    /// If the message does not begin the protocol, or cannot be sent.
     pub async fn contract_net(
         &self,
         call: MessageBuilder,
@@ -43,8 +43,8 @@ impl Agent {
         ContractNet::begin(self, "fipa-contract-net", call, receivers, patience).await
     }
 
-    /// The same with the leave to call again for better proposals
-    /// ([`ContractNet::call_again`], FIPA00030).
+    /// Calls for proposals like [`contract_net`](Self::contract_net), with the iterated protocol
+    /// (FIPA00030), which allows further calls for better proposals ([`ContractNet::call_again`]).
     ///
     /// # Errors
     /// See [`contract_net`](Self::contract_net).
@@ -59,26 +59,35 @@ impl Agent {
     }
 }
 
-/// A call for proposals whose time is up. Every proposal is to be decided upon with
-/// [`award`](Self::award).
-#[must_use = "proposals are decided upon with award()"]
+/// A call for proposals whose answers are collected. [`award`](Self::award) decides on the proposals.
+#[must_use = "award() decides on the proposals"]
 pub struct ContractNet<'a> {
     dialogue: Dialogue<'a>,
     bids: Bids,
-    /// With whom it has not ended.
+    /// The agents with which the conversation has not ended.
     open: Vec<AgentId>,
-    /// Rejections on their way.
+    /// Rejections in transit.
     rejections: Vec<Sending>,
 }
 
-/// What an agent whose proposal was accepted made of it.
+/// The result of an accepted proposal.
 #[derive(Debug)]
 #[non_exhaustive]
 pub struct Awarded {
-    /// The agent.
+    /// The name of the agent.
     pub agent: String,
-    /// Its `inform`, or why there is none.
+    /// Its `inform`, or the error instead of one.
     pub result: Result<Message, DialogueError>,
+}
+
+impl fmt::Debug for ContractNet<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("ContractNet")
+            .field("dialogue", &self.dialogue)
+            .field("bids", &self.bids)
+            .field("open", &self.open)
+            .finish_non_exhaustive()
+    }
 }
 
 impl<'a> ContractNet<'a> {
@@ -105,24 +114,23 @@ impl<'a> ContractNet<'a> {
         Ok(net)
     }
 
-    /// What came of the last call.
+    /// Returns the answers to the last call.
     #[must_use]
     pub fn bids(&self) -> &Bids {
         &self.bids
     }
 
-    /// The conversation's id.
+    /// Returns the conversation id.
     #[must_use]
     pub fn conversation_id(&self) -> &str {
         self.dialogue.id()
     }
 
-    /// Calls those who made some of the proposals for better ones, and rejects the others
-    /// (FIPA00030); what came of it is in [`bids`](Self::bids), which holds the proposals of the
-    /// last round only.
+    /// Calls the agents of the `invited` proposals for better ones, and rejects the other proposals
+    /// (FIPA00030). Afterwards [`bids`](Self::bids) returns the answers to this call only.
     ///
     /// # Errors
-    /// When the protocol is not the iterated one, the message is no `cfp`, or cannot be sent.
+    /// If the protocol is not the iterated one, or if the message is not a `cfp` or cannot be sent.
     pub async fn call_again(
         &mut self,
         invited: &[Message],
@@ -142,7 +150,7 @@ impl<'a> ContractNet<'a> {
             false => match self.dialogue.post(call.receivers(senders), due) {
                 Ok(sending) => Some(sending),
                 Err(error) => {
-                    // They can still be accepted.
+                    // The proposals can still be accepted.
                     self.bids.proposals = again.into_iter().chain(others).collect();
                     return Err(error);
                 }
@@ -162,12 +170,12 @@ impl<'a> ContractNet<'a> {
         Ok(())
     }
 
-    /// Accepts these proposals and rejects all others, and waits for what those who were accepted
-    /// make of it. `content` goes with both. All are told at once: nobody waits for who cannot be
-    /// reached any more.
+    /// Accepts these proposals, rejects all others, and waits for the results of the accepted ones.
+    /// `content` is the content of acceptances and rejections. All of them are sent before the first
+    /// outcome is awaited, so that an unreachable agent does not delay the others.
     ///
     /// # Errors
-    /// When an answer cannot be sent. What becomes of each award is in the list.
+    /// If an answer cannot be sent. The list has the failures of single agents.
     pub async fn award(
         &mut self,
         accepted: &[Message],
@@ -176,21 +184,21 @@ impl<'a> ContractNet<'a> {
     ) -> Result<Vec<Awarded>, DialogueError> {
         let due = after(patience);
         let mut results = Vec::new();
-        let mut at_work = Vec::new();
-        let mut told = Vec::new();
+        let mut working = Vec::new();
+        let mut sent = Vec::new();
         for proposal in std::mem::take(&mut self.bids.proposals) {
             if accepted.contains(&proposal) {
                 let act = Performative::AcceptProposal;
                 let content = content.to_owned();
                 let sending = self.dialogue.post_answer(&proposal, act, content, due)?;
-                told.push((name_of(&proposal), sending));
+                sent.push((name_of(&proposal), sending));
             } else {
                 self.reject(&proposal, content)?;
             }
         }
-        for (agent, sending) in told {
+        for (agent, sending) in sent {
             match only_delivered(&deliveries(sending).await) {
-                Ok(()) => at_work.push(agent),
+                Ok(()) => working.push(agent),
                 Err(error) => {
                     self.open.retain(|open| open.name() != agent);
                     let result = Err(error);
@@ -198,11 +206,11 @@ impl<'a> ContractNet<'a> {
                 }
             }
         }
-        while !at_work.is_empty() {
-            let (agent, result) = match self.dialogue.hear(due).await {
-                Ok(heard) if heard.meaning.void => continue,
-                Ok(heard) => {
-                    let message = heard.message;
+        while !working.is_empty() {
+            let (agent, result) = match self.dialogue.receive(due).await {
+                Ok(received) if received.meaning.void => continue,
+                Ok(received) => {
+                    let message = received.message;
                     match message.performative() {
                         Performative::Inform => (name_of(&message), Ok(message)),
                         Performative::Failure => {
@@ -227,15 +235,15 @@ impl<'a> ContractNet<'a> {
                 Err(DialogueError::Undelivered(_)) => continue,
                 Err(other) => return Err(other),
             };
-            if let Some(at) = at_work.iter().position(|name| *name == agent) {
-                at_work.swap_remove(at);
+            if let Some(at) = working.iter().position(|name| *name == agent) {
+                working.swap_remove(at);
                 if !matches!(result, Err(DialogueError::Violation { .. })) {
                     self.open.retain(|open| open.name() != agent);
                 }
                 results.push(Awarded { agent, result });
             }
         }
-        for agent in at_work {
+        for agent in working {
             let result = Err(DialogueError::TimedOut);
             results.push(Awarded { agent, result });
         }
@@ -243,18 +251,17 @@ impl<'a> ContractNet<'a> {
         Ok(results)
     }
 
-    /// Cancels the call, with all with whom it has not ended: those who have not answered, whose
-    /// proposals are not decided upon, or who have not told the result. Waits until all have said
-    /// whether it is cancelled.
+    /// Cancels the call with all agents with which it has not ended: those that have not answered,
+    /// whose proposals are undecided, or that have not sent the result. Waits for their confirmations.
     ///
     /// # Errors
-    /// When somebody goes on ([`DialogueError::Failed`]), cannot be reached, or does not say in time
-    /// whether it does.
+    /// If an agent does not cancel ([`DialogueError::Failed`]), cannot be reached, or does not answer
+    /// within `patience`.
     pub async fn cancel(mut self, patience: Duration) -> Result<(), DialogueError> {
         self.dialogue.cancel(self.open, after(patience)).await
     }
 
-    /// Waits until these have answered.
+    /// Waits until these agents have answered, or until `due`.
     async fn collect(
         &mut self,
         mut called: Vec<String>,
@@ -280,7 +287,7 @@ impl<'a> ContractNet<'a> {
         Ok(())
     }
 
-    /// What is proposed after the time of the call is rejected; what else comes then ends by itself.
+    /// Rejects a proposal that arrives after the time of its call. Other late answers need no reaction.
     fn late(&mut self, answer: &Message) -> Result<(), DialogueError> {
         if *answer.performative() == Performative::Propose {
             self.reject(answer, "late")?;
@@ -298,12 +305,13 @@ impl<'a> ContractNet<'a> {
         Ok(())
     }
 
-    /// Waits until the rejections have arrived or failed, so that whoever ends now takes none back.
+    /// Waits until the rejections are delivered or have failed, so that none is lost if this process
+    /// ends now.
     async fn settle(&mut self, due: Option<Instant>) {
         settle(self.rejections.drain(..), due).await;
     }
 
-    /// These cannot be reached.
+    /// Counts agents that cannot be reached as silent.
     fn lose<'n>(&mut self, names: impl Iterator<Item = &'n str>) {
         for name in names {
             self.open.retain(|open| open.name() != name);

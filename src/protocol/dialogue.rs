@@ -1,5 +1,6 @@
-//! One conversation that is led by a call.
+//! One conversation that a call leads.
 
+use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -12,55 +13,55 @@ use crate::agent::Agent;
 use crate::delivery::{Deliveries, Delivery, deliveries};
 use crate::error::{ReceiveError, SendError};
 
-/// Why a protocol did not yield what it was begun for.
+/// The error of a conversation.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum DialogueError {
-    /// The other side refused.
-    #[error("refused: {0}")]
+    /// The other side refused. Holds its `refuse`.
+    #[error("the other side refused: {0}")]
     Refused(Box<Message>),
-    /// The other side tried, and failed.
-    #[error("failed: {0}")]
+    /// The other side failed. Holds its `failure`.
+    #[error("the other side failed: {0}")]
     Failed(Box<Message>),
-    /// The other side did not understand what was said to it.
-    #[error("did not understand: {0}")]
+    /// The other side did not understand a message. Holds its `not-understood`.
+    #[error("the other side did not understand a message: {0}")]
     NotUnderstood(Box<Message>),
-    /// The initiator has cancelled.
-    #[error("cancelled: {0}")]
+    /// The initiator cancelled the conversation. Holds its `cancel`.
+    #[error("the initiator cancelled: {0}")]
     Cancelled(Box<Message>),
-    /// A message did not reach its receiver.
+    /// A message was not delivered.
     #[error("not delivered to {}: {reason}", escape(receiver))]
     NotDelivered {
-        /// The receiver.
+        /// The name of the receiver.
         receiver: String,
-        /// Why not.
+        /// The reason.
         reason: FailureReason,
     },
-    /// The message transport service told of a message that was not delivered.
-    #[error("not delivered: {0}")]
+    /// A message transport service reported a message as not delivered. Holds the report.
+    #[error("a message transport service reports an undelivered message: {0}")]
     Undelivered(Box<Message>),
-    /// Nothing was said within the time that was given.
-    #[error("no answer in time")]
+    /// No message arrived within the given time.
+    #[error("no answer arrived in time")]
     TimedOut,
-    /// The other side said something that the protocol allows, but nobody waited for.
-    #[error("not waited for: {0}")]
+    /// The other side sent a message that the protocol allows but the call does not expect.
+    #[error("received a message that this call does not expect: {0}")]
     Unexpected(Box<Message>),
-    /// The other side broke the protocol.
+    /// The other side violated the protocol.
     #[error("{violation}")]
     Violation {
-        /// In which way.
+        /// The violation.
         violation: Box<Violation>,
-        /// With what.
+        /// The message.
         message: Box<Message>,
     },
-    /// What was to be said breaks the protocol.
+    /// The message to be sent violates the protocol, and was not sent.
     #[error("not sent: {0}")]
     WouldViolate(Box<Violation>),
-    /// The protocol cannot be followed with such a message.
-    #[error("cannot be followed: {0}")]
+    /// The message cannot be checked against a protocol, for example because it names none.
+    #[error("cannot follow the protocol: {0}")]
     Unchecked(Unchecked),
-    /// Nobody has won the auction.
-    #[error("nobody has won the auction: no bid was accepted")]
+    /// The auction has no winner.
+    #[error("the auction has no winner: no bid was accepted")]
     NoWinner,
     /// The message cannot be built.
     #[error(transparent)]
@@ -73,48 +74,48 @@ pub enum DialogueError {
     Receive(ReceiveError),
 }
 
-/// A message that was received, and what it means.
-pub(super) struct Heard {
+/// A received message and its meaning for the conversation.
+pub(super) struct Interpreted {
     pub(super) message: Message,
     pub(super) meaning: Meaning,
 }
 
-/// What a message means to its conversation.
+/// The meaning of a message for its conversation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Meaning {
-    pub(super) standing: Standing,
-    /// Whether nothing can follow from its sender any more.
+    pub(super) state: DialogueState,
+    /// Whether its sender can send nothing more in the conversation.
     pub(super) over: bool,
-    /// Whether it answers what has been said anew since, and changes nothing.
+    /// Whether it answers a message that a later one has replaced, and so has no effect.
     pub(super) void: bool,
 }
 
-/// Where a conversation is after a message.
+/// The state of a conversation after a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Standing {
-    /// In a state of its protocol.
+pub(super) enum DialogueState {
+    /// A state of its own protocol.
     Own,
-    /// It belongs to a protocol within that began between others.
-    Elsewhere,
+    /// A state of a protocol within the conversation that other agents began.
+    Delegated,
     NotUnderstood,
     Cancelling,
     Cancelled,
     Undelivered,
 }
 
-/// A conversation. Dropped, it is no longer led; what still comes goes to [`Agent::receive`].
+/// A conversation. After dropping it, its further messages go to [`Agent::receive`].
 pub(super) struct Dialogue<'a> {
     agent: &'a Agent,
     protocol: String,
     id: String,
     monitor: Monitor,
-    /// Where its own protocol is, with whoever the last message concerned.
+    /// The state of its own protocol, with the agent of the last message.
     state: String,
     replies: u32,
 }
 
 impl<'a> Dialogue<'a> {
-    /// Begins a conversation of this protocol; `due` is when its first answer must have come.
+    /// Begins a conversation of this protocol. The first answer must arrive by `due`.
     pub(super) async fn open(
         agent: &'a Agent,
         protocol: &str,
@@ -123,7 +124,7 @@ impl<'a> Dialogue<'a> {
     ) -> Result<(Self, Deliveries), DialogueError> {
         let id = format!("{}--{}", agent.name(), Incarnation::random());
         let mut dialogue = Self::led(agent, protocol, id);
-        let deliveries = dialogue.tell(first, due).await?;
+        let deliveries = dialogue.send(first, due).await?;
         Ok((dialogue, deliveries))
     }
 
@@ -134,7 +135,7 @@ impl<'a> Dialogue<'a> {
         let mut dialogue = Self::led(agent, first.protocol().unwrap_or_default(), id.to_owned());
         dialogue
             .check(first)
-            .map_err(|wrong| wrong.of_others(first))?;
+            .map_err(|failure| failure.on_received(first))?;
         Ok(dialogue)
     }
 
@@ -151,8 +152,8 @@ impl<'a> Dialogue<'a> {
         }
     }
 
-    /// Says something in this conversation, and that the answer is wanted by then.
-    pub(super) async fn tell(
+    /// Sends a message in this conversation, with `due` as its `reply-by`, and waits for the outcomes.
+    pub(super) async fn send(
         &mut self,
         message: MessageBuilder,
         due: Option<Instant>,
@@ -160,7 +161,7 @@ impl<'a> Dialogue<'a> {
         Ok(deliveries(self.post(message, due)?).await)
     }
 
-    /// The same without waiting for the outcomes: it is on its way when this returns.
+    /// Sends a message like [`send`](Self::send), without waiting for the outcomes.
     pub(super) fn post(
         &mut self,
         message: MessageBuilder,
@@ -170,7 +171,8 @@ impl<'a> Dialogue<'a> {
         self.post_within(message, due)
     }
 
-    /// The same in the protocol that the message names, which runs within this one.
+    /// Sends a message like [`post`](Self::post), in the protocol that the message names, which runs
+    /// within this one.
     pub(super) fn post_within(
         &mut self,
         message: MessageBuilder,
@@ -190,12 +192,12 @@ impl<'a> Dialogue<'a> {
             }
         }
         let message = message.build()?;
-        self.check(&message).map_err(Wrong::of_ours)?;
+        self.check(&message).map_err(CheckFailure::on_sent)?;
         let letter = letter_for(&message, SystemTime::now());
         Ok(self.agent.endpoint.send(&message, letter, deadline)?)
     }
 
-    /// Answers a message of this conversation.
+    /// Answers a message of this conversation, and waits for the outcome.
     pub(super) async fn answer(
         &mut self,
         to: &Message,
@@ -207,8 +209,8 @@ impl<'a> Dialogue<'a> {
         only_delivered(&deliveries(sending).await)
     }
 
-    /// The same without waiting for the outcome, so that several can be answered at once and nobody
-    /// waits for who cannot be reached.
+    /// Answers a message without waiting for the outcome, so that an unreachable agent does not delay
+    /// answers to others.
     pub(super) fn post_answer(
         &mut self,
         to: &Message,
@@ -232,9 +234,12 @@ impl<'a> Dialogue<'a> {
         only_delivered(&deliveries(sending).await)
     }
 
-    /// The next message, or none by then. What does not fit the protocol is an error, and so is what
-    /// ends it for reasons of no protocol of its own.
-    pub(super) async fn hear(&mut self, due: Option<Instant>) -> Result<Heard, DialogueError> {
+    /// Waits for the next message until `due`. A message that violates the protocol is an error, and so
+    /// are not-understood, cancel and the report of an undelivered message.
+    pub(super) async fn receive(
+        &mut self,
+        due: Option<Instant>,
+    ) -> Result<Interpreted, DialogueError> {
         let next = self
             .agent
             .demultiplexer
@@ -257,17 +262,17 @@ impl<'a> Dialogue<'a> {
             Err(other) => return Err(DialogueError::Receive(other)),
         };
         let meaning = self.check(&message);
-        let meaning = meaning.map_err(|wrong| wrong.of_others(&message))?;
-        match meaning.standing {
-            Standing::NotUnderstood => Err(DialogueError::NotUnderstood(Box::new(message))),
-            Standing::Cancelling => Err(DialogueError::Cancelled(Box::new(message))),
-            Standing::Undelivered => Err(DialogueError::Undelivered(Box::new(message))),
-            _ => Ok(Heard { message, meaning }),
+        let meaning = meaning.map_err(|failure| failure.on_received(&message))?;
+        match meaning.state {
+            DialogueState::NotUnderstood => Err(DialogueError::NotUnderstood(Box::new(message))),
+            DialogueState::Cancelling => Err(DialogueError::Cancelled(Box::new(message))),
+            DialogueState::Undelivered => Err(DialogueError::Undelivered(Box::new(message))),
+            _ => Ok(Interpreted { message, meaning }),
         }
     }
 
-    /// Cancels the conversation with these (FIPA's cancel meta-protocol), and waits until all have
-    /// said whether it is cancelled. The first who did not cancel it is the error.
+    /// Cancels the conversation with these agents (FIPA's cancel meta-protocol), and waits until all
+    /// have answered. The error is that of the first agent that did not cancel.
     pub(super) async fn cancel(
         &mut self,
         mut with: Vec<AgentId>,
@@ -277,15 +282,15 @@ impl<'a> Dialogue<'a> {
             return Ok(());
         }
         let cancel = self.agent.message(Performative::Cancel);
-        let told = self.tell(cancel.receivers(with.clone()), due).await?;
-        let mut result = only_delivered(&told);
-        with.retain(|agent| !unreached(&told).any(|name| name == agent.name()));
+        let sent = self.send(cancel.receivers(with.clone()), due).await?;
+        let mut result = only_delivered(&sent);
+        with.retain(|agent| !unreached(&sent).any(|name| name == agent.name()));
         while !with.is_empty() {
-            let (from, answer) = match self.hear(due).await {
-                Ok(Heard { message, meaning }) => {
+            let (from, answer) = match self.receive(due).await {
+                Ok(Interpreted { message, meaning }) => {
                     let from = name_of(&message);
-                    match meaning.standing {
-                        Standing::Cancelled => (from, Ok(())),
+                    match meaning.state {
+                        DialogueState::Cancelled => (from, Ok(())),
                         _ => (from, Err(DialogueError::Failed(Box::new(message)))),
                     }
                 }
@@ -293,7 +298,7 @@ impl<'a> Dialogue<'a> {
                     let from = name_of(&message);
                     (from, Err(DialogueError::NotUnderstood(message)))
                 }
-                // What had been said before the cancel came, or is known already.
+                // A cancel that crossed this one, or an outcome that is known already.
                 Err(DialogueError::Cancelled(_) | DialogueError::Undelivered(_)) => continue,
                 Err(other) => return Err(other),
             };
@@ -309,7 +314,7 @@ impl<'a> Dialogue<'a> {
         &self.id
     }
 
-    /// The agent whose side of the conversation this is.
+    /// Returns the agent whose side of the conversation this is.
     pub(super) fn agent(&self) -> &'a Agent {
         self.agent
     }
@@ -318,16 +323,16 @@ impl<'a> Dialogue<'a> {
         &self.state
     }
 
-    /// Whether its protocol is the one of this name, whatever the messages call it.
+    /// Whether the conversation follows the protocol of this name, including its aliases.
     pub(super) fn follows(&self, protocol: &str) -> bool {
         let machine = self.monitor.library().find(&self.protocol);
         machine.is_some_and(|machine| machine.is_called(protocol))
     }
 
-    fn check(&mut self, message: &Message) -> Result<Meaning, Wrong> {
+    fn check(&mut self, message: &Message) -> Result<Meaning, CheckFailure> {
         let now = SystemTime::now();
         let own = Meaning {
-            standing: Standing::Own,
+            state: DialogueState::Own,
             over: false,
             void: false,
         };
@@ -337,27 +342,37 @@ impl<'a> Dialogue<'a> {
                     accepted.state.clone_into(&mut self.state);
                 }
                 Ok(Meaning {
-                    standing: match accepted.state {
-                        _ if accepted.elsewhere => Standing::Elsewhere,
-                        _ if accepted.own => Standing::Own,
-                        "not-understood" => Standing::NotUnderstood,
-                        "cancelling" => Standing::Cancelling,
-                        "cancelled" => Standing::Cancelled,
-                        "undelivered" => Standing::Undelivered,
-                        _ => Standing::Own,
+                    state: match accepted.state {
+                        _ if accepted.elsewhere => DialogueState::Delegated,
+                        _ if accepted.own => DialogueState::Own,
+                        "not-understood" => DialogueState::NotUnderstood,
+                        "cancelling" => DialogueState::Cancelling,
+                        "cancelled" => DialogueState::Cancelled,
+                        "undelivered" => DialogueState::Undelivered,
+                        _ => DialogueState::Own,
                     },
                     over: accepted.over,
                     void: accepted.void,
                 })
             }
-            Verdict::Violation(violation) => Err(Wrong::Violation(violation)),
+            Verdict::Violation(violation) => Err(CheckFailure::Violation(violation)),
             Verdict::Unchecked(Unchecked::BegunElsewhere) => Ok(Meaning {
-                standing: Standing::Elsewhere,
+                state: DialogueState::Delegated,
                 ..own
             }),
-            Verdict::Unchecked(why) => Err(Wrong::Unchecked(why)),
+            Verdict::Unchecked(why) => Err(CheckFailure::Unchecked(why)),
             _ => Ok(own),
         }
+    }
+}
+
+impl fmt::Debug for Dialogue<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Dialogue")
+            .field("protocol", &self.protocol)
+            .field("id", &self.id)
+            .field("state", &self.state)
+            .finish_non_exhaustive()
     }
 }
 
@@ -367,20 +382,21 @@ impl Drop for Dialogue<'_> {
     }
 }
 
-enum Wrong {
+/// The failure of the check of a message.
+enum CheckFailure {
     Violation(Box<Violation>),
     Unchecked(Unchecked),
 }
 
-impl Wrong {
-    fn of_ours(self) -> DialogueError {
+impl CheckFailure {
+    fn on_sent(self) -> DialogueError {
         match self {
             Self::Violation(violation) => DialogueError::WouldViolate(violation),
             Self::Unchecked(why) => DialogueError::Unchecked(why),
         }
     }
 
-    fn of_others(self, message: &Message) -> DialogueError {
+    fn on_received(self, message: &Message) -> DialogueError {
         match self {
             Self::Violation(violation) => DialogueError::Violation {
                 violation,
@@ -391,8 +407,8 @@ impl Wrong {
     }
 }
 
-/// Waits until it is known what became of these messages, though not longer than until then. That
-/// changes nothing: who has gone away needs no rejection.
+/// Waits for the outcomes of these messages, at most until `due`. The outcomes are ignored: an agent
+/// that has ended needs no rejection.
 pub(super) async fn settle(sent: impl IntoIterator<Item = Sending>, due: Option<Instant>) {
     for sending in sent {
         let settled = deliveries(sending);
@@ -407,7 +423,7 @@ pub(super) async fn settle(sent: impl IntoIterator<Item = Sending>, due: Option<
     }
 }
 
-/// An error unless all receivers have got it.
+/// Returns an error unless the message was delivered to all receivers.
 pub(super) fn only_delivered(deliveries: &Deliveries) -> Result<(), DialogueError> {
     for delivery in &deliveries.0 {
         if let Outcome::Failed { reason, .. } = &delivery.outcome {
@@ -420,20 +436,20 @@ pub(super) fn only_delivered(deliveries: &Deliveries) -> Result<(), DialogueErro
     Ok(())
 }
 
-/// The names of the receivers who have not got it.
+/// Returns the names of the receivers to which the message was not delivered.
 pub(super) fn unreached(deliveries: &Deliveries) -> impl Iterator<Item = &str> {
     let failed = |delivery: &&Delivery| !delivery.outcome.is_success();
     let failed = deliveries.0.iter().filter(failed);
     failed.map(|delivery| &*delivery.receiver)
 }
 
-/// The name of the sender.
+/// Returns the name of the sender.
 pub(super) fn name_of(message: &Message) -> String {
     let sender = message.sender();
     sender.map_or_else(String::new, |sender| sender.name().to_owned())
 }
 
-/// When a span from now is over; never, when that is beyond all times.
+/// Returns the time after this span from now, or `None` if it cannot be represented.
 pub(super) fn after(span: Duration) -> Option<Instant> {
     Instant::now().checked_add(span)
 }

@@ -1,4 +1,4 @@
-//! Asking one agent: request, query, request-when; and proposing.
+//! The initiator's side of request, query, request-when and propose, with one participant.
 
 use std::time::{Duration, Instant};
 
@@ -8,9 +8,9 @@ use super::dialogue::{Dialogue, DialogueError, after, only_delivered};
 use crate::agent::Agent;
 
 impl Agent {
-    /// Asks an agent to perform an action (FIPA00026). The message is a `request` with one
-    /// receiver; protocol, conversation and what a reply needs are filled in. All answers must
-    /// have come within `patience`.
+    /// Requests an action from an agent (FIPA00026). The message is a `request` with one receiver. The
+    /// call sets its protocol, conversation id, `reply-with` and `reply-by`. All answers must arrive
+    /// within `patience`.
     ///
     /// ```no_run
     /// # async fn example(agent: fipa::Agent) -> Result<(), Box<dyn std::error::Error>> {
@@ -23,7 +23,7 @@ impl Agent {
     ///     .content("(lift crate)");
     /// let mut request = agent.request(lift, Duration::from_secs(30)).await?;
     /// if request.agreed().await? {
-    ///     println!("arm_1 is at it");
+    ///     println!("arm_1 agreed");
     /// }
     /// println!("{}", request.result().await?);
     /// # Ok(())
@@ -31,7 +31,7 @@ impl Agent {
     /// ```
     ///
     /// # Errors
-    /// When the message is none that begins the protocol, or does not arrive.
+    /// If the message does not begin the protocol, or is not delivered.
     pub async fn request(
         &self,
         request: MessageBuilder,
@@ -40,7 +40,7 @@ impl Agent {
         Request::begin(self, "fipa-request", request, patience).await
     }
 
-    /// Asks an agent whether something is true (`query-if`) or for an object (`query-ref`)
+    /// Queries an agent for the truth of a proposition (`query-if`) or for an object (`query-ref`)
     /// (FIPA00027); see [`request`](Self::request).
     ///
     /// # Errors
@@ -53,7 +53,7 @@ impl Agent {
         Request::begin(self, "fipa-query", query, patience).await
     }
 
-    /// Asks an agent to perform an action once a condition holds (`request-when`, FIPA00028); see
+    /// Requests an action from an agent once a condition holds (`request-when`, FIPA00028); see
     /// [`request`](Self::request).
     ///
     /// # Errors
@@ -66,12 +66,12 @@ impl Agent {
         Request::begin(self, "fipa-request-when", request, patience).await
     }
 
-    /// Proposes to an agent to do something oneself (`propose`, FIPA00036), and waits for its
+    /// Proposes an action of this agent to another agent (`propose`, FIPA00036), and waits for the
     /// decision.
     ///
     /// # Errors
-    /// When the message is none that begins the protocol, does not arrive, or is not decided upon
-    /// within `patience`.
+    /// If the message does not begin the protocol, is not delivered, or is not decided on within
+    /// `patience`.
     pub async fn propose(
         &self,
         proposal: MessageBuilder,
@@ -80,7 +80,7 @@ impl Agent {
         let due = after(patience);
         let (mut dialogue, sent) = Dialogue::open(self, "fipa-propose", proposal, due).await?;
         only_delivered(&sent)?;
-        let message = dialogue.hear(due).await?.message;
+        let message = dialogue.receive(due).await?.message;
         Ok(match message.performative() {
             Performative::AcceptProposal => Decision::Accepted(message),
             _ => Decision::Rejected(message),
@@ -88,23 +88,24 @@ impl Agent {
     }
 }
 
-/// What became of a proposal.
+/// The decision on a proposal.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[allow(clippy::exhaustive_enums, reason = "the standard is final")]
 pub enum Decision {
-    /// It was accepted.
+    /// The proposal was accepted. Holds the `accept-proposal`.
     Accepted(Message),
-    /// It was rejected.
+    /// The proposal was rejected. Holds the `reject-proposal`.
     Rejected(Message),
 }
 
-/// Something that an agent was asked for. Dropped, it is no longer waited for, but not cancelled.
-#[must_use = "the answer comes with result()"]
+/// A request or query. Dropping it does not cancel it; further answers go to [`Agent::receive`].
+#[derive(Debug)]
+#[must_use = "result() returns the answer"]
 pub struct Request<'a> {
     dialogue: Dialogue<'a>,
     receivers: Vec<AgentId>,
     due: Option<Instant>,
-    /// What has come before it was asked for.
+    /// A message that arrived before the caller asked for it.
     early: Option<Message>,
     agreed: bool,
 }
@@ -129,20 +130,20 @@ impl<'a> Request<'a> {
         })
     }
 
-    /// The conversation's id.
+    /// Returns the conversation id.
     #[must_use]
     pub fn conversation_id(&self) -> &str {
         self.dialogue.id()
     }
 
-    /// Waits until the other side agrees, or does what it was asked for at once: whether it said
-    /// that it agrees.
+    /// Waits for the first answer, and returns whether it is an `agree`. If it is the result itself,
+    /// [`result`](Self::result) returns it.
     ///
     /// # Errors
-    /// When it refuses, fails, or does not answer in time.
+    /// If the other side refuses, fails, or does not answer in time.
     pub async fn agreed(&mut self) -> Result<bool, DialogueError> {
         if !self.agreed && self.early.is_none() {
-            let message = self.dialogue.hear(self.due).await?.message;
+            let message = self.dialogue.receive(self.due).await?.message;
             match message.performative() {
                 Performative::Agree => self.agreed = true,
                 Performative::Refuse => return Err(DialogueError::Refused(Box::new(message))),
@@ -153,27 +154,27 @@ impl<'a> Request<'a> {
         Ok(self.agreed)
     }
 
-    /// Waits for the result: the `inform` with what the other side has to say.
+    /// Waits for the result, an `inform`.
     ///
     /// # Errors
-    /// When it refuses, fails, or does not answer in time.
+    /// If the other side refuses, fails, or does not answer in time.
     pub async fn result(mut self) -> Result<Message, DialogueError> {
         self.agreed().await?;
         if let Some(early) = self.early.take() {
             return Ok(early);
         }
-        let message = self.dialogue.hear(self.due).await?.message;
+        let message = self.dialogue.receive(self.due).await?.message;
         match message.performative() {
             Performative::Failure => Err(DialogueError::Failed(Box::new(message))),
             _ => Ok(message),
         }
     }
 
-    /// Cancels what was asked for, and waits until the other side has confirmed that.
+    /// Cancels the request and waits for the confirmation of the other side.
     ///
     /// # Errors
-    /// When it is not cancelled ([`DialogueError::Failed`]), or it is not said in time whether it
-    /// is.
+    /// If the other side does not cancel ([`DialogueError::Failed`]), or does not answer within
+    /// `patience`.
     pub async fn cancel(mut self, patience: Duration) -> Result<(), DialogueError> {
         self.dialogue.cancel(self.receivers, after(patience)).await
     }

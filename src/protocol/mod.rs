@@ -1,20 +1,21 @@
-//! Interaction protocols as calls: nobody writes state machines by hand.
+//! Interaction protocols as calls, so that applications need no state machines of their own.
 //!
 //! An initiator calls [`Agent::request`], [`Agent::query`], [`Agent::request_when`],
 //! [`Agent::propose`], [`Agent::subscribe`], [`Agent::contract_net`],
 //! [`Agent::iterated_contract_net`], [`Agent::english_auction`], [`Agent::dutch_auction`],
-//! [`Agent::brokering`] or [`Agent::recruiting`] and gets what the protocol yields. A participant
-//! gives an opening message that it has received to [`Agent::take_part`], agrees, works and replies.
-//! Other messages go to [`Agent::receive`] as ever, meanwhile. The same calls without an async runtime
-//! are in [`blocking`](crate::blocking).
+//! [`Agent::brokering`] or [`Agent::recruiting`], and gets the result of the protocol. A participant
+//! passes a received opening message to [`Agent::take_part`], agrees, works and replies. Messages of
+//! other conversations still go to [`Agent::receive`]. [`blocking`](crate::blocking) has the same calls
+//! for processes without an async runtime.
 //!
-//! * `dialogue.rs` is one conversation: it gives it an id, sets `reply-with`, `in-reply-to` and
-//!   `reply-by`, and checks every message with the machine of the protocol, whether the
-//!   configuration has agents checked or not.
-//! * `initiator.rs`, `subscription.rs`, `contract_net.rs`, `auction.rs` and `proxied.rs` are what
-//!   initiators hold, `bids.rs` what comes of a call; `participant.rs` is what participants do.
+//! * `dialogue.rs` is one conversation: it assigns the conversation id, sets `reply-with`,
+//!   `in-reply-to` and `reply-by`, and checks every message with the state machine of the protocol,
+//!   independently of `monitor.check`.
+//! * `initiator.rs`, `subscription.rs`, `contract_net.rs`, `auction.rs` and `proxied.rs` are the sides
+//!   of initiators; `bids.rs` collects the answers to a call for proposals. `participant.rs` is the
+//!   side of participants.
 //!
-//! What must not live here: what a protocol allows (that is `fipa-monitor`).
+//! Not in this module: the rules of the protocols (`fipa-monitor`).
 
 mod auction;
 mod bids;

@@ -1,4 +1,4 @@
-//! Answering: what a participant does with a message that begins a protocol.
+//! The participant's side of a conversation.
 
 use std::time::{Duration, Instant};
 
@@ -9,27 +9,27 @@ use super::dialogue::{Dialogue, DialogueError, after, name_of, only_delivered, u
 use crate::agent::Agent;
 use crate::delivery::deliveries;
 
-/// How a participant answers in the end.
+/// The last message of a participant.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Reply {
-    /// It will not (`refuse`), with a reason.
+    /// Refuses the request (`refuse`). Holds the reason.
     Refuse(Bytes),
-    /// It is done, or this is the answer (`inform`).
+    /// Reports the completion or the answer (`inform`). Holds the content.
     Inform(Bytes),
-    /// It was tried in vain (`failure`), with a reason.
+    /// Reports a failure (`failure`). Holds the reason.
     Failure(Bytes),
-    /// The proposal that was made is accepted (`accept-proposal`).
+    /// Accepts the initiator's proposal (`accept-proposal`). Holds the content.
     Accept(Bytes),
-    /// It is not (`reject-proposal`).
+    /// Rejects the initiator's proposal (`reject-proposal`). Holds the reason.
     Reject(Bytes),
-    /// All has been said already, for example because the initiator cancelled.
+    /// Sends no message, for example because the cancel of the initiator is already confirmed.
     Nothing,
 }
 
 impl Agent {
-    /// Takes part in the conversation that a message of a known protocol begins. What is said in
-    /// it is checked against the protocol before it is sent.
+    /// Takes part in the conversation that a message of a known protocol begins. Every message of the
+    /// conversation is checked against the protocol before it is sent.
     ///
     /// ```no_run
     /// use fipa::protocol::{DialogueError, Reply, Task};
@@ -52,7 +52,7 @@ impl Agent {
     /// ```
     ///
     /// # Errors
-    /// When the message begins no known protocol.
+    /// If the message does not begin a known protocol.
     pub fn take_part(&self, first: &Message) -> Result<Task<'_>, DialogueError> {
         Ok(Task {
             dialogue: Dialogue::join(self, first)?,
@@ -65,68 +65,70 @@ impl Agent {
     }
 }
 
-/// A participant's side of a conversation. Dropped without a reply, it tells the initiator nothing.
+/// The participant's side of a conversation. Dropping it without a reply sends nothing to the
+/// initiator.
+#[derive(Debug)]
 pub struct Task<'a> {
     dialogue: Dialogue<'a>,
     first: Message,
-    /// What is answered.
+    /// The last message of the initiator, which the next message answers.
     last: Message,
-    /// Whether nothing can follow what the initiator said last.
+    /// Whether the last message of the initiator ended the conversation.
     over: bool,
-    /// What came instead of a decision.
+    /// A message that arrived instead of a decision.
     early: Option<Message>,
-    /// To whom something was passed on, and who may still answer.
+    /// The agents to which a message was passed on and that may still answer.
     asked: Vec<String>,
 }
 
 impl Task<'_> {
-    /// What the initiator said last.
+    /// Returns the last message of the initiator.
     #[must_use]
     pub fn message(&self) -> &Message {
         &self.last
     }
 
-    /// Where the conversation is, by the name of the state in the protocol's file (`fipa protocol show
-    /// NAME`).
+    /// Returns the state of the conversation: the name of the state in the file of the protocol
+    /// (`fipa protocol show NAME`).
     #[must_use]
     pub fn state(&self) -> &str {
         self.dialogue.state()
     }
 
-    /// Says that it will be done (`agree`).
+    /// Agrees to the request (`agree`).
     ///
     /// # Errors
-    /// When the protocol does not allow that now, or it does not arrive.
+    /// If the protocol does not allow the message in this state, or it is not delivered.
     pub async fn agree(&mut self, content: impl Into<Bytes>) -> Result<(), DialogueError> {
-        self.say(Performative::Agree, content).await
+        self.send(Performative::Agree, content).await
     }
 
-    /// Tells something (`inform`) without ending the conversation: for subscriptions, and for brokers
-    /// and recruiters that have passed on what they were asked to.
+    /// Sends an `inform` that does not end the conversation: a notification of a subscription, or the
+    /// report of a broker or recruiter that it has passed the message on.
     ///
     /// # Errors
     /// See [`agree`](Self::agree).
     pub async fn inform(&mut self, content: impl Into<Bytes>) -> Result<(), DialogueError> {
-        self.say(Performative::Inform, content).await
+        self.send(Performative::Inform, content).await
     }
 
-    /// Makes a proposal (`propose`) and waits until it is decided upon: whether it was accepted.
-    /// When it was not, there may be another call ([`next_call`](Self::next_call)).
+    /// Makes a proposal (`propose`), waits for the decision, and returns whether it was accepted. After
+    /// a rejection there may be another call ([`next_call`](Self::next_call)).
     ///
     /// # Errors
-    /// When the protocol does not allow that now, it does not arrive, or nothing is decided within
-    /// `patience`.
+    /// If the protocol does not allow the message in this state, if it is not delivered, or if no
+    /// decision arrives within `patience`.
     pub async fn propose(
         &mut self,
         content: impl Into<Bytes>,
         patience: Duration,
     ) -> Result<bool, DialogueError> {
-        self.say(Performative::Propose, content).await?;
-        let answer = self.hear(after(patience)).await?;
+        self.send(Performative::Propose, content).await?;
+        let answer = self.receive(after(patience)).await?;
         match answer.performative() {
             Performative::AcceptProposal => Ok(true),
             Performative::RejectProposal => Ok(false),
-            // A revised call, or the next thing in an auction.
+            // A revised call, or the next message of an auction.
             _ => {
                 self.early = Some(answer);
                 Ok(false)
@@ -134,9 +136,10 @@ impl Task<'_> {
         }
     }
 
-    /// Waits for the next call for proposals: the revised one of an iterated contract net, or the next
-    /// price of an auction. None when there is no further one: the proposal was rejected for good, or
-    /// the auction has ended. What was said is in [`message`](Self::message).
+    /// Waits for the next call for proposals: the revised call of an iterated contract net, or the next
+    /// price of an auction. Returns `None` if there is no further call, because the proposal was
+    /// finally rejected or the auction has ended. [`message`](Self::message) then returns the last
+    /// message.
     ///
     /// ```no_run
     /// # use fipa::protocol::{DialogueError, Task};
@@ -144,11 +147,11 @@ impl Task<'_> {
     ///
     /// const PATIENCE: Duration = Duration::from_secs(60);
     ///
-    /// /// Bids up to 20 in an English auction, and says whether it has won.
+    /// /// Bids up to 20 in an English auction, and returns whether it has won.
     /// async fn bid(task: &mut Task<'_>) -> Result<bool, DialogueError> {
     ///     while let Some(call) = task.next_call(PATIENCE).await? {
     ///         let price = String::from_utf8_lossy(call.content().map_or(b"", |c| c)).into_owned();
-    ///         // Who leads has nothing to gain from bidding more.
+    ///         // The leading bidder gains nothing from a higher bid.
     ///         let leads = task.state() == "called-leading";
     ///         if !leads && price.parse::<u32>().is_ok_and(|price| price <= 20) {
     ///             task.propose("", PATIENCE).await?;
@@ -159,7 +162,7 @@ impl Task<'_> {
     /// ```
     ///
     /// # Errors
-    /// When nothing is said within `patience`, or something else than that.
+    /// If no message arrives within `patience`, or a message of another kind arrives.
     pub async fn next_call(
         &mut self,
         patience: Duration,
@@ -167,30 +170,31 @@ impl Task<'_> {
         if self.over {
             return Ok(None);
         }
-        let said = self.next(patience).await?;
-        match said.performative() {
-            Performative::Cfp => Ok(Some(said)),
+        let message = self.next(patience).await?;
+        match message.performative() {
+            Performative::Cfp => Ok(Some(message)),
             Performative::Inform | Performative::RejectProposal => Ok(None),
-            _ => Err(DialogueError::Unexpected(Box::new(said))),
+            _ => Err(DialogueError::Unexpected(Box::new(message))),
         }
     }
 
-    /// Waits for what the initiator says next, for example what the winner of an auction is asked for.
+    /// Waits for the next message of the initiator, for example the request to the winner of an
+    /// auction.
     ///
     /// # Errors
-    /// When nothing is said within `patience`.
+    /// If no message arrives within `patience`.
     pub async fn next(&mut self, patience: Duration) -> Result<Message, DialogueError> {
         match self.early.take() {
             Some(early) => Ok(early),
-            None => self.hear(after(patience)).await,
+            None => self.receive(after(patience)).await,
         }
     }
 
-    /// Passes something on, as a broker (FIPA00033) or recruiter (FIPA00034) that has agreed: the message
-    /// begins another protocol, which it names, within this conversation. To a recruiter's message
-    /// the initiator gets the answers, unless it has a `reply-to` already; a broker gets them with
-    /// [`next_answer`](Self::next_answer). Tell the initiator with [`inform`](Self::inform) that it
-    /// is done.
+    /// Passes a message on, as a broker (FIPA00033) or recruiter (FIPA00034) that has agreed. The
+    /// message begins another protocol, which it names, within this conversation. A broker gets the
+    /// answers with [`next_answer`](Self::next_answer). The answers to a recruiter's message go to the
+    /// initiator, unless the message has a `reply-to`. Report the completion to the initiator with
+    /// [`inform`](Self::inform).
     ///
     /// ```no_run
     /// # use fipa::protocol::{DialogueError, Reply, Task};
@@ -215,7 +219,8 @@ impl Task<'_> {
     /// ```
     ///
     /// # Errors
-    /// When the message begins no protocol that may run here, or arrives at none of its receivers.
+    /// If the message does not begin a protocol that is allowed within this one, or if it is delivered
+    /// to none of its receivers.
     pub async fn pass_on(
         &mut self,
         message: MessageBuilder,
@@ -225,24 +230,24 @@ impl Task<'_> {
         let mut message = message;
         let built = message.clone().build()?;
         if recruits && built.reply_to().is_empty() {
-            let answers_to = self
+            let to_initiator = self
                 .dialogue
                 .agent()
                 .reply(&self.first, Performative::Inform);
-            let answers_to = answers_to.build()?;
-            let agents = answers_to.receivers().iter().cloned();
+            let to_initiator = to_initiator.build()?;
+            let agents = to_initiator.receivers().iter().cloned();
             message = agents.fold(message, MessageBuilder::reply_to);
         }
         let sending = self.dialogue.post_within(message, after(patience))?;
-        let told = deliveries(sending).await;
-        let lost: Vec<&str> = unreached(&told).collect();
+        let sent = deliveries(sending).await;
+        let lost: Vec<&str> = unreached(&sent).collect();
         let all = built.receivers().iter().map(|agent| agent.name());
         let reached: Vec<String> = all
             .filter(|name| !lost.contains(name))
             .map(str::to_owned)
             .collect();
         if reached.is_empty() {
-            return only_delivered(&told);
+            return only_delivered(&sent);
         }
         if !recruits {
             self.asked.extend(reached);
@@ -250,20 +255,21 @@ impl Task<'_> {
         Ok(())
     }
 
-    /// The next answer to what was passed on, as a broker; none when nobody can answer any more.
+    /// Waits, as a broker, for the next answer to a message that was passed on. Returns `None` if no
+    /// agent can answer any more.
     ///
     /// # Errors
-    /// When none comes within `patience`, or the initiator cancels.
+    /// If no answer arrives within `patience`, or the initiator cancels.
     pub async fn next_answer(
         &mut self,
         patience: Duration,
     ) -> Result<Option<Message>, DialogueError> {
         let due = after(patience);
         while !self.asked.is_empty() {
-            let (answer, over) = match self.dialogue.hear(due).await {
-                Ok(heard) => (heard.message, heard.meaning.over),
+            let (answer, over) = match self.dialogue.receive(due).await {
+                Ok(received) => (received.message, received.meaning.over),
                 Err(DialogueError::NotUnderstood(message)) => (*message, true),
-                // Who it is about was found out before.
+                // `pass_on` has already left out its receiver.
                 Err(DialogueError::Undelivered(_)) => continue,
                 Err(other) => return Err(self.noted(other)),
             };
@@ -279,12 +285,12 @@ impl Task<'_> {
         Ok(None)
     }
 
-    /// Passes an answer back to the initiator, as a broker, with its performative and content. A
-    /// `failure` ends the brokering.
+    /// Forwards an answer to the initiator, as a broker, with its performative and content. A `failure`
+    /// ends the brokering.
     ///
     /// # Errors
-    /// When the protocol does not allow that now, as before [`inform`](Self::inform), or it does
-    /// not arrive.
+    /// If the protocol does not allow the message in this state, for example before
+    /// [`inform`](Self::inform), or if it is not delivered.
     pub async fn forward(&mut self, answer: &Message) -> Result<(), DialogueError> {
         let agent = self.dialogue.agent();
         let mut message = agent.reply(&self.first, answer.performative().clone());
@@ -301,32 +307,32 @@ impl Task<'_> {
                 message = set(message, text);
             }
         }
-        only_delivered(&self.dialogue.tell(message, None).await?)
+        only_delivered(&self.dialogue.send(message, None).await?)
     }
 
-    /// Waits until the initiator cancels, for those who work in the meantime (with
-    /// `tokio::select!`). Confirm it with [`confirm_cancel`](Self::confirm_cancel).
+    /// Waits for a cancel of the initiator, for use in `tokio::select!` beside the work. Confirm the
+    /// cancel with [`confirm_cancel`](Self::confirm_cancel).
     ///
     /// # Errors
-    /// When something else is said.
+    /// If another message arrives.
     pub async fn cancelled(&mut self) -> Result<(), DialogueError> {
-        match self.hear(None).await {
+        match self.receive(None).await {
             Err(DialogueError::Cancelled(_)) => Ok(()),
             Ok(message) => Err(DialogueError::Unexpected(Box::new(message))),
             Err(other) => Err(other),
         }
     }
 
-    /// Says that what was asked for is cancelled; what is left to reply is nothing then.
+    /// Confirms a cancel of the initiator. Returns [`Reply::Nothing`], because no reply may follow.
     ///
     /// # Errors
     /// See [`agree`](Self::agree).
     pub async fn confirm_cancel(&mut self) -> Result<Reply, DialogueError> {
-        self.say(Performative::Inform, "cancelled").await?;
+        self.send(Performative::Inform, "cancelled").await?;
         Ok(Reply::Nothing)
     }
 
-    /// Says the last thing.
+    /// Sends the last message of the participant.
     ///
     /// # Errors
     /// See [`agree`](Self::agree).
@@ -339,10 +345,10 @@ impl Task<'_> {
             Reply::Reject(content) => (Performative::RejectProposal, content),
             Reply::Nothing => return Ok(()),
         };
-        self.say(act, content).await
+        self.send(act, content).await
     }
 
-    async fn say(
+    async fn send(
         &mut self,
         act: Performative,
         content: impl Into<Bytes>,
@@ -350,19 +356,19 @@ impl Task<'_> {
         self.dialogue.answer(&self.last, act, content, None).await
     }
 
-    /// What the initiator says.
-    async fn hear(&mut self, due: Option<Instant>) -> Result<Message, DialogueError> {
-        match self.dialogue.hear(due).await {
-            Ok(heard) => {
-                self.last = heard.message.clone();
-                self.over = heard.meaning.over;
-                Ok(heard.message)
+    /// Waits for the next message of the initiator.
+    async fn receive(&mut self, due: Option<Instant>) -> Result<Message, DialogueError> {
+        match self.dialogue.receive(due).await {
+            Ok(received) => {
+                self.last = received.message.clone();
+                self.over = received.meaning.over;
+                Ok(received.message)
             }
             Err(error) => Err(self.noted(error)),
         }
     }
 
-    /// A cancel is what is answered next.
+    /// Stores a cancel as the message that the next message answers.
     fn noted(&mut self, error: DialogueError) -> DialogueError {
         if let DialogueError::Cancelled(message) = &error {
             self.last = Message::clone(message);

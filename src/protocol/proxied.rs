@@ -1,17 +1,17 @@
-//! Having others asked: brokering (FIPA00033) and recruiting (FIPA00034).
+//! The initiator's side of brokering (FIPA00033) and recruiting (FIPA00034).
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use fipa_acl::{AgentId, Message, MessageBuilder, Performative};
 
-use super::dialogue::{Dialogue, DialogueError, Heard, Standing, after, only_delivered};
+use super::dialogue::{Dialogue, DialogueError, DialogueState, Interpreted, after, only_delivered};
 use crate::agent::Agent;
 
 impl Agent {
-    /// Asks a broker to pass a message on to those whom it knows to be right for it, and to pass
-    /// back their answers (`proxy`, FIPA00033). What to pass on, and to whom, is in the content.
-    /// Waits until the broker has agreed and passed it on.
+    /// Requests a broker to pass a message on to suitable agents and to forward their answers (`proxy`,
+    /// FIPA00033). The content holds the message and the description of the agents. Waits until the
+    /// broker has agreed and passed the message on.
     ///
     /// ```no_run
     /// # async fn example(agent: fipa::Agent) -> Result<(), Box<dyn std::error::Error>> {
@@ -29,8 +29,8 @@ impl Agent {
     /// ```
     ///
     /// # Errors
-    /// When the message is none that begins the protocol, does not arrive, the broker refuses or
-    /// finds nobody ([`DialogueError::Failed`]), or does not answer within `patience`.
+    /// If the message does not begin the protocol or is not delivered, or if the broker refuses, finds
+    /// no agent ([`DialogueError::Failed`]) or does not answer within `patience`.
     pub async fn brokering(
         &self,
         proxy: MessageBuilder,
@@ -39,9 +39,10 @@ impl Agent {
         Proxied::begin(self, "fipa-brokering", proxy, patience).await
     }
 
-    /// The same with a recruiter (FIPA00034): those whom it asks answer directly, in this
-    /// conversation. Whether their first answers fit what they were asked cannot be checked here, as
-    /// only they and the recruiter know that. Go on with [`Proxied::answer`].
+    /// Requests a recruiter to pass a message on to suitable agents (FIPA00034), which answer this agent
+    /// directly, in this conversation. Their first answers are not checked against the protocol of the
+    /// message that was passed on, because this agent has not seen it. Continue with
+    /// [`Proxied::answer`].
     ///
     /// # Errors
     /// See [`brokering`](Self::brokering).
@@ -54,16 +55,18 @@ impl Agent {
     }
 }
 
-/// Something that was passed on to others. Dropped, their answers go to [`Agent::receive`].
-#[must_use = "the answers come with next()"]
+/// A message that a broker or recruiter has passed on. After dropping it, the answers go to
+/// [`Agent::receive`].
+#[derive(Debug)]
+#[must_use = "next() returns the answers"]
 pub struct Proxied<'a> {
     dialogue: Dialogue<'a>,
     receivers: Vec<AgentId>,
-    /// Answers that came before it was said that all had been asked.
+    /// Answers that arrived before the report that the message was passed on.
     early: VecDeque<Message>,
 }
 
-/// Most answers that are kept so.
+/// Maximum number of early answers.
 const MAX_EARLY: usize = 1_024;
 
 impl<'a> Proxied<'a> {
@@ -88,8 +91,8 @@ impl<'a> Proxied<'a> {
 
     async fn passed_on(&mut self, due: Option<Instant>) -> Result<(), DialogueError> {
         while self.early.len() < MAX_EARLY {
-            let Heard { message, meaning } = self.dialogue.hear(due).await?;
-            if meaning.standing == Standing::Elsewhere {
+            let Interpreted { message, meaning } = self.dialogue.receive(due).await?;
+            if meaning.state == DialogueState::Delegated {
                 self.early.push_back(message);
                 continue;
             }
@@ -97,43 +100,43 @@ impl<'a> Proxied<'a> {
                 Performative::Refuse => return Err(DialogueError::Refused(Box::new(message))),
                 Performative::Failure => return Err(DialogueError::Failed(Box::new(message))),
                 Performative::Inform => break,
-                // It agrees.
+                // An `agree`.
                 _ => {}
             }
         }
         Ok(())
     }
 
-    /// The conversation's id.
+    /// Returns the conversation id.
     #[must_use]
     pub fn conversation_id(&self) -> &str {
         self.dialogue.id()
     }
 
-    /// The next answer, whatever its performative; waits for it for so long. Nobody says which is the
-    /// last.
+    /// Waits for the next answer of any performative, at most for `patience`. The protocol does not mark
+    /// the last answer.
     ///
     /// # Errors
-    /// When none comes in time, or the broker says that it has failed.
+    /// If no answer arrives in time, or the broker sends `failure`.
     pub async fn next(&mut self, patience: Duration) -> Result<Message, DialogueError> {
         if let Some(early) = self.early.pop_front() {
             return Ok(early);
         }
         let due = after(patience);
         loop {
-            let Heard { message, meaning } = self.dialogue.hear(due).await?;
+            let Interpreted { message, meaning } = self.dialogue.receive(due).await?;
             match message.performative() {
-                _ if meaning.standing == Standing::Elsewhere => return Ok(message),
+                _ if meaning.state == DialogueState::Delegated => return Ok(message),
                 Performative::Failure => return Err(DialogueError::Failed(Box::new(message))),
-                // A recruiter has no answers, and may be slower than those it has recruited.
+                // Messages of a recruiter are not answers, and may arrive after those of the agents.
                 _ if self.dialogue.follows("fipa-recruiting") => {}
                 _ => return Ok(message),
             }
         }
     }
 
-    /// Goes on with somebody who was recruited, in the protocol of its answer: accepts a proposal, for
-    /// example. What it says next comes with [`next`](Self::next).
+    /// Answers a recruited agent in the protocol of its answer, for example accepts a proposal.
+    /// [`next`](Self::next) returns its next message.
     ///
     /// ```no_run
     /// # use std::time::Duration;
@@ -150,8 +153,8 @@ impl<'a> Proxied<'a> {
     /// ```
     ///
     /// # Errors
-    /// When that protocol does not allow it after this answer, as after those of a broker, or it does
-    /// not arrive.
+    /// If that protocol does not allow the message after this answer, which is always so for answers
+    /// that a broker forwards, or if it is not delivered.
     pub async fn answer(
         &mut self,
         to: &Message,
@@ -163,11 +166,10 @@ impl<'a> Proxied<'a> {
         self.dialogue.answer_within(to, act, content, due).await
     }
 
-    /// Cancels what was asked for, and waits until the broker or recruiter has confirmed that.
+    /// Cancels the request and waits for the confirmation of the broker or recruiter.
     ///
     /// # Errors
-    /// When it is not cancelled ([`DialogueError::Failed`]), or it is not said in time whether it
-    /// is.
+    /// If it does not cancel ([`DialogueError::Failed`]), or does not answer within `patience`.
     pub async fn cancel(mut self, patience: Duration) -> Result<(), DialogueError> {
         self.dialogue.cancel(self.receivers, after(patience)).await
     }

@@ -1,4 +1,4 @@
-//! Being told of every change (FIPA00035).
+//! Subscriptions (FIPA00035).
 
 use std::time::Duration;
 
@@ -8,12 +8,12 @@ use super::dialogue::{Dialogue, DialogueError, after, only_delivered};
 use crate::agent::Agent;
 
 impl Agent {
-    /// Subscribes to what an agent has to tell (`subscribe`, FIPA00035), and waits until it
-    /// agrees, or tells something at once.
+    /// Subscribes to the notifications of an agent (`subscribe`, FIPA00035). Waits until the agent
+    /// agrees or sends the first notification.
     ///
     /// # Errors
-    /// When the message is none that begins the protocol, does not arrive, is refused, or is not
-    /// answered within `patience`.
+    /// If the message does not begin the protocol, is not delivered, is refused, or is not answered
+    /// within `patience`.
     pub async fn subscribe(
         &self,
         subscribe: MessageBuilder,
@@ -23,7 +23,7 @@ impl Agent {
         let receivers = subscribe.clone().build()?.receivers().to_vec();
         let (mut dialogue, sent) = Dialogue::open(self, "fipa-subscribe", subscribe, due).await?;
         only_delivered(&sent)?;
-        let first = dialogue.hear(due).await?.message;
+        let first = dialogue.receive(due).await?.message;
         let early = match first.performative() {
             Performative::Agree => None,
             Performative::Refuse => return Err(DialogueError::Refused(Box::new(first))),
@@ -38,8 +38,9 @@ impl Agent {
     }
 }
 
-/// A subscription. Dropped, it is no longer read, but not cancelled.
-#[must_use = "what is told comes with next()"]
+/// A subscription. Dropping it does not cancel it; further notifications go to [`Agent::receive`].
+#[derive(Debug)]
+#[must_use = "next() returns the notifications"]
 pub struct Subscription<'a> {
     dialogue: Dialogue<'a>,
     receivers: Vec<AgentId>,
@@ -47,31 +48,32 @@ pub struct Subscription<'a> {
 }
 
 impl Subscription<'_> {
-    /// The conversation's id.
+    /// Returns the conversation id.
     #[must_use]
     pub fn conversation_id(&self) -> &str {
         self.dialogue.id()
     }
 
-    /// What is told next (`inform`); waits as long as it takes.
+    /// Waits for the next notification (`inform`), without a time limit.
     ///
     /// # Errors
-    /// When the other side ends the subscription with `failure`, or breaks the protocol.
+    /// If the other side ends the subscription with `failure`, or violates the protocol.
     pub async fn next(&mut self) -> Result<Message, DialogueError> {
         if let Some(early) = self.early.take() {
             return Ok(early);
         }
-        let message = self.dialogue.hear(None).await?.message;
+        let message = self.dialogue.receive(None).await?.message;
         match message.performative() {
             Performative::Failure => Err(DialogueError::Failed(Box::new(message))),
             _ => Ok(message),
         }
     }
 
-    /// Ends the subscription, and waits until the other side has confirmed that.
+    /// Cancels the subscription and waits for the confirmation of the other side.
     ///
     /// # Errors
-    /// When it goes on ([`DialogueError::Failed`]), or it is not said in time whether it does.
+    /// If the other side continues the subscription ([`DialogueError::Failed`]), or does not answer
+    /// within `patience`.
     pub async fn cancel(mut self, patience: Duration) -> Result<(), DialogueError> {
         self.dialogue.cancel(self.receivers, after(patience)).await
     }

@@ -1,20 +1,21 @@
-//! Watching the letters of a domain on this host: who writes what to whom, which way, and what
-//! becomes of it. Agents are not asked, and notice nothing.
+//! Watching the letters of a domain on this host: sender, receivers, content, route and outcome.
+//! Agents do not take part in it.
 //!
-//! A [`Watcher`] puts up a socket in the domain's private directory. Every process of the domain
-//! sees it there, connects, and from then on tells of each letter that passes it: sender, gateway
-//! and receiver each for themselves, which the watcher makes one [`Event`] of. A process never
-//! waits for a watcher: what cannot be told is counted, and the count is told.
+//! A [`Watcher`] creates a socket in the private directory of the domain. Every process of the domain
+//! finds it there, connects, and sends a record of each letter that passes through it. The process of
+//! the sender, the gateway and the process of the receiver each send records of their own; the watcher
+//! joins them into one [`Event`]. A process never waits for a watcher: it counts lost records and
+//! sends the count.
 //!
-//! What must not live here: the format of what is told, and how it is put together; that is
-//! `fipa_mts::watch`.
+//! Not in this module: the format of the records and how they are joined (`fipa_mts::watch`).
 
-mod line;
-mod listening;
+mod connection;
+mod listener;
 mod socket;
-mod taps;
+mod watchers;
 
 use std::collections::HashSet;
+use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -26,108 +27,109 @@ use fipa_transport::Incarnation;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
-use self::listening::Told;
-pub(crate) use self::taps::Taps;
+use self::listener::ProcessEvent;
+pub(crate) use self::watchers::Watchers;
 use crate::Config;
+use crate::dir_maintenance::DirMaintenance;
+use crate::domain_dir::DomainDir;
 use crate::error::OpenError;
 use crate::host_directory;
-use crate::keeper::Keeper;
 use crate::owner::Owner;
-use crate::place::Place;
 
-/// What is to be seen.
+/// The options of a [`Watcher`].
 #[derive(Debug, Clone, Copy, Default)]
 pub struct WatchOptions {
-    /// How many bytes of the content of each message, from its beginning; at most 24 KiB.
+    /// Number of bytes from the beginning of each message's content to include; at most 24 KiB.
     pub content: usize,
 }
 
-/// Somebody who watches a domain. Ends when dropped.
+/// Watches the letters of a domain. Dropping it ends the watching.
 pub struct Watcher {
-    told: mpsc::Receiver<Told>,
+    events: mpsc::Receiver<ProcessEvent>,
     joiner: Joiner,
     host: Arc<HostDirectory>,
-    place: Place,
+    dir: DomainDir,
     owner: Owner,
-    listening: JoinHandle<()>,
-    keeper: JoinHandle<()>,
+    accepting: JoinHandle<()>,
+    maintenance: JoinHandle<()>,
 }
 
-/// What processes have told and nobody has looked at yet, in records; then they are not listened
-/// to, and their own bounds hold.
-const TOLD: usize = 4096;
-/// How long processes have to say that they tell of their letters, before the watching begins.
-const ANSWERING: Duration = Duration::from_secs(1);
-/// How much is looked at before the next event is told.
-const BATCH: usize = 2 * TOLD;
+/// Maximum number of received records that wait to be joined. Beyond it the watcher stops reading,
+/// and the queues of the processes fill.
+const MAX_WAITING: usize = 4096;
+/// Time for the processes of the domain to connect before [`Watcher::open`] returns.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(1);
+/// Maximum number of records that are joined before the next event is returned.
+const BATCH: usize = 2 * MAX_WAITING;
 
 impl Watcher {
-    /// Watches the domain that the configuration names: from the return of this on all processes
-    /// that have agents and answer within a second, the others as soon as they do. Must be called
-    /// within a tokio runtime.
+    /// Watches the domain that the configuration names. When it returns, all processes with agents
+    /// that connected within a second are watched; the others are watched as soon as they connect.
+    /// Must be called within a tokio runtime.
     ///
     /// # Errors
-    /// When the domain's directory cannot be used.
+    /// If the configuration is invalid, or the directory of the domain cannot be used.
     pub async fn open(config: &Config, options: WatchOptions) -> Result<Self, OpenError> {
         config.check()?;
         tokio::runtime::Handle::try_current().map_err(|_| OpenError::NoRuntime)?;
         let name = format!("fipa-watch-{}", std::process::id());
         let own = fipa_sds::Mts::new(name, Incarnation::random());
-        let (place, host) = host_directory::join(&config.domain, &own, false)?;
-        let socket = host.listen().inspect_err(|_| leave(&host, &place))?;
-        let listener = socket::listening(socket).map_err(|source| {
-            leave(&host, &place);
+        let (dir, host) = host_directory::join(&config.domain, &own, false)?;
+        let socket = host.listen().inspect_err(|_| leave(&host, &dir))?;
+        let socket = socket::listening(socket).map_err(|source| {
+            leave(&host, &dir);
             OpenError::Watch(source)
         })?;
         let content = u32::try_from(options.content.min(MAX_CONTENT)).unwrap_or(u32::MAX);
-        let (sender, told) = mpsc::channel(TOLD);
-        let listening = tokio::spawn(listening::run(listener, Wish { content }, sender));
-        let keeper = Keeper::new(place.clone(), Arc::clone(&host));
+        let (sender, events) = mpsc::channel(MAX_WAITING);
+        let accepting = tokio::spawn(listener::run(socket, Wish { content }, sender));
+        let maintenance = DirMaintenance::new(dir.clone(), Arc::clone(&host));
         let mut watcher = Self {
-            told,
+            events,
             joiner: Joiner::new(),
             host,
-            keeper: tokio::spawn(keeper.run()),
-            place,
+            maintenance: tokio::spawn(maintenance.run()),
+            dir,
             owner: Owner::this(),
-            listening,
+            accepting,
         };
-        // One that does not answer may be stopped; the others are watched all the same.
-        let _ = tokio::time::timeout(ANSWERING, watcher.greeted()).await;
+        // A process that does not connect may be stopped; the others are watched in any case.
+        let _ = tokio::time::timeout(CONNECT_TIMEOUT, watcher.all_connected()).await;
         Ok(watcher)
     }
 
-    /// Waits until all processes that have agents tell of their letters.
-    async fn greeted(&mut self) {
-        while !self.all_tell() {
-            match self.told.recv().await {
-                Some(told) => self.hear(told),
+    /// Waits until all processes with agents have connected.
+    async fn all_connected(&mut self) {
+        while !self.is_connected_to_all() {
+            match self.events.recv().await {
+                Some(event) => self.handle(event),
                 None => return,
             }
         }
     }
 
-    fn all_tell(&self) -> bool {
+    fn is_connected_to_all(&self) -> bool {
         let entries = self.host.entries();
         let here = entries.iter().filter(|entry| entry.reach == Reach::Local);
-        let telling: HashSet<Incarnation> = self.joiner.services().collect();
+        let connected: HashSet<Incarnation> = self.joiner.services().collect();
         here.map(|entry| entry.mts.incarnation)
-            .all(|mts| telling.contains(&mts))
+            .all(|mts| connected.contains(&mts))
     }
 
-    /// How many processes tell of their letters.
+    /// Returns the number of connected processes.
     #[must_use]
     pub fn processes(&self) -> usize {
         self.joiner.services().count()
     }
 
-    /// The next event; waits until there is one. Dropping the future loses nothing.
+    /// Waits for the next event. Never returns once the listener has ended, which it logs. Dropping the
+    /// future loses no event.
     pub async fn next(&mut self) -> Event {
         loop {
-            // Everything that is there first: it may have been before what is known already.
+            // Joins all waiting records first: they may precede events that are ready.
             for _ in 0..BATCH {
-                match self.told.try_recv() {
-                    Ok(told) => self.hear(told),
+                match self.events.try_recv() {
+                    Ok(event) => self.handle(event),
                     Err(_) => break,
                 }
             }
@@ -135,58 +137,70 @@ impl Watcher {
                 return event;
             }
             let due = self.joiner.poll_timeout();
-            let told = match due {
-                Some(due) => tokio::time::timeout_at(due.into(), self.told.recv()).await,
-                None => Ok(self.told.recv().await),
+            let event = match due {
+                Some(due) => tokio::time::timeout_at(due.into(), self.events.recv()).await,
+                None => Ok(self.events.recv().await),
             };
-            match told {
-                Ok(Some(told)) => self.hear(told),
-                // Nobody will be heard any more; and it is logged why.
+            match event {
+                Ok(Some(event)) => self.handle(event),
+                // The accepting task has ended, so no further event can come.
                 Ok(None) if due.is_none() => std::future::pending().await,
                 Ok(None) | Err(_) => {}
             }
         }
     }
 
-    /// What is known already and was held back, without waiting for anything: the watching ends.
+    /// Returns an event that is held back for further records, without waiting. For the end of the
+    /// watching: call it until it returns `None`.
     pub fn finish(&mut self) -> Option<Event> {
-        while let Ok(told) = self.told.try_recv() {
-            self.hear(told);
+        while let Ok(event) = self.events.try_recv() {
+            self.handle(event);
         }
         self.joiner.finish()
     }
 
-    fn hear(&mut self, told: Told) {
-        match told {
-            Told::Begin(source, name) => self.joiner.handle_begin(source, name),
-            Told::Record(source, record) => self.joiner.handle(Instant::now(), source, record),
-            Told::Malformed(source, why) => self.joiner.handle_malformed(source, why),
-            Told::End(source) => self.joiner.handle_end(source),
+    fn handle(&mut self, event: ProcessEvent) {
+        match event {
+            ProcessEvent::Begin(source, name) => self.joiner.handle_begin(source, name),
+            ProcessEvent::Record(source, record) => {
+                self.joiner.handle(Instant::now(), source, record)
+            }
+            ProcessEvent::Malformed(source, why) => self.joiner.handle_malformed(source, why),
+            ProcessEvent::End(source) => self.joiner.handle_end(source),
         }
     }
 
-    /// Who is there: the agents of this host and, when a gateway is running, those it knows of.
+    /// Returns the directory: the agents of this host and, if a gateway is running, the agents that it
+    /// has discovered on other hosts.
     #[must_use]
     pub fn directory(&self) -> &dyn Directory {
         &*self.host
     }
 }
 
-impl Drop for Watcher {
-    fn drop(&mut self) {
-        // In a forked child everything stays the parent's.
-        if !self.owner.is_this() {
-            return;
-        }
-        self.listening.abort();
-        self.keeper.abort();
-        leave(&self.host, &self.place);
+impl fmt::Debug for Watcher {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Watcher")
+            .field("dir", &self.dir.path())
+            .finish_non_exhaustive()
     }
 }
 
-fn leave(host: &HostDirectory, place: &Place) {
-    if let Err(error) = host.close() {
-        tracing::warn!(%error, "could not leave the directory of this host in order");
+impl Drop for Watcher {
+    fn drop(&mut self) {
+        // In a forked child, everything still belongs to the parent.
+        if !self.owner.is_this() {
+            return;
+        }
+        self.accepting.abort();
+        self.maintenance.abort();
+        leave(&self.host, &self.dir);
     }
-    place.leave();
+}
+
+fn leave(host: &HostDirectory, dir: &DomainDir) {
+    if let Err(error) = host.close() {
+        tracing::warn!(%error, "cannot remove this process from the directory of this host");
+    }
+    dir.leave();
 }

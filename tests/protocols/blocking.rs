@@ -1,4 +1,4 @@
-//! The same calls in processes without an async runtime: each side on a thread of its own.
+//! The blocking calls of all protocols, with each side on a thread of its own.
 
 use std::thread;
 
@@ -6,7 +6,7 @@ use fipa::blocking;
 
 use super::*;
 
-/// A rover here and an arm there, which does something for the first message that it gets.
+/// Runs a rover and an arm of two processes. The arm runs `arm_does` with its first message.
 fn between<T: Send + 'static>(
     arm_does: impl FnOnce(&blocking::Agent, &Message) -> T + Send + 'static,
     rover_does: impl FnOnce(&blocking::Agent),
@@ -34,7 +34,7 @@ fn arm() -> [AgentId; 1] {
 }
 
 #[test]
-fn a_request_is_done_and_another_cancelled() {
+fn a_request_is_answered_and_another_cancelled() {
     let asked = between(
         |arm, first| {
             let mut task = arm.take_part(first).unwrap();
@@ -67,7 +67,7 @@ fn a_request_is_done_and_another_cancelled() {
 }
 
 #[test]
-fn everything_else_between_two() {
+fn query_request_when_propose_and_subscribe() {
     between(
         |arm, first| {
             let mut first = first.clone();
@@ -174,7 +174,7 @@ fn auctions() {
 fn brokering_and_recruiting() {
     between(
         |broker, first| {
-            // It is the arm itself that is found to be right.
+            // The broker passes the query to the initiator itself.
             let query = || {
                 let query = broker.message(Performative::QueryRef).content("load?");
                 let query = query.protocol("fipa-query");
@@ -183,7 +183,7 @@ fn brokering_and_recruiting() {
             let mut task = broker.take_part(first).unwrap();
             task.agree("").unwrap();
             let early = task.next_answer(PATIENCE).unwrap();
-            assert!(early.is_none(), "nobody was asked");
+            assert!(early.is_none(), "no message was passed on");
             task.inform("passed on").unwrap();
             let answer = broker.message(Performative::Confirm).build().unwrap();
             task.forward(&answer).unwrap();

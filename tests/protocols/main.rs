@@ -1,8 +1,9 @@
-//! Protocols between agents of two processes (each a membership of its own, here in one test
-//! process): led by calls, and checked when the configuration wants it.
+//! Protocols between agents of two processes, as calls and with the checks of `[monitor]`. Each
+//! process is a membership of its own, here in one test process.
 //!
-//! Here the protocols between two and the contract net; auctions and rounds are in `selling.rs`, those
-//! who ask for others in `proxies.rs`, and all of them without an async runtime in `blocking.rs`.
+//! This file has the protocols with one participant and the contract net. `selling.rs` has auctions
+//! and the iterated contract net, `proxies.rs` brokering and recruiting, and `blocking.rs` the blocking
+//! calls of all protocols.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -22,16 +23,16 @@ use fipa::{
     ReceiveError, SendError,
 };
 
-/// Longer than any test takes; nothing waits so long unless something is wrong.
+/// Time limit of all calls, which a passing test does not reach.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// What the agent gets next. A letter that never comes ends the test.
-async fn heard(agent: &Agent) -> Result<Incoming, ReceiveError> {
+/// Waits for the next message of an agent. The test fails if none arrives.
+async fn next_message(agent: &Agent) -> Result<Incoming, ReceiveError> {
     let received = tokio::time::timeout(PATIENCE, agent.receive()).await;
-    received.unwrap_or_else(|_| panic!("nothing came to {}", agent.name()))
+    received.unwrap_or_else(|_| panic!("no message for {}", agent.name()))
 }
 
-/// A configuration for a domain that no other test has.
+/// Makes a configuration for a domain that no other test uses.
 fn config(set: &[&str]) -> Config {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     let number = NEXT.fetch_add(1, Ordering::Relaxed);
@@ -54,7 +55,7 @@ async fn two(set: &[&str]) -> (Domain, Domain) {
     (member().await, member().await)
 }
 
-/// A rover and an arm of another process.
+/// Registers a rover, and an arm of another process.
 async fn pair(set: &[&str]) -> (Agent, Agent) {
     let (here, there) = two(set).await;
     (
@@ -70,7 +71,7 @@ fn to(agent: &Agent, act: Performative, receiver: &Agent, content: &str) -> Mess
         .content(content.to_owned())
 }
 
-/// What a participant does that is called for this message.
+/// Takes part in the conversation of this message, and replies with the result of the handler.
 async fn respond(
     agent: &Agent,
     first: &Message,
@@ -86,7 +87,7 @@ fn text(message: &Message) -> &str {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_request_is_agreed_to_and_done() {
+async fn a_request_is_agreed_to_and_answered() {
     let (rover, arm) = pair(&["monitor.check=enforce"]).await;
     let initiator = async {
         let lift = to(&rover, Performative::Request, &arm, "lift");
@@ -95,7 +96,7 @@ async fn a_request_is_agreed_to_and_done() {
         assert_eq!(text(&request.result().await.unwrap()), "lifted");
     };
     let participant = async {
-        let first = heard(&arm).await.unwrap().message;
+        let first = next_message(&arm).await.unwrap().message;
         assert_eq!(first.protocol(), Some("fipa-request"));
         assert!(first.reply_by().is_some() && first.reply_with().is_some());
         let handler = async |task: &mut Task<'_>| {
@@ -109,14 +110,14 @@ async fn a_request_is_agreed_to_and_done() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn answers_of_every_kind() {
+async fn each_kind_of_answer_yields_its_result_or_error() {
     let (rover, arm) = pair(&[]).await;
     let initiator = async {
         let ask = |act| to(&rover, act, &arm, "?");
         let request = rover.request(ask(Performative::Request), PATIENCE).await;
         let refused = request.unwrap().result().await;
         assert!(matches!(&refused, Err(DialogueError::Refused(why)) if text(why) == "busy"));
-        // Without agreeing first.
+        // The participant answers without an `agree`.
         let query = rover.query(ask(Performative::QueryRef), PATIENCE).await;
         let mut query = query.unwrap();
         assert!(!query.agreed().await.unwrap());
@@ -131,13 +132,13 @@ async fn answers_of_every_kind() {
         assert!(matches!(decided, Ok(Decision::Accepted(_))));
         let decided = rover.propose(ask(Performative::Propose), PATIENCE).await;
         assert!(matches!(decided, Ok(Decision::Rejected(_))));
-        // What begins no such protocol is not sent.
+        // A message that does not begin the protocol is not sent.
         let wrong = rover.request(ask(Performative::Inform), PATIENCE).await;
         assert!(matches!(wrong, Err(DialogueError::WouldViolate(_))));
-        let nobody = rover
+        let to_unknown = rover
             .message(Performative::Request)
-            .receiver(AgentId::new("nobody").unwrap());
-        let unknown = rover.request(nobody, PATIENCE).await;
+            .receiver(AgentId::new("unknown").unwrap());
+        let unknown = rover.request(to_unknown, PATIENCE).await;
         assert!(matches!(unknown, Err(DialogueError::NotDelivered { .. })));
     };
     let participant = async {
@@ -148,7 +149,7 @@ async fn answers_of_every_kind() {
             Reply::Accept("".into()),
             Reply::Reject("".into()),
         ] {
-            let first = heard(&arm).await.unwrap().message;
+            let first = next_message(&arm).await.unwrap().message;
             let when = *first.performative() == Performative::RequestWhen;
             let handler = async |task: &mut Task<'_>| {
                 if when {
@@ -163,7 +164,7 @@ async fn answers_of_every_kind() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn silence_and_nonsense_are_errors() {
+async fn missing_and_invalid_answers_are_errors() {
     let (rover, arm) = pair(&[]).await;
     let lift = || to(&rover, Performative::Request, &arm, "lift");
     let request = rover.request(lift(), Duration::from_secs(1)).await.unwrap();
@@ -171,17 +172,17 @@ async fn silence_and_nonsense_are_errors() {
         request.result().await,
         Err(DialogueError::TimedOut)
     ));
-    let first = heard(&arm).await.unwrap().message;
-    // Nobody waits for it any more: it goes to whoever receives.
+    let first = next_message(&arm).await.unwrap().message;
+    // No call leads the conversation any more, so its message goes to `receive`.
     let late = arm.reply(&first, Performative::Agree).build().unwrap();
     assert!(arm.send(late).await.unwrap().all_succeeded());
-    let late = heard(&rover).await.unwrap().message;
+    let late = next_message(&rover).await.unwrap().message;
     assert_eq!(*late.performative(), Performative::Agree);
 
     let request = rover.request(lift(), PATIENCE).await.unwrap();
-    let first = heard(&arm).await.unwrap().message;
-    let nonsense = arm.reply(&first, Performative::Propose).build().unwrap();
-    arm.send(nonsense).await.unwrap();
+    let first = next_message(&arm).await.unwrap().message;
+    let invalid = arm.reply(&first, Performative::Propose).build().unwrap();
+    arm.send(invalid).await.unwrap();
     match request.result().await {
         Err(DialogueError::Violation { violation, message }) => {
             assert_eq!(violation.kind, ViolationKind::Unexpected);
@@ -190,7 +191,7 @@ async fn silence_and_nonsense_are_errors() {
         other => panic!("{other:?}"),
     }
     let request = rover.request(lift(), PATIENCE).await.unwrap();
-    let first = heard(&arm).await.unwrap().message;
+    let first = next_message(&arm).await.unwrap().message;
     let answer = arm
         .reply(&first, Performative::NotUnderstood)
         .build()
@@ -198,25 +199,25 @@ async fn silence_and_nonsense_are_errors() {
     arm.send(answer).await.unwrap();
     let result = request.result().await;
     assert!(matches!(result, Err(DialogueError::NotUnderstood(_))));
-    // A handler that would break the protocol does not.
+    // A reply that violates the protocol is not sent.
     let _request = rover.request(lift(), PATIENCE).await.unwrap();
-    let first = heard(&arm).await.unwrap().message;
+    let first = next_message(&arm).await.unwrap().message;
     let wrong = respond(&arm, &first, async |_| Ok(Reply::Accept("".into()))).await;
     assert!(matches!(wrong, Err(DialogueError::WouldViolate(_))));
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn other_messages_are_received_meanwhile() {
+async fn other_messages_are_received_during_a_conversation() {
     let (rover, arm) = pair(&[]).await;
     let lift = to(&rover, Performative::Request, &arm, "lift");
     let request = rover.request(lift, PATIENCE).await.unwrap();
-    let first = heard(&arm).await.unwrap().message;
+    let first = next_message(&arm).await.unwrap().message;
     for number in 0..5 {
         let note = to(&arm, Performative::Inform, &rover, &number.to_string());
         arm.send(note.build().unwrap()).await.unwrap();
     }
     // Read before the result, and after it.
-    let early = heard(&rover).await.unwrap().message;
+    let early = next_message(&rover).await.unwrap().message;
     assert_eq!(text(&early), "0");
     let result = tokio::join!(request.result(), async {
         respond(&arm, &first, async |_| Ok(Reply::Inform("done".into())))
@@ -232,7 +233,7 @@ async fn other_messages_are_received_meanwhile() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_conversation_behind_messages_that_nobody_reads_ends_with_the_domain() {
+async fn a_conversation_blocked_by_unread_messages_ends_with_the_domain() {
     let (rover, arm) = pair(&[]).await;
     let initiator = async {
         let subscribe = to(&rover, Performative::Subscribe, &arm, "pose");
@@ -240,14 +241,14 @@ async fn a_conversation_behind_messages_that_nobody_reads_ends_with_the_domain()
         tokio::time::timeout(PATIENCE, poses.next()).await.unwrap()
     };
     let participant = async {
-        let first = heard(&arm).await.unwrap().message;
+        let first = next_message(&arm).await.unwrap().message;
         let mut task = arm.take_part(&first).unwrap();
         task.agree("").await.unwrap();
-        // As many as are put aside for `receive`, which nobody calls.
+        // As many messages as can be set aside for `receive`, which the rover does not call.
         for number in 0..1_024 {
             let note = to(&arm, Performative::Inform, &rover, &number.to_string());
-            let told = arm.send(note.build().unwrap()).await.unwrap();
-            assert!(told.all_succeeded(), "{told:?}");
+            let sent = arm.send(note.build().unwrap()).await.unwrap();
+            assert!(sent.all_succeeded(), "{sent:?}");
         }
         rover.domain().clone().close().await;
     };
@@ -269,7 +270,7 @@ async fn a_subscription_goes_on_until_it_is_cancelled() {
         poses.cancel(PATIENCE).await.unwrap();
     };
     let participant = async {
-        let first = heard(&arm).await.unwrap().message;
+        let first = next_message(&arm).await.unwrap().message;
         let handler = async |task: &mut Task<'_>| {
             task.agree("").await?;
             for number in 0..10 {
@@ -293,7 +294,7 @@ async fn a_request_is_cancelled() {
         request.cancel(PATIENCE).await.unwrap();
     };
     let participant = async {
-        let first = heard(&arm).await.unwrap().message;
+        let first = next_message(&arm).await.unwrap().message;
         let handler = async |task: &mut Task<'_>| {
             task.agree("").await?;
             tokio::select! {
@@ -316,10 +317,10 @@ async fn a_contract_net_with_several_participants() {
     let names = ["cheap", "dear", "lazy"];
     let arms = names.map(|name| there.register(name).unwrap());
     let mut called: Vec<AgentId> = arms.iter().map(|arm| arm.id().clone()).collect();
-    called.push(AgentId::new("nobody").unwrap());
+    called.push(AgentId::new("unknown").unwrap());
     let participants = async {
         let bid = async |arm: &Agent, price: &'static str| {
-            let call = heard(arm).await.unwrap().message;
+            let call = next_message(arm).await.unwrap().message;
             respond(arm, &call, async |task| {
                 if task.propose(price, PATIENCE).await? {
                     return Ok(Reply::Inform("carried".into()));
@@ -330,7 +331,7 @@ async fn a_contract_net_with_several_participants() {
             .unwrap();
         };
         let refuse = async |arm: &Agent| {
-            let call = heard(arm).await.unwrap().message;
+            let call = next_message(arm).await.unwrap().message;
             let answer = respond(arm, &call, async |_| Ok(Reply::Refuse("no".into())));
             answer.await.unwrap();
         };
@@ -341,7 +342,7 @@ async fn a_contract_net_with_several_participants() {
         let mut net = rover.contract_net(call, &called, PATIENCE).await.unwrap();
         let bids = net.bids().clone();
         assert_eq!(bids.refusals.len(), 1, "{bids:?}");
-        assert_eq!(bids.silent, ["nobody"]);
+        assert_eq!(bids.silent, ["unknown"]);
         let cheap = bids.proposals.iter().find(|bid| text(bid) == "10");
         let cheap = cheap.unwrap().clone();
         let results = net.award(&[cheap], "", PATIENCE).await.unwrap();
@@ -361,7 +362,7 @@ fn in_protocol(from: &Agent, act: Performative, to_: &Agent, id: &str) -> Messag
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn enforcing_stops_what_would_break_a_protocol() {
+async fn enforcing_refuses_to_send_messages_that_violate_a_protocol() {
     let (rover, arm) = pair(&["monitor.check=enforce"]).await;
     let illegal = in_protocol(&rover, Performative::AcceptProposal, &arm, "c");
     let refused = rover.send(illegal).await;
@@ -372,7 +373,7 @@ async fn enforcing_stops_what_would_break_a_protocol() {
         .send(in_protocol(&rover, Performative::Cfp, &arm, "c"))
         .await
         .unwrap();
-    heard(&arm).await.unwrap();
+    next_message(&arm).await.unwrap();
     let early = arm
         .send(in_protocol(&arm, Performative::Inform, &rover, "c"))
         .await;
@@ -381,15 +382,15 @@ async fn enforcing_stops_what_would_break_a_protocol() {
     };
     assert_eq!(violation.state.as_deref(), Some("called"));
     assert!(rover.try_receive().unwrap().is_none());
-    // Messages of no conversation are nobody's business.
+    // Messages outside of a conversation are not checked.
     let note = to(&arm, Performative::Inform, &rover, "hello")
         .build()
         .unwrap();
     arm.send(note).await.unwrap();
-    assert_eq!(text(&heard(&rover).await.unwrap().message), "hello");
+    assert_eq!(text(&next_message(&rover).await.unwrap().message), "hello");
 }
 
-/// One process that checks, and one that does not.
+/// Registers agents in a process that checks messages, and in one that does not.
 async fn only_one_checks(set: &[&str]) -> (Agent, Agent) {
     let unchecked = config(&[]);
     let mut checked = config(set);
@@ -403,17 +404,17 @@ async fn only_one_checks(set: &[&str]) -> (Agent, Agent) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_comes_and_breaks_a_protocol_is_handed_over_as_such() {
+async fn a_received_message_that_violates_a_protocol_is_returned_as_a_violation() {
     let (rover, arm) = only_one_checks(&["monitor.check=enforce", "monitor.answer=true"]).await;
     rover
         .send(in_protocol(&rover, Performative::Cfp, &arm, "c"))
         .await
         .unwrap();
-    heard(&arm).await.unwrap();
+    next_message(&arm).await.unwrap();
     arm.send(in_protocol(&arm, Performative::Inform, &rover, "c"))
         .await
         .unwrap();
-    match heard(&rover).await {
+    match next_message(&rover).await {
         Err(ReceiveError::Violation {
             violation,
             incoming,
@@ -423,27 +424,27 @@ async fn what_comes_and_breaks_a_protocol_is_handed_over_as_such() {
         }
         other => panic!("{other:?}"),
     }
-    let answer = heard(&arm).await.unwrap().message;
+    let answer = next_message(&arm).await.unwrap().message;
     assert_eq!(*answer.performative(), Performative::NotUnderstood);
     assert!(text(&answer).contains("expected refuse, propose from arm to rover"));
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn warning_lets_everything_pass() {
+async fn violations_pass_and_are_marked_if_the_check_is_warn() {
     let (rover, arm) = only_one_checks(&["monitor.check=warn"]).await;
     rover
         .send(in_protocol(&rover, Performative::Cfp, &arm, "c"))
         .await
         .unwrap();
-    heard(&arm).await.unwrap();
+    next_message(&arm).await.unwrap();
     arm.send(in_protocol(&arm, Performative::Inform, &rover, "c"))
         .await
         .unwrap();
-    let incoming = heard(&rover).await.unwrap();
+    let incoming = next_message(&rover).await.unwrap();
     assert_eq!(incoming.violation.unwrap().kind, ViolationKind::OutOfOrder);
     let illegal = in_protocol(&rover, Performative::AcceptProposal, &arm, "c");
     rover.send(illegal).await.unwrap();
-    let incoming = heard(&arm).await.unwrap();
+    let incoming = next_message(&arm).await.unwrap();
     assert_eq!(
         *incoming.message.performative(),
         Performative::AcceptProposal
@@ -452,9 +453,9 @@ async fn warning_lets_everything_pass() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn protocols_of_ones_own_are_read_and_checked() {
-    let place = tempfile::tempdir().unwrap();
-    let file = place.path().join("handover.scxml");
+async fn protocols_of_the_configuration_are_read_and_checked() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("handover.scxml");
     let own = r#"<scxml initial="1">
         <state id="1"><transition performative="propose" from="a" to="b" target="2"/></state>
         <state id="2"><transition performative="confirm" from="b" to="a" target="3"/></state>
@@ -462,25 +463,25 @@ async fn protocols_of_ones_own_are_read_and_checked() {
     std::fs::write(&file, own).unwrap();
     let set = format!("monitor.protocols={}", file.display());
     let (rover, arm) = pair(&["monitor.check=enforce", &set]).await;
-    let say = |from: &Agent, act, receiver: &Agent| {
+    let message = |from: &Agent, act, receiver: &Agent| {
         let message = to(from, act, receiver, "").protocol("handover");
         message.conversation_id("c").build().unwrap()
     };
     rover
-        .send(say(&rover, Performative::Propose, &arm))
+        .send(message(&rover, Performative::Propose, &arm))
         .await
         .unwrap();
-    heard(&arm).await.unwrap();
+    next_message(&arm).await.unwrap();
     let wrong = arm
-        .send(say(&arm, Performative::AcceptProposal, &rover))
+        .send(message(&arm, Performative::AcceptProposal, &rover))
         .await;
     assert!(matches!(wrong, Err(SendError::Violation(_))));
-    arm.send(say(&arm, Performative::Confirm, &rover))
+    arm.send(message(&arm, Performative::Confirm, &rover))
         .await
         .unwrap();
-    heard(&rover).await.unwrap();
+    next_message(&rover).await.unwrap();
 
-    // Its states are its own, whatever they are called.
+    // A state may have the same name as a state of the monitor, and still belongs to the protocol.
     let named = r#"<scxml initial="1">
         <state id="1"><transition performative="propose" from="a" to="b" target="2"/></state>
         <state id="2"><transition performative="inform" from="a" to="b" target="cancelling"/></state>
@@ -488,11 +489,11 @@ async fn protocols_of_ones_own_are_read_and_checked() {
         <state id="3" final="yes"/></scxml>"#;
     std::fs::write(&file, named).unwrap();
     let (rover, arm) = pair(&[&set]).await;
-    let propose = say(&rover, Performative::Propose, &arm);
+    let propose = message(&rover, Performative::Propose, &arm);
     rover.send(propose).await.unwrap();
-    let first = heard(&arm).await.unwrap().message;
+    let first = next_message(&arm).await.unwrap().message;
     let mut task = arm.take_part(&first).unwrap();
-    let inform = say(&rover, Performative::Inform, &arm);
+    let inform = message(&rover, Performative::Inform, &arm);
     rover.send(inform).await.unwrap();
     let second = task.next(PATIENCE).await.unwrap();
     assert_eq!(*second.performative(), Performative::Inform);

@@ -1,8 +1,8 @@
-//! Those who ask for others: brokers and recruiters.
+//! Brokering and recruiting.
 
 use super::*;
 
-/// These agents, each in a membership of its own and held to its protocols.
+/// Registers agents, each in a membership of its own, with `monitor.check=enforce`.
 async fn enforcing<const N: usize>(names: [&str; N]) -> [Agent; N] {
     let config = config(&["monitor.check=enforce"]);
     let mut agents = Vec::new();
@@ -13,7 +13,7 @@ async fn enforcing<const N: usize>(names: [&str; N]) -> [Agent; N] {
     agents.try_into().ok().unwrap()
 }
 
-/// A rover, somebody who asks for it, and an arm that is asked.
+/// Registers a rover, a broker or recruiter, and an arm.
 async fn three(go_between: &str) -> [Agent; 3] {
     enforcing(["rover", go_between, "arm"]).await
 }
@@ -29,9 +29,9 @@ fn query(from: &Agent, arm: &str) -> MessageBuilder {
         .content("load?")
 }
 
-/// Agrees and answers, whoever wants to know.
+/// Agrees to a query and answers it.
 async fn answer(arm: &Agent) -> Message {
-    let first = heard(arm).await.unwrap().message;
+    let first = next_message(arm).await.unwrap().message;
     assert_eq!(first.protocol(), Some("fipa-query"));
     respond(arm, &first, async |task| {
         task.agree("wait").await?;
@@ -43,7 +43,7 @@ async fn answer(arm: &Agent) -> Message {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_broker_passes_answers_back() {
+async fn a_broker_forwards_answers() {
     let [rover, broker, arm] = three("broker").await;
     let initiator = async {
         let proxy = proxy(&rover, &broker);
@@ -59,13 +59,13 @@ async fn a_broker_passes_answers_back() {
         assert!(matches!(&failed, Err(DialogueError::Failed(why)) if text(why) == "no more"));
     };
     let goes_between = async {
-        let first = heard(&broker).await.unwrap().message;
+        let first = next_message(&broker).await.unwrap().message;
         let mut task = broker.take_part(&first).unwrap();
-        // Not before it has agreed.
+        // It cannot pass a message on before it has agreed.
         let early = task.pass_on(query(&broker, "arm"), PATIENCE).await;
         assert!(matches!(early, Err(DialogueError::WouldViolate(_))));
         task.agree("").await.unwrap();
-        let lost = task.pass_on(query(&broker, "nobody"), PATIENCE).await;
+        let lost = task.pass_on(query(&broker, "unknown"), PATIENCE).await;
         assert!(matches!(lost, Err(DialogueError::NotDelivered { .. })));
         task.pass_on(query(&broker, "arm"), PATIENCE).await.unwrap();
         task.inform("passed on").await.unwrap();
@@ -87,7 +87,7 @@ async fn a_broker_passes_answers_back() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_recruited_answer_directly() {
+async fn recruited_agents_answer_the_initiator_directly() {
     let [rover, recruiter, arm] = three("recruiter").await;
     let initiator = async {
         let proxy = proxy(&rover, &recruiter);
@@ -102,13 +102,13 @@ async fn the_recruited_answer_directly() {
     };
     let (early, answered) = tokio::sync::oneshot::channel();
     let goes_between = async {
-        let first = heard(&recruiter).await.unwrap().message;
+        let first = next_message(&recruiter).await.unwrap().message;
         let mut task = recruiter.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         task.pass_on(query(&recruiter, "arm"), PATIENCE)
             .await
             .unwrap();
-        // The recruited may be faster than the word that they are.
+        // The answers may arrive before the report of the recruiter.
         answered.await.unwrap();
         task.inform("recruited").await.unwrap();
         assert!(task.next_answer(PATIENCE).await.unwrap().is_none());
@@ -122,9 +122,9 @@ async fn the_recruited_answer_directly() {
     tokio::join!(initiator, goes_between, recruited);
 }
 
-/// Passes a call for proposals on, to an arm that agrees to be told by others what to do.
+/// Passes a call for proposals on to the arm, with this agent as its `reply-to`.
 async fn recruit(recruiter: &Agent, reply_to: Option<&Agent>) {
-    let first = heard(recruiter).await.unwrap().message;
+    let first = next_message(recruiter).await.unwrap().message;
     let mut task = recruiter.take_part(&first).unwrap();
     task.agree("").await.unwrap();
     let mut call = recruiter
@@ -140,7 +140,7 @@ async fn recruit(recruiter: &Agent, reply_to: Option<&Agent>) {
 }
 
 async fn propose(arm: &Agent) {
-    let first = heard(arm).await.unwrap().message;
+    let first = next_message(arm).await.unwrap().message;
     respond(arm, &first, async |task| {
         assert!(task.propose("20", PATIENCE).await?);
         Ok(Reply::Inform(task.message().content().unwrap().clone()))
@@ -150,7 +150,7 @@ async fn propose(arm: &Agent) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn who_has_others_recruited_accepts_their_proposal() {
+async fn the_initiator_accepts_the_proposal_of_a_recruited_agent() {
     let [rover, recruiter, arm] = three("recruiter").await;
     let initiator = async {
         let proxy = proxy(&rover, &recruiter);
@@ -171,22 +171,22 @@ async fn who_has_others_recruited_accepts_their_proposal() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn whom_the_recruited_are_told_to_answer_accepts_a_proposal() {
+async fn a_designated_receiver_accepts_the_proposal_of_a_recruited_agent() {
     let [rover, recruiter, arm, base] = enforcing(["rover", "recruiter", "arm", "base"]).await;
     let initiator = async {
         let proxy = proxy(&rover, &recruiter);
         let _answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
     };
     let designated = async {
-        let proposal = heard(&base).await.unwrap().message;
+        let proposal = next_message(&base).await.unwrap().message;
         assert_eq!(*proposal.performative(), Performative::Propose);
         let accept = base.reply(&proposal, Performative::AcceptProposal);
         let accept = accept.content("do").build().unwrap();
         base.send(accept.clone()).await.unwrap();
-        // It is enforced as with those who began.
+        // The protocol is enforced as for agents that began the conversation.
         let again = base.send(accept).await;
         assert!(matches!(again, Err(SendError::Violation(_))), "{again:?}");
-        let done = heard(&base).await.unwrap().message;
+        let done = next_message(&base).await.unwrap().message;
         assert_eq!(*done.performative(), Performative::Inform);
     };
     let goes_between = recruit(&recruiter, Some(&base));
@@ -194,15 +194,15 @@ async fn whom_the_recruited_are_told_to_answer_accepts_a_proposal() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_recruited_answer_whom_they_are_told_to() {
-    // The base is told of nothing before the answers come.
+async fn recruited_agents_answer_the_designated_receiver() {
+    // The base gets no message before the answers.
     let [rover, recruiter, arm, base] = enforcing(["rover", "recruiter", "arm", "base"]).await;
     let initiator = async {
         let proxy = proxy(&rover, &recruiter);
         let _answers = rover.recruiting(proxy, PATIENCE).await.unwrap();
     };
     let goes_between = async {
-        let first = heard(&recruiter).await.unwrap().message;
+        let first = next_message(&recruiter).await.unwrap().message;
         let mut task = recruiter.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         let query = query(&recruiter, "arm").reply_to(base.id().clone());
@@ -211,7 +211,7 @@ async fn the_recruited_answer_whom_they_are_told_to() {
     };
     let designated = async {
         for act in [Performative::Agree, Performative::Inform] {
-            let answer = heard(&base).await.unwrap().message;
+            let answer = next_message(&base).await.unwrap().message;
             assert_eq!(*answer.performative(), act);
             assert_eq!(answer.sender().unwrap().name(), "arm");
         }
@@ -220,23 +220,23 @@ async fn the_recruited_answer_whom_they_are_told_to() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn who_asks_for_others_may_refuse_and_find_nobody() {
+async fn a_broker_or_recruiter_may_refuse_or_find_no_agent() {
     let [rover, broker, _arm] = three("broker").await;
     let initiator = async {
         let refused = rover.brokering(proxy(&rover, &broker), PATIENCE).await;
         assert!(matches!(refused.err(), Some(DialogueError::Refused(_))));
-        let nobody = rover.recruiting(proxy(&rover, &broker), PATIENCE).await;
-        assert!(matches!(nobody.err(), Some(DialogueError::Failed(_))));
+        let none = rover.recruiting(proxy(&rover, &broker), PATIENCE).await;
+        assert!(matches!(none.err(), Some(DialogueError::Failed(_))));
         let moment = Duration::from_secs(1);
         let silent = rover.brokering(proxy(&rover, &broker), moment).await;
         assert!(matches!(silent.err(), Some(DialogueError::TimedOut)));
     };
     let goes_between = async {
-        let first = heard(&broker).await.unwrap().message;
+        let first = next_message(&broker).await.unwrap().message;
         respond(&broker, &first, async |_| Ok(Reply::Refuse("no".into())))
             .await
             .unwrap();
-        let first = heard(&broker).await.unwrap().message;
+        let first = next_message(&broker).await.unwrap().message;
         respond(&broker, &first, async |task| {
             task.agree("").await?;
             Ok(Reply::Failure("no match".into()))
@@ -256,7 +256,7 @@ async fn brokering_is_cancelled() {
         answers.cancel(PATIENCE).await.unwrap();
     };
     let goes_between = async {
-        let first = heard(&broker).await.unwrap().message;
+        let first = next_message(&broker).await.unwrap().message;
         let mut task = broker.take_part(&first).unwrap();
         task.agree("").await.unwrap();
         task.pass_on(query(&broker, "arm"), PATIENCE).await.unwrap();

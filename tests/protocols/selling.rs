@@ -1,8 +1,8 @@
-//! The iterated contract net and the auctions; and a contract net that is cancelled or disturbed.
+//! The iterated contract net, auctions, and contract nets that are cancelled or disturbed.
 
 use super::*;
 
-/// A rover here, and others there.
+/// Registers a rover, and agents of another process.
 async fn rover_and<const N: usize>(names: [&str; N]) -> (Agent, [Agent; N]) {
     let (here, there) = two(&["monitor.check=enforce"]).await;
     let rover = here.register("rover").unwrap();
@@ -27,12 +27,12 @@ fn from<'m>(messages: &'m [Message], sender: &str) -> &'m Message {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_iterated_contract_net_goes_on_with_some() {
+async fn an_iterated_contract_net_calls_some_participants_again() {
     let (rover, arms) = rover_and(["cheap", "dear", "stubborn"]).await;
     let called = ids(&arms);
-    // Proposes these prices one after the other; how often it was called.
+    // Proposes these prices in turn. Returns the number of calls, and whether a proposal was accepted.
     let bid = async |arm: &Agent, prices: &[&'static str]| {
-        let call = heard(arm).await.unwrap().message;
+        let call = next_message(arm).await.unwrap().message;
         let mut task = arm.take_part(&call).unwrap();
         let mut calls = 1;
         for price in prices {
@@ -77,12 +77,12 @@ async fn an_iterated_contract_net_goes_on_with_some() {
         bid(&arms[2], &["30"])
     );
     assert_eq!(cheap, (2, true));
-    assert_eq!(dear, (1, false), "rejected, and told so");
+    assert_eq!(dear, (1, false), "rejected");
     assert_eq!(stubborn, (2, false));
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_contract_net_is_not_called_again() {
+async fn a_second_call_in_a_contract_net_is_refused() {
     let (rover, arms) = rover_and(["arm"]).await;
     let initiator = async {
         let mut net = rover
@@ -92,7 +92,7 @@ async fn a_contract_net_is_not_called_again() {
         let bids = net.bids().proposals.clone();
         let again = net.call_again(&bids, cfp(&rover, "cheaper?"), PATIENCE);
         assert!(matches!(again.await, Err(DialogueError::WouldViolate(_))));
-        // Nothing is lost by that.
+        // The proposals can still be awarded.
         let results = net.award(&bids, "", PATIENCE).await.unwrap();
         assert!(results[0].result.is_ok());
     };
@@ -106,7 +106,7 @@ async fn a_contract_net_is_not_called_again() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn who_breaks_a_contract_net_spoils_it_for_nobody_else() {
+async fn a_violation_by_one_participant_does_not_affect_the_others() {
     // The arms do not check what they send.
     let unchecked = config(&[]);
     let mut checked = config(&["monitor.check=enforce"]);
@@ -119,15 +119,15 @@ async fn who_breaks_a_contract_net_spoils_it_for_nobody_else() {
     let arms = ["wild", "tame"].map(|name| there.register(name).unwrap());
     let [wild, tame] = &arms;
     let participants = async {
-        let call = heard(wild).await.unwrap().message;
+        let call = next_message(wild).await.unwrap().message;
         let early = wild.reply(&call, Performative::Inform).build().unwrap();
         wild.send(early).await.unwrap();
         let late = wild.reply(&call, Performative::Propose).build().unwrap();
         wild.send(late).await.unwrap();
-        let call = heard(tame).await.unwrap().message;
+        let call = next_message(tame).await.unwrap().message;
         let mut task = tame.take_part(&call).unwrap();
         assert!(task.propose("10", PATIENCE).await.unwrap());
-        // In the middle of the work of the other.
+        // Arrives while the other agent works.
         let wrong = wild.reply(&call, Performative::Agree).build().unwrap();
         wild.send(wrong).await.unwrap();
         task.reply(Reply::Inform("done".into())).await.unwrap();
@@ -165,23 +165,23 @@ async fn winners_do_not_wait_for_losers() {
     let arms = ["loser", "winner"].map(|name| there.register(name).unwrap());
     let [loser, winner] = &arms;
     let (proposed, first) = tokio::sync::oneshot::channel();
-    let (done, told) = tokio::sync::oneshot::channel();
+    let (done, finished) = tokio::sync::oneshot::channel();
     let loses = async {
-        let call = heard(loser).await.unwrap().message;
+        let call = next_message(loser).await.unwrap().message;
         let bid = loser.reply(&call, Performative::Propose).build().unwrap();
         loser.send(bid).await.unwrap();
-        // Its queue is full, so that the rejection has to wait.
+        // The letter fills its queue, so that the rejection has to wait.
         let full = loser.message(Performative::Inform);
         let full = full.receiver(loser.id().clone()).content("full");
         loser.send(full.build().unwrap()).await.unwrap();
         proposed.send(()).unwrap();
-        told.await.unwrap();
-        assert_eq!(text(&heard(loser).await.unwrap().message), "full");
-        let rejected = heard(loser).await.unwrap().message;
+        finished.await.unwrap();
+        assert_eq!(text(&next_message(loser).await.unwrap().message), "full");
+        let rejected = next_message(loser).await.unwrap().message;
         assert_eq!(*rejected.performative(), Performative::RejectProposal);
     };
     let wins = async {
-        let call = heard(winner).await.unwrap().message;
+        let call = next_message(winner).await.unwrap().message;
         first.await.unwrap();
         let mut task = winner.take_part(&call).unwrap();
         assert!(task.propose("10", PATIENCE).await.unwrap());
@@ -194,7 +194,7 @@ async fn winners_do_not_wait_for_losers() {
             .await
             .unwrap();
         let bids = net.bids().proposals.clone();
-        assert_eq!(name(&bids[0]), "loser", "it is told first");
+        assert_eq!(name(&bids[0]), "loser", "it is answered first");
         let results = net.award(&bids[1..], "", PATIENCE).await.unwrap();
         assert_eq!(results.len(), 1);
         assert!(results[0].result.is_ok(), "{results:?}");
@@ -203,11 +203,11 @@ async fn winners_do_not_wait_for_losers() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_contract_net_is_cancelled_with_all_with_whom_it_goes_on() {
+async fn a_contract_net_is_cancelled_with_all_open_participants() {
     let (rover, arms) = rover_and(["waiting", "thinking", "refusing"]).await;
     let [waiting, thinking, refusing] = &arms;
     let waits = async {
-        let call = heard(waiting).await.unwrap().message;
+        let call = next_message(waiting).await.unwrap().message;
         let mut task = waiting.take_part(&call).unwrap();
         let cancelled = task.propose("10", PATIENCE).await;
         assert!(matches!(cancelled, Err(DialogueError::Cancelled(_))));
@@ -215,20 +215,20 @@ async fn a_contract_net_is_cancelled_with_all_with_whom_it_goes_on() {
         task.reply(nothing).await.unwrap();
     };
     let thinks = async {
-        let call = heard(thinking).await.unwrap().message;
+        let call = next_message(thinking).await.unwrap().message;
         let mut task = thinking.take_part(&call).unwrap();
         task.cancelled().await.unwrap();
         let nothing = task.confirm_cancel().await.unwrap();
         task.reply(nothing).await.unwrap();
     };
     let refuses = async {
-        let call = heard(refusing).await.unwrap().message;
+        let call = next_message(refusing).await.unwrap().message;
         respond(refusing, &call, async |_| Ok(Reply::Refuse("no".into())))
             .await
             .unwrap();
     };
     let initiator = async {
-        // Long enough for the two that answer, and the third never does.
+        // Long enough for the two that answer; the third never does.
         let patience = Duration::from_secs(3);
         let net = rover
             .contract_net(cfp(&rover, "carry"), &ids(&arms), patience)
@@ -238,23 +238,25 @@ async fn a_contract_net_is_cancelled_with_all_with_whom_it_goes_on() {
         net.cancel(PATIENCE).await.unwrap();
     };
     tokio::join!(initiator, waits, thinks, refuses);
-    assert!(refusing.try_receive().unwrap().is_none(), "has ended");
+    let message = refusing.try_receive().unwrap();
+    assert!(message.is_none(), "its conversation has ended already");
 }
 
-/// Bids while the price is right, and says how often it was called and what it was asked for.
+/// Bids at acceptable prices. Returns the numbers of calls and of accepted bids, and the request to the
+/// winner.
 async fn bidder(
     agent: &Agent,
-    right: impl Fn(u32) -> bool,
+    accepts: impl Fn(u32) -> bool,
     buys: usize,
 ) -> (usize, usize, Option<String>) {
-    let opening = heard(agent).await.unwrap().message;
+    let opening = next_message(agent).await.unwrap().message;
     assert_eq!(text(&opening), "a crate");
     let mut task = agent.take_part(&opening).unwrap();
     let (mut calls, mut bought) = (0, 0);
     while let Some(call) = task.next_call(PATIENCE).await.unwrap() {
         calls += 1;
         let price = text(&call).parse().unwrap();
-        if right(price) && task.state() != "called-leading" && bought < buys {
+        if accepts(price) && task.state() != "called-leading" && bought < buys {
             bought += usize::from(task.propose("", PATIENCE).await.unwrap());
         }
     }
@@ -266,15 +268,15 @@ async fn bidder(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_english_auction_is_won_by_who_bids_last() {
+async fn the_last_bidder_wins_an_english_auction() {
     let (rover, arms) = rover_and(["rich", "poor"]).await;
     let mut bidders = ids(&arms);
-    bidders.push(AgentId::new("nobody").unwrap());
+    bidders.push(AgentId::new("unknown").unwrap());
     let auctioneer = async {
         let opening = rover.message(Performative::Inform).content("a crate");
         let mut auction = rover.english_auction(opening, &bidders).await.unwrap();
         assert_eq!(auction.bidders(), ids(&arms));
-        // Both bid, and one is accepted; what the other bid is rejected with the next call.
+        // Both bid, and one bid is accepted. The next call rejects the other one.
         let bids = auction.call("10", PATIENCE).await.unwrap();
         assert_eq!(bids.proposals.len(), 2);
         auction
@@ -288,7 +290,7 @@ async fn an_english_auction_is_won_by_who_bids_last() {
         let bids = auction.call("20", moment).await.unwrap();
         assert_eq!(bids.silent, ["poor"], "it leads");
         auction.accept(&bids.proposals[0], "").await.unwrap();
-        // 30 is more than the other has.
+        // 30 is too much for the other bidder.
         let bids = auction.call("30", moment).await.unwrap();
         assert_eq!(bids.proposals, []);
         auction.close("sold").await.unwrap();
@@ -306,7 +308,7 @@ async fn an_english_auction_is_won_by_who_bids_last() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_dutch_auction_goes_on_while_something_is_left() {
+async fn a_dutch_auction_continues_while_goods_are_left() {
     let (rover, arms) = rover_and(["eager", "patient"]).await;
     let auctioneer = async {
         let opening = rover.message(Performative::Inform).content("a crate");
@@ -324,7 +326,7 @@ async fn a_dutch_auction_goes_on_while_something_is_left() {
             price -= 10;
         }
         auction.close("all gone").await.unwrap();
-        // There is nobody to be asked in this one.
+        // A Dutch auction has no request to the winner.
         let asked = auction.ask_winner("take it").await;
         assert!(matches!(asked, Err(DialogueError::WouldViolate(_))));
         sold
@@ -356,8 +358,8 @@ async fn an_auction_without_a_bid_has_no_winner() {
                 .is_empty()
         );
         auction.close("not sold").await.unwrap();
-        let nobody = auction.ask_winner("take it").await;
-        assert!(matches!(nobody, Err(DialogueError::NoWinner)));
+        let no_winner = auction.ask_winner("take it").await;
+        assert!(matches!(no_winner, Err(DialogueError::NoWinner)));
     };
     let (_, bid) = tokio::join!(auctioneer, bidder(&arms[0], |_| false, 0));
     assert_eq!(bid, (1, 0, None));
@@ -367,7 +369,7 @@ async fn an_auction_without_a_bid_has_no_winner() {
 async fn a_bid_that_crosses_the_next_call_does_not_count() {
     let (rover, arms) = rover_and(["arm"]).await;
     let [arm] = &arms;
-    let (first_over, told) = tokio::sync::oneshot::channel();
+    let (first_over, ended) = tokio::sync::oneshot::channel();
     let auctioneer = async {
         let opening = rover.message(Performative::Inform).content("a crate");
         let mut auction = rover.english_auction(opening, &ids(&arms)).await.unwrap();
@@ -384,11 +386,11 @@ async fn a_bid_that_crosses_the_next_call_does_not_count() {
         auction.ask_winner("take it").await.unwrap();
     };
     let participant = async {
-        let opening = heard(arm).await.unwrap().message;
+        let opening = next_message(arm).await.unwrap().message;
         let mut task = arm.take_part(&opening).unwrap();
         task.next_call(PATIENCE).await.unwrap().unwrap();
-        // The second call is on its way when this bid leaves.
-        told.await.unwrap();
+        // The time of the first call is over when this bid is sent.
+        ended.await.unwrap();
         assert!(!task.propose("for 10", PATIENCE).await.unwrap());
         let second = task.next_call(PATIENCE).await.unwrap().unwrap();
         assert_eq!(text(&second), "20");

@@ -1,4 +1,4 @@
-//! How often a message is checked: once where it leaves, and once where it comes.
+//! The number of checks per message: one at its sender and one at its receiver.
 
 use std::collections::HashMap;
 use std::sync::{LazyLock, Mutex};
@@ -9,10 +9,10 @@ use tracing::{Event, Metadata, Subscriber};
 
 use super::*;
 
-/// Verdicts, by conversation.
+/// The number of verdicts, by conversation.
 static GIVEN: LazyLock<Mutex<HashMap<String, u32>>> = LazyLock::new(Mutex::default);
 
-/// Counts what agents trace of their checks.
+/// Counts the trace events of checks.
 struct Counter;
 
 impl Subscriber for Counter {
@@ -56,7 +56,7 @@ fn given(id: &str) -> u32 {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn four_verdicts_for_a_request_and_its_inform() {
-    // Other tests of this program are counted as well, under other conversations.
+    // Checks of other tests in this program count for other conversations.
     let _ = tracing::subscriber::set_global_default(Counter);
     let (rover, arm) = pair(&["monitor.check=enforce"]).await;
     let ask = to(&rover, Performative::Request, &arm, "lift")
@@ -65,18 +65,18 @@ async fn four_verdicts_for_a_request_and_its_inform() {
         .build()
         .unwrap();
     rover.send(ask).await.unwrap();
-    let asked = heard(&arm).await.unwrap().message;
+    let asked = next_message(&arm).await.unwrap().message;
     let done = arm.reply(&asked, Performative::Inform).build().unwrap();
     arm.send(done).await.unwrap();
-    heard(&rover).await.unwrap();
+    next_message(&rover).await.unwrap();
     assert_eq!(given("counted"), 4);
 
-    // Those who lead a conversation check it as well, as they do when nothing is enforced; that
-    // enforcing adds no more.
+    // Calls that lead a conversation check its messages themselves, whatever `monitor.check` is. The
+    // checks of `monitor.check` stay at one per side and message.
     let lift = to(&rover, Performative::Request, &arm, "lift");
     let request = rover.request(lift, PATIENCE).await.unwrap();
     let id = request.conversation_id().to_owned();
-    let asked = heard(&arm).await.unwrap().message;
+    let asked = next_message(&arm).await.unwrap().message;
     let task = arm.take_part(&asked).unwrap();
     task.reply(Reply::Inform("done".into())).await.unwrap();
     request.result().await.unwrap();

@@ -1,7 +1,8 @@
-//! Services that tests put together themselves, to look at their transports or take these away.
+//! Services that tests assemble themselves, to read the counters of their transports or to close
+//! transports.
 #![allow(dead_code, reason = "each test file uses a part of it")]
 
-pub(crate) mod weather;
+pub(crate) mod links;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -24,15 +25,16 @@ use fipa_transport_shm::{ShmConfig, ShmCounters, ShmTransport};
 use tempfile::TempDir;
 use tokio::runtime::Handle;
 
-/// Nobody has keys.
+/// Without the feature `secure` there are no keys.
 #[cfg(not(feature = "secure"))]
 pub(crate) type Security = std::convert::Infallible;
 
-/// The life of the agent that sends, and of the one that receives.
+/// The incarnation of the agent that sends.
 pub(crate) const ROVER: Incarnation = Incarnation::from_u64(0x50e4);
+/// The incarnation of the agent that receives.
 pub(crate) const ARM: Incarnation = Incarnation::from_u64(0xa53);
 
-/// A letter from the rover to the arm with this number.
+/// Makes a letter from the rover to the arm with this number as its content.
 pub(crate) fn letter(number: usize) -> Letter {
     let message = Message::builder(Performative::Inform)
         .sender(AgentId::new("rover").unwrap())
@@ -43,15 +45,15 @@ pub(crate) fn letter(number: usize) -> Letter {
     letter_for(&message, SystemTime::now()).unwrap()
 }
 
-/// The number of such a letter.
+/// Returns the number in such a letter.
 pub(crate) fn number(letter: &Letter) -> usize {
     let message = Message::decode(letter.payload()).unwrap();
     let text = std::str::from_utf8(message.content().unwrap()).unwrap();
     text.parse().unwrap()
 }
 
-/// A service: a robot process, or a gateway.
-pub(crate) struct Place {
+/// A message transport service: of a robot process, or a gateway.
+pub(crate) struct TestService {
     pub(crate) mts: Mts,
     directory: Arc<MemoryDirectory>,
     shm: Option<Arc<ShmTransport>>,
@@ -63,21 +65,21 @@ pub(crate) struct Place {
     locations: Vec<Location>,
 }
 
-/// What a service takes.
+/// The restrictions of a service.
 #[derive(Default)]
 struct Bounds {
-    /// Processes that can have its mailbox open.
+    /// Maximum number of processes that can have its mailbox open.
     clients: Option<usize>,
     gate: Option<Arc<dyn Gate>>,
 }
 
-impl Place {
-    /// A service of this host with these transports, in this order of preference.
+impl TestService {
+    /// Starts a service of this host with these transports, in this order of preference.
     pub(crate) fn start(host: &Path, name: &str, order: &[Kind], forwards: bool) -> Self {
         Self::with_keys(host, name, order, forwards, None)
     }
 
-    /// The same, speaking with trusted peers only; QUIC needs that.
+    /// Starts a service that accepts trusted peers only, which QUIC requires.
     pub(crate) fn with_keys(
         host: &Path,
         name: &str,
@@ -88,7 +90,7 @@ impl Place {
         Self::build(host, name, order, forwards, security, Bounds::default())
     }
 
-    /// A gateway with keys that refuses what this gate does not admit.
+    /// Starts a gateway with keys that refuses the letters that this gate does not admit.
     pub(crate) fn with_gate(
         host: &Path,
         name: &str,
@@ -103,7 +105,7 @@ impl Place {
         Self::build(host, name, order, true, Some(security), bounds)
     }
 
-    /// A service without leave to forward, whose mailbox so many processes can have open.
+    /// Starts a service that does not forward, and whose mailbox so many processes can have open.
     pub(crate) fn with_clients(host: &Path, name: &str, order: &[Kind], clients: usize) -> Self {
         let bounds = Bounds {
             clients: Some(clients),
@@ -122,10 +124,10 @@ impl Place {
     ) -> Self {
         let mut limits = Limits::default();
         if security.is_some() {
-            // Links to such services are cut, and that is to be noticed soon.
+            // Tests cut the links to such services, which must be detected soon.
             limits.keep_alive = Duration::from_millis(500);
         }
-        // Nobody can have any.
+        // There are no keys without the feature.
         #[cfg(not(feature = "secure"))]
         drop(security);
         let incarnation = Incarnation::random();
@@ -222,24 +224,24 @@ impl Place {
         }
     }
 
-    /// Where this is by this kind of transport.
+    /// Returns the location of the service for this kind of transport.
     pub(crate) fn at(&self, kind: Kind) -> Location {
         let mut locations = self.locations.iter();
         locations.find(|it| it.kind() == kind).unwrap().clone()
     }
 
-    /// Letters for the arm go from here to one of these places.
-    pub(crate) fn knows_arm_at(&self, there: Vec<Location>) {
+    /// Registers the arm in the directory of this service, at these locations.
+    pub(crate) fn register_arm_at(&self, there: Vec<Location>) {
         let arm = Registration::new("arm", ARM, there);
         self.directory.register(arm).unwrap();
     }
 
-    /// Everywhere that this is.
-    pub(crate) fn everywhere(&self) -> Vec<Location> {
+    /// Returns all locations of the service.
+    pub(crate) fn all_locations(&self) -> Vec<Location> {
         self.locations.clone()
     }
 
-    /// One of its transports.
+    /// Returns one of its transports.
     pub(crate) fn transport(&self, kind: Kind) -> Arc<dyn Transport> {
         let found = match kind {
             Kind::Shm => self.shm.clone().map(|it| it as Arc<dyn Transport>),
@@ -261,9 +263,9 @@ impl Place {
     }
 }
 
-/// Keys of services that trust each other and no other service.
+/// Makes keys for services that trust each other and no other service.
 #[cfg(feature = "secure")]
-pub(crate) fn friends<const N: usize>(here: &Path, names: [&str; N]) -> [Security; N] {
+pub(crate) fn mutual_keys<const N: usize>(here: &Path, names: [&str; N]) -> [Security; N] {
     let keys = names.map(|name| fipa::keys::Keys::at(here.join(format!("keys-{name}"))));
     for (keys, name) in keys.iter().zip(names) {
         keys.init(name, &[], fipa::keys::VALID).unwrap();
@@ -286,7 +288,7 @@ pub(crate) fn friends<const N: usize>(here: &Path, names: [&str; N]) -> [Securit
     })
 }
 
-/// The directory of a host that no other test has.
+/// Makes the directory of a host that no other test uses.
 pub(crate) fn host() -> TempDir {
     let mut builder = tempfile::Builder::new();
     builder.prefix("services-").tempdir().unwrap()

@@ -1,13 +1,13 @@
-//! What is refused, and in which words.
+//! Refused configurations and their error messages.
 
 use std::fs;
 
 use super::{config, error};
 use crate::config::{Config, ConfigError, Interface, Sources};
 
-/// Each line: a file, and everything that is said about it.
+/// Each case is a file and its complete error message.
 #[test]
-fn mistakes_are_named_with_line_and_key() {
+fn mistakes_are_reported_with_line_and_key() {
     let cases: &[(&str, &str)] = &[
         // Unknown keys.
         (
@@ -36,111 +36,111 @@ fn mistakes_are_named_with_line_and_key() {
         ),
         (
             "[mts]\nname.first = \"x\"\n",
-            "fipa.toml:2: `mts.name` is wrong: a table cannot stand here (a name with dots needs \
+            "fipa.toml:2: `mts.name` is invalid: a table is not allowed here (a name with dots needs \
              quotes); expected a name of 1 to 255 bytes",
         ),
         (
             "[routes]\ncamera.left = [\"shm\"]\n",
-            "fipa.toml:2: `routes.camera` is wrong: a table cannot stand here (a name with dots \
+            "fipa.toml:2: `routes.camera` is invalid: a table is not allowed here (a name with dots \
              needs quotes); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
         ),
         (
             "\nmts = 5\n",
             "fipa.toml:2: `mts` is a section, not a value; \
-             write [mts], and below it its keys: name, transports, deadline, queue, queue_bytes",
+             write [mts] and below it some of its keys: name, transports, deadline, queue, queue_bytes",
         ),
         (
             "routes = \"x\"\n",
             "fipa.toml:1: `routes` is a section, not a value; \
-             write [routes], and below it its keys: names of your choice",
+             write [routes] and below it some of its keys: names of your choice",
         ),
         // Values of the wrong kind.
         (
             "domain = 5\n",
-            "fipa.toml:1: `domain` is wrong: 5: an integer cannot stand here; \
+            "fipa.toml:1: `domain` is invalid: 5: an integer is not allowed here; \
              expected a name of 1 to 32 letters, digits, '_' or '-'",
         ),
         (
             "[mts]\ntransports = \"shm\"\n",
-            "fipa.toml:2: `mts.transports` is wrong: \"shm\": a string cannot stand here; \
+            "fipa.toml:2: `mts.transports` is invalid: \"shm\": a string is not allowed here; \
              expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
         ),
         (
             "[mts]\ntransports = [\n  \"shm\",\n  \"tpc\",\n]\n",
-            "fipa.toml:4: `mts.transports` is wrong: \"tpc\": unknown transport \"tpc\" \
+            "fipa.toml:4: `mts.transports` is invalid: \"tpc\": unknown transport \"tpc\" \
              (known: shm, unix, tcp, udp, quic); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
         ),
         (
             "[mts]\ntransports = [\"udt\"]\n",
-            "fipa.toml:2: `mts.transports` is wrong: \"udt\": unknown transport \"udt\" \
+            "fipa.toml:2: `mts.transports` is invalid: \"udt\": unknown transport \"udt\" \
              (known: shm, unix, tcp, udp, quic); expected a list of transports such as [\"shm\", \"unix\", \"tcp\"]",
         ),
         (
             "[mts]\nname = true\n",
-            "fipa.toml:2: `mts.name` is wrong: true: a boolean cannot stand here; \
+            "fipa.toml:2: `mts.name` is invalid: true: a boolean is not allowed here; \
              expected a name of 1 to 255 bytes",
         ),
         (
             "[mts]\ndeadline = 5\n",
-            "fipa.toml:2: `mts.deadline` is wrong: 5: the unit is missing; \
+            "fipa.toml:2: `mts.deadline` is invalid: 5: the unit is missing; \
              expected a duration such as \"5s\" or \"500ms\"",
         ),
         (
             "[mts]\ndeadline = \"5 parsecs\"\n",
-            "fipa.toml:2: `mts.deadline` is wrong: \"5 parsecs\": unknown time unit \"parsecs\", \
+            "fipa.toml:2: `mts.deadline` is invalid: \"5 parsecs\": unknown time unit \"parsecs\", \
              supported units: ns, us/µs, ms, sec, min, hours, days, weeks, months, years \
              (and few variations); expected a duration such as \"5s\" or \"500ms\"",
         ),
         (
             "[mts]\nqueue = \"many\"\n",
-            "fipa.toml:2: `mts.queue` is wrong: \"many\": a string cannot stand here; \
+            "fipa.toml:2: `mts.queue` is invalid: \"many\": a string is not allowed here; \
              expected a number of letters such as 256",
         ),
         (
             "[mts]\nqueue = -1\n",
-            "fipa.toml:2: `mts.queue` is wrong: -1: a negative number cannot stand here; \
+            "fipa.toml:2: `mts.queue` is invalid: -1: a negative number is not allowed; \
              expected a number of letters such as 256",
         ),
         (
             "[transport.shm]\ncapacity = \"256 buckets\"\n",
-            "fipa.toml:2: `transport.shm.capacity` is wrong: \"256 buckets\": not a size; \
+            "fipa.toml:2: `transport.shm.capacity` is invalid: \"256 buckets\": not a size; \
              expected a size such as \"64MiB\"",
         ),
         (
             "[transport.shm]\nmax_letter = -5\n",
-            "fipa.toml:2: `transport.shm.max_letter` is wrong: -5: a negative number cannot stand \
-             here; expected a size such as \"64MiB\"",
+            "fipa.toml:2: `transport.shm.max_letter` is invalid: -5: a negative number is not \
+             allowed; expected a size such as \"64MiB\"",
         ),
         (
             "[transport.shm]\nspin = 2.5\n",
-            "fipa.toml:2: `transport.shm.spin` is wrong: 2.5: a float cannot stand here; \
+            "fipa.toml:2: `transport.shm.spin` is invalid: 2.5: a float is not allowed here; \
              expected a duration such as \"50us\", or 0",
         ),
         (
             "[transport.tcp]\nlisten = [\"localhost:7788\"]\n",
-            "fipa.toml:2: `transport.tcp.listen` is wrong: \"localhost:7788\": not a numeric \
+            "fipa.toml:2: `transport.tcp.listen` is invalid: \"localhost:7788\": not a numeric \
              address with port; expected a list of numeric addresses with port such as \
              [\"127.0.0.1:0\"]",
         ),
         (
             "[transport.udp]\nlisten = [7788]\n",
-            "fipa.toml:2: `transport.udp.listen` is wrong: 7788: an integer cannot stand here; \
+            "fipa.toml:2: `transport.udp.listen` is invalid: 7788: an integer is not allowed here; \
              expected a list of numeric addresses with port such as [\"127.0.0.1:0\"]",
         ),
         (
             "[discovery]\nmdns = \"yes\"\n",
-            "fipa.toml:2: `discovery.mdns` is wrong: \"yes\": a string cannot stand here; \
+            "fipa.toml:2: `discovery.mdns` is invalid: \"yes\": a string is not allowed here; \
              expected true or false",
         ),
         (
             "[discovery]\ninterfaces = [\"eth0/1\"]\n",
-            "fipa.toml:2: `discovery.interfaces` is wrong: \"eth0/1\": neither the name of an \
-             interface nor an address; expected a list of interface names or addresses such as \
+            "fipa.toml:2: `discovery.interfaces` is invalid: \"eth0/1\": neither an interface \
+             name nor an address; expected a list of interface names or addresses such as \
              [\"wlan0\", \"10.0.0.7\"]",
         ),
         (
             "[discovery]\nstatic = { crex = [\n\"10.0.0.2:7788\"] }\n",
-            "fipa.toml:3: `discovery.static.crex` is wrong: \"10.0.0.2:7788\": not a location \
+            "fipa.toml:3: `discovery.static.crex` is invalid: \"10.0.0.2:7788\": not a location \
              (expected for example tcp://10.0.0.2:7788): \"10.0.0.2:7788\"; \
              expected a list of locations such as [\"tcp://10.0.0.2:7788\"]",
         ),
@@ -176,18 +176,18 @@ fn mistakes_are_named_with_line_and_key() {
         ),
         (
             "[mts]\ntransports = [\"shm\", \"quic\", \"tcp\"]\n",
-            "fipa.toml:2: `mts.transports` lists quic, which is never spoken without keys; \
-             make keys (`fipa keys init`) and set security.keys, or take quic out",
+            "fipa.toml:2: `mts.transports` lists quic, which needs keys; \
+             make keys (`fipa keys init`) and set security.keys, or remove quic",
         ),
         (
             "[mts]\ndeadline = \"0s\"\n",
             "fipa.toml:2: `mts.deadline` cannot be 0s; \
-             a letter needs time to arrive: more than 0, at most 1h",
+             use more than 0, at most 1h",
         ),
         (
             "[mts]\ndeadline = \"1h 1ns\"\n",
             "fipa.toml:2: `mts.deadline` cannot be 1h 1ns; \
-             a letter needs time to arrive: more than 0, at most 1h",
+             use more than 0, at most 1h",
         ),
         (
             "[mts]\nqueue = 0\n",
@@ -203,8 +203,8 @@ fn mistakes_are_named_with_line_and_key() {
         ),
         (
             "[routes]\n\"camera_(\" = [\"shm\"]\n",
-            "fipa.toml:2: `routes.\"camera_(\"` cannot be matched: unclosed group; \
-             write the name of an agent, or a regular expression for whole names",
+            "fipa.toml:2: `routes.\"camera_(\"` is not a valid pattern: unclosed group; \
+             write the name of an agent, or a regular expression that matches whole names",
         ),
         (
             "[access.deny]\nrover = [\"arm request\"]\n",
@@ -227,17 +227,17 @@ fn mistakes_are_named_with_line_and_key() {
         (
             "[routes]\na = [\"tcp\"]\n[mts]\ntransports = [\"shm\"]\n",
             "fipa.toml:2: `routes.a` lists only transports that are off; \
-             list one of `mts.transports`, or turn one of these on there",
+             list one that is in `mts.transports`, or add one of these to `mts.transports`",
         ),
         (
             "[transport.shm]\ncapacity = \"99999999EiB\"\n",
             "fipa.toml:2: `transport.shm.capacity` cannot be 18446744073709551615 bytes; \
-             use 1MiB to 1TiB, and what fits /dev/shm",
+             use 1MiB to 1TiB, and at most the size of /dev/shm",
         ),
         (
             "[transport.shm]\nmax_letter = \"1GiB\"\n",
             "fipa.toml:2: `transport.shm.max_letter` is 1073741824 bytes, more than the 268435456 \
-             of `transport.shm.capacity`; make it smaller, or the capacity larger",
+             of `transport.shm.capacity`; lower it, or raise the capacity",
         ),
         (
             "[transport.shm]\nmax_letter = \"100 B\"\n",
@@ -260,15 +260,15 @@ fn mistakes_are_named_with_line_and_key() {
         (
             "[discovery]\nstatic = { crex = [] }\n",
             "fipa.toml:2: `discovery.static.crex` is empty; \
-             list at least one location of this gateway",
+             list at least one location of this peer",
         ),
         (
             "[discovery.static]\ncrex = [\"tcp://a:1\", \"tcp://a:1\"]\n",
-            "fipa.toml:2: `discovery.static.crex` lists tcp://a:1 twice; list each once",
+            "fipa.toml:2: `discovery.static.crex` lists tcp://a:1 twice; list each location once",
         ),
         (
             "[discovery.static]\ncrex = [\"shm://1\"]\n",
-            "fipa.toml:2: `discovery.static.crex` lists shm://1, which leads to no other host; \
+            "fipa.toml:2: `discovery.static.crex` lists shm://1, which works only within one host; \
              write for example tcp://10.0.0.2:7788",
         ),
         (
@@ -276,14 +276,14 @@ fn mistakes_are_named_with_line_and_key() {
             "fipa.toml:2: `discovery.static.crex` lists tcp://10.0.0.2, which has no port; \
              write for example tcp://10.0.0.2:7788 or tcp://[fe80::1%eth0]:7788",
         ),
-        // Not TOML at all.
+        // Files that are not TOML.
         (
             "domain = \"a\"\n[mts\nname = 5\n",
-            "fipa.toml:2: not TOML: unclosed table, expected `]`; look at the line \"[mts\"",
+            "fipa.toml:2: not TOML: unclosed table, expected `]`; correct the line \"[mts\"",
         ),
         (
             "domain = \"a\"\ndomain = \"b\"\n",
-            "fipa.toml:2: not TOML: duplicate key; look at the line \"domain = \\\"b\\\"\"",
+            "fipa.toml:2: not TOML: duplicate key; correct the line \"domain = \\\"b\\\"\"",
         ),
     ];
     for (text, expected) in cases {
@@ -344,20 +344,20 @@ fn lists_are_bounded() {
 }
 
 #[test]
-fn all_mistakes_are_told_at_once_in_order() {
+fn all_mistakes_are_reported_at_once_in_order() {
     assert_eq!(
         error("domain = 1\nmts.queue = \"x\"\n", &["a", "b"]),
         "--set a: not of the form key=value; write for example --set mts.deadline=9s\n\
          --set b: not of the form key=value; write for example --set mts.deadline=9s\n\
-         fipa.toml:1: `domain` is wrong: 1: an integer cannot stand here; \
+         fipa.toml:1: `domain` is invalid: 1: an integer is not allowed here; \
          expected a name of 1 to 32 letters, digits, '_' or '-'\n\
-         fipa.toml:2: `mts.queue` is wrong: \"x\": a string cannot stand here; \
+         fipa.toml:2: `mts.queue` is invalid: \"x\": a string is not allowed here; \
          expected a number of letters such as 256"
     );
 }
 
 #[test]
-fn mistakes_in_set_name_it() {
+fn mistakes_in_set_arguments_name_the_argument() {
     assert_eq!(
         error("", &["mts.deadlin=5s"]),
         "--set mts.deadlin=5s: unknown key `mts.deadlin`; did you mean `mts.deadline`? \
@@ -365,21 +365,21 @@ fn mistakes_in_set_name_it() {
     );
     assert_eq!(
         error("", &["mts.transports=shm,quic"]),
-        "--set mts.transports=shm,quic: `mts.transports` lists quic, which is never spoken without \
-         keys; make keys (`fipa keys init`) and set security.keys, or take quic out"
+        "--set mts.transports=shm,quic: `mts.transports` lists quic, which needs keys; \
+         make keys (`fipa keys init`) and set security.keys, or remove quic"
     );
     assert_eq!(
         error("", &["mts=5"]),
         "--set mts=5: `mts` is a section, not a value; \
-         write [mts], and below it its keys: name, transports, deadline, queue, queue_bytes"
+         write [mts] and below it some of its keys: name, transports, deadline, queue, queue_bytes"
     );
     assert_eq!(
         error("", &["mts.queue=x\u{1b}[31m"]),
-        "--set mts.queue=x\\u{1b}[31m: `mts.queue` is wrong: \"x\\u001B[31m\": \
-         a string cannot stand here; expected a number of letters such as 256"
+        "--set mts.queue=x\\u{1b}[31m: `mts.queue` is invalid: \"x\\u001B[31m\": \
+         a string is not allowed here; expected a number of letters such as 256"
     );
-    // What --set replaces is still looked at.
-    assert!(error("domain = 5\n", &["domain=a"]).starts_with("fipa.toml:1: `domain` is wrong"));
+    // A value that --set replaces is still checked.
+    assert!(error("domain = 5\n", &["domain=a"]).starts_with("fipa.toml:1: `domain` is invalid"));
 }
 
 #[test]
@@ -427,7 +427,7 @@ fn a_found_file_must_be_readable_text() {
     assert_eq!(
         refused(&[b'#'; (1 << 20) + 1]),
         "cannot read the configuration fipa.toml (found in the current directory): \
-         larger than 1048576 bytes, so it is no configuration"
+         larger than 1048576 bytes, the maximum for a configuration"
     );
 }
 
@@ -454,7 +454,7 @@ fn a_changed_configuration_is_checked_again() {
             "`mts.queue` cannot be 0; use 1 to 65536 letters",
             "`transport.tcp.listen` lists \"nowhere\", not a numeric address with port; \
              write for example 127.0.0.1:0 or [fe80::1%eth0]:7788",
-            "`discovery.interfaces` lists \"a b\", which no interface can be called; \
+            "`discovery.interfaces` lists \"a b\", which is not a possible name of an interface; \
              `ip link` lists the names",
         ]
     );

@@ -1,4 +1,5 @@
-//! A `/dev/shm` that is too small: an error that says so, another way, and never a signal.
+//! A `/dev/shm` that is too small or full: letters take the next route, errors name the cause, and no
+//! process gets a signal.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -6,13 +7,13 @@ use fipa::config::Sources;
 use fipa::{AgentId, Config, Domain, Kind, Outcome, Performative};
 
 #[test]
-fn what_has_no_room_takes_the_next_way() {
-    fipa_testbed::isolated("inside_what_has_no_room_takes_the_next_way", &[]);
+fn letters_without_space_take_the_next_route() {
+    fipa_testbed::isolated("inside_letters_without_space_take_the_next_route", &[]);
 }
 
 #[test]
 #[ignore = "is run by the other test in namespaces of its own"]
-fn inside_what_has_no_room_takes_the_next_way() {
+fn inside_letters_without_space_take_the_next_route() {
     fipa_testbed::enter();
     fipa_testbed::run("mount -t tmpfs -o size=6M tmpfs /dev/shm");
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -22,7 +23,8 @@ fn inside_what_has_no_room_takes_the_next_way() {
     runtime.block_on(large_contents());
 }
 
-/// A configuration for a domain with this random name. In namespaces process numbers repeat.
+/// Makes a configuration for a domain with this random name, because process numbers repeat in
+/// namespaces.
 fn config(name: u64, transports: &str) -> Config {
     let config = Config::load(&Sources {
         set: vec![
@@ -44,9 +46,10 @@ async fn large_contents() {
         there.register("arm_0").unwrap(),
         there.register("arm_1").unwrap(),
     ];
-    let mut ways = Vec::new();
-    // Held, so that every letter needs new memory; for one, loaned for one, and for both.
-    let mut held = Vec::new();
+    let mut transports_used = Vec::new();
+    // The letters are kept, so that each needs new memory. They are for one receiver, loaned for one,
+    // and for both, in turn.
+    let mut kept = Vec::new();
     for round in 0..24_u8 {
         let len = 300_000 + 100_000 * usize::from(round);
         let to = if round % 3 == 2 { "arm_.*" } else { "arm_0" };
@@ -68,23 +71,23 @@ async fn large_contents() {
         for receiver in receivers {
             let incoming = receiver.receive().await.unwrap();
             assert_eq!(incoming.message.content().unwrap(), &vec![round; len]);
-            held.push(incoming);
+            kept.push(incoming);
         }
         for delivery in sent.0 {
             let Outcome::Delivered { via, attempts } = delivery.outcome else {
                 panic!("{}", delivery.outcome);
             };
             for attempt in &attempts {
-                let said = attempt.to_string();
-                assert!(said.contains("/dev/shm"), "{said}");
+                let reason = attempt.to_string();
+                assert!(reason.contains("/dev/shm"), "{reason}");
             }
-            ways.push(via);
+            transports_used.push(via);
         }
     }
-    assert!(ways.contains(&Kind::Shm), "{ways:?}");
-    assert!(ways.contains(&Kind::Unix), "{ways:?}");
-    // Small letters still go.
-    held.clear();
+    assert!(transports_used.contains(&Kind::Shm), "{transports_used:?}");
+    assert!(transports_used.contains(&Kind::Unix), "{transports_used:?}");
+    // Small letters are still delivered.
+    kept.clear();
     let message = rover
         .message(Performative::Inform)
         .receiver(AgentId::new("arm_0").unwrap())
@@ -111,7 +114,7 @@ fn inside_a_full_file_system_is_a_failed_attempt() {
     runtime.block_on(full());
 }
 
-/// Another program takes all but this much of the file system, in bytes; or frees it.
+/// Takes all but this many bytes of the file system, as another program would, or frees it.
 fn leave(free: Option<u64>) {
     let outsider = std::fs::File::create("/dev/shm/outsider").unwrap();
     let Some(left) = free else {
@@ -144,7 +147,7 @@ async fn full() {
         let attempts = attempts.iter().map(ToString::to_string);
         (via, attempts.collect::<Vec<_>>().join("; "))
     };
-    // First contact, for which there is no room at all.
+    // The first letter to the arm, without any free space.
     leave(Some(0));
     let (via, attempts) = letter().await;
     assert_eq!(via, Kind::Unix);

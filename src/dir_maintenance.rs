@@ -1,5 +1,5 @@
-//! Keeps a process in its domain when another program removes the runtime directory, as cleaners of
-//! `/tmp` do.
+//! Maintains a process's files in the directory of its domain: renews their timestamps, and joins
+//! the domain again if another program removes the directory, as cleaners of `/tmp` do.
 
 use std::sync::{Arc, Weak};
 use std::time::Duration;
@@ -10,32 +10,32 @@ use fipa_transport_net::{UnixError, UnixTransport};
 use fipa_transport_shm::{ShmError, ShmTransport};
 use tokio::time::{Instant, sleep, sleep_until};
 
-use crate::place::{Place, PlaceError};
+use crate::domain_dir::{DomainDir, DomainDirError};
 
-/// Time between two looks for files that were removed. Mostly the kernel reports a removal at once.
+/// Time between two checks for removed files. In most cases the kernel reports a removal at once.
 const CHECK_EVERY: Duration = Duration::from_secs(5);
 
-/// Time before joining is tried again.
+/// Time between two attempts to join again.
 const RETRY_AFTER: Duration = Duration::from_millis(500);
 
-/// Time between two renewals of timestamps: far less than any cleaner's age.
+/// Time between two renewals of timestamps: far less than the age from which cleaners remove files.
 const RENEW_EVERY: Duration = Duration::from_secs(24 * 60 * 60);
 
-/// What a process has in the runtime directory of its domain.
+/// The parts of a process that have files in the directory of its domain.
 #[derive(Clone)]
-pub(crate) struct Keeper {
-    pub(crate) place: Place,
+pub(crate) struct DirMaintenance {
+    pub(crate) dir: DomainDir,
     pub(crate) host: Arc<HostDirectory>,
     #[cfg(feature = "shm")]
     pub(crate) shm: Option<Weak<ShmTransport>>,
     pub(crate) unix: Option<Weak<UnixTransport>>,
 }
 
-/// Why a domain could not be joined again.
+/// The error if a domain cannot be joined again.
 #[derive(Debug, thiserror::Error)]
 enum RejoinError {
     #[error(transparent)]
-    Place(#[from] PlaceError),
+    DomainDir(#[from] DomainDirError),
     #[error(transparent)]
     Directory(#[from] HostError),
     #[cfg(feature = "shm")]
@@ -45,10 +45,10 @@ enum RejoinError {
     Unix(#[from] UnixError),
 }
 
-impl Keeper {
-    pub(crate) fn new(place: Place, host: Arc<HostDirectory>) -> Self {
+impl DirMaintenance {
+    pub(crate) fn new(dir: DomainDir, host: Arc<HostDirectory>) -> Self {
         Self {
-            place,
+            dir,
             host,
             #[cfg(feature = "shm")]
             shm: None,
@@ -56,62 +56,62 @@ impl Keeper {
         }
     }
 
-    /// Works until it is aborted.
+    /// Runs until it is aborted.
     pub(crate) async fn run(mut self) {
         let mut renewal = Instant::now() + RENEW_EVERY;
-        // What was logged last, so that a trouble is logged once.
-        let mut trouble: Option<String> = None;
+        // The last logged problem, so that each problem is logged once.
+        let mut problem: Option<String> = None;
         loop {
-            let pause = match trouble {
+            let pause = match problem {
                 Some(_) => RETRY_AFTER,
                 None => CHECK_EVERY,
             };
             tokio::select! {
-                () = self.host.disturbed(), if trouble.is_none() => {}
+                () = self.host.disturbed(), if problem.is_none() => {}
                 () = sleep(pause) => {}
                 () = sleep_until(renewal) => {
                     renewal = Instant::now() + RENEW_EVERY;
-                    let place = self.place.clone();
-                    // Many files, perhaps on a slow card.
-                    let _ = tokio::task::spawn_blocking(move || place.renew()).await;
+                    let dir = self.dir.clone();
+                    // There may be many files on a slow SD card.
+                    let _ = tokio::task::spawn_blocking(move || dir.renew()).await;
                     continue;
                 }
             }
             if self.is_there() {
-                trouble = None;
+                problem = None;
                 continue;
             }
-            if trouble.is_none() {
+            if problem.is_none() {
                 tracing::warn!(
-                    "files in {} were removed by another program; joining the domain again (exempt \
-                     the directory from cleaning, or name another one in FIPA_RUNTIME_DIR)",
-                    self.place.path().display()
+                    "another program removed files in {}; joining the domain again (exempt the \
+                     directory from cleaning, or set FIPA_RUNTIME_DIR to another one)",
+                    self.dir.path().display()
                 );
-                trouble = Some(String::new());
+                problem = Some(String::new());
             }
-            let mut keeper = self.clone();
-            let joining = tokio::task::spawn_blocking(move || keeper.rejoin().map(|()| keeper));
-            match joining.await {
-                Ok(Ok(keeper)) => {
-                    self = keeper;
-                    trouble = None;
-                    tracing::info!("joined the domain in {} again", self.place.path().display());
+            let mut joining = self.clone();
+            let joined = tokio::task::spawn_blocking(move || joining.rejoin().map(|()| joining));
+            match joined.await {
+                Ok(Ok(joined)) => {
+                    self = joined;
+                    problem = None;
+                    tracing::info!("joined the domain in {} again", self.dir.path().display());
                 }
                 Ok(Err(error)) => {
                     let text = error.to_string();
-                    if trouble.as_ref() != Some(&text) {
+                    if problem.as_ref() != Some(&text) {
                         tracing::error!(%error, "cannot join the domain again; retrying");
                     }
-                    trouble = Some(text);
+                    problem = Some(text);
                 }
-                // The runtime ends.
+                // The runtime is shutting down.
                 Err(_) => return,
             }
         }
     }
 
-    /// Whether other processes find what this one has there. What cannot be examined counts as
-    /// there.
+    /// Whether the files of this process still exist. A file that cannot be examined counts as
+    /// existing.
     fn is_there(&self) -> bool {
         let host = self.host.is_there().unwrap_or(true);
         #[cfg(feature = "shm")]
@@ -119,11 +119,11 @@ impl Keeper {
         #[cfg(not(feature = "shm"))]
         let shm = true;
         let unix = self.unix().is_none_or(|unix| unix.is_there());
-        self.place.is_there() && host && shm && unix
+        self.dir.is_there() && host && shm && unix
     }
 
     fn rejoin(&mut self) -> Result<(), RejoinError> {
-        self.place.rejoin()?;
+        self.dir.rejoin()?;
         self.host.rejoin()?;
         #[cfg(feature = "shm")]
         if let Some(shm) = self.shm() {

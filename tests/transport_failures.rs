@@ -1,8 +1,8 @@
-//! Each transport is taken away from the receiver while letters flow, in each position of the order:
-//! every letter arrives once and in order, and those that follow go the next way.
+//! Each transport of the receiver is closed while letters flow, in each position of the order. Every
+//! letter arrives once and in order, and later letters take the next route.
 //!
-//! With `--nocapture` it says how long it took from the moment a way broke until a letter had been
-//! delivered by another: the system tells of all these breaks.
+//! With `--nocapture` the test prints the time from each failure until a letter was delivered by
+//! another transport. The system reports all these failures.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -17,15 +17,15 @@ use fipa_mts::core::Submission;
 use tokio::task::{JoinHandle, spawn_blocking};
 use tokio::time::timeout;
 
-use services::{ARM, Place, ROVER, host, letter};
+use services::{ARM, ROVER, TestService, host, letter};
 
-/// Letters by each way.
+/// Number of letters per transport.
 const EACH: usize = 60;
-/// Letters under way.
+/// Maximum number of letters without an outcome.
 const WINDOW: usize = 8;
 const WATCHDOG: Duration = Duration::from_secs(120);
 
-/// A letter with this number.
+/// Makes a submission of a letter with this number.
 fn submission(number: usize) -> Submission {
     Submission {
         sender: ROVER,
@@ -35,7 +35,7 @@ fn submission(number: usize) -> Submission {
     }
 }
 
-/// The way that a letter went, and when that was known.
+/// Waits for the delivery of a letter. Returns its transport and the time of the outcome.
 async fn delivered(sending: Sending) -> (Kind, Instant) {
     let outcomes = timeout(WATCHDOG, sending.outcomes()).await.unwrap();
     match &outcomes[..] {
@@ -44,13 +44,14 @@ async fn delivered(sending: Sending) -> (Kind, Instant) {
     }
 }
 
-/// Sends letters, pulls one plug after the other, and returns how long each change took.
-async fn pull_plugs(order: [Kind; 3]) -> Vec<(Kind, Kind, Duration)> {
+/// Sends letters and closes one transport after the other. Returns the failed and the next transport
+/// and the time of each change.
+async fn close_transports(order: [Kind; 3]) -> Vec<(Kind, Kind, Duration)> {
     let here = host();
-    let rovers = Place::start(here.path(), "rovers", &order, false);
-    let arms = Place::start(here.path(), "arms", &order, false);
-    rovers.knows_arm_at(arms.everywhere());
-    arms.knows_arm_at(arms.everywhere());
+    let rovers = TestService::start(here.path(), "rovers", &order, false);
+    let arms = TestService::start(here.path(), "arms", &order, false);
+    rovers.register_arm_at(arms.all_locations());
+    arms.register_arm_at(arms.all_locations());
     rovers.mts.register("rover".into(), ROVER);
     arms.mts.register("arm".into(), ARM);
     let total = EACH * order.len();
@@ -71,8 +72,12 @@ async fn pull_plugs(order: [Kind; 3]) -> Vec<(Kind, Kind, Duration)> {
     for number in 0..total {
         if number > 0 && number % EACH == 0 {
             let kind = order[pulled.len()];
-            let plug = arms.transport(kind);
-            pulled.push((kind, Instant::now(), spawn_blocking(move || plug.close())));
+            let transport = arms.transport(kind);
+            pulled.push((
+                kind,
+                Instant::now(),
+                spawn_blocking(move || transport.close()),
+            ));
         }
         under_way.push_back(rovers.mts.send(submission(number)));
         if under_way.len() >= WINDOW {
@@ -85,8 +90,8 @@ async fn pull_plugs(order: [Kind; 3]) -> Vec<(Kind, Kind, Duration)> {
     timeout(WATCHDOG, receiving).await.unwrap().unwrap();
     assert!(arms.mts.try_receive(ARM).is_none(), "a letter twice");
 
-    // What is left at the end goes the only way that is left; which one a letter goes before depends
-    // on how busy the machine is, too.
+    // The last letters take the only remaining transport. The transports of earlier ones also depend
+    // on the load of the machine.
     assert_eq!(went.last().unwrap().0, order[2], "{order:?}");
     let mut changes = Vec::new();
     for (kind, at, closing) in pulled {
@@ -95,14 +100,14 @@ async fn pull_plugs(order: [Kind; 3]) -> Vec<(Kind, Kind, Duration)> {
         let (next, known) = others.find(|(_, known)| *known > at).unwrap();
         changes.push((kind, *next, *known - at));
     }
-    for place in [&rovers, &arms] {
-        place.mts.close(Duration::from_secs(1)).await;
+    for service in [&rovers, &arms] {
+        service.mts.close(Duration::from_secs(1)).await;
     }
     changes
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_plug_that_is_pulled_loses_doubles_and_disorders_nothing() {
+async fn a_closed_transport_loses_duplicates_and_reorders_no_letters() {
     let [shm, unix, tcp, udp] = [Kind::Shm, Kind::Unix, Kind::Tcp, Kind::Udp];
     for order in [
         [shm, unix, tcp],
@@ -115,8 +120,8 @@ async fn a_plug_that_is_pulled_loses_doubles_and_disorders_nothing() {
         [udp, unix, tcp],
         [udp, tcp, shm],
     ] {
-        for (broken, next, took) in pull_plugs(order).await {
-            println!("{broken} broke: by {next} after {took:.1?}");
+        for (broken, next, took) in close_transports(order).await {
+            println!("{broken} failed; next delivery by {next} after {took:.1?}");
         }
     }
 }

@@ -1,7 +1,7 @@
-//! The line from a process to one watcher.
+//! The connection from a process to one watcher.
 //!
-//! Agents write their records here and never wait: what the socket does not take is kept, up to a
-//! bound, and what does not find room there is lost and counted.
+//! Sending a record never waits. A record that the socket does not accept is queued, up to a limit of
+//! bytes. A record beyond the limit is lost and counted.
 
 use std::collections::VecDeque;
 use std::io::{self, ErrorKind};
@@ -16,35 +16,35 @@ use tokio::io::Interest;
 use tokio::net::UnixDatagram;
 use tokio::sync::Notify;
 
-/// Bytes of records that are kept for a watcher that is slow.
-const KEPT: usize = 1 << 20;
-/// What a kept record costs besides its bytes.
+/// Maximum number of bytes of queued records for one slow watcher.
+const MAX_QUEUED: usize = 1 << 20;
+/// Bytes that a queued record counts in addition to its own.
 const OVERHEAD: usize = 64;
-/// How long a watcher that took nothing more is left alone.
+/// Time between two attempts to send to a watcher whose socket is full.
 const PAUSE: Duration = Duration::from_millis(1);
 
-/// One watcher, as the agents of this process see it.
-pub(super) struct Line {
+/// The connection to one watcher.
+pub(super) struct Connection {
     socket: UnixDatagram,
-    /// How much content it wishes to be told; none before it has said so.
+    /// Number of bytes of content per message that the watcher requests; 0 until its request arrives.
     content: AtomicU32,
     outgoing: Mutex<Outgoing>,
-    /// Something is kept, or the watcher has gone.
+    /// Notified when a record is queued or the watcher has disconnected.
     wake: Notify,
 }
 
 #[derive(Default)]
 struct Outgoing {
-    kept: VecDeque<Vec<u8>>,
+    queued: VecDeque<Vec<u8>>,
     bytes: usize,
-    /// How many records were lost.
+    /// Number of lost records.
     lost: u64,
-    /// How many the watcher knows of.
-    told: u64,
-    gone: bool,
+    /// Number of lost records that were reported to the watcher.
+    reported: u64,
+    disconnected: bool,
 }
 
-impl Line {
+impl Connection {
     pub(super) fn new(socket: UnixDatagram) -> Self {
         Self {
             socket,
@@ -60,89 +60,90 @@ impl Line {
         }
     }
 
-    /// Tells the watcher something, now or later or never; without waiting.
-    pub(super) fn tell(&self, mut bytes: Vec<u8>) {
+    /// Sends a record, queues it, or counts it as lost. Never waits.
+    pub(super) fn send(&self, mut bytes: Vec<u8>) {
         let mut outgoing = self.outgoing.lock();
-        if outgoing.gone {
+        if outgoing.disconnected {
             return;
         }
         record::set_lost(&mut bytes, outgoing.lost);
-        if outgoing.kept.is_empty() && self.sent(&mut outgoing, &bytes) {
-            outgoing.told = outgoing.lost;
+        if outgoing.queued.is_empty() && self.try_send(&mut outgoing, &bytes) {
+            outgoing.reported = outgoing.lost;
             return;
         }
         let size = bytes.len() + OVERHEAD;
-        if outgoing.bytes + size > KEPT {
+        if outgoing.bytes + size > MAX_QUEUED {
             outgoing.lost += 1;
             return;
         }
-        if outgoing.kept.is_empty() {
+        if outgoing.queued.is_empty() {
             self.wake.notify_one();
         }
         outgoing.bytes += size;
-        outgoing.kept.push_back(bytes);
+        outgoing.queued.push_back(bytes);
     }
 
-    /// Whether nothing more is to be done about this record.
-    fn sent(&self, outgoing: &mut Outgoing, bytes: &[u8]) -> bool {
+    /// Tries to send a record. Returns whether it is done: sent, or dropped because the watcher has
+    /// disconnected.
+    fn try_send(&self, outgoing: &mut Outgoing, bytes: &[u8]) -> bool {
         let flags = SendFlags::DONTWAIT | SendFlags::NOSIGNAL;
         let sent = || Ok(send(&self.socket, bytes, flags)?);
         match self.socket.try_io(Interest::WRITABLE, sent) {
             Ok(_) => true,
-            Err(error) if later(&error) => false,
+            Err(error) if is_temporary(&error) => false,
             Err(error) => {
                 if !matches!(
                     error.kind(),
                     ErrorKind::BrokenPipe | ErrorKind::ConnectionReset
                 ) {
-                    tracing::warn!(%error, "a watcher cannot be told anything any more");
+                    tracing::warn!(%error, "cannot send to a watcher; closing the connection");
                 }
-                outgoing.gone = true;
-                outgoing.kept.clear();
+                outgoing.disconnected = true;
+                outgoing.queued.clear();
                 self.wake.notify_one();
                 true
             }
         }
     }
 
-    /// Sends what was kept. Whether all of it has been sent.
+    /// Sends the queued records. Returns whether the queue is empty.
     fn flush(&self) -> bool {
         let mut outgoing = self.outgoing.lock();
-        while let Some(bytes) = outgoing.kept.pop_front() {
-            if !self.sent(&mut outgoing, &bytes) {
-                outgoing.kept.push_front(bytes);
+        while let Some(bytes) = outgoing.queued.pop_front() {
+            if !self.try_send(&mut outgoing, &bytes) {
+                outgoing.queued.push_front(bytes);
                 return false;
             }
-            // Nothing is kept any more when the watcher has gone.
+            // The queue was cleared if the watcher has disconnected.
             outgoing.bytes = outgoing.bytes.saturating_sub(bytes.len() + OVERHEAD);
         }
-        if outgoing.lost > outgoing.told {
+        if outgoing.lost > outgoing.reported {
             let mut bytes = record::lost(SystemTime::now());
             record::set_lost(&mut bytes, outgoing.lost);
-            if !self.sent(&mut outgoing, &bytes) {
+            if !self.try_send(&mut outgoing, &bytes) {
                 return false;
             }
-            outgoing.told = outgoing.lost;
+            outgoing.reported = outgoing.lost;
         }
         true
     }
 
-    fn has_something_to_tell(&self) -> bool {
+    fn has_records(&self) -> bool {
         let outgoing = self.outgoing.lock();
-        !outgoing.gone && (!outgoing.kept.is_empty() || outgoing.lost > outgoing.told)
+        !outgoing.disconnected && (!outgoing.queued.is_empty() || outgoing.lost > outgoing.reported)
     }
 
-    fn is_gone(&self) -> bool {
-        self.outgoing.lock().gone
+    fn is_disconnected(&self) -> bool {
+        self.outgoing.lock().disconnected
     }
 
-    /// Sends what was kept whenever there is room, until the watcher has gone.
+    /// Sends queued records whenever the socket accepts them, until the watcher disconnects.
     pub(super) async fn serve(&self) {
-        while !self.is_gone() {
-            let waiting = self.has_something_to_tell();
+        while !self.is_disconnected() {
+            let waiting = self.has_records();
             tokio::select! {
                 () = self.wake.notified() => {}
-                () = self.heard() => return,
+                () = self.read_requests() => return,
                 ready = self.socket.writable(), if waiting => match ready {
                     Ok(()) if !self.flush() => tokio::time::sleep(PAUSE).await,
                     Ok(()) => {}
@@ -152,8 +153,8 @@ impl Line {
         }
     }
 
-    /// Hears what the watcher wishes, until it has gone or says what is not understood.
-    async fn heard(&self) {
+    /// Receives the requests of the watcher, until it disconnects or sends an invalid one.
+    async fn read_requests(&self) {
         let mut buffer = [0; Wish::LEN + 1];
         while let Ok(len) = self.socket.recv(&mut buffer).await {
             match buffer.get(..len).and_then(Wish::parse) {
@@ -164,8 +165,8 @@ impl Line {
     }
 }
 
-/// Whether the system may take later what it did not take now.
-fn later(error: &io::Error) -> bool {
+/// Whether a later attempt to send can succeed.
+fn is_temporary(error: &io::Error) -> bool {
     use ErrorKind::{Interrupted, WouldBlock};
     matches!(error.kind(), WouldBlock | Interrupted)
         || Errno::from_io_error(error) == Some(Errno::NOBUFS)

@@ -1,4 +1,4 @@
-//! Links between services that can be cut: relays on loopback that stop passing on what is said.
+//! Links between services that can be cut: relays on loopback that stop forwarding.
 
 use std::net::SocketAddr;
 
@@ -9,30 +9,30 @@ use tokio::net::{TcpListener, TcpStream, UdpSocket};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
-/// What becomes of what is said over a link.
+/// The state of a link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Sky {
-    /// It is passed on.
-    Clear,
-    /// It is kept, or lost, and nobody is told.
-    Silent,
-    /// What the side that dialled says is passed on, and the answers are kept or lost.
-    Unanswered,
-    /// Connections break, and there are no new ones.
-    Broken,
+pub(crate) enum LinkState {
+    /// The link forwards all data.
+    Up,
+    /// The link silently delays or loses all data.
+    Stalled,
+    /// The link forwards the data of the connecting side, and delays or loses the answers.
+    OneWay,
+    /// Connections are closed, and new ones are refused.
+    Closed,
 }
 
-/// A link to a location, which it takes the place of.
+/// A relay in front of a location.
 pub(crate) struct Link {
     pub(crate) location: Location,
-    sky: watch::Sender<Sky>,
+    state: watch::Sender<LinkState>,
     task: JoinHandle<()>,
 }
 
 impl Link {
     pub(crate) async fn before(behind: &Location) -> Self {
         let to: SocketAddr = behind.address().parse().unwrap();
-        let (sky, seen) = watch::channel(Sky::Clear);
+        let (state, seen) = watch::channel(LinkState::Up);
         let (at, task) = match behind.kind() {
             Kind::Tcp => {
                 let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -48,13 +48,13 @@ impl Link {
         let location = Location::new(behind.kind(), &at.to_string()).unwrap();
         Self {
             location: location.with_incarnation(behind.incarnation()),
-            sky,
+            state,
             task,
         }
     }
 
-    pub(crate) fn turn(&self, sky: Sky) {
-        self.sky.send_replace(sky);
+    pub(crate) fn set(&self, state: LinkState) {
+        self.state.send_replace(state);
     }
 }
 
@@ -64,22 +64,22 @@ impl Drop for Link {
     }
 }
 
-async fn connections(listener: TcpListener, to: SocketAddr, sky: watch::Receiver<Sky>) {
-    while let Ok((dialler, _)) = listener.accept().await {
-        if *sky.borrow() == Sky::Broken {
+async fn connections(listener: TcpListener, to: SocketAddr, state: watch::Receiver<LinkState>) {
+    while let Ok((caller, _)) = listener.accept().await {
+        if *state.borrow() == LinkState::Closed {
             continue;
         }
-        let mut seen = sky.clone();
+        let mut seen = state.clone();
         tokio::spawn(async move {
             let Ok(other) = TcpStream::connect(to).await else {
                 return;
             };
-            let (there, back) = (dialler.into_split(), other.into_split());
+            let (there, back) = (caller.into_split(), other.into_split());
             tokio::select! {
-                () = pass(there.0, back.1, seen.clone(), &[Sky::Clear, Sky::Unanswered]) => {}
-                () = pass(back.0, there.1, seen.clone(), &[Sky::Clear]) => {}
-                // An error means that the test is over.
-                _ = seen.wait_for(|sky| *sky == Sky::Broken) => {}
+                () = pass(there.0, back.1, seen.clone(), &[LinkState::Up, LinkState::OneWay]) => {}
+                () = pass(back.0, there.1, seen.clone(), &[LinkState::Up]) => {}
+                // An error means that the test has ended.
+                _ = seen.wait_for(|state| *state == LinkState::Closed) => {}
             }
         });
     }
@@ -88,12 +88,12 @@ async fn connections(listener: TcpListener, to: SocketAddr, sky: watch::Receiver
 async fn pass(
     mut from: tokio::net::tcp::OwnedReadHalf,
     mut to: tokio::net::tcp::OwnedWriteHalf,
-    mut sky: watch::Receiver<Sky>,
-    under: &[Sky],
+    mut state: watch::Receiver<LinkState>,
+    under: &[LinkState],
 ) {
     let mut bytes = vec![0; 65_536];
     while let Ok(len @ 1..) = from.read(&mut bytes).await {
-        if sky.wait_for(|sky| under.contains(sky)).await.is_err() {
+        if state.wait_for(|state| under.contains(state)).await.is_err() {
             return;
         }
         let Some(read) = bytes.get(..len) else { return };
@@ -103,26 +103,26 @@ async fn pass(
     }
 }
 
-async fn datagrams(front: UdpSocket, to: SocketAddr, sky: watch::Receiver<Sky>) {
+async fn datagrams(front: UdpSocket, to: SocketAddr, state: watch::Receiver<LinkState>) {
     let back = UdpSocket::bind("127.0.0.1:0").await.unwrap();
     back.connect(to).await.unwrap();
     let (mut there, mut here) = (vec![0; 65_536], vec![0; 65_536]);
-    let mut dialler = None;
+    let mut caller = None;
     loop {
         tokio::select! {
             read = front.recv_from(&mut there) => {
                 let Ok((len, from)) = read else { continue };
-                dialler = Some(from);
-                if [Sky::Clear, Sky::Unanswered].contains(&*sky.borrow()) {
-                    // What a socket does not take is lost, as on any network.
+                caller = Some(from);
+                if [LinkState::Up, LinkState::OneWay].contains(&*state.borrow()) {
+                    // A datagram that the socket does not accept is lost, as on any network.
                     let _ = back.send(&there[..len]).await;
                 }
             }
             read = back.recv(&mut here) => {
-                // Nobody is there any more, perhaps.
+                // The other side may have ended.
                 let Ok(len) = read else { continue };
-                if let (Some(dialler), Sky::Clear) = (dialler, *sky.borrow()) {
-                    let _ = front.try_send_to(&here[..len], dialler);
+                if let (Some(caller), LinkState::Up) = (caller, *state.borrow()) {
+                    let _ = front.try_send_to(&here[..len], caller);
                 }
             }
         }

@@ -1,5 +1,5 @@
-//! An agent that moves from host to host keeps its name, and letters on their way follow it or
-//! fail: three gateways and their robots, on loopback.
+//! An agent that moves from host to host keeps its name, and letters in transit follow it or fail.
+//! Three gateways and their robot processes, on loopback.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -18,9 +18,9 @@ use tokio::sync::Semaphore;
 
 const LETTERS: usize = 1000;
 const MOVES: usize = 20;
-/// What the agent takes on each host at least before it moves on.
+/// Minimum number of letters that the agent receives on each host before it moves.
 const STAY: usize = 20;
-/// Letters without an outcome at a time.
+/// Maximum number of letters without an outcome.
 const UNDER_WAY: usize = 16;
 
 struct Host {
@@ -29,7 +29,7 @@ struct Host {
 }
 
 impl Host {
-    /// A host of its own, as far as names and shared memory go, that knows these others.
+    /// Starts a simulated host, with names and shared memory of its own, that knows these peers.
     async fn start(peers: &[&Self]) -> Self {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let mark = format!(
@@ -65,13 +65,13 @@ impl Host {
     }
 
     fn address(&self) -> String {
-        let mut ways = self.gateway.locations().into_iter();
-        let way = ways.find(|way| way.kind() == Kind::Tcp).unwrap();
-        way.address().to_owned()
+        let mut locations = self.gateway.locations().into_iter();
+        let location = locations.find(|it| it.kind() == Kind::Tcp).unwrap();
+        location.address().to_owned()
     }
 
-    /// The agent registers here as soon as this host knows that it has left the other.
-    async fn welcome(&self, name: &str) -> Agent {
+    /// Registers the agent here as soon as this host knows that it has left the other host.
+    async fn register_when_free(&self, name: &str) -> Agent {
         let started = Instant::now();
         loop {
             match self.domain.register(name) {
@@ -85,7 +85,7 @@ impl Host {
     }
 }
 
-/// The letters that the agent has taken, in order, whichever life of it.
+/// The letters that all incarnations of the agent have received, in order.
 #[derive(Default)]
 struct Taken {
     numbers: Mutex<Vec<usize>>,
@@ -94,7 +94,7 @@ struct Taken {
 
 impl Taken {
     fn take(&self, incoming: &Incoming) {
-        // Gateways may have something to say, too.
+        // Gateways may send failure messages.
         if *incoming.message.performative() != Performative::Inform {
             return;
         }
@@ -105,7 +105,7 @@ impl Taken {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn every_letter_to_an_agent_on_the_move_has_one_outcome_and_it_is_true() {
+async fn every_letter_to_a_moving_agent_has_one_correct_outcome() {
     let first = Host::start(&[]).await;
     let second = Host::start(&[&first]).await;
     let third = Host::start(&[&first, &second]).await;
@@ -114,9 +114,9 @@ async fn every_letter_to_an_agent_on_the_move_has_one_outcome_and_it_is_true() {
     let moved = Arc::new(AtomicUsize::new(0));
 
     let sending = tokio::spawn(send_all(Arc::clone(&rover), Arc::clone(&moved)));
-    // Now where the sender is, too.
+    // The agent also moves to the host of the sender.
     let hosts = [&second, &third, &first];
-    let mut arm = hosts[0].welcome("arm").await;
+    let mut arm = hosts[0].register_when_free("arm").await;
     for next in 1..=MOVES {
         taken.in_this_life.store(0, Ordering::Relaxed);
         while taken.in_this_life.load(Ordering::Relaxed) < STAY && !sending.is_finished() {
@@ -128,7 +128,7 @@ async fn every_letter_to_an_agent_on_the_move_has_one_outcome_and_it_is_true() {
         for unread in arm.deregister().unwrap() {
             taken.take(&unread.unwrap());
         }
-        arm = hosts[next % hosts.len()].welcome("arm").await;
+        arm = hosts[next % hosts.len()].register_when_free("arm").await;
         moved.store(next, Ordering::Relaxed);
     }
     let outcomes = {
@@ -150,13 +150,13 @@ async fn every_letter_to_an_agent_on_the_move_has_one_outcome_and_it_is_true() {
     }
 }
 
-/// Sends all letters, and the last of them when the agent has moved for the last time.
+/// Sends all letters, the last of them after the last move of the agent.
 async fn send_all(rover: Arc<Agent>, moved: Arc<AtomicUsize>) -> BTreeMap<usize, Outcome> {
     let room = Arc::new(Semaphore::new(UNDER_WAY));
     let outcomes = Arc::new(Mutex::new(BTreeMap::new()));
     for number in 0..LETTERS {
         let started = Instant::now();
-        // Some for each stay; and none while nobody knows the name, which would fail at once.
+        // Sends some letters per stay, and none while the name is unknown, because they would fail.
         let waits = |moved: usize| {
             let known = rover.domain().directory().known("arm").is_some();
             !known || number >= (moved + 2) * LETTERS / (MOVES + 2)
@@ -165,7 +165,7 @@ async fn send_all(rover: Arc<Agent>, moved: Arc<AtomicUsize>) -> BTreeMap<usize,
             assert!(started.elapsed() < Duration::from_secs(60), "never moves");
             tokio::time::sleep(Duration::from_millis(1)).await;
         }
-        let place = Arc::clone(&room).acquire_owned().await.unwrap();
+        let permit = Arc::clone(&room).acquire_owned().await.unwrap();
         let message = rover
             .message(Performative::Inform)
             .receiver(AgentId::new("arm").unwrap())
@@ -181,7 +181,7 @@ async fn send_all(rover: Arc<Agent>, moved: Arc<AtomicUsize>) -> BTreeMap<usize,
             };
             let before = outcomes.lock().insert(number, delivery.outcome.clone());
             assert_eq!(before, None);
-            drop(place);
+            drop(permit);
         });
     }
     drop(room.acquire_many(UNDER_WAY as u32).await.unwrap());

@@ -1,11 +1,11 @@
-//! Where the processes of a domain meet on one host: a private directory.
+//! The private directory that the processes of a domain share on one host.
 //!
-//! `$FIPA_RUNTIME_DIR/<domain>`, or `/tmp/fipa-<uid>/<domain>`: the same for a login shell and a
-//! service of the same user. Both levels belong to the user, are closed to everybody else and are
-//! removed by whoever leaves last.
+//! Its path is `$FIPA_RUNTIME_DIR/<domain>`, or `/tmp/fipa-<uid>/<domain>`, which is the same for a
+//! login shell and a service of the same user. Both levels belong to the user and have mode 0700.
+//! The last process that leaves removes them.
 //!
-//! Cleaners of `/tmp` remove what is old. Every process holds a shared lock on both levels, which
-//! systemd-tmpfiles respects, and renews the timestamps once a day for the others.
+//! Cleaners of `/tmp` remove old files. Every process holds a shared lock on both levels, which
+//! systemd-tmpfiles respects, and renews the timestamps once a day for other cleaners.
 
 use std::fs::{self, DirBuilder};
 use std::io;
@@ -19,94 +19,96 @@ use std::time::{Duration, Instant, SystemTime};
 use rustix::fs::{AtFlags, CWD, FlockOperation, Mode, OFlags, Timespec, Timestamps};
 use rustix::io::Errno;
 
-/// The environment variable that says where domains meet, instead of `/tmp/fipa-<uid>`.
+/// The environment variable with the directory of all domains, instead of `/tmp/fipa-<uid>`.
 pub(crate) const VARIABLE: &str = "FIPA_RUNTIME_DIR";
 
-/// How often a place that somebody else is just leaving is made again.
+/// Maximum number of attempts to create a directory that another process removes as it leaves.
 pub(crate) const RETRIES: u32 = 20;
 
-/// Time to wait for a cleaner that has locked a directory. It holds the lock while it looks through
-/// the directory.
-const LOCKING: Duration = Duration::from_secs(10);
+/// Time to wait for a cleaner that has locked a directory. It holds the lock while it examines the
+/// directory.
+const LOCK_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Maximum number of files whose timestamps are renewed.
 const MAX_RENEWED: usize = 100_000;
 
-/// Maximum depth of directories that are looked through; there are four.
+/// Maximum depth of the directories whose timestamps are renewed; there are four levels.
 const MAX_DEPTH: usize = 8;
 
-/// Age of timestamps that no other process has renewed.
+/// Age from which timestamps count as not renewed by another process.
 const STALE: Duration = Duration::from_secs(12 * 60 * 60);
 
-/// File with the identifier of the host that the directory had before it was removed.
+/// File with the host identifier from before the directory was removed and created again.
 const HOST: &str = "host";
 
-/// Longest identifier of a host, in bytes.
+/// Maximum length of a host identifier, in bytes.
 const MAX_HOST: usize = 128;
 
-/// The directory of a domain, made private.
+/// The private directory of a domain.
 #[derive(Debug, Clone)]
-pub(crate) struct Place {
+pub(crate) struct DomainDir {
     base: PathBuf,
     domain: String,
-    /// Set once the process has joined.
-    held: Option<Arc<Held>>,
+    /// The locks; set when the process has joined.
+    locks: Option<Arc<DirLocks>>,
 }
 
-/// Shared locks on both levels of the directory, and what has to outlive it.
+/// Shared locks on both levels of the directory.
 #[derive(Debug)]
-struct Held {
+struct DirLocks {
     base: OwnedFd,
     domain: OwnedFd,
+    /// The host identifier at the time of locking, which outlives the directory.
     host: Option<String>,
 }
 
-/// Why the domain's directory cannot be used.
+/// The error if the directory of a domain cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub enum PlaceError {
-    /// The directory cannot be made or looked at.
+pub enum DomainDirError {
+    /// The directory cannot be created or examined.
     #[error("cannot use the directory {}: {source}", path.display())]
     Io {
-        /// Which one.
+        /// The directory.
         path: PathBuf,
-        /// What the operating system said.
+        /// The error of the operating system.
         source: io::Error,
     },
-    /// Somebody else could read or change what lies there.
+    /// Other users could read or change the contents of the directory.
     #[error(
-        "{} must be a directory of this user that nobody else may enter, and {problem}; \
-         remove it, or name another place in FIPA_RUNTIME_DIR",
+        "{} must be a directory of this user with mode 700, but {problem}; remove it, or set \
+         FIPA_RUNTIME_DIR to another directory",
         path.display()
     )]
     NotPrivate {
-        /// Which one.
+        /// The directory.
         path: PathBuf,
-        /// What is wrong.
+        /// The violated requirement, for example `its mode is 755`.
         problem: String,
     },
 }
 
-impl Place {
-    /// The place of this domain; the directories of all domains are in `base`, or where the
-    /// environment says.
-    pub(crate) fn prepare(domain: &str) -> Result<Self, PlaceError> {
-        let place = Self::of(domain);
-        let made = || make_private(&place.base).and_then(|()| make_private(&place.path()));
-        let mut result = made();
+impl DomainDir {
+    /// Creates the directory of a domain, and checks that it is private.
+    pub(crate) fn prepare(domain: &str) -> Result<Self, DomainDirError> {
+        let dir = Self::of(domain);
+        let create = || make_private(&dir.base).and_then(|()| make_private(&dir.path()));
+        let mut result = create();
         for _ in 0..RETRIES {
             match &result {
-                // Whoever left last has removed the one between the two.
-                Err(PlaceError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
-                    result = made();
+                // The last process that left removed the upper level in between.
+                Err(DomainDirError::Io { source, .. })
+                    if source.kind() == io::ErrorKind::NotFound =>
+                {
+                    result = create();
                 }
                 _ => break,
             }
         }
-        result.map(|()| place)
+        result.map(|()| dir)
     }
 
-    /// The place of this domain, whether it is there or not.
+    /// Returns the directory of a domain without creating or examining it.
     pub(crate) fn of(domain: &str) -> Self {
         let base = match std::env::var_os(VARIABLE).filter(|value| !value.is_empty()) {
             Some(base) => PathBuf::from(base),
@@ -115,45 +117,45 @@ impl Place {
         Self {
             base,
             domain: domain.to_owned(),
-            held: None,
+            locks: None,
         }
     }
 
-    /// Locks both levels, so that systemd-tmpfiles passes them over. To be called when this process
-    /// has files there, so that no other process removes the levels as empty.
-    pub(crate) fn hold(&mut self) -> Result<(), PlaceError> {
-        let held = Held {
-            base: hold(&self.base)?,
-            domain: hold(&self.path())?,
+    /// Locks both levels, so that systemd-tmpfiles skips them. Must be called after this process has
+    /// created files in the directory, so that no other process removes the levels as empty.
+    pub(crate) fn lock(&mut self) -> Result<(), DomainDirError> {
+        let locks = DirLocks {
+            base: lock_shared(&self.base)?,
+            domain: lock_shared(&self.path())?,
             host: self.host_id().ok(),
         };
-        self.held = Some(Arc::new(held));
+        self.locks = Some(Arc::new(locks));
         Ok(())
     }
 
-    /// Whether the levels that were locked are still those of these paths.
+    /// Whether the paths still lead to the levels that were locked.
     pub(crate) fn is_there(&self) -> bool {
-        self.held.as_ref().is_none_or(|held| {
-            is_same(&held.base, &self.base) && is_same(&held.domain, &self.path())
+        self.locks.as_ref().is_none_or(|locks| {
+            is_same(&locks.base, &self.base) && is_same(&locks.domain, &self.path())
         })
     }
 
-    /// Makes and locks the levels again after they were removed.
-    pub(crate) fn rejoin(&mut self) -> Result<(), PlaceError> {
+    /// Creates and locks the levels again after another program removed them.
+    pub(crate) fn rejoin(&mut self) -> Result<(), DomainDirError> {
         if self.is_there() {
             return Ok(());
         }
         make_private(&self.base)?;
         make_private(&self.path())?;
-        let host = self.held.as_ref().and_then(|held| held.host.clone());
+        let host = self.locks.as_ref().and_then(|locks| locks.host.clone());
         if let Some(host) = &host {
-            // Processes that start from now on must not count as another host.
-            self.write_host(host).map_err(|source| PlaceError::Io {
+            // Processes that start from now on must get the same host identifier.
+            self.write_host(host).map_err(|source| DomainDirError::Io {
                 path: self.path().join(HOST),
                 source,
             })?;
         }
-        self.hold()
+        self.lock()
     }
 
     fn write_host(&self, host: &str) -> io::Result<()> {
@@ -161,14 +163,14 @@ impl Place {
         options.write(true).create_new(true).mode(0o600);
         match options.open(self.path().join(HOST)) {
             Ok(mut file) => file.write_all(host.as_bytes()),
-            // By another process of the domain.
+            // Another process of the domain has written it.
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Ok(()),
             Err(error) => Err(error),
         }
     }
 
-    /// Renews the timestamps of all that is there, for cleaners that go by age alone; unless
-    /// another process has done so lately.
+    /// Renews the timestamps of all files in the directory, for cleaners that check only the age.
+    /// Does nothing if another process has renewed them within the last 12 hours.
     pub(crate) fn renew(&self) {
         let path = self.path();
         let renewed = fs::symlink_metadata(&path).and_then(|found| found.modified());
@@ -179,16 +181,18 @@ impl Place {
         let mut left = MAX_RENEWED;
         renew_below(&path, MAX_DEPTH, &mut left);
         touch(&self.base, true);
-        // Last: says that it is done.
+        // Last, because this timestamp tells other processes that the renewal is complete.
         touch(&path, true);
     }
 
-    /// Whether it is there; as private as it has to be, as far as it is.
-    pub(crate) fn look(&self) -> Result<bool, PlaceError> {
+    /// Checks that the existing levels are private. Returns whether both exist.
+    pub(crate) fn exists(&self) -> Result<bool, DomainDirError> {
         for path in [&self.base, &self.path()] {
             match check_private(path) {
                 Ok(()) => {}
-                Err(PlaceError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
+                Err(DomainDirError::Io { source, .. })
+                    if source.kind() == io::ErrorKind::NotFound =>
+                {
                     return Ok(false);
                 }
                 Err(error) => return Err(error),
@@ -197,18 +201,18 @@ impl Place {
         Ok(true)
     }
 
-    /// The domain's directory.
+    /// Returns the path of the directory.
     pub(crate) fn path(&self) -> PathBuf {
         self.base.join(&self.domain)
     }
 
-    /// The directory of one of the parts that keep files here.
+    /// Returns the path of a subdirectory, for example `directory`, `shm` or `unix`.
     pub(crate) fn part(&self, name: &str) -> PathBuf {
         self.path().join(name)
     }
 
-    /// What the names of this domain's shared memory begin with: other users' domains, and those
-    /// in other places, have other names.
+    /// Returns the prefix of the names of this domain's shared memory. It differs for domains of
+    /// other users and in other directories.
     #[cfg_attr(
         not(feature = "shm"),
         expect(dead_code, reason = "there is no shared memory")
@@ -221,11 +225,11 @@ impl Place {
         )
     }
 
-    /// What tells this host from others: the running kernel and the directory itself, so that
-    /// containers and network namespaces with places of their own count as hosts.
+    /// Returns the identifier of this host: the boot identifier of the kernel, and device and inode
+    /// of the directory. Containers with a directory of their own thus count as hosts of their own.
     pub(crate) fn host_id(&self) -> io::Result<String> {
-        if let Some(kept) = self.kept_host() {
-            return Ok(kept);
+        if let Some(saved) = self.saved_host_id() {
+            return Ok(saved);
         }
         let boot = fs::read_to_string("/proc/sys/kernel/random/boot_id")?;
         let directory = fs::metadata(self.path())?;
@@ -237,22 +241,22 @@ impl Place {
         ))
     }
 
-    /// The identifier from before the directory was removed and joined again.
-    fn kept_host(&self) -> Option<String> {
+    /// Returns the host identifier from before the directory was removed and created again.
+    fn saved_host_id(&self) -> Option<String> {
         let text = fs::read_to_string(self.path().join(HOST)).ok()?;
         let is_plain = text.bytes().all(|byte| byte.is_ascii_graphic());
         (is_plain && (1..=MAX_HOST).contains(&text.len())).then_some(text)
     }
 
-    /// Whether nothing but the identifier of the host is left.
+    /// Whether the directory contains at most the file with the host identifier.
     fn is_empty_but_for_host(&self) -> bool {
         let mut names = fs::read_dir(self.path()).into_iter().flatten();
         names.all(|entry| entry.is_ok_and(|entry| entry.file_name() == HOST))
     }
 
-    /// Removes what is empty. Not an error when somebody is still there.
+    /// Removes the empty directories. Those that other processes use are not empty and stay.
     pub(crate) fn leave(&self) {
-        // Fails when it is not empty or gone: then there is nothing to do here.
+        // Fails if the directory is not empty or does not exist, and then nothing is to be done.
         let remove = |path: PathBuf| drop(fs::remove_dir(path));
         remove(self.part("directory"));
         remove(self.part("shm"));
@@ -265,15 +269,15 @@ impl Place {
     }
 }
 
-/// The 32-bit FNV-1a hash: short, and the same in every version of every program.
+/// Computes the 32-bit FNV-1a hash, which is short and the same in every version of this program.
 fn fnv(bytes: &[u8]) -> u32 {
     let step = |hash: u32, byte: &u8| (hash ^ u32::from(*byte)).wrapping_mul(0x0100_0193);
     bytes.iter().fold(0x811c_9dc5, step)
 }
 
-/// Opens a directory and locks it, shared.
-fn hold(path: &Path) -> Result<OwnedFd, PlaceError> {
-    let io_error = |source| PlaceError::Io {
+/// Opens a directory and takes a shared lock on it.
+fn lock_shared(path: &Path) -> Result<OwnedFd, DomainDirError> {
+    let io_error = |source| DomainDirError::Io {
         path: path.to_owned(),
         source,
     };
@@ -284,14 +288,15 @@ fn hold(path: &Path) -> Result<OwnedFd, PlaceError> {
     loop {
         match rustix::fs::flock(&directory, FlockOperation::NonBlockingLockShared) {
             Ok(()) => break,
-            Err(Errno::WOULDBLOCK) if began.elapsed() < LOCKING => {
+            Err(Errno::WOULDBLOCK) if began.elapsed() < LOCK_TIMEOUT => {
                 std::thread::sleep(Duration::from_millis(5));
             }
-            // The process can do without: it joins again when the directory is removed.
+            // The lock is optional: the process joins again if the directory is removed.
             Err(error) => {
                 tracing::warn!(
                     %error,
-                    "cannot lock {}: cleaners of temporary files may remove it",
+                    "cannot lock {}, so cleaners of temporary files may remove it; exempt it from \
+                     cleaning, or set FIPA_RUNTIME_DIR to another directory",
                     path.display()
                 );
                 break;
@@ -305,7 +310,7 @@ fn hold(path: &Path) -> Result<OwnedFd, PlaceError> {
     }
 }
 
-/// Whether the path leads to this directory. What cannot be examined counts as the same.
+/// Whether the path leads to this directory. A path that cannot be examined counts as the same.
 fn is_same(directory: &OwnedFd, path: &Path) -> bool {
     let held = rustix::fs::fstat(directory);
     let found = rustix::fs::lstat(path);
@@ -316,7 +321,7 @@ fn is_same(directory: &OwnedFd, path: &Path) -> bool {
     }
 }
 
-/// Renews timestamps of everything below a directory.
+/// Renews the timestamps of all files below a directory.
 fn renew_below(directory: &Path, depth: usize, left: &mut usize) {
     let found = fs::read_dir(directory).into_iter().flatten().flatten();
     for entry in found {
@@ -328,13 +333,13 @@ fn renew_below(directory: &Path, depth: usize, left: &mut usize) {
         if depth > 0 && entry.file_type().is_ok_and(|kind| kind.is_dir()) {
             renew_below(&path, depth - 1, left);
         }
-        // Of a file with entries, the time of modification is its version.
+        // The modification time of a file with entries is its version.
         let is_versioned = path.extension().is_some_and(|end| end == "entries");
         touch(&path, !is_versioned);
     }
 }
 
-/// Sets the time of the last access, and that of the last modification if it may be changed.
+/// Sets the access time to now, and also the modification time if `modification` is true.
 fn touch(path: &Path, modification: bool) {
     let at = |tv_nsec| Timespec { tv_sec: 0, tv_nsec };
     let times = Timestamps {
@@ -344,12 +349,12 @@ fn touch(path: &Path, modification: bool) {
             false => rustix::fs::UTIME_OMIT,
         }),
     };
-    // It may have gone meanwhile.
+    // The file may have been removed in the meantime.
     let _ = rustix::fs::utimensat(CWD, path, &times, AtFlags::SYMLINK_NOFOLLOW);
 }
 
-fn make_private(path: &Path) -> Result<(), PlaceError> {
-    let io_error = |source| PlaceError::Io {
+fn make_private(path: &Path) -> Result<(), DomainDirError> {
+    let io_error = |source| DomainDirError::Io {
         path: path.to_owned(),
         source,
     };
@@ -359,8 +364,8 @@ fn make_private(path: &Path) -> Result<(), PlaceError> {
     }
 }
 
-fn check_private(path: &Path) -> Result<(), PlaceError> {
-    let io_error = |source| PlaceError::Io {
+fn check_private(path: &Path) -> Result<(), DomainDirError> {
+    let io_error = |source| DomainDirError::Io {
         path: path.to_owned(),
         source,
     };
@@ -376,7 +381,7 @@ fn check_private(path: &Path) -> Result<(), PlaceError> {
     } else {
         return Ok(());
     };
-    Err(PlaceError::NotPrivate {
+    Err(DomainDirError::NotPrivate {
         path: path.to_owned(),
         problem,
     })
@@ -388,7 +393,7 @@ mod tests {
     use std::os::unix::fs::{PermissionsExt, symlink};
 
     #[test]
-    fn what_others_could_enter_is_refused() {
+    fn a_directory_that_other_users_could_enter_is_refused() {
         let home = tempfile::tempdir().unwrap();
         let open = home.path().join("open");
         fs::create_dir(&open).unwrap();
@@ -412,28 +417,28 @@ mod tests {
     }
 
     #[test]
-    fn prefixes_differ_by_domain_and_place() {
-        let place = |base: &str, domain: &str| Place {
+    fn prefixes_differ_by_domain_and_base() {
+        let dir = |base: &str, domain: &str| DomainDir {
             base: base.into(),
             domain: domain.into(),
-            held: None,
+            locks: None,
         };
-        let all = [place("/a", "x"), place("/a", "y"), place("/b", "x")].map(|p| p.prefix());
+        let all = [dir("/a", "x"), dir("/a", "y"), dir("/b", "x")].map(|p| p.prefix());
         assert!(all[0] != all[1] && all[0] != all[2] && all[1] != all[2]);
-        assert!(place("/a", &"d".repeat(32)).prefix().len() <= 64);
+        assert!(dir("/a", &"d".repeat(32)).prefix().len() <= 64);
     }
 
-    /// A place that is made, in a directory that goes away with the test.
-    fn made() -> (tempfile::TempDir, Place) {
+    /// Creates a domain directory in a temporary directory.
+    fn created() -> (tempfile::TempDir, DomainDir) {
         let home = tempfile::tempdir().unwrap();
-        let place = Place {
+        let dir = DomainDir {
             base: home.path().join("base"),
             domain: "domain".to_owned(),
-            held: None,
+            locks: None,
         };
-        make_private(&place.base).unwrap();
-        make_private(&place.path()).unwrap();
-        (home, place)
+        make_private(&dir.base).unwrap();
+        make_private(&dir.path()).unwrap();
+        (home, dir)
     }
 
     fn is_locked(path: &Path) -> bool {
@@ -443,41 +448,44 @@ mod tests {
     }
 
     #[test]
-    fn both_levels_are_locked_and_made_again() {
-        let (_home, mut place) = made();
-        assert!(!is_locked(&place.base) && !is_locked(&place.path()));
-        let host = place.host_id().unwrap();
-        place.hold().unwrap();
-        assert!(is_locked(&place.base) && is_locked(&place.path()));
-        assert!(place.is_there());
-        fs::remove_dir(place.path()).unwrap();
-        // So that the file system does not give the same number to the next one.
-        fs::create_dir(place.base.join("another")).unwrap();
-        assert!(!place.is_there());
-        place.rejoin().unwrap();
-        assert!(place.is_there() && is_locked(&place.path()));
-        // For processes that start now, too.
-        assert_eq!(place.host_id().unwrap(), host);
-        fs::remove_dir(place.base.join("another")).unwrap();
-        place.leave();
-        assert!(!place.base.exists());
+    fn both_levels_are_locked_and_created_again() {
+        let (_home, mut dir) = created();
+        assert!(!is_locked(&dir.base) && !is_locked(&dir.path()));
+        let host = dir.host_id().unwrap();
+        dir.lock().unwrap();
+        assert!(is_locked(&dir.base) && is_locked(&dir.path()));
+        assert!(dir.is_there());
+        fs::remove_dir(dir.path()).unwrap();
+        // Keeps the file system from reusing the inode number.
+        fs::create_dir(dir.base.join("another")).unwrap();
+        assert!(!dir.is_there());
+        dir.rejoin().unwrap();
+        assert!(dir.is_there() && is_locked(&dir.path()));
+        // Processes that start now get the same identifier.
+        assert_eq!(dir.host_id().unwrap(), host);
+        fs::remove_dir(dir.base.join("another")).unwrap();
+        dir.leave();
+        assert!(!dir.base.exists());
     }
 
     #[test]
-    fn a_directory_of_the_same_name_that_others_may_enter_is_not_joined() {
-        let (_home, mut place) = made();
-        place.hold().unwrap();
-        fs::remove_dir(place.path()).unwrap();
-        fs::create_dir(place.path()).unwrap();
-        fs::set_permissions(place.path(), fs::Permissions::from_mode(0o755)).unwrap();
-        let error = place.rejoin().unwrap_err();
-        assert!(matches!(error, PlaceError::NotPrivate { .. }), "{error}");
+    fn a_replaced_directory_that_other_users_could_enter_is_not_joined() {
+        let (_home, mut dir) = created();
+        dir.lock().unwrap();
+        fs::remove_dir(dir.path()).unwrap();
+        fs::create_dir(dir.path()).unwrap();
+        fs::set_permissions(dir.path(), fs::Permissions::from_mode(0o755)).unwrap();
+        let error = dir.rejoin().unwrap_err();
+        assert!(
+            matches!(error, DomainDirError::NotPrivate { .. }),
+            "{error}"
+        );
     }
 
     #[test]
     fn timestamps_are_renewed_by_one_process_for_all() {
-        let (_home, place) = made();
-        let part = place.part("directory");
+        let (_home, dir) = created();
+        let part = dir.part("directory");
         fs::create_dir(&part).unwrap();
         let (lock, entries) = (part.join("lock"), part.join("1.entries"));
         for file in [&lock, &entries] {
@@ -492,24 +500,24 @@ mod tests {
                 last_access: age,
                 last_modification: age,
             };
-            for path in [&lock, &entries, &part, &place.path(), &place.base] {
+            for path in [&lock, &entries, &part, &dir.path(), &dir.base] {
                 rustix::fs::utimensat(CWD, path, &times, AtFlags::empty()).unwrap();
             }
         };
         let is_old = |seconds: i64| seconds == 1000;
         old();
-        place.renew();
-        for path in [&lock, &part, &place.path(), &place.base] {
+        dir.renew();
+        for path in [&lock, &part, &dir.path(), &dir.base] {
             let found = fs::metadata(path).unwrap();
             assert!(!is_old(found.atime()) && !is_old(found.mtime()), "{path:?}");
         }
         let found = fs::metadata(&entries).unwrap();
         assert!(!is_old(found.atime()), "a cleaner would remove it");
-        assert!(is_old(found.mtime()), "its version has changed");
-        // Another process that wakes later.
+        assert!(is_old(found.mtime()), "its version must not change");
+        // Another process renews nothing after the first has.
         old();
-        touch(&place.path(), true);
-        place.renew();
+        touch(&dir.path(), true);
+        dir.renew();
         assert!(is_old(fs::metadata(&lock).unwrap().mtime()));
     }
 }

@@ -1,5 +1,5 @@
-//! A mailbox that as many processes have open as it has room for: the letters of further processes
-//! take the next route.
+//! A mailbox that the maximum number of processes have open: the letters of further processes take the
+//! next route.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -12,29 +12,29 @@ use fipa_mts::core::Submission;
 use fipa_transport::Incarnation;
 use tokio::time::timeout;
 
-use services::{ARM, Place, host, letter, number};
+use services::{ARM, TestService, host, letter, number};
 
 const ORDER: [Kind; 2] = [Kind::Shm, Kind::Unix];
 
-/// Processes that can have the mailbox open.
+/// Maximum number of processes that can have the mailbox open.
 const CLIENTS: usize = 3;
 
-/// Processes that send.
+/// Number of processes that send.
 const SENDERS: usize = 6;
 
 #[tokio::test(flavor = "multi_thread")]
 async fn beyond_max_clients_letters_take_the_next_route() {
     let host = host();
-    let arms = Place::with_clients(host.path(), "arms", &ORDER, CLIENTS);
+    let arms = TestService::with_clients(host.path(), "arms", &ORDER, CLIENTS);
     arms.mts.register("arm".into(), ARM);
     let mut senders = Vec::new();
     for sender in 0..SENDERS {
-        let place = Place::start(host.path(), &format!("rovers-{sender}"), &ORDER, false);
-        place.knows_arm_at(arms.everywhere());
+        let service = TestService::start(host.path(), &format!("rovers-{sender}"), &ORDER, false);
+        service.register_arm_at(arms.all_locations());
         let rover = Incarnation::random();
-        place.mts.register("rover".into(), rover);
+        service.mts.register("rover".into(), rover);
         for letter in 0..3 {
-            let outcome = send((&place, rover), &arms, 10 * sender + letter).await;
+            let outcome = send((&service, rover), &arms, 10 * sender + letter).await;
             let Outcome::Delivered { via, attempts } = outcome else {
                 panic!("{outcome}");
             };
@@ -43,18 +43,18 @@ async fn beyond_max_clients_letters_take_the_next_route() {
                 false => Kind::Unix,
             };
             assert_eq!(via, expected, "sender {sender}");
-            // The route says why it was not taken, at least the first time.
+            // The outcome has the reason for the failed attempt, at least the first time.
             if letter == 0 && expected == Kind::Unix {
                 let reasons: Vec<String> = attempts.iter().map(ToString::to_string).collect();
                 let reasons = reasons.join("; ");
                 assert!(reasons.contains("max_clients"), "{reasons}");
             }
         }
-        senders.push((place, rover));
+        senders.push((service, rover));
     }
     assert_eq!(arms.shm().arrived, 3 * CLIENTS as u64);
 
-    // A process that leaves makes room for another one.
+    // After a process leaves, another one can open the mailbox.
     let (left, _) = senders.remove(0);
     left.mts.close(Duration::from_secs(1)).await;
     drop(left);
@@ -71,8 +71,12 @@ async fn beyond_max_clients_letters_take_the_next_route() {
     timeout(Duration::from_secs(60), patience).await.unwrap();
 }
 
-/// Sends a letter with this number and takes it out.
-async fn send((from, rover): (&Place, Incarnation), to: &Place, sequence: usize) -> Outcome {
+/// Sends a letter with this number and receives it.
+async fn send(
+    (from, rover): (&TestService, Incarnation),
+    to: &TestService,
+    sequence: usize,
+) -> Outcome {
     let sending = from.mts.send(Submission {
         sender: rover,
         letter: letter(sequence),
