@@ -38,7 +38,7 @@
 //! keys = ""                           # directory of `fipa keys init`; empty: no encryption
 //! insecure = false                    # true: listen on the network without keys
 //! loopback = false                    # with keys: peers on loopback prove their identity, too
-//! old_peers = []                      # with keys: addresses of legacy peers, which have no keys
+//! legacy_peers = []                   # with keys: addresses of legacy peers, which have no keys
 //! [access]
 //! rate = 0                            # letters per second of one sender; 0: no limit
 //! allow = { "rover_.*" = ["arm performative=request"] }   # all others are refused (none by default)
@@ -220,7 +220,7 @@ pub struct Security {
     pub insecure: bool,
     /// `loopback`: whether peers on loopback addresses must prove their identity, too.
     pub loopback: bool,
-    /// `old_peers`: addresses of legacy peers, which cannot prove their identity. The gateway exchanges
+    /// `legacy_peers`: addresses of legacy peers, which cannot prove their identity. The gateway exchanges
     /// letters in their dialects with them despite its keys. At most 64.
     pub old_peers: Vec<IpAddr>,
     /// `peer_connections`: maximum number of connections of each transport from the peers with one

@@ -135,7 +135,7 @@ impl Findings {
             );
         }
         if security.old_peers.len() > MAX_OLD_PEERS {
-            let path = ["security", "old_peers"];
+            let path = ["security", "legacy_peers"];
             self.too_many(&path, security.old_peers.len(), MAX_OLD_PEERS);
         }
         if security.peer_connections == 0 {

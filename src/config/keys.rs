@@ -59,6 +59,17 @@ const SIZE: &str = r#"a size such as "64MiB""#;
 const ACCESS: &str = r#"a list of receivers such as ["arm_.* performative=request,cancel"]"#;
 const ADDRESSES: &str = r#"a list of numeric addresses with port such as ["127.0.0.1:0"]"#;
 
+/// Former names of keys, which are read as well.
+const ALIASES: &[(&[&str], &[&str])] =
+    &[(&["security", "old_peers"], &["security", "legacy_peers"])];
+
+/// Replaces the former name of a key by its present one.
+pub(super) fn present_name(path: &mut Vec<String>) {
+    if let Some((_, present)) = ALIASES.iter().find(|(former, _)| path == former) {
+        *path = present.iter().map(|part| (*part).to_owned()).collect();
+    }
+}
+
 /// Every key, in the order in which `fipa config show` prints them, before the [`MAPS`].
 pub(super) const KEYS: &[Key] = &[
     Key {
@@ -188,7 +199,7 @@ pub(super) const KEYS: &[Key] = &[
         read: |config| Value::Truth(config.security.loopback),
     },
     Key {
-        path: &["security", "old_peers"],
+        path: &["security", "legacy_peers"],
         shape: Shape::List,
         expected: r#"a list of addresses such as ["10.0.0.9"]"#,
         write: |config, value| items(value, ip).map(|all| config.security.old_peers = all),

@@ -33,6 +33,19 @@ fn error(text: &str, set: &[&str]) -> String {
 }
 
 #[test]
+fn the_former_name_of_a_key_is_read_as_the_present_one() {
+    let addresses: [std::net::IpAddr; 1] = ["10.0.0.9".parse().unwrap()];
+    for (text, set) in [
+        ("[security]\nold_peers = [\"10.0.0.9\"]\n", &[][..]),
+        ("", &["security.old_peers=10.0.0.9"][..]),
+        ("", &["security.legacy_peers=10.0.0.9"][..]),
+    ] {
+        let config = config(text, set);
+        assert_eq!(config.security.old_peers, addresses, "{text:?} {set:?}");
+    }
+}
+
+#[test]
 fn an_empty_configuration_yields_the_defaults() {
     let sources = Sources {
         host_name: "sherpa".to_owned(),
@@ -102,7 +115,7 @@ fn every_key_is_read() {
         [security]
         keys = "/etc/fipa/keys"
         loopback = true
-        old_peers = ["10.0.0.9", "::1"]
+        legacy_peers = ["10.0.0.9", "::1"]
         peer_connections = 8
         peer_letters = 0
         peer_bytes = "1MiB"
@@ -309,7 +322,7 @@ interfaces = []                      # default
 keys = ""                            # default
 insecure = false                     # default
 loopback = false                     # default
-old_peers = []                       # default
+legacy_peers = []                    # default
 peer_connections = 64                # default
 peer_letters = 20000                 # default
 peer_bytes = "256MiB"                # default
