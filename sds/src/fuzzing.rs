@@ -1,4 +1,4 @@
-//! Parts that the fuzz targets reach; `fuzz/` has the targets.
+//! Functions for the fuzz targets in `fuzz/`.
 
 #[cfg(feature = "mdns")]
 pub use crate::mdns::fuzzing::{Ear, announced};

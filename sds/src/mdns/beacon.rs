@@ -1,19 +1,20 @@
-//! Beacons: how gateways notice that they have missed something of each other.
+//! Beacons: gateways detect with them that they missed announcements of each other.
 //!
-//! An announcement or a goodbye is said once or twice. Who was out of range then never hears of
-//! it: the next question is asked within the hour, and a record that is gone is believed in for
-//! minutes. So every gateway says every two seconds how many agents it announces and a digest of
-//! them, and the same of the coalitions among them, in a packet of 150 bytes that old peers pass
-//! over:
+//! An announcement or a goodbye is sent once or twice. A host that was out of range misses it: the
+//! next query may come up to an hour later, and a removed record stays in caches for minutes. Every
+//! gateway therefore sends, every two seconds, the number and a digest of the agents that it
+//! announces, and the same of the coalitions among them, in a packet of 150 bytes that legacy peers
+//! ignore:
 //!
 //! `<incarnation>._fipa_gateway._udp.local. TXT "agents=500" "digest=0123456789abcdef"
 //! "coalitions=2:0123456789abcdef"`
 //!
-//! with a PTR record that introduces it.
+//! together with a PTR record that introduces it.
 //!
-//! Whoever holds something else of that gateway asks the network, first for what it has not got,
-//! then for what it should not have any more. Who is not heard for some seconds is asked, too.
-//! Nothing new is believed because of a beacon: it makes others ask, or, when they hold just what
+//! A gateway whose records of the sender differ queries the network, first for missing records,
+//! then for surplus ones. It also queries for a gateway whose beacons stop for some seconds. A
+//! beacon never adds an entry: it triggers queries, or, when it matches the stored records, makes
+//! queries for their renewal unnecessary.
 //! it says, spares them asking whether that is still so.
 
 use std::collections::HashMap;
@@ -26,24 +27,24 @@ use simple_dns::{CLASS, Label, Name, Packet, PacketFlag, ResourceRecord};
 use super::packet::parse_answer;
 use super::record::Properties;
 
-/// How often a gateway says what it has.
+/// Interval between beacons.
 pub(super) const INTERVAL: Duration = Duration::from_secs(2);
-/// For how long it counts; no more than that is remembered by others' caches.
+/// TTL in seconds; other hosts cache a beacon for no longer.
 const TTL: u32 = 10;
-/// How long a gateway that said something is silent before it is asked.
+/// Time without a beacon after which a gateway is queried.
 pub(super) const SILENCE: Duration = Duration::from_secs(8);
-/// How long what is held of a gateway has to be unchanged before it is compared: what is under
-/// way need not be asked for.
+/// Time for which the stored records of a gateway must be unchanged before they are compared:
+/// records that are still arriving need no query.
 const QUIET: Duration = Duration::from_secs(1);
-/// Pauses between two repairs of the same gateway.
+/// Pauses between two queries for the same gateway.
 const FIRST_PAUSE: Duration = Duration::from_secs(2);
 const LONGEST_PAUSE: Duration = Duration::from_secs(60);
-/// Most gateways that are listened to.
+/// Maximum number of gateways whose beacons are processed.
 const MAX_GATEWAYS: usize = 1024;
 
 const TYPE_LABELS: [&str; 3] = ["_fipa_gateway", "_udp", "local"];
 
-/// What a gateway announces, in short.
+/// Number and digest of the records that a gateway announces.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Digest {
     agents: u32,
@@ -51,9 +52,9 @@ pub(super) struct Digest {
 }
 
 impl Digest {
-    /// The digest of one record.
+    /// Computes the digest of one record.
     pub(super) fn of(properties: &Properties) -> Self {
-        // Fowler, Noll and Vo: nobody gains by forging it, being the same everywhere is the point.
+        // FNV-1a: all hosts must compute the same value, and a forged digest gains nothing.
         let strings = properties.iter().flat_map(|(key, value)| {
             let ends = [0xff_u8, u8::try_from(value.len()).unwrap_or(u8::MAX)];
             key.bytes().chain(ends).chain(value.iter().copied())
@@ -75,34 +76,34 @@ impl Digest {
     }
 }
 
-/// What a beacon says that its gateway announces.
+/// The content of a beacon.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Announced {
-    /// All of it.
+    /// All agents of the gateway.
     pub(super) all: Digest,
-    /// The coalitions, which are seen to change [together](super::together).
+    /// The coalitions, which change [atomically](super::coalition_sync).
     pub(super) coalitions: Digest,
 }
 
-/// What is held of one gateway, and since when.
+/// Digest of the stored records of one gateway, and the time of its last change.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Held {
     pub(super) digest: Digest,
     pub(super) changed: Instant,
 }
 
-/// What there is to be asked.
+/// A query that a beacon triggers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Repair {
-    /// For whatever is not held.
+    /// For records that are missing.
     Missing,
-    /// Whether all that is held of this gateway is still so.
+    /// For all stored records of this gateway, because some may be outdated.
     Surplus(Incarnation),
-    /// Whether this gateway is still there.
+    /// For this gateway, which sends no beacons any more.
     Silent(Incarnation),
 }
 
-/// Others' beacons.
+/// Beacons of other gateways.
 #[derive(Debug, Default)]
 pub(super) struct Beacons {
     heard: HashMap<Incarnation, Heard>,
@@ -112,14 +113,15 @@ pub(super) struct Beacons {
 struct Heard {
     digest: Digest,
     last: Instant,
-    /// How often in a row what is held was different.
+    /// Number of consecutive mismatches that led to a query.
     repairs: u32,
-    /// When it may be repaired next.
+    /// Earliest time of the next query.
     due: Instant,
 }
 
 impl Beacons {
-    /// A gateway has said what it has. What follows from that, given what is held of it.
+    /// Handles a beacon, and returns the query that it triggers, given the stored records of the
+    /// gateway.
     pub(super) fn handle(
         &mut self,
         now: Instant,
@@ -137,7 +139,7 @@ impl Beacons {
             due: now + QUIET,
         });
         if heard.digest != digest {
-            // What has just changed is announced at this moment.
+            // The gateway is still announcing its latest change.
             heard.due = heard.due.max(now + QUIET);
         }
         heard.digest = digest;
@@ -154,14 +156,14 @@ impl Beacons {
         let pause = FIRST_PAUSE * 2_u32.saturating_pow((heard.repairs / 2).min(8));
         heard.due = now + pause.min(LONGEST_PAUSE);
         heard.repairs += 1;
-        // In turns, beginning with what is more likely: both may be true.
+        // Alternates, starting with the likelier cause, because both may apply.
         Some(match (nothing_missing, heard.repairs % 2) {
             (true, 1) | (false, 0) => Repair::Surplus(gateway),
             _ => Repair::Missing,
         })
     }
 
-    /// Gateways that have been silent for a while. Each is told once.
+    /// Returns the gateways whose beacons have stopped, each once.
     pub(super) fn silent(&mut self, now: Instant) -> Vec<Repair> {
         let mut silent = Vec::new();
         self.heard.retain(|gateway, heard| {
@@ -175,7 +177,7 @@ impl Beacons {
     }
 }
 
-/// The packet with the beacon of a gateway.
+/// Builds the packet with the beacon of a gateway.
 pub(super) fn packet(gateway: Incarnation, announced: Announced) -> Option<Vec<u8>> {
     let label = gateway.to_string();
     let mut labels = vec![Label::new(label.as_bytes()).ok()?];
@@ -198,8 +200,8 @@ pub(super) fn packet(gateway: Incarnation, announced: Announced) -> Option<Vec<u
     let mut packet = Packet::new_reply(0);
     packet.set_flags(PacketFlag::AUTHORITATIVE_ANSWER);
     packet.answers.push(record.with_cache_flush(true));
-    // The mDNS library keeps what belongs to no service that is introduced, and every change of it,
-    // for ever.
+    // The mDNS library keeps records of a service that is not introduced, and every version of
+    // them, forever.
     let service = Name::new_with_labels(&labels[1..]);
     let introduced = RData::PTR(PTR(Name::new_with_labels(&labels)));
     let record = ResourceRecord::new(service, CLASS::IN, TTL, introduced);
@@ -207,9 +209,9 @@ pub(super) fn packet(gateway: Incarnation, announced: Announced) -> Option<Vec<u
     packet.build_bytes_vec_compressed().ok()
 }
 
-/// The beacon that a packet is, if it is one.
+/// Parses a beacon; `None` if the packet is not one.
 pub(super) fn read(packet: &[u8]) -> Option<(Incarnation, Announced)> {
-    // Nearly all packets are none: that is seen without reading them.
+    // Most packets are not beacons; this search rejects them without parsing.
     memchr::memmem::find(packet, TYPE_LABELS[0].as_bytes())?;
     let packet = parse_answer(packet)?;
     let mut answers = packet.answers.iter();
@@ -273,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn beacons_are_read_as_they_were_written() {
+    fn beacons_survive_a_round_trip() {
         for numbers in [&[][..], &[7], &[1, 2, 3]] {
             let announced = Announced {
                 all: digest(numbers),
@@ -285,7 +287,8 @@ mod tests {
         }
         assert_eq!(read(b""), None);
         assert_eq!(read(&question_for_all(&[])[0]), None);
-        // It introduces itself, or the mDNS library would keep it for ever.
+        // The PTR record is needed because the mDNS library would otherwise keep the beacon
+        // forever.
         let written = packet(gateway(0xab), Announced::default()).unwrap();
         let answers = parse_answer(&written).unwrap().answers;
         let (of, introduced) = match &answers[..] {
@@ -297,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_is_asked_for_in_turns_with_what_is_too_much() {
+    fn queries_for_missing_and_surplus_records_alternate() {
         let mut beacons = Beacons::default();
         let start = Instant::now();
         let mut asked = Vec::new();
@@ -314,7 +317,7 @@ mod tests {
             ]
         );
         assert!((4..=6).contains(&asked.len()), "{asked:?}");
-        // What is held now is right, and then more than right.
+        // The stored records first match, and then include a surplus.
         let now = start + Duration::from_secs(100);
         let held = |numbers: &[u64]| {
             Some(Held {
@@ -327,7 +330,7 @@ mod tests {
             beacons.handle(now, gateway(1), digest(beacon), held)
         };
         assert_eq!(hear(0, &[1, 2], held(&[1, 2])), None);
-        // It has just changed; a moment later it counts.
+        // A change counts only after the quiet time.
         assert_eq!(hear(0, &[1], held(&[1, 2])), None);
         assert_eq!(
             hear(2000, &[1], held(&[1, 2])),
@@ -341,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn the_silent_are_told_once() {
+    fn a_silent_gateway_is_reported_once() {
         let mut beacons = Beacons::default();
         let now = Instant::now();
         beacons.handle(now, gateway(1), digest(&[1]), None);
@@ -356,7 +359,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn broken_beacons_do_no_harm(at in 0_usize..140, byte: u8) {
+        fn a_corrupted_beacon_does_not_panic(at in 0_usize..140, byte: u8) {
             let mut written = packet(gateway(1), Announced::default()).unwrap();
             if let Some(broken) = written.get_mut(at) {
                 *broken = byte;

@@ -1,5 +1,5 @@
-//! What is heard on the network, and what is asked and said there beside what the mDNS library
-//! says: who there is ([`super::browse`]), and beacons ([`super::beacon`]).
+//! Receives from the network, and sends the packets that the mDNS library does not send: the
+//! queries of [`super::browse`] and the beacons of [`super::beacon`].
 
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
@@ -11,9 +11,9 @@ use super::beacon::{self, Beacons, Digest, Repair};
 use super::browse::{Browser, Heard};
 use super::sockets::Sockets;
 
-/// Up to how much is added to the time between two beacons, so that not all speak at once.
+/// Maximum jitter of the beacon interval, so that gateways do not send simultaneously.
 const JITTER: Duration = Duration::from_millis(500);
-/// Least time between two beacons, however fast coalitions change.
+/// Minimum time between two beacons, however fast coalitions change.
 const BREATH: Duration = Duration::from_millis(200);
 
 pub(super) struct Ear {
@@ -21,9 +21,9 @@ pub(super) struct Ear {
     pub(super) browser: Browser,
     beacons: Beacons,
     next_beacon: Instant,
-    /// When one may be said that cannot wait until then.
+    /// Earliest time of the next urgent beacon.
     next_urgent: Instant,
-    /// Until when the mDNS library looks at the interfaces more often than usual.
+    /// Until this time the mDNS library polls the interfaces at a shorter interval.
     looks_soon: Option<Instant>,
 }
 
@@ -40,11 +40,11 @@ impl Ear {
         }
     }
 
-    /// Says and asks what is due, and says when there is more.
+    /// Sends everything that is due, and returns the time of the next call.
     pub(super) fn speak(&mut self, shared: &Shared) -> Instant {
         let now = Instant::now();
         if shared.coalitions_changed.swap(false, Ordering::Relaxed) {
-            // Others wait for it.
+            // Other gateways delay coalition changes until they receive the beacon.
             self.next_beacon = self.next_beacon.min(self.next_urgent.max(now));
         }
         if shared.interfaces_changed.swap(false, Ordering::Relaxed) {
@@ -59,14 +59,14 @@ impl Ear {
         if now >= self.next_beacon {
             self.next_beacon = now + beacon::INTERVAL + JITTER.mul_f64(fastrand::f64());
             self.next_urgent = now + BREATH;
-            // Interfaces come and go.
+            // Interfaces may have appeared or disappeared.
             match self.sockets.refresh(&shared.config) {
                 Ok(changed) => {
                     if changed.more {
                         self.browser.start_again(now, fastrand::f64());
                     }
-                    // An address that is gone is noticed by the daemon when it looks next. Until
-                    // then it would use that one instead of the new one.
+                    // The library notices a removed address only at its next poll, and until then
+                    // would use it instead of the new one.
                     if changed.more && !changed.fewer {
                         shared.daemon_adds_interfaces();
                     }
@@ -103,13 +103,14 @@ impl Ear {
         }
     }
 
-    /// Hears one packet.
+    /// Receives one packet and processes it.
     pub(super) async fn listen(&mut self, shared: &Shared) -> Heard {
         let (packet, from) = self.sockets.receive().await;
         let now = Instant::now();
         let is_question = packet.get(2).is_some_and(|flags| flags & 0x80 == 0);
         if is_question && from.port() != shared.config.port {
-            // Who asks so is answered directly (RFC 6762 clause 6.7), which we do not hear.
+            // A query from another port gets a unicast answer (RFC 6762 clause 6.7), which does not
+            // arrive here.
             return Heard::default();
         }
         if let Some((gateway, said)) = beacon::read(packet) {
@@ -143,7 +144,7 @@ impl Ear {
     }
 
     fn repair(&mut self, shared: &Shared, repair: Repair) {
-        tracing::debug!(?repair, "what is held of others is not what they have");
+        tracing::debug!(?repair, "stored records of another gateway differ from its beacon");
         match repair {
             Repair::Missing => {
                 let question = self.browser.ask_for_missing(Instant::now());
