@@ -1,4 +1,4 @@
-//! The back end with what neighbours have told.
+//! The back end with the entries that neighbors sent.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -11,16 +11,16 @@ use super::{Agents, Exchange, ExchangeError};
 use crate::table::Table;
 use crate::{Directory, Entry, Role, Subscriber};
 
-/// The agents that neighbours have told of.
+/// The agents that neighbors sent.
 ///
-/// Of two neighbours with a [certified](Mandate::Certified) link that claim one name, the one that
-/// claimed it first here has it until its entry leaves: neither can claim an earlier registration.
+/// If two neighbors with a [certified](Mandate::Certified) link claim one name, the first claim
+/// received holds it until its entry leaves: a neighbor cannot claim an earlier registration.
 #[derive(Debug)]
 pub struct ExchangeDirectory {
     table: Table<Teller>,
-    /// The certified links with neighbours.
+    /// Mandates of the neighbors with certified links.
     mandates: ArcSwap<HashMap<Incarnation, Mandate>>,
-    /// What each gateway has told. The lock is held while the table is changed, too.
+    /// Agents of each gateway. The lock is held while the table is updated.
     told: Mutex<HashMap<Incarnation, Agents>>,
 }
 
@@ -34,7 +34,7 @@ impl Default for ExchangeDirectory {
     }
 }
 
-/// The gateway that has told of an agent.
+/// The gateway that sent an agent's entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 struct Teller {
     gateway: Incarnation,
@@ -45,11 +45,11 @@ struct Teller {
 type Update = (Teller, Arc<str>, Option<Arc<Entry>>);
 
 impl ExchangeDirectory {
-    /// Most contested names that [`contested`](Self::contested) returns.
+    /// Maximum number of pairs that [`contested`](Self::contested) returns.
     pub const MAX_CONTESTED: usize = 1024;
 
-    /// Names that more than one neighbour with a certified link claims: the entry that has the name,
-    /// and each other one. At most [`MAX_CONTESTED`](Self::MAX_CONTESTED).
+    /// Returns the names that several neighbors with a certified link claim: the entry that holds
+    /// the name, and each other entry. At most [`MAX_CONTESTED`](Self::MAX_CONTESTED) pairs.
     #[must_use]
     pub fn contested(&self) -> Vec<(Arc<Entry>, Arc<Entry>)> {
         self.table.contested(Self::MAX_CONTESTED)
@@ -61,8 +61,8 @@ impl ExchangeDirectory {
         !self.mandates.load().is_empty()
     }
 
-    /// The link with the gateway proves this. What the gateway has told before is forgotten when that is
-    /// something else.
+    /// Sets the mandate that the link with the gateway proves. If it changed, the gateway's entries
+    /// are dropped.
     pub(super) fn prove(&self, gateway: Incarnation, mandate: &Mandate) {
         if self.mandate(gateway) == *mandate {
             return;
@@ -76,7 +76,7 @@ impl ExchangeDirectory {
             };
             mandates
         });
-        // What other directories say of this gateway counts, or no longer does.
+        // The mandate decides which entries of this gateway in other directories are visible.
         self.table.tell_all();
     }
 
@@ -87,7 +87,7 @@ impl ExchangeDirectory {
         }
     }
 
-    /// These are all agents of the gateway now.
+    /// Replaces all agents of the gateway.
     pub(super) fn replace(
         &self,
         gateway: Incarnation,
@@ -113,7 +113,7 @@ impl ExchangeDirectory {
         Ok(())
     }
 
-    /// These agents of the gateway have joined or are different now, and those have left.
+    /// Adds or updates some agents of the gateway, and removes others.
     pub(super) fn change(
         &self,
         gateway: Incarnation,
@@ -144,7 +144,7 @@ impl ExchangeDirectory {
         Ok(())
     }
 
-    /// The gateway is elsewhere now, and all its agents with it.
+    /// Sets new locations of the gateway and all its agents.
     pub(super) fn relocate(&self, gateway: Incarnation, locations: &[Location]) {
         let teller = self.teller(gateway);
         let mut told = self.told.lock();
@@ -159,9 +159,9 @@ impl ExchangeDirectory {
         self.table.update(updates);
     }
 
-    /// Lets go of agents of the gateway that another directory knows, unless they are proved. Says
-    /// whether there were any.
-    /// Coalitions stay: this directory [speaks for](Directory::speaks_for) them.
+    /// Drops agents of the gateway that another directory knows, unless they are proved. Returns
+    /// whether there were any. Coalitions stay, because this directory [speaks
+    /// for](Directory::speaks_for) them.
     pub(super) fn leave_to_others(
         &self,
         gateway: Incarnation,
@@ -184,7 +184,7 @@ impl ExchangeDirectory {
         any
     }
 
-    /// The gateway is gone, and all its agents with it.
+    /// Removes the gateway's agents.
     pub(super) fn forget(&self, gateway: Incarnation) {
         let teller = self.teller(gateway);
         let mut told = self.told.lock();
@@ -196,7 +196,7 @@ impl ExchangeDirectory {
 impl Directory for ExchangeDirectory {
     reads_its_table!(table);
 
-    /// What a gateway tells in letters comes at once and is all there is.
+    /// The letters of a gateway apply atomically and contain all its coalitions.
     fn speaks_for(&self, mts: Incarnation) -> bool {
         self.told.lock().contains_key(&mts)
     }

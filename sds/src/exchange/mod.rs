@@ -1,19 +1,20 @@
-//! The exchange of directories between gateways that can write to each other.
+//! Exchange of directory entries between gateways that have a connection.
 //!
-//! Where multicast is filtered, nobody is found by it; but gateways that a connection is open
-//! between, whoever knows whose address, can tell each other who is on their hosts. Each tells
-//! its **neighbours** of its own agents only, in letters: everything first, then what changes.
-//! What it is told goes into an [`ExchangeDirectory`], and leaves it with the neighbour.
+//! Where multicast is filtered, mDNS finds nothing; but connected gateways, of which one has the
+//! other's address, can send each other the agents of their hosts. Each sends its **neighbors** its
+//! own agents only, in letters: all of them first, then changes. Received entries are stored in an
+//! [`ExchangeDirectory`], and are removed when the neighbor disconnects.
 //!
-//! [`Exchange`] has no input, output or clock: neighbours, own agents, letters and `now` go in,
-//! letters to be sent come out. It relies on nothing but letters arriving once and in order, or
-//! being known not to have: every letter says from which state of the teller to which it leads,
-//! and who cannot follow asks for everything again. At most one letter is under way to each
-//! neighbour, and what changes meanwhile goes into the next, so that hundreds of agents that
+//! [`Exchange`] has no I/O and no clock: neighbors, own agents, letters and `now` go in, letters to
+//! send come out. It requires only that each letter arrives once and in order, or is reported as
+//! lost. Every letter states the state of the sender to which it applies and the state to which it
+//! leads; a receiver in another state requests all entries again. At most one letter is in flight
+//! to each neighbor, and changes in the meantime go into the next, so that hundreds of agents that
 //! start at once make a few letters.
 //!
-//! A neighbour may be hostile: it can tell of agents of its own only, that are reached through
-//! itself, and that the certificate of its link names, if it has one; how many it may tell of is bounded; and what makes no sense is not used.
+//! A neighbor may be hostile. It can send only agents of its own that are reached through itself
+//! and, if its link has a certificate, that this certificate names. The number of its agents is
+//! bounded, and malformed letters are rejected.
 
 mod directory;
 mod wire;
@@ -32,36 +33,38 @@ use wire::{Changes, Full, Told};
 use crate::entry::time_of_millis;
 use crate::{Entry, Mts, Reach, Role, Source};
 
-/// The ontology of the letters, by which they are told from others.
+/// Ontology of the letters of the exchange.
 pub const EXCHANGE_ONTOLOGY: &str = "fipa-sds-exchange";
 
 /// Agents by name.
 type Agents = BTreeMap<Arc<str>, Arc<Entry>>;
 
-/// The agents of one's neighbours, and what they are told of one's own.
+/// State of the exchange with all neighbors.
 #[derive(Debug)]
 pub struct Exchange {
     own: Own,
     neighbours: HashMap<Incarnation, Neighbour>,
-    /// Who has told something before it was known to be a neighbour, and is to be asked for it.
+    /// Gateways that sent a letter before they were reported as neighbors; they are asked for all
+    /// entries later.
     early: HashSet<Incarnation>,
     directory: Arc<ExchangeDirectory>,
     random: u64,
 }
 
-/// A gateway that can be written to.
+/// A gateway with an open connection.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Present {
     /// The gateway.
     pub mts: Mts,
-    /// Where it takes letters.
+    /// Locations at which it accepts letters.
     pub locations: Vec<Location>,
-    /// The agents that its links prove it to speak for. It can tell of no others.
+    /// The agents for which its links prove that it may speak. Entries of other agents are
+    /// rejected.
     pub mandate: Mandate,
 }
 
 impl Present {
-    /// A gateway on whose links nothing is proved.
+    /// Creates a gateway whose links prove nothing.
     #[must_use]
     pub const fn unproved(mts: Mts, locations: Vec<Location>) -> Self {
         Self {
@@ -72,59 +75,60 @@ impl Present {
     }
 }
 
-/// What this gateway tells.
+/// The agents that this gateway sends to its neighbors.
 #[derive(Debug, Default)]
 struct Own {
     agents: Agents,
-    /// Counts the changes of `agents`.
+    /// Number of changes of `agents` so far.
     version: u64,
-    /// The names that changed, the latest last; that of `version` is the last one. Coalitions that
-    /// changed together stand together.
+    /// Names that changed, the latest last; the last one belongs to `version`. Coalitions that
+    /// changed together are adjacent.
     log: VecDeque<Logged>,
 }
 
 #[derive(Debug, Clone)]
 struct Logged {
     name: Arc<str>,
-    /// It changed together with the one before it: they are told in one letter.
+    /// Whether it changed together with the previous one; both are then sent in one letter.
     together: bool,
 }
 
-/// A gateway that can be written to, or could a moment ago.
+/// A gateway that is connected, or was until recently.
 #[derive(Debug)]
 struct Neighbour {
     mts: Mts,
     locations: Vec<Location>,
     mandate: Mandate,
-    /// Since when it cannot be written to.
+    /// Time of the disconnect.
     gone: Option<Instant>,
     telling: Telling,
-    /// What was sent and has not arrived yet, if anything is under way.
+    /// State of the neighbor once the letter in flight has arrived, if there is one.
     under_way: Option<Telling>,
-    /// When the next letter may go.
+    /// Earliest time of the next letter.
     due: Instant,
-    /// Letters in a row that did not arrive.
+    /// Number of consecutive letters that did not arrive.
     failures: u32,
-    /// Which of its states is in the directory.
+    /// The neighbor's version that is in the directory.
     held: Option<u64>,
-    /// What it has told so far, of a state that takes several letters.
+    /// Entries received so far of a state that takes several letters.
     staged: Option<Staged>,
-    /// When to ask it for everything, if that is wanted, and when that was done last.
+    /// Time at which to request all entries, if necessary, and time of the last request.
     ask: Option<Instant>,
     asked: Option<Instant>,
-    /// When it was last told everything from the start.
+    /// Time at which this gateway last started to send all entries.
     told: Option<Instant>,
 }
 
-/// What a neighbour knows of one's own agents.
+/// State of a neighbor's copy of this gateway's agents.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Telling {
-    /// Everything up to this name, of a state that is not older than this one; nothing at first.
+    /// It has the agents up to this name, of a state at least as new as this version; initially
+    /// none.
     Some {
         upto: Option<Arc<str>>,
         version: u64,
     },
-    /// All of this state.
+    /// It has all agents of this version.
     All { version: u64 },
 }
 
@@ -135,34 +139,35 @@ struct Staged {
 }
 
 impl Exchange {
-    /// Most agents that one neighbour can tell of.
+    /// Maximum number of agents of one neighbor.
     pub const MAX_AGENTS: usize = 10_000;
-    /// Most agents that all neighbours together can tell of.
+    /// Maximum number of agents of all neighbors together.
     pub const MAX_TOTAL: usize = 40_000;
-    /// Most neighbours that are told anything.
+    /// Maximum number of neighbors.
     pub const MAX_NEIGHBOURS: usize = 256;
-    /// Largest letter content that is read, in bytes.
+    /// Maximum length of a letter's content, in bytes.
     pub const MAX_CONTENT: usize = 1024 * 1024;
-    /// How long the agents of a neighbour are kept when it cannot be written to any more: a
-    /// connection that breaks is usually made again.
+    /// Time for which the agents of a disconnected neighbor are kept: a broken connection is
+    /// usually restored.
     pub const MEMORY: Duration = Duration::from_secs(5);
 
-    /// How long changes are gathered before they are told.
+    /// Time for which changes are collected before they are sent.
     const GATHERING: Duration = Duration::from_millis(50);
-    /// Up to how much is added to that.
+    /// Maximum jitter of that time.
     const JITTER: Duration = Duration::from_millis(50);
-    /// How often a neighbour is told that nothing has changed.
+    /// Interval at which a letter is sent without changes.
     const ALIVE: Duration = Duration::from_secs(15);
-    /// Pauses after a letter that did not arrive, and between two questions.
+    /// Backoff after a letter that did not arrive, and minimum time between two requests.
     const FIRST_PAUSE: Duration = Duration::from_secs(1);
     const LONGEST_PAUSE: Duration = Duration::from_secs(30);
-    /// Most agents in one letter, and most bytes of what they say about themselves.
+    /// Maximum number of agents in one letter, and maximum bytes of their texts.
     const BATCH: usize = 256;
     const BATCH_BYTES: usize = 192 * 1024;
-    /// Most changes that are remembered; who is further behind is told everything.
+    /// Maximum length of the change log; a neighbor that is further behind gets all entries.
     const LOG: usize = 4096;
 
-    /// Nobody is there yet. The seed decides the jitter; that of two gateways should differ.
+    /// Creates an exchange without neighbors. The seed determines the jitter and should differ
+    /// between gateways.
     #[must_use]
     pub fn new(seed: u64) -> Self {
         Self {
@@ -174,14 +179,13 @@ impl Exchange {
         }
     }
 
-    /// What the neighbours have told.
+    /// Returns the directory with the entries of the neighbors.
     #[must_use]
     pub fn directory(&self) -> Arc<ExchangeDirectory> {
         Arc::clone(&self.directory)
     }
 
-    /// These are the agents and coalitions to be told of now: those of this host, gateways left
-    /// out.
+    /// Sets the agents and coalitions to send: those of this host. Gateways are left out.
     pub fn handle_own<'a>(
         &mut self,
         now: Instant,
@@ -205,14 +209,14 @@ impl Exchange {
         }
     }
 
-    /// These gateways can be written to now.
+    /// Sets the gateways that are connected now.
     pub fn handle_neighbours(&mut self, now: Instant, present: &[Present]) {
         for neighbour in self.neighbours.values_mut() {
             let mts = neighbour.mts.incarnation;
             let here = present.iter().any(|it| it.mts.incarnation == mts);
             if here {
                 if neighbour.gone.take().is_some() {
-                    // It may have forgotten meanwhile what it was told, and then says so.
+                    // It may have dropped its copy in the meantime, and then requests all entries.
                     neighbour.failures = 0;
                     neighbour.due = now;
                     if neighbour.held.is_none() {
@@ -257,21 +261,21 @@ impl Exchange {
         self.end_replaced();
     }
 
-    /// Lets go of the agents of gateways that cannot be written to at present, if another directory
-    /// knows them: it may know them at another gateway already.
+    /// Drops agents of disconnected gateways that another directory knows, because that one may
+    /// already have them at another gateway.
     pub fn leave_to_others(&mut self, knows: impl Fn(&Entry) -> bool) {
         for (incarnation, neighbour) in &mut self.neighbours {
             if neighbour.gone.is_some() && self.directory.leave_to_others(*incarnation, &knows) {
-                // Everything is told again when the gateway is back.
+                // The gateway sends all entries again when it reconnects.
                 neighbour.held = None;
             }
         }
     }
 
-    /// The gateway of this location did not answer there. If another gateway takes letters there and has
-    /// told its agents, the silent one has ended, even if a connection with it seems to be open: over
-    /// datagrams a connection outlives a gateway that was killed. Returns whether it has ended. One that
-    /// is there nevertheless is asked for its agents.
+    /// Handles a gateway that does not answer at this location. If another gateway accepts letters
+    /// there and has sent its agents, the silent one has ended, even if a connection with it
+    /// appears open: a datagram connection outlives a gateway that was killed. Returns whether it
+    /// has ended. If a connection with it is still open, it is asked for its agents.
     pub fn handle_silence(&mut self, now: Instant, location: &Location) -> bool {
         let gateway = location.incarnation();
         if !self.is_replaced(gateway, std::slice::from_ref(location)) {
@@ -288,10 +292,11 @@ impl Exchange {
         true
     }
 
-    /// Ends gateways that another incarnation has replaced: a gateway that was killed and started again
-    /// listens where it listened before. Its agents are those that the new incarnation tells of, and
-    /// letters in the custody of the old one are lost. While a connection with the old one is open and
-    /// it answers, its entries stay: two gateways behind one address translator show the same location.
+    /// Ends disconnected gateways that another incarnation has replaced: a gateway that was killed
+    /// and restarted listens at the same address. Its agents are those that the new incarnation
+    /// sends, and letters in the custody of the old one are lost. Entries of a gateway that is
+    /// connected and answers stay: two gateways behind one address translator have the same
+    /// location.
     fn end_replaced(&mut self) {
         let gone = self.neighbours.iter().filter(|(_, old)| old.gone.is_some());
         let replaced = gone.filter(|(gateway, old)| self.is_replaced(**gateway, &old.locations));
@@ -301,7 +306,7 @@ impl Exchange {
         }
     }
 
-    /// Whether another gateway takes letters at one of these locations of this one, and has told its
+    /// Whether another connected gateway accepts letters at one of these locations and has sent its
     /// agents.
     fn is_replaced(&self, gateway: Incarnation, locations: &[Location]) -> bool {
         let mut others = self.neighbours.iter();
@@ -317,10 +322,10 @@ impl Exchange {
         self.directory.prove(gateway, &Mandate::Unproved);
     }
 
-    /// What a letter of this gateway, with [`EXCHANGE_ONTOLOGY`], has as its content.
+    /// Handles the content of a letter from this gateway with [`EXCHANGE_ONTOLOGY`].
     ///
     /// # Errors
-    /// Says why it was not used. Nothing was changed then.
+    /// Returns the reason when the letter was rejected; nothing has changed then.
     pub fn handle_letter(
         &mut self,
         now: Instant,
@@ -342,7 +347,7 @@ impl Exchange {
                 if let Some(under_way) = &mut neighbour.under_way {
                     *under_way = Telling::nothing();
                 }
-                // Who asks all the time is answered now and then.
+                // Limits the rate of answers to a neighbor that keeps asking.
                 let told = neighbour.told.map_or(now, |told| told + Self::FIRST_PAUSE);
                 neighbour.due = told.max(now);
                 Ok(())
@@ -362,7 +367,7 @@ impl Exchange {
         }
     }
 
-    /// The letter that went to this neighbour has arrived, or will not.
+    /// Handles the result of the letter in flight to this neighbor.
     pub fn handle_sent(&mut self, now: Instant, to: Incarnation, arrived: bool) {
         let Some(neighbour) = self.neighbours.get_mut(&to) else {
             return;
@@ -379,7 +384,7 @@ impl Exchange {
             }
             _ if arrived => {}
             _ => {
-                // It may have arrived after all: what it knows is not known any more.
+                // It may have arrived nevertheless, so the state of the neighbor is unknown.
                 neighbour.telling = Telling::nothing();
                 let doubled = Self::FIRST_PAUSE * 2_u32.saturating_pow(neighbour.failures.min(8));
                 neighbour.failures += 1;
@@ -388,7 +393,7 @@ impl Exchange {
         }
     }
 
-    /// Lets go of neighbours that have been away for too long, with all they have told.
+    /// Removes neighbors that have been disconnected for too long, with all their entries.
     pub fn handle_timeout(&mut self, now: Instant) {
         let directory = &self.directory;
         self.neighbours.retain(|incarnation, neighbour| {
@@ -403,7 +408,7 @@ impl Exchange {
         });
     }
 
-    /// When there is something to be done next.
+    /// Time of the next action.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
         let times = self
@@ -417,8 +422,8 @@ impl Exchange {
         times.flatten().min()
     }
 
-    /// The next letter to be sent: to which neighbour, and its content. Each is followed by
-    /// [`handle_sent`](Self::handle_sent).
+    /// Returns the next letter to send: the neighbor and the content. The caller reports its result
+    /// with [`handle_sent`](Self::handle_sent).
     pub fn poll_letter(&mut self, now: Instant) -> Option<(Incarnation, Vec<u8>)> {
         let mut ready = self
             .neighbours
@@ -440,8 +445,7 @@ impl Exchange {
         Some((*incarnation, wire::encode(&told)))
     }
 
-    /// The letters with which this gateway takes leave: to whom, and their content, which is the
-    /// same for all.
+    /// Returns the final letters of this gateway: their receivers and their common content.
     #[must_use]
     pub fn goodbye(&self) -> (Vec<Incarnation>, Vec<u8>) {
         let present = self.neighbours.iter();
@@ -451,7 +455,7 @@ impl Exchange {
     }
 
     fn jitter(&mut self) -> Duration {
-        // SplitMix64: not to be guessed is not the point, differing is.
+        // SplitMix64: the values must differ, but need not be unpredictable.
         self.random = self.random.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut mixed = self.random;
         mixed = (mixed ^ (mixed >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -462,7 +466,7 @@ impl Exchange {
 }
 
 impl Own {
-    /// Whether anything is different now.
+    /// Replaces the agents; returns whether anything changed.
     fn replace(&mut self, agents: Agents) -> bool {
         let before = std::mem::replace(&mut self.agents, agents);
         let left = before
@@ -490,7 +494,7 @@ impl Own {
         any
     }
 
-    /// What to tell who knows that, and what it knows then.
+    /// Returns the next message for a neighbor in this state, and its state after receipt.
     fn next(&self, knows: &Telling) -> (Told, Telling) {
         match knows {
             Telling::All { version } => {
@@ -501,7 +505,7 @@ impl Own {
                 }
             }
             Telling::Some { upto, version } => {
-                // Too much has changed since the first part of it was told.
+                // Start again if more has changed since the first part than the log holds.
                 let behind = usize::try_from(self.version - version).unwrap_or(usize::MAX);
                 match upto {
                     Some(_) if behind <= self.log.len() => self.part(upto.as_ref(), *version),
@@ -511,8 +515,8 @@ impl Own {
         }
     }
 
-    /// The part behind that name of everything. What has changed since the first part was told is
-    /// told again by what follows the last.
+    /// Builds the part of all entries after that name. Changes since the first part are sent after
+    /// the last part.
     fn part(&self, upto: Option<&Arc<str>>, version: u64) -> (Told, Telling) {
         let from = upto.map_or(Bound::Unbounded, |name| Bound::Excluded(Arc::clone(name)));
         let rest = self
@@ -546,7 +550,7 @@ impl Own {
         let (mut bytes, mut taken) = (0, 0);
         for Logged { name, together } in self.log.range(start..) {
             let full = names.len() >= Exchange::BATCH || bytes > Exchange::BATCH_BYTES;
-            // Coalitions that changed together are not torn apart, as long as they fit a letter.
+            // Coalitions that changed together stay in one letter, as long as they fit.
             if full && !(*together && bytes <= Exchange::MAX_CONTENT / 2) {
                 break;
             }
@@ -577,7 +581,7 @@ impl Own {
     }
 }
 
-/// As many as go into one letter, at least one.
+/// As many entries as fit one letter, at least one.
 fn batch<'a>(entries: impl Iterator<Item = &'a Arc<Entry>>) -> Vec<&'a Arc<Entry>> {
     let mut bytes = 0;
     let fits = |entry: &&Arc<Entry>| {
@@ -624,7 +628,7 @@ impl Neighbour {
         }
     }
 
-    /// Whether it takes letters at one of these locations, of whichever incarnation.
+    /// Whether it accepts letters at one of these locations, of any incarnation.
     fn is_at_one_of(&self, locations: &[Location]) -> bool {
         let same = |one: &Location, two: &Location| {
             one.kind() == two.kind() && one.address() == two.address()
@@ -633,12 +637,13 @@ impl Neighbour {
         own.any(|one| locations.iter().any(|two| same(one, two)))
     }
 
-    /// When the next letter to it may go.
+    /// Earliest time of the next letter to it.
     fn next_letter(&self) -> Instant {
         self.ask.map_or(self.due, |ask| ask.min(self.due))
     }
 
-    /// Asks it for everything: what it tells does not follow from what is known.
+    /// Schedules a request for all entries, because a received letter does not fit the stored
+    /// state.
     fn ask_again(&mut self, now: Instant) {
         let earliest = self
             .asked
@@ -700,13 +705,13 @@ impl Neighbour {
         Ok(())
     }
 
-    /// The entry of an agent of this neighbour. It is where the neighbour is, whatever it says.
-    /// None if there cannot be such an agent, or its link does not speak for it. The others are used
-    /// nevertheless.
+    /// Builds the entry of an agent of this neighbor; its locations are always those of the
+    /// neighbor. Returns `None` if the agent is not valid or the neighbor may not speak for it; the
+    /// other agents of the letter are still used.
     fn entry(&self, agent: wire::Agent) -> Option<Arc<Entry>> {
         if !self.mandate.speaks_for(&agent.name) {
             let (gateway, agent) = (escape(&self.mts.name), escape(&agent.name));
-            tracing::debug!(%gateway, %agent, "the certificate of the gateway does not name this agent");
+            tracing::debug!(%gateway, %agent, "agent ignored: the certificate of its gateway does not name it");
             return None;
         }
         let entry = Entry {
@@ -724,29 +729,29 @@ impl Neighbour {
             role: agent.coalition.map_or(Role::Agent, Role::Coalition),
         };
         if let Err(error) = entry.check() {
-            tracing::debug!(gateway = %self.mts.name, %error, "agent not used");
+            tracing::debug!(gateway = %self.mts.name, %error, "agent ignored");
             return None;
         }
         entry.incarnation.is_known().then(|| Arc::new(entry))
     }
 }
 
-/// Why what a neighbour has told was not used.
+/// Error of [`Exchange::handle_letter`].
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ExchangeError {
-    /// It came from somebody who is no neighbour.
-    #[error("the letter comes from somebody who is no neighbour")]
+    /// The sender is not a neighbor.
+    #[error("the sender of the letter is not a connected gateway")]
     Stranger,
     /// The letter is too large.
-    #[error("the letter has {0} bytes; at most {max} are read", max = Exchange::MAX_CONTENT)]
+    #[error("the letter has {0} bytes; at most {max} are allowed", max = Exchange::MAX_CONTENT)]
     TooLarge(usize),
-    /// It is none that is understood.
-    #[error("the letter makes no sense: {}", escape(&.0.to_string()))]
+    /// The content is not a valid letter of the exchange.
+    #[error("the letter is not a valid exchange letter: {}", escape(&.0.to_string()))]
     Malformed(#[from] serde_json::Error),
-    /// There are more agents than are kept.
+    /// The number of agents exceeds a limit.
     #[error(
-        "the neighbour tells of too many agents; {one} of one neighbour and {all} of all are kept",
+        "the neighbor sent too many agents; at most {one} per neighbor and {all} in total are kept",
         one = Exchange::MAX_AGENTS,
         all = Exchange::MAX_TOTAL
     )]

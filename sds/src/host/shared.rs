@@ -1,4 +1,4 @@
-//! What this process knows of the others, and how it changes what they know of it.
+//! State of a host's directory: the entries of other processes, and those that this process writes.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -20,30 +20,30 @@ use crate::{DeregisterError, Entry, Mts, Reach, RegisterError};
 /// Locks are taken in this order: the domain's, `own`, `others`, the table's.
 #[derive(Debug)]
 pub(super) struct Shared {
-    /// Another one after the directory was removed and joined again.
+    /// Replaced when the directory was removed and joined again.
     place: ArcSwap<Place>,
     pub(super) table: Table<Id>,
     mts: Mts,
     own: Mutex<Own>,
     others: Mutex<Others>,
-    /// Counts processes that have ended.
+    /// Number of processes that have ended.
     ended: watch::Sender<u64>,
     sockets: watch::Sender<Vec<SocketId>>,
-    /// Is notified when the directory may have been removed.
+    /// Notified when the directory may have been removed.
     disturbed: Notify,
 }
 
-/// What this process tells the others.
+/// The entries that this process writes.
 #[derive(Debug, Default)]
 struct Own {
     closed: bool,
     agents: Entries,
-    /// Agents of other hosts, published by a gateway. Not in its own table: it knows them
-    /// better than through itself.
+    /// Agents of other hosts that this gateway publishes. They are not in its own table, because it
+    /// has them from other back ends.
     remote: Vec<Arc<Entry>>,
 }
 
-/// What the others have told.
+/// The entries of the other processes.
 #[derive(Debug, Default)]
 struct Others {
     generation: u64,
@@ -51,8 +51,7 @@ struct Others {
 }
 
 impl Others {
-    /// Whether another process has registered an agent of this name, according to the files that
-    /// are there now.
+    /// Whether another process has registered an agent of this name in a file that exists now.
     fn has_registered(&self, name: &str) -> bool {
         self.processes.values().any(|process| {
             let entry = process.entries.get(name);
@@ -85,7 +84,7 @@ impl Shared {
         self.place.load_full()
     }
 
-    /// Says that the directory may have been removed.
+    /// Reports that the directory may have been removed.
     pub(super) fn say_disturbed(&self) {
         self.disturbed.notify_one();
     }
@@ -94,7 +93,7 @@ impl Shared {
         self.disturbed.notified().await;
     }
 
-    /// Whether others can find what this process has written.
+    /// Whether other processes can find the entries of this one.
     pub(super) fn is_there(&self) -> Result<bool, HostError> {
         let own = self.own.lock();
         if own.closed {
@@ -105,11 +104,11 @@ impl Shared {
         Ok(place.is_there()? && (nothing || place.version(place.id())?.is_some()))
     }
 
-    /// Joins the directory again after it, or files of this process in it, were removed. Says
+    /// Joins the directory again after it, or files of this process in it, were removed; returns
     /// whether that was necessary.
     ///
-    /// What others have registered stays known until [`rescan`](Self::rescan): they need a moment
-    /// to join again.
+    /// Entries of other processes stay until [`rescan`](Self::rescan): these processes need time to
+    /// join again.
     pub(super) fn rejoin(&self) -> Result<bool, HostError> {
         if self.is_there()? {
             return Ok(false);
@@ -127,7 +126,7 @@ impl Shared {
         let mut others = self.others.lock();
         others.generation = 0;
         for process in others.processes.values_mut() {
-            // A new file may have the version of the one that was removed.
+            // A new file may have the version of the removed one.
             process.version = None;
         }
         self.scan(&mut others)?;
@@ -161,7 +160,7 @@ impl Shared {
         self.ended.subscribe()
     }
 
-    /// Says that processes have ended.
+    /// Reports that processes have ended.
     pub(super) fn say_ended(&self) {
         self.ended.send_modify(|count| *count += 1);
     }
@@ -170,7 +169,7 @@ impl Shared {
         self.sockets.subscribe()
     }
 
-    /// Sees which processes have a socket.
+    /// Updates the list of processes that have a socket.
     pub(super) fn find_sockets(&self) -> Result<(), HostError> {
         let names = self.place().names()?;
         let mut found: Vec<SocketId> = names
@@ -189,8 +188,7 @@ impl Shared {
         Ok(())
     }
 
-    /// Reads what others have written, if anybody has since the last time: one system call when
-    /// nobody has.
+    /// Reads the changes of other processes; takes one system call when there are none.
     pub(super) fn refresh(&self) -> Result<(), HostError> {
         let generation = self.place().generation()?;
         let mut others = self.others.lock();
@@ -198,12 +196,12 @@ impl Shared {
             return Ok(());
         }
         self.scan(&mut others)?;
-        // The number was read before the files: what was written in between is read again.
+        // Read before the files, so that a change in between causes another read.
         others.generation = generation;
         Ok(())
     }
 
-    /// Reads everything again and checks who lives, whatever the generation says.
+    /// Reads all files again and checks which processes are running, regardless of the generation.
     pub(super) fn rescan(&self) -> Result<(), HostError> {
         let mut others = self.others.lock();
         let known: Vec<Id> = others.processes.keys().copied().collect();
@@ -212,7 +210,7 @@ impl Shared {
                 self.forget(&mut others, id);
             }
         }
-        // Among those of whom nothing was heard there may be some who have ended.
+        // A process may have ended before its files were read for the first time.
         self.say_ended();
         self.scan(&mut others)?;
         drop(others);
@@ -230,7 +228,7 @@ impl Shared {
         Ok(())
     }
 
-    /// Reads what a process has written, if it has written anything new.
+    /// Reads the process's entries file if it has changed.
     pub(super) fn process_wrote(&self, id: Id) -> Result<(), HostError> {
         if id == self.place().id() {
             return Ok(());
@@ -244,18 +242,18 @@ impl Shared {
         if known.is_some_and(|process| process.version == version) {
             return Ok(());
         }
-        // Somebody new may be somebody dead, whose files nobody has removed yet.
+        // The files of an unknown process may be leftovers of a dead one.
         if known.is_none() && !self.place().lives(id)? {
             return Ok(());
         }
         let entries = self.read_file(id).unwrap_or_else(|error| {
-            // Its agents are not there for us, as if it had none; its next file may be better.
+            // Treated as empty; the process's next file may be valid.
             let path = self.place().path().join(Name::Entries(id).to_string());
             tracing::error!(path = %path.display(), %error, "entries file ignored");
             Entries::new()
         });
         let process = others.processes.entry(id).or_default();
-        // Taken before reading: what was replaced in between is read again.
+        // Taken before reading, so that a replacement in between causes another read.
         process.version = version;
         let before = std::mem::replace(&mut process.entries, entries);
         self.tell(id, &before, &process.entries);
@@ -279,7 +277,7 @@ impl Shared {
         self.table.update(left.chain(changed));
     }
 
-    /// Forgets a process if it is dead. False when it lives.
+    /// Drops the entries of a process if it is dead. Returns false if it is running.
     pub(super) fn process_ended(&self, id: Id) -> Result<bool, HostError> {
         if self.place().lives(id)? {
             return Ok(false);
@@ -294,8 +292,8 @@ impl Shared {
         }
     }
 
-    /// Removes the files of a process if it is dead. False when somebody else is just changing
-    /// the directory.
+    /// Removes the files of a process if it is dead. Returns false if another process holds the
+    /// lock.
     pub(super) fn try_bury(&self, id: Id) -> Result<bool, HostError> {
         let place = self.place();
         let Some(guard) = place.try_lock()? else {
@@ -363,7 +361,7 @@ impl Shared {
         Ok(())
     }
 
-    /// Sees to it that nobody who lives has the name.
+    /// Checks that no running process holds the name, and removes the files of dead ones that do.
     fn free(&self, guard: &Guard<'_>, entry: &Entry) -> Result<(), RegisterError> {
         self.refresh().map_err(failed)?;
         while let Some((id, holder)) = self.table.holder(&entry.name) {
@@ -404,7 +402,7 @@ impl Shared {
         })
     }
 
-    /// Replaces what this gateway publishes of other hosts.
+    /// Replaces the agents of other hosts that this gateway publishes.
     pub(super) fn publish(&self, remote: Vec<Arc<Entry>>) -> Result<(), HostError> {
         self.change(|guard, own| {
             if own.closed {
@@ -424,22 +422,23 @@ impl Shared {
         })
     }
 
-    /// Changes what this process tells the others, under the lock of the domain unless the
-    /// directory was removed.
+    /// Changes this process's entries under the lock of the domain, or without it if the directory
+    /// was removed.
     fn change<T>(&self, change: impl FnOnce(Result<Guard<'_>, HostError>, &mut Own) -> T) -> T {
         loop {
             let place = self.place();
             let guard = place.lock();
             let mut own = self.own.lock();
-            // Joined again meanwhile, the place is another one. Under this lock it stays.
+            // After a rejoin, this is a different directory. `own` is locked, so it cannot change
+            // below.
             if Arc::ptr_eq(&place, &self.place()) {
                 return change(guard, &mut own);
             }
         }
     }
 
-    /// Writes what this process tells the others; when the directory was removed,
-    /// [`rejoin`](Self::rejoin) will.
+    /// Writes this process's entries. If the directory was removed, [`rejoin`](Self::rejoin) writes
+    /// them later.
     fn write_now_or_later(
         &self,
         guard: Result<Guard<'_>, HostError>,
@@ -454,20 +453,20 @@ impl Shared {
     }
 
     fn write(&self, guard: &Guard<'_>, own: &Own) -> Result<(), WriteError> {
-        // A name that is registered here is not also published as somebody else's.
+        // A name that is registered here is not also published as a remote agent.
         let remote = own.remote.iter();
         let remote = remote.filter(|entry| !own.agents.contains_key(&entry.name));
         let count = own.agents.len() + own.remote.len();
         if count > file::MAX_ENTRIES {
             let most = file::MAX_ENTRIES;
-            let why = format!("{count} entries in one process, and at most {most} are allowed");
+            let why = format!("this process has {count} entries; at most {most} are allowed");
             return Err(WriteError::Full(why));
         }
         let bytes = file::write(&self.mts, own.agents.values().chain(remote));
         if bytes.len() > MAX_ENTRIES_FILE {
             let len = bytes.len();
             let why = format!(
-                "the entries of this process take {len} bytes, and at most {MAX_ENTRIES_FILE} are allowed"
+                "the entries of this process take {len} bytes, but at most {MAX_ENTRIES_FILE} are allowed"
             );
             return Err(WriteError::Full(why));
         }
@@ -475,7 +474,7 @@ impl Shared {
         Ok(())
     }
 
-    /// Leaves the directory. Doing it again does nothing.
+    /// Leaves the directory. A repeated call does nothing.
     pub(super) fn close(&self) -> Result<(), HostError> {
         let place = self.place();
         let guard = place.lock();

@@ -1,4 +1,4 @@
-//! Sockets in the directory: how processes of a domain that find each other there can talk.
+//! Sockets in the directory, for connections between processes of a domain.
 
 use std::os::fd::OwnedFd;
 
@@ -12,7 +12,7 @@ use rustix::net::{
 use super::HostError;
 use super::place::{Guard, Id, Name, Place};
 
-/// Connections that wait to be accepted.
+/// Maximum number of connections that wait to be accepted.
 const BACKLOG: i32 = 1024;
 
 impl Guard<'_> {
@@ -22,7 +22,7 @@ impl Guard<'_> {
         place.remove(temporary)?;
         let socket = new_socket()
             .and_then(|socket| {
-                // The path of the directory may be longer than that of a socket can be.
+                // The full path may exceed the length limit of a socket's path.
                 let path = place.pinned_path().join(temporary.to_string());
                 bind(&socket, &SocketAddrUnix::new(&path)?)?;
                 let private = Mode::RUSR | Mode::WUSR;
@@ -36,7 +36,7 @@ impl Guard<'_> {
                 Ok(socket)
             })
             .map_err(|error| place.io("listen at", temporary)(error.into()))?;
-        // Seen only now, when it can be connected to.
+        // Appears under its name only now that it accepts connections.
         place.rename(temporary, Name::Socket(place.id()))?;
         Ok(socket)
     }
@@ -47,7 +47,8 @@ impl Place {
         use std::os::fd::AsRawFd as _;
         let name = Name::Socket(id);
         let failed = |error: Errno| self.io("connect to", name)(error.into());
-        // What is examined here is what is connected to below, whatever the name is given to.
+        // Opened first: the connection below is to the file that was examined, even if the name is
+        // reassigned.
         let flags = OFlags::PATH | OFlags::NOFOLLOW | OFlags::CLOEXEC;
         let file = rustix::fs::openat(self.dir(), name.to_string(), flags, Mode::empty());
         let file = file.map_err(failed)?;

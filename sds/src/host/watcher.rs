@@ -1,8 +1,8 @@
-//! The task that listens to what happens in the directory.
+//! The task that watches the directory.
 //!
-//! A process that ends, in whatever way, closes its lock file, which it had open for writing; the
-//! kernel reports that to everybody who watches the directory. A process that cannot get an inotify
-//! instance, of which the kernel limits the number per user, polls the directory instead.
+//! When a process ends, in any way, the kernel closes its lock file, which was open for writing,
+//! and reports that to every watcher. A process that cannot get an inotify instance, of which the
+//! kernel limits the number per user, polls the directory instead.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsStr;
@@ -26,7 +26,7 @@ pub(super) struct Watcher {
     events: Events,
 }
 
-/// Source of the news about the directory.
+/// Source of changes of the directory.
 enum Events {
     Inotify(EventStream<Vec<u8>>),
     Polling(Poller),
@@ -63,12 +63,12 @@ impl Watcher {
         inotify.into_event_stream(vec![0; 16 * 1024])
     }
 
-    /// Keeps the view up to date, for ever. What others had registered when the directory was
-    /// removed is forgotten at `settled`, unless they have joined again.
+    /// Keeps the view up to date until it is aborted. At `settled`, entries from before a removal
+    /// of the directory are dropped, unless their process has joined again.
     ///
-    /// The first change is read at once, and what follows it together after a pause: a process that
-    /// registers a hundred agents replaces its file a hundred times, and everybody who read it each
-    /// time would read for as long as the square of that.
+    /// The first change is read at once, and later ones are collected during a pause: a process
+    /// that registers a hundred agents replaces its file a hundred times, and reading each version
+    /// would take quadratic time.
     pub(super) async fn run(mut self, shared: Arc<Shared>, mut settled: Option<Instant>) {
         let mut ending = Ending::default();
         loop {
@@ -85,12 +85,12 @@ impl Watcher {
             let handled = news.and_then(|news| handle(&shared, news, &mut ending));
             if let Err(error) = handled {
                 if matches!(shared.is_there(), Ok(false)) {
-                    // Joining it again ends this watcher.
+                    // A rejoin ends this watcher.
                     shared.say_disturbed();
                 } else {
                     tracing::error!(%error, "the view of the host's directory may be out of date");
                 }
-                // Whatever it is (no descriptors left, say), not in a tight loop.
+                // The error may persist (for example `EMFILE`); the pause prevents a busy loop.
                 tokio::time::sleep(Duration::from_millis(100)).await;
                 ending.rescan = true;
             }
@@ -98,7 +98,7 @@ impl Watcher {
         }
     }
 
-    /// Everything that has happened since the last time, at least one thing.
+    /// Waits for at least one change, and returns all since the last call.
     async fn news(&mut self, shared: &Shared) -> Result<News, HostError> {
         match &mut self.events {
             Events::Inotify(events) => {
@@ -123,14 +123,14 @@ impl Watcher {
 async fn next_events(events: &mut EventStream<Vec<u8>>) -> io::Result<News> {
     let mut news = News::default();
     poll_fn(|context| {
-        // So many at most, to let others run.
+        // Bounded, so that other tasks can run.
         for _ in 0..4096 {
             match Pin::new(&mut *events).poll_next(context) {
                 Poll::Ready(Some(event)) => {
                     let event = event?;
                     news.add(event.mask, event.name.as_deref().and_then(OsStr::to_str));
                 }
-                // The kernel does not end this.
+                // The stream does not end.
                 Poll::Ready(None) => return Poll::Ready(Err(ErrorKind::UnexpectedEof.into())),
                 Poll::Pending if news.is_empty() => return Poll::Pending,
                 Poll::Pending => break,
@@ -141,14 +141,15 @@ async fn next_events(events: &mut EventStream<Vec<u8>>) -> io::Result<News> {
     .await
 }
 
-/// Time between two looks at the directory without inotify.
+/// Interval between polls of the directory without inotify.
 const POLL_EVERY: Duration = Duration::from_millis(100);
 
-/// Maximum number of processes whose lock is tried in one poll. Each costs four system calls. When
-/// another process has an inotify instance, it removes the files of the dead, which one poll finds.
+/// Maximum number of processes whose lock is tried in one poll. Each costs four system calls.
+/// Another process with an inotify instance removes the files of dead processes, which one poll
+/// detects.
 const LOCKS_PER_POLL: usize = 8;
 
-/// Finds out what inotify would report.
+/// Detects what inotify would report.
 #[derive(Debug, Default)]
 struct Poller {
     /// Generation and time of the last change, as of the last poll.
@@ -190,7 +191,7 @@ impl Poller {
         Ok(())
     }
 
-    /// Looks for processes that were killed, which changes nothing in the directory.
+    /// Detects processes that were killed, which changes nothing in the directory.
     fn try_locks(&mut self, place: &Place, news: &mut News) -> Result<(), HostError> {
         let after = self.tried.map_or(Bound::Unbounded, Bound::Excluded);
         let later = self.processes.range((after, Bound::Unbounded));
@@ -200,7 +201,7 @@ impl Poller {
                 news.ended.insert(*id);
             }
         }
-        // At the end, the next poll begins again.
+        // After the last process, the next poll starts over.
         self.tried = (ids.len() == LOCKS_PER_POLL)
             .then(|| ids.last().copied())
             .flatten();
@@ -208,16 +209,16 @@ impl Poller {
     }
 }
 
-/// How long to let changes gather, after those before took so long to read: where there are many of
-/// them, or little of the processor, reading leaves most of it to those who make them. Whoever
-/// looks for a name that is not there yet does not wait for this.
+/// Time to collect changes after a read of this duration. With many changes or little CPU time,
+/// reading leaves most of the time to the writers. A lookup of an unknown name does not wait for
+/// this pause.
 fn pause_after(reading: Duration) -> Duration {
     const LEAST: Duration = Duration::from_millis(5);
     const MOST: Duration = Duration::from_millis(100);
     (reading * 8).clamp(LEAST, MOST)
 }
 
-/// What has happened, each thing once however often it did.
+/// Collected changes, without duplicates.
 #[derive(Debug, Default)]
 struct News {
     wrote: BTreeSet<Id>,
@@ -258,7 +259,7 @@ async fn sleep_until(time: Option<Instant>) {
 }
 
 fn handle(shared: &Shared, news: News, ending: &mut Ending) -> Result<(), HostError> {
-    // Files that vanish together with the directory are no end of their processes.
+    // Files that disappear together with the directory do not mean that their processes ended.
     if (news.lost || ending.rescan || !news.ended.is_empty()) && !shared.is_there()? {
         return Err(HostError::Removed {
             path: shared.place().path().to_owned(),
@@ -281,9 +282,8 @@ fn handle(shared: &Shared, news: News, ending: &mut Ending) -> Result<(), HostEr
 
 /// Processes that are ending.
 ///
-/// The kernel reports the closing of a file just before it lets go of the lock, and somebody else
-/// may be changing the directory when the remains are to be removed; so both are tried again,
-/// some times.
+/// The kernel reports the closing of a file just before it releases the lock, and another process
+/// may hold the domain's lock when the files are to be removed; both are retried a few times.
 #[derive(Debug, Default)]
 struct Ending {
     processes: BTreeMap<Id, End>,
@@ -298,7 +298,7 @@ struct End {
 
 impl Ending {
     const FIRST_PAUSE: Duration = Duration::from_millis(1);
-    /// After about a second it is not ending: somebody has only touched its lock file.
+    /// After about a second, the process is not ending: a program has only touched its lock file.
     const LAST_PAUSE: Duration = Duration::from_millis(512);
 
     fn add(&mut self, id: Id) {

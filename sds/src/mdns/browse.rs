@@ -126,9 +126,9 @@ struct Record {
     text: Option<Life>,
     digest: Digest,
     len: usize,
-    /// What it says and has not been told.
+    /// Properties that have not been reported yet.
     news: Option<Properties>,
-    /// Whether both have been heard.
+    /// Whether both its SRV and TXT record have arrived.
     known: bool,
     /// Expiry if nothing more arrives: the record is not known yet, is in doubt, or had a goodbye.
     ends: Option<Instant>,
@@ -148,7 +148,7 @@ struct Questions {
 struct Life {
     heard: Instant,
     ttl: Duration,
-    /// How often it has been asked for since.
+    /// Number of renewal queries since then.
     asked: usize,
 }
 

@@ -335,8 +335,8 @@ struct Own {
     resting: HashMap<Arc<str>, Instant>,
     /// Full names that the library has renamed, and will always rename again.
     spoilt: HashSet<Arc<str>>,
-    /// What was announced when the daemon was ended, until there is another one: nobody hears of
-    /// what changes meanwhile, and who was told of it would ask in vain.
+    /// The announcements at the time the library was stopped, until the next one starts. Later changes
+    /// are not announced meanwhile, so a beacon with them would cause unanswered queries.
     meanwhile: Option<beacon::Announced>,
     /// Names of records in which only the locations changed. They are announced at once, because
     /// the library needs about two seconds.

@@ -1,14 +1,14 @@
-//! Coalitions that change together are seen to change together.
+//! Atomic visibility of coalition changes.
 //!
-//! A merger changes one record and takes another one back; a split changes one and adds one. The
-//! network carries records one by one, and loses some. So the beacon of a gateway
-//! ([`super::beacon`]) has a digest of all coalitions that it announces, and is sent at once when
-//! they change. What is heard of a gateway's coalitions waits here until all of it together is
-//! what a beacon says, and is then shown in one go.
+//! A merger changes one record and withdraws another; a split changes one and adds one. The network
+//! carries records one by one, and loses some. The beacon of a gateway ([`super::beacon`])
+//! therefore has a digest of all coalitions that it announces, and is sent at once when they
+//! change. Received coalition records of a gateway wait here until they match its beacon, and then
+//! become visible as one update.
 //!
-//! Waiting ends: what is not complete after [`PATIENCE`] is shown as it is, and so is what comes
-//! from a gateway whose beacons have stopped. So somebody who forges beacons delays what is told
-//! of coalitions by that much, and nothing else. Agents never wait.
+//! The wait is bounded: records that do not match after [`PATIENCE`] become visible as they are,
+//! and so do those of a gateway whose beacons have stopped. A host that forges beacons can
+//! therefore only delay coalition changes by that time. Agents never wait.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -20,44 +20,43 @@ use super::beacon::{Digest, SILENCE};
 use super::record;
 use crate::{Entry, Role};
 
-/// How long records wait for what belongs to them: a record that has just been changed stays so for
-/// three seconds, a new one is probed for most of a second, and a beacon that was lost is repeated
-/// after two and a half.
+/// Maximum time for which a record waits: a changed record stays unchanged for three seconds, a new
+/// one is probed for most of a second, and a lost beacon is repeated after two and a half.
 const PATIENCE: Duration = Duration::from_secs(7);
-/// Most records that wait at one time, of all gateways.
+/// Maximum number of waiting records of all gateways.
 const MAX_WAITING: usize = 1024;
-/// Most gateways whose coalitions wait for each other.
+/// Maximum number of gateways with waiting coalitions.
 const MAX_GATEWAYS: usize = 1024;
 
-/// What the records with these full names are now, none for those that are gone.
+/// New entries of the records with these full names; `None` for removed ones.
 pub(super) type Updates = Vec<(Arc<str>, Option<Arc<Entry>>)>;
 
-/// What is heard of others' coalitions and not shown yet.
+/// Coalition records of other gateways that are not visible yet.
 #[derive(Debug, Default)]
 pub(super) struct Together {
     gateways: HashMap<Incarnation, Gateway>,
-    /// Whose coalition a record is, from when it is heard until its end has been shown.
+    /// The gateway of each coalition record, until its removal is visible.
     records: HashMap<Arc<str>, Incarnation>,
-    /// How many wait, of all gateways.
+    /// Number of waiting records of all gateways.
     waiting: usize,
 }
 
 #[derive(Debug, Default)]
 struct Gateway {
-    /// What its last beacon said of its coalitions, and when.
+    /// Coalition digest of its last beacon, and its time.
     said: Option<(Instant, Digest)>,
-    /// What has been heard of each record.
+    /// Digest of each received record.
     heard: HashMap<Arc<str>, Digest>,
-    /// The digest of all that.
+    /// Digest of all of them.
     digest: Digest,
-    /// What has been heard and not been shown.
+    /// Received records that are not visible yet.
     waiting: HashMap<Arc<str>, Option<Arc<Entry>>>,
-    /// Since when something waits.
+    /// Start of the wait.
     since: Option<Instant>,
 }
 
 impl Together {
-    /// A record is that now, or gone: what is to be shown because of that.
+    /// Handles a record, or its removal, and returns the updates that become visible.
     pub(super) fn put(
         &mut self,
         now: Instant,
@@ -73,7 +72,7 @@ impl Together {
         if let Some(before) = before
             && gateway != Some(before)
         {
-            // It has become somebody else's, who need not wait for the other.
+            // The record now belongs to another gateway, and must not wait for the previous one.
             self.records.remove(fullname);
             if let Some(other) = self.gateways.get_mut(&before) {
                 other.hear(fullname, None);
@@ -98,7 +97,7 @@ impl Together {
         shown
     }
 
-    /// A beacon of the gateway has said that of its coalitions: what is to be shown now.
+    /// Handles the coalition digest of a beacon, and returns the updates that become visible.
     pub(super) fn said(&mut self, now: Instant, gateway: Incarnation, digest: Digest) -> Updates {
         let unknown = !self.gateways.contains_key(&gateway);
         if unknown && (digest == Digest::default() || !self.has_room(now)) {
@@ -109,7 +108,7 @@ impl Together {
         self.settle(now, gateway)
     }
 
-    /// What has waited for long enough.
+    /// Returns the updates whose wait has ended.
     pub(super) fn handle_timeout(&mut self, now: Instant) -> Updates {
         let due = |known: &Gateway| known.due().is_some_and(|due| due <= now);
         let due = self.gateways.iter().filter(|(_, known)| due(known));
@@ -117,7 +116,7 @@ impl Together {
         due.into_iter().flat_map(|one| self.show(one)).collect()
     }
 
-    /// When something will have waited for long enough.
+    /// Time at which a wait ends next.
     pub(super) fn poll_timeout(&self) -> Option<Instant> {
         if self.waiting == 0 {
             return None;
@@ -125,7 +124,7 @@ impl Together {
         self.gateways.values().filter_map(Gateway::due).min()
     }
 
-    /// The gateway for whose beacons this entry has to wait, if it has to.
+    /// Returns the gateway whose beacon this entry must wait for, if any.
     fn gateway_of(&mut self, now: Instant, entry: &Entry) -> Option<Incarnation> {
         let gateway = entry.mts.incarnation;
         let waits = matches!(entry.role, Role::Coalition(_)) && gateway.is_known();
@@ -133,10 +132,10 @@ impl Together {
         room.then_some(gateway)
     }
 
-    /// Whether one more gateway can be remembered.
+    /// Whether another gateway can be stored.
     fn has_room(&mut self, now: Instant) -> bool {
         if self.gateways.len() >= MAX_GATEWAYS {
-            // Those of whom nothing but an old beacon is known.
+            // Drops gateways of which only an old beacon is stored.
             self.gateways.retain(|_, known| {
                 let said = known.said.is_some_and(|(when, _)| now < when + SILENCE);
                 said || !known.heard.is_empty() || !known.waiting.is_empty()
@@ -156,7 +155,7 @@ impl Together {
         Updates::new()
     }
 
-    /// All that waits of this gateway is shown.
+    /// Makes all waiting records of this gateway visible.
     fn show(&mut self, gateway: Incarnation) -> Updates {
         let Some(known) = self.gateways.get_mut(&gateway) else {
             return Updates::new();
@@ -164,7 +163,8 @@ impl Together {
         known.since = None;
         let mut shown: Updates = known.waiting.drain().collect();
         self.waiting -= shown.len();
-        // A record that goes on under another label has not been away.
+        // Additions come first, so that a record that continues under another label does not
+        // disappear in between.
         shown.sort_by_key(|(_, entry)| entry.is_none());
         for (fullname, _) in shown.iter().filter(|(_, entry)| entry.is_none()) {
             self.records.remove(fullname);
@@ -189,7 +189,7 @@ impl Gateway {
         }
     }
 
-    /// When what waits is shown in any case.
+    /// Time at which its waiting records become visible in any case.
     fn due(&self) -> Option<Instant> {
         let patience = self.since? + PATIENCE;
         let silent = self.said.map(|(when, _)| when + SILENCE);
@@ -240,7 +240,7 @@ mod tests {
         coalitions.iter().map(own).collect()
     }
 
-    /// What a watcher sees.
+    /// The state that a watcher sees.
     #[derive(Default)]
     struct Shown(State);
 
@@ -268,13 +268,13 @@ mod tests {
     }
 
     #[test]
-    fn a_merger_is_shown_when_all_of_it_is_there() {
+    fn a_merger_becomes_visible_when_it_is_complete() {
         let (mut together, now, mut shown) =
             (Together::default(), Instant::now(), Shown::default());
         let apart = state(&[("one", &["a", "b"]), ("two", &["c"])]);
         let merged = state(&[("one", &["a", "b", "c"])]);
         let gateway = Incarnation::from_u64(1);
-        // Nothing is shown of what is found one by one, either.
+        // The initial records also become visible only when they are complete.
         assert!(put(&mut together, now, &apart, "one").is_empty());
         assert!(together.said(now, gateway, digest(1, &apart)).is_empty());
         shown.apply(put(&mut together, now, &apart, "two"));
@@ -285,7 +285,7 @@ mod tests {
         assert!(put(&mut together, now, &merged, "one").is_empty());
         shown.apply(together.said(now, gateway, digest(1, &merged)));
         assert_eq!(shown.0, merged);
-        // The last one leaves, and nothing is remembered.
+        // After the last coalition left, no state remains.
         let none = State::new();
         assert!(put(&mut together, now, &none, "one").is_empty());
         shown.apply(together.said(now, gateway, digest(1, &none)));
@@ -294,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn what_never_becomes_complete_is_shown_after_a_while() {
+    fn an_incomplete_update_becomes_visible_after_the_timeout() {
         let (mut together, now) = (Together::default(), Instant::now());
         let half = state(&[("one", &["a"]), ("two", &["b"])]);
         let gateway = Incarnation::from_u64(1);
@@ -304,13 +304,13 @@ mod tests {
         assert!(together.handle_timeout(now + PATIENCE / 2).is_empty());
         assert_eq!(together.handle_timeout(now + PATIENCE).len(), 1);
         assert_eq!(together.poll_timeout(), None);
-        // Who is silent is not waited for.
+        // A gateway without beacons is not waited for.
         let later = now + SILENCE;
         assert_eq!(put(&mut together, later, &half, "two").len(), 1);
     }
 
     #[test]
-    fn agents_and_what_changes_hands_do_not_wait() {
+    fn agents_and_records_that_change_their_gateway_do_not_wait() {
         let (mut together, now) = (Together::default(), Instant::now());
         let mut agent = Entry::clone(&entry(1, "one", &["a".to_owned()]));
         agent.role = Role::Agent;
@@ -321,7 +321,8 @@ mod tests {
         let coalition = state(&[("one", &["a"])]);
         assert!(put(&mut together, now, &coalition, "one").is_empty());
         assert!(together.put(now, &name, None).is_empty(), "waits");
-        // The label is another gateway's now, or an agent's: what waited does not undo that.
+        // The label now belongs to another gateway, or to an agent: the waiting removal does not
+        // apply to it.
         let other = entry(2, "one", &["b".to_owned()]);
         assert!(together.put(now, &name, Some(other)).is_empty());
         assert_eq!(together.put(now, &name, Some(Arc::new(agent))).len(), 1);
@@ -330,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn what_waits_is_bounded() {
+    fn the_number_of_waiting_records_is_bounded() {
         let (mut together, now) = (Together::default(), Instant::now());
         let mut shown = 0;
         for number in 0..10_000_u64 {
@@ -344,25 +345,25 @@ mod tests {
         assert_eq!((shown, together.waiting), (10_000, 0));
     }
 
-    /// Merges and splits, in bursts, on a network that delays each record by itself, repeats some
-    /// and loses beacons: whoever watches sees what was once so and nothing else, and in the end
-    /// what is.
+    /// Simulates mergers and splits, in bursts, on a network that delays each record independently,
+    /// repeats some and loses beacons. A watcher must see only states that existed, and finally the
+    /// current one.
     #[test]
-    fn nobody_sees_a_state_that_never_was() {
+    fn no_watcher_sees_a_state_that_never_existed() {
         let seeds = std::env::var("FIPA_SIM_SEEDS").ok();
         let seeds: u64 = seeds.map_or(40, |seeds| seeds.parse().unwrap());
         for seed in 0..seeds {
-            one_world(seed);
+            simulate(seed);
         }
     }
 
-    fn one_world(seed: u64) {
+    fn simulate(seed: u64) {
         let mut random = fastrand::Rng::with_seed(seed);
         let (start, gateway) = (Instant::now(), Incarnation::from_u64(1));
         let (mut together, mut shown) = (Together::default(), Shown::default());
         let mut is = state(&[("c0", &["a", "b", "c", "d", "e", "f"])]);
         let mut was = vec![State::new(), is.clone()];
-        // When which record is heard; what is heard is what it is then.
+        // Times at which records arrive; the content is that at the time of arrival.
         let mut records = vec![(0, "c0".to_owned())];
         let mut beacons: VecDeque<(u64, Digest)> = VecDeque::new();
         let (mut next_beacon, mut lost, mut next_change, mut named) = (0, false, 9_000, 1);
@@ -375,17 +376,17 @@ mod tests {
                     for _ in 0..random.u32(1..3) {
                         records.push((millis + random.u64(0..150) * 10, name.clone()));
                     }
-                    // The last word, of which the repetition may be lost.
+                    // The final transmission; the earlier repetition may be lost.
                     records.push((millis + 1500, name));
                 }
                 let pause = if random.bool() { 300 } else { 9_000 };
                 next_change += pause + random.u64(0..50) * 10;
-                // Said at once.
+                // The beacon is sent at once.
                 next_beacon = millis;
             }
             if millis == next_beacon {
                 next_beacon += 2_000 + random.u64(0..50) * 10;
-                // Not two in a row.
+                // Never two losses in a row.
                 lost = !lost && random.u8(0..5) == 0;
                 if !lost {
                     beacons.push_back((millis + random.u64(0..10) * 10, digest(1, &is)));
@@ -414,7 +415,7 @@ mod tests {
         assert_eq!(together.poll_timeout(), None, "seed {seed}");
     }
 
-    /// A merger or a split: the names of those that are different.
+    /// Performs a merger or a split, and returns the names of the changed coalitions.
     fn change(random: &mut fastrand::Rng, is: &mut State, named: &mut u32) -> Vec<String> {
         let names: Vec<String> = is.keys().cloned().collect();
         let one = random.choice(&names).unwrap().clone();
