@@ -17,7 +17,7 @@ use crate::{Directory, Entry, NameError, Role, check_name};
 
 /// Members of a coalition, and its leader if it has one.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(try_from = "Said", into = "Said")]
+#[serde(try_from = "CoalitionRecord", into = "CoalitionRecord")]
 pub struct Members {
     names: Arc<[Arc<str>]>,
     leader: Option<Arc<str>>,
@@ -25,7 +25,7 @@ pub struct Members {
 
 /// Serialized form: `{"members": [name], "leader": name}`.
 #[derive(Serialize, Deserialize)]
-struct Said {
+struct CoalitionRecord {
     members: Vec<Arc<str>>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     leader: Option<Arc<str>>,
@@ -94,15 +94,15 @@ impl Members {
     }
 }
 
-impl TryFrom<Said> for Members {
+impl TryFrom<CoalitionRecord> for Members {
     type Error = MembersError;
 
-    fn try_from(said: Said) -> Result<Self, MembersError> {
-        Self::new(said.members, said.leader)
+    fn try_from(record: CoalitionRecord) -> Result<Self, MembersError> {
+        Self::new(record.members, record.leader)
     }
 }
 
-impl From<Members> for Said {
+impl From<Members> for CoalitionRecord {
     fn from(members: Members) -> Self {
         Self {
             members: members.names.to_vec(),

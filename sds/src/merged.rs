@@ -84,13 +84,13 @@ impl Directory for MergedDirectory {
         }
         // Taken before reading: a change during the read causes another read next time.
         let generations = self.generations().collect();
-        let mut merged: HashMap<Arc<str>, Claim> = HashMap::new();
+        let mut merged: HashMap<Arc<str>, NameClaim> = HashMap::new();
         for (at, one) in self.back_ends.iter().enumerate() {
             for entry in one.entries().iter() {
                 if !counts(&self.back_ends, at, entry) {
                     continue;
                 }
-                let claim = Claim {
+                let claim = NameClaim {
                     at,
                     entry: Arc::clone(entry),
                 };
@@ -166,9 +166,9 @@ impl Directory for MergedDirectory {
 fn holder(back_ends: &[Arc<dyn Directory>], name: &str) -> Option<Arc<Entry>> {
     let claims = back_ends.iter().enumerate().filter_map(|(at, one)| {
         let entry = one.known(name)?;
-        counts(back_ends, at, &entry).then_some(Claim { at, entry })
+        counts(back_ends, at, &entry).then_some(NameClaim { at, entry })
     });
-    let better = |best: Claim, next: Claim| match next.is_better(&best, back_ends) {
+    let better = |best: NameClaim, next: NameClaim| match next.is_better(&best, back_ends) {
         true => next,
         false => best,
     };
@@ -176,13 +176,13 @@ fn holder(back_ends: &[Arc<dyn Directory>], name: &str) -> Option<Arc<Entry>> {
 }
 
 /// The entry of one directory for a name.
-struct Claim {
+struct NameClaim {
     /// Index of the directory.
     at: usize,
     entry: Arc<Entry>,
 }
 
-impl Claim {
+impl NameClaim {
     /// Whether this claim replaces the claim of an earlier directory.
     fn is_better(&self, before: &Self, back_ends: &[Arc<dyn Directory>]) -> bool {
         let (new, old) = (&self.entry, &before.entry);
@@ -246,14 +246,14 @@ fn counts(back_ends: &[Arc<dyn Directory>], at: usize, entry: &Entry) -> bool {
 /// The entries of a merged view that a watcher has been told of.
 pub(crate) struct MergedView {
     back_ends: BackEnds,
-    told: HashMap<Arc<str>, Arc<Entry>>,
+    reported: HashMap<Arc<str>, Arc<Entry>>,
 }
 
 impl MergedView {
     fn new(back_ends: &BackEnds) -> Self {
         let mut view = Self {
             back_ends: Arc::clone(back_ends),
-            told: HashMap::new(),
+            reported: HashMap::new(),
         };
         view.reread();
         view
@@ -261,7 +261,7 @@ impl MergedView {
 
     /// Converts a change in one of the directories to the change of the merged view, if there is
     /// one.
-    pub(crate) fn told(&mut self, raw: Change) -> Option<Change> {
+    pub(crate) fn translate(&mut self, raw: Change) -> Option<Change> {
         match &raw {
             Change::Together(raws) => {
                 let names = raws.iter().filter_map(Change::name);
@@ -282,18 +282,18 @@ impl MergedView {
     fn now(&mut self, name: &Arc<str>) -> Option<Change> {
         let after = holder(&self.back_ends, name);
         let before = match &after {
-            Some(entry) => self.told.insert(name.clone(), Arc::clone(entry)),
-            None => self.told.remove(name),
+            Some(entry) => self.reported.insert(name.clone(), Arc::clone(entry)),
+            None => self.reported.remove(name),
         };
         Change::between(before, after)
     }
 
     fn reread(&mut self) {
-        self.told.clear();
+        self.reported.clear();
         for one in self.back_ends.iter() {
             for entry in one.entries().iter() {
                 if let Some(entry) = holder(&self.back_ends, &entry.name) {
-                    self.told.insert(entry.name.clone(), entry);
+                    self.reported.insert(entry.name.clone(), entry);
                 }
             }
         }

@@ -9,7 +9,7 @@ use arc_swap::ArcSwapOption;
 use fipa_transport::Incarnation;
 use parking_lot::RwLock;
 
-use crate::watch::Hub;
+use crate::watch::Subscribers;
 use crate::{Change, Entry, Subscriber};
 
 /// Implements the part of [`Directory`](crate::Directory) that all back ends read from their
@@ -47,7 +47,7 @@ pub(crate) struct Table<O> {
     index: RwLock<Index<O>>,
     sorted: ArcSwapOption<Sorted>,
     generation: AtomicU64,
-    hub: Hub,
+    subscribers: Subscribers,
 }
 
 #[derive(Debug)]
@@ -87,7 +87,7 @@ impl<O: Clone + Eq + Hash> Table<O> {
             }),
             sorted: ArcSwapOption::empty(),
             generation: AtomicU64::new(0),
-            hub: Hub::default(),
+            subscribers: Subscribers::default(),
         }
     }
 
@@ -142,9 +142,9 @@ impl<O: Clone + Eq + Hash> Table<O> {
 
     /// Tells all watchers to read again, because the mandates that a merged view applies to these
     /// entries changed.
-    pub(crate) fn tell_all(&self) {
+    pub(crate) fn notify_reread(&self) {
         let _index = self.index.write();
-        self.tell(Some(Change::Lagged));
+        self.notify(Some(Change::Lagged));
     }
 
     pub(crate) fn generation(&self) -> u64 {
@@ -152,7 +152,7 @@ impl<O: Clone + Eq + Hash> Table<O> {
     }
 
     pub(crate) fn subscribe(&self, subscriber: &Subscriber) {
-        self.hub.subscribe(subscriber);
+        self.subscribers.subscribe(subscriber);
     }
 
     /// Inserts the entry; replaces the one that the same origin claims by that name.
@@ -193,23 +193,23 @@ impl<O: Clone + Eq + Hash> Table<O> {
     #[cfg(feature = "mdns")]
     pub(crate) fn replace(&self, updates: impl IntoIterator<Item = (O, Option<Arc<Entry>>)>) {
         let mut index = self.index.write();
-        let mut together = Vec::new();
+        let mut coalitions = Vec::new();
         for (origin, entry) in updates {
             let before = index.origins.remove(&origin);
             if let Some(name) = before
                 && entry.as_ref().is_none_or(|entry| entry.name != name)
             {
                 let change = index.change(origin.clone(), name, None);
-                self.tell_or_keep(change, &mut together);
+                self.notify_or_collect(change, &mut coalitions);
             }
             if let Some(entry) = entry {
                 let name = entry.name.clone();
                 index.origins.insert(origin.clone(), name.clone());
                 let change = index.change(origin, name, Some(entry));
-                self.tell_or_keep(change, &mut together);
+                self.notify_or_collect(change, &mut coalitions);
             }
         }
-        self.tell(Change::together(together));
+        self.notify(Change::together(coalitions));
     }
 
     /// Number of origins that have an entry by [`replace`](Self::replace).
@@ -224,32 +224,32 @@ impl<O: Clone + Eq + Hash> Table<O> {
         updates: impl IntoIterator<Item = (O, Arc<str>, Option<Arc<Entry>>)>,
     ) {
         let mut index = self.index.write();
-        let mut together = Vec::new();
+        let mut coalitions = Vec::new();
         for (origin, name, entry) in updates {
             let change = index.change(origin, name, entry);
-            self.tell_or_keep(change, &mut together);
+            self.notify_or_collect(change, &mut coalitions);
         }
-        self.tell(Change::together(together));
+        self.notify(Change::together(coalitions));
     }
 
     /// Collects changes of coalitions, which are reported as one change so that a merger has no
     /// intermediate state; reports other changes at once.
-    fn tell_or_keep(&self, change: Option<Change>, together: &mut Vec<Change>) {
+    fn notify_or_collect(&self, change: Option<Change>, coalitions: &mut Vec<Change>) {
         match change {
-            Some(change) if change.of_coalition() => together.push(change),
-            change => self.tell(change),
+            Some(change) if change.of_coalition() => coalitions.push(change),
+            change => self.notify(change),
         }
     }
 
     /// Notifies watchers under the lock, so that they receive changes in order.
     fn apply(&self, index: &mut Index<O>, origin: O, name: Arc<str>, entry: Option<Arc<Entry>>) {
-        self.tell(index.change(origin, name, entry));
+        self.notify(index.change(origin, name, entry));
     }
 
-    fn tell(&self, change: Option<Change>) {
+    fn notify(&self, change: Option<Change>) {
         if let Some(change) = change {
             self.generation.fetch_add(1, Ordering::Release);
-            self.hub.tell(&change);
+            self.subscribers.tell(&change);
         }
     }
 }
@@ -284,15 +284,15 @@ impl<O: Eq> Index<O> {
         };
         let first_unproved = proved(&claims);
         if let Some(entry) = entry {
-            let place = match is_proved(&origin) {
+            let index = match is_proved(&origin) {
                 true => before.unwrap_or(first_unproved),
                 false => {
                     let mut unproved = claims.iter().skip(first_unproved);
-                    let place = unproved.position(|(_, other)| entry.precedes(other));
-                    place.map_or(claims.len(), |place| first_unproved + place)
+                    let index = unproved.position(|(_, other)| entry.precedes(other));
+                    index.map_or(claims.len(), |index| first_unproved + index)
                 }
             };
-            claims.insert(place, (origin, entry));
+            claims.insert(index, (origin, entry));
         }
         if proved(&claims) > 1 {
             self.contested.insert(name.clone());

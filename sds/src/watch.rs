@@ -124,7 +124,7 @@ impl Watch {
             } else {
                 self.changes.recv().await?
             };
-            if let Some(change) = self.told(raw) {
+            if let Some(change) = self.translate(raw) {
                 return Some(change);
             }
         }
@@ -138,7 +138,7 @@ impl Watch {
             } else {
                 self.changes.try_recv().ok()?
             };
-            if let Some(change) = self.told(raw) {
+            if let Some(change) = self.translate(raw) {
                 return Some(change);
             }
         }
@@ -154,9 +154,9 @@ impl Watch {
         lags
     }
 
-    fn told(&mut self, raw: Change) -> Option<Change> {
+    fn translate(&mut self, raw: Change) -> Option<Change> {
         match &mut self.merged {
-            Some(view) => view.told(raw),
+            Some(view) => view.translate(raw),
             None => Some(raw),
         }
     }
@@ -191,11 +191,11 @@ impl Subscriber {
 
 /// All subscribers of a directory.
 #[derive(Debug, Default)]
-pub(crate) struct Hub {
+pub(crate) struct Subscribers {
     subscribers: Mutex<Vec<Subscriber>>,
 }
 
-impl Hub {
+impl Subscribers {
     pub(crate) fn subscribe(&self, subscriber: &Subscriber) {
         let mut subscribers = self.subscribers.lock();
         // Dropped watches are otherwise removed only at the next change, which may never come.

@@ -4,20 +4,20 @@ use fipa_acl::{Message, Payload, Performative};
 
 use super::one_line;
 
-/// What the message transport service or the agent management system of either host says in a
-/// failure message: a letter was not delivered to one receiver.
+/// A failure message of the message transport service or agent management system of either host: a
+/// letter was not delivered to one receiver.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DeliveryFailure {
-    /// The name of the receiver, if the message gives it.
+    /// Name of the receiver, if the message has it.
     pub receiver: Option<String>,
-    /// The reason, as the service words it: one line of at most 400 bytes,
+    /// The reason in the words of the service: one line of at most 400 bytes,
     /// [escaped](fipa_acl::escape).
     pub reason: String,
 }
 
 impl DeliveryFailure {
-    /// Reads a failure message. None if the message is no failure, or the failure of something else
-    /// than a delivery, such as of an action that the receiver agreed to.
+    /// Reads a failure message. `None` if the message is not a failure, or reports another failure
+    /// than a delivery, such as that of an action that the receiver agreed to.
     #[must_use]
     pub fn read(message: &Message) -> Option<Self> {
         if *message.performative() != Performative::Failure {
@@ -110,7 +110,7 @@ impl<'a> Iterator for Tokens<'a> {
     }
 }
 
-/// Where the literal that begins this text ends: at a quotation mark without `\` before it.
+/// Offset of the literal's end: of the first quotation mark without `\` before it.
 fn end_of_text(inside: &str) -> usize {
     let mut escaped = false;
     let end = inside.bytes().position(|byte| {
@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn other_failures_are_none_of_a_delivery() {
+    fn failures_of_other_actions_are_not_delivery_failures() {
         let message = |performative, content: &str| {
             Message::builder(performative)
                 .content(content.to_owned())

@@ -17,32 +17,32 @@ use crate::{Directory, Entry, Role, Subscriber};
 /// received holds it until its entry leaves: a neighbor cannot claim an earlier registration.
 #[derive(Debug)]
 pub struct ExchangeDirectory {
-    table: Table<Teller>,
+    table: Table<Origin>,
     /// Mandates of the neighbors with certified links.
     mandates: ArcSwap<HashMap<Incarnation, Mandate>>,
     /// Agents of each gateway. The lock is held while the table is updated.
-    told: Mutex<HashMap<Incarnation, Agents>>,
+    agents_of: Mutex<HashMap<Incarnation, Agents>>,
 }
 
 impl Default for ExchangeDirectory {
     fn default() -> Self {
         Self {
-            table: Table::proved_by(|teller| teller.is_proved),
+            table: Table::proved_by(|origin| origin.is_proved),
             mandates: ArcSwap::default(),
-            told: Mutex::default(),
+            agents_of: Mutex::default(),
         }
     }
 }
 
 /// The gateway that sent an agent's entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-struct Teller {
+struct Origin {
     gateway: Incarnation,
     /// Whether its link is certified.
     is_proved: bool,
 }
 
-type Update = (Teller, Arc<str>, Option<Arc<Entry>>);
+type Update = (Origin, Arc<str>, Option<Arc<Entry>>);
 
 impl ExchangeDirectory {
     /// Maximum number of pairs that [`contested`](Self::contested) returns.
@@ -77,11 +77,11 @@ impl ExchangeDirectory {
             mandates
         });
         // The mandate decides which entries of this gateway in other directories are visible.
-        self.table.tell_all();
+        self.table.notify_reread();
     }
 
-    fn teller(&self, gateway: Incarnation) -> Teller {
-        Teller {
+    fn origin(&self, gateway: Incarnation) -> Origin {
+        Origin {
             gateway,
             is_proved: self.mandates.load().contains_key(&gateway),
         }
@@ -93,21 +93,21 @@ impl ExchangeDirectory {
         gateway: Incarnation,
         entries: Agents,
     ) -> Result<(), ExchangeError> {
-        let teller = self.teller(gateway);
-        let mut told = self.told.lock();
-        let others = told.iter().filter(|(other, _)| **other != gateway);
+        let origin = self.origin(gateway);
+        let mut agents_of = self.agents_of.lock();
+        let others = agents_of.iter().filter(|(other, _)| **other != gateway);
         let total: usize = others.map(|(_, entries)| entries.len()).sum();
         if total + entries.len() > Exchange::MAX_TOTAL {
             return Err(ExchangeError::TooMany);
         }
-        let before = told.insert(gateway, entries).unwrap_or_default();
-        let now = told.get(&gateway);
+        let before = agents_of.insert(gateway, entries).unwrap_or_default();
+        let now = agents_of.get(&gateway);
         let left = before
             .into_keys()
             .filter(|name| now.is_none_or(|now| !now.contains_key(name)))
-            .map(|name| (teller, name, None));
+            .map(|name| (origin, name, None));
         let here = now.into_iter().flatten();
-        let here = here.map(|(name, entry)| (teller, Arc::clone(name), Some(Arc::clone(entry))));
+        let here = here.map(|(name, entry)| (origin, Arc::clone(name), Some(Arc::clone(entry))));
         let updates: Vec<Update> = left.chain(here).collect();
         self.table.update(updates);
         Ok(())
@@ -120,20 +120,20 @@ impl ExchangeDirectory {
         joined: Vec<Arc<Entry>>,
         left: Vec<String>,
     ) -> Result<(), ExchangeError> {
-        let teller = self.teller(gateway);
-        let mut told = self.told.lock();
-        let total: usize = told.values().map(Agents::len).sum();
-        let of_gateway = told.entry(gateway).or_default();
+        let origin = self.origin(gateway);
+        let mut agents_of = self.agents_of.lock();
+        let total: usize = agents_of.values().map(Agents::len).sum();
+        let of_gateway = agents_of.entry(gateway).or_default();
         let mut after = of_gateway.clone();
         let mut updates: Vec<Update> = Vec::new();
         for name in left {
             if let Some((name, _)) = after.remove_entry(name.as_str()) {
-                updates.push((teller, name, None));
+                updates.push((origin, name, None));
             }
         }
         for entry in joined {
             after.insert(Arc::clone(&entry.name), Arc::clone(&entry));
-            updates.push((teller, Arc::clone(&entry.name), Some(entry)));
+            updates.push((origin, Arc::clone(&entry.name), Some(entry)));
         }
         let total = total - of_gateway.len() + after.len();
         if after.len() > Exchange::MAX_AGENTS || total > Exchange::MAX_TOTAL {
@@ -146,15 +146,15 @@ impl ExchangeDirectory {
 
     /// Sets new locations of the gateway and all its agents.
     pub(super) fn relocate(&self, gateway: Incarnation, locations: &[Location]) {
-        let teller = self.teller(gateway);
-        let mut told = self.told.lock();
+        let origin = self.origin(gateway);
+        let mut agents_of = self.agents_of.lock();
         let mut updates: Vec<Update> = Vec::new();
-        for (name, entry) in told.get_mut(&gateway).into_iter().flatten() {
+        for (name, entry) in agents_of.get_mut(&gateway).into_iter().flatten() {
             *entry = Arc::new(Entry {
                 locations: locations.to_vec(),
                 ..Entry::clone(entry)
             });
-            updates.push((teller, Arc::clone(name), Some(Arc::clone(entry))));
+            updates.push((origin, Arc::clone(name), Some(Arc::clone(entry))));
         }
         self.table.update(updates);
     }
@@ -167,9 +167,9 @@ impl ExchangeDirectory {
         gateway: Incarnation,
         knows: impl Fn(&Entry) -> bool,
     ) -> bool {
-        let teller = self.teller(gateway);
-        let mut told = self.told.lock();
-        let Some(agents) = told.get_mut(&gateway).filter(|_| !teller.is_proved) else {
+        let origin = self.origin(gateway);
+        let mut agents_of = self.agents_of.lock();
+        let Some(agents) = agents_of.get_mut(&gateway).filter(|_| !origin.is_proved) else {
             return false;
         };
         let agent = |entry: &&Arc<Entry>| entry.role == Role::Agent && knows(entry);
@@ -179,17 +179,17 @@ impl ExchangeDirectory {
             agents.remove(name);
         }
         let any = !known.is_empty();
-        let updates: Vec<Update> = known.into_iter().map(|name| (teller, name, None)).collect();
+        let updates: Vec<Update> = known.into_iter().map(|name| (origin, name, None)).collect();
         self.table.update(updates);
         any
     }
 
     /// Removes the gateway's agents.
     pub(super) fn forget(&self, gateway: Incarnation) {
-        let teller = self.teller(gateway);
-        let mut told = self.told.lock();
-        let names = told.remove(&gateway).unwrap_or_default().into_keys();
-        self.table.update(names.map(|name| (teller, name, None)));
+        let origin = self.origin(gateway);
+        let mut agents_of = self.agents_of.lock();
+        let names = agents_of.remove(&gateway).unwrap_or_default().into_keys();
+        self.table.update(names.map(|name| (origin, name, None)));
     }
 }
 
@@ -198,7 +198,7 @@ impl Directory for ExchangeDirectory {
 
     /// The letters of a gateway apply atomically and contain all its coalitions.
     fn speaks_for(&self, mts: Incarnation) -> bool {
-        self.told.lock().contains_key(&mts)
+        self.agents_of.lock().contains_key(&mts)
     }
 
     fn mandate(&self, mts: Incarnation) -> Mandate {

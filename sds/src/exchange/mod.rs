@@ -28,7 +28,7 @@ use fipa_acl::escape;
 use fipa_transport::{Incarnation, Location, Mandate};
 
 pub use directory::ExchangeDirectory;
-use wire::{Changes, Full, Told};
+use wire::{Changes, Full, ExchangeMessage};
 
 use crate::entry::time_of_millis;
 use crate::{Entry, Mts, Reach, Role, Source};
@@ -42,8 +42,8 @@ type Agents = BTreeMap<Arc<str>, Arc<Entry>>;
 /// State of the exchange with all neighbors.
 #[derive(Debug)]
 pub struct Exchange {
-    own: Own,
-    neighbours: HashMap<Incarnation, Neighbour>,
+    own: LocalAgents,
+    neighbors: HashMap<Incarnation, Neighbor>,
     /// Gateways that sent a letter before they were reported as neighbors; they are asked for all
     /// entries later.
     early: HashSet<Incarnation>,
@@ -77,7 +77,7 @@ impl Present {
 
 /// The agents that this gateway sends to its neighbors.
 #[derive(Debug, Default)]
-struct Own {
+struct LocalAgents {
     agents: Agents,
     /// Number of changes of `agents` so far.
     version: u64,
@@ -90,26 +90,26 @@ struct Own {
 struct Logged {
     name: Arc<str>,
     /// Whether it changed together with the previous one; both are then sent in one letter.
-    together: bool,
+    with_previous: bool,
 }
 
 /// A gateway that is connected, or was until recently.
 #[derive(Debug)]
-struct Neighbour {
+struct Neighbor {
     mts: Mts,
     locations: Vec<Location>,
     mandate: Mandate,
     /// Time of the disconnect.
     gone: Option<Instant>,
-    telling: Telling,
+    state: SyncState,
     /// State of the neighbor once the letter in flight has arrived, if there is one.
-    under_way: Option<Telling>,
+    under_way: Option<SyncState>,
     /// Earliest time of the next letter.
     due: Instant,
     /// Number of consecutive letters that did not arrive.
     failures: u32,
     /// The neighbor's version that is in the directory.
-    held: Option<u64>,
+    stored: Option<u64>,
     /// Entries received so far of a state that takes several letters.
     staged: Option<Staged>,
     /// Time at which to request all entries, if necessary, and time of the last request.
@@ -121,7 +121,7 @@ struct Neighbour {
 
 /// State of a neighbor's copy of this gateway's agents.
 #[derive(Debug, Clone, PartialEq, Eq)]
-enum Telling {
+enum SyncState {
     /// It has the agents up to this name, of a state at least as new as this version; initially
     /// none.
     Some {
@@ -171,8 +171,8 @@ impl Exchange {
     #[must_use]
     pub fn new(seed: u64) -> Self {
         Self {
-            own: Own::default(),
-            neighbours: HashMap::new(),
+            own: LocalAgents::default(),
+            neighbors: HashMap::new(),
             early: HashSet::new(),
             directory: Arc::default(),
             random: seed,
@@ -202,29 +202,29 @@ impl Exchange {
             return;
         }
         let soon = now + Self::GATHERING + self.jitter();
-        for neighbour in self.neighbours.values_mut() {
-            if matches!(neighbour.telling, Telling::All { .. }) && neighbour.failures == 0 {
-                neighbour.due = neighbour.due.min(soon);
+        for neighbor in self.neighbors.values_mut() {
+            if matches!(neighbor.state, SyncState::All { .. }) && neighbor.failures == 0 {
+                neighbor.due = neighbor.due.min(soon);
             }
         }
     }
 
     /// Sets the gateways that are connected now.
     pub fn handle_neighbours(&mut self, now: Instant, present: &[Present]) {
-        for neighbour in self.neighbours.values_mut() {
-            let mts = neighbour.mts.incarnation;
+        for neighbor in self.neighbors.values_mut() {
+            let mts = neighbor.mts.incarnation;
             let here = present.iter().any(|it| it.mts.incarnation == mts);
             if here {
-                if neighbour.gone.take().is_some() {
+                if neighbor.gone.take().is_some() {
                     // It may have dropped its copy in the meantime, and then requests all entries.
-                    neighbour.failures = 0;
-                    neighbour.due = now;
-                    if neighbour.held.is_none() {
-                        neighbour.ask_again(now);
+                    neighbor.failures = 0;
+                    neighbor.due = now;
+                    if neighbor.stored.is_none() {
+                        neighbor.request_all(now);
                     }
                 }
-            } else if neighbour.gone.is_none() {
-                neighbour.gone = Some(now);
+            } else if neighbor.gone.is_none() {
+                neighbor.gone = Some(now);
             }
         }
         for Present {
@@ -233,12 +233,12 @@ impl Exchange {
             mandate,
         } in present
         {
-            if let Some(known) = self.neighbours.get_mut(&mts.incarnation) {
+            if let Some(known) = self.neighbors.get_mut(&mts.incarnation) {
                 if known.mandate != *mandate {
                     known.mandate = mandate.clone();
                     self.directory.prove(mts.incarnation, mandate);
-                    (known.held, known.staged) = (None, None);
-                    known.ask_again(now);
+                    (known.stored, known.staged) = (None, None);
+                    known.request_all(now);
                 }
                 if known.locations != *locations {
                     known.locations.clone_from(locations);
@@ -246,17 +246,17 @@ impl Exchange {
                 }
                 continue;
             }
-            if self.neighbours.len() >= Self::MAX_NEIGHBOURS || !mts.incarnation.is_known() {
+            if self.neighbors.len() >= Self::MAX_NEIGHBOURS || !mts.incarnation.is_known() {
                 continue;
             }
             let due = now + self.jitter();
-            let mut neighbour = Neighbour::new(mts.clone(), locations.clone(), due);
-            neighbour.mandate = mandate.clone();
+            let mut neighbor = Neighbor::new(mts.clone(), locations.clone(), due);
+            neighbor.mandate = mandate.clone();
             self.directory.prove(mts.incarnation, mandate);
             if self.early.remove(&mts.incarnation) {
-                neighbour.ask_again(now);
+                neighbor.request_all(now);
             }
-            self.neighbours.insert(mts.incarnation, neighbour);
+            self.neighbors.insert(mts.incarnation, neighbor);
         }
         self.end_replaced();
     }
@@ -264,10 +264,10 @@ impl Exchange {
     /// Drops agents of disconnected gateways that another directory knows, because that one may
     /// already have them at another gateway.
     pub fn leave_to_others(&mut self, knows: impl Fn(&Entry) -> bool) {
-        for (incarnation, neighbour) in &mut self.neighbours {
-            if neighbour.gone.is_some() && self.directory.leave_to_others(*incarnation, &knows) {
+        for (incarnation, neighbor) in &mut self.neighbors {
+            if neighbor.gone.is_some() && self.directory.leave_to_others(*incarnation, &knows) {
                 // The gateway sends all entries again when it reconnects.
-                neighbour.held = None;
+                neighbor.stored = None;
             }
         }
     }
@@ -281,11 +281,11 @@ impl Exchange {
         if !self.is_replaced(gateway, std::slice::from_ref(location)) {
             return false;
         }
-        match self.neighbours.get_mut(&gateway) {
+        match self.neighbors.get_mut(&gateway) {
             Some(silent) if silent.gone.is_none() => {
                 self.directory.forget(gateway);
-                (silent.held, silent.staged) = (None, None);
-                silent.ask_again(now);
+                (silent.stored, silent.staged) = (None, None);
+                silent.request_all(now);
             }
             _ => self.end(gateway),
         }
@@ -298,7 +298,7 @@ impl Exchange {
     /// connected and answers stay: two gateways behind one address translator have the same
     /// location.
     fn end_replaced(&mut self) {
-        let gone = self.neighbours.iter().filter(|(_, old)| old.gone.is_some());
+        let gone = self.neighbors.iter().filter(|(_, old)| old.gone.is_some());
         let replaced = gone.filter(|(gateway, old)| self.is_replaced(**gateway, &old.locations));
         let replaced: Vec<Incarnation> = replaced.map(|(incarnation, _)| *incarnation).collect();
         for incarnation in replaced {
@@ -309,15 +309,15 @@ impl Exchange {
     /// Whether another connected gateway accepts letters at one of these locations and has sent its
     /// agents.
     fn is_replaced(&self, gateway: Incarnation, locations: &[Location]) -> bool {
-        let mut others = self.neighbours.iter();
+        let mut others = self.neighbors.iter();
         others.any(|(other, new)| {
-            let tells = new.gone.is_none() && new.held.is_some();
+            let tells = new.gone.is_none() && new.stored.is_some();
             *other != gateway && tells && new.is_at_one_of(locations)
         })
     }
 
     fn end(&mut self, gateway: Incarnation) {
-        self.neighbours.remove(&gateway);
+        self.neighbors.remove(&gateway);
         self.directory.forget(gateway);
         self.directory.prove(gateway, &Mandate::Unproved);
     }
@@ -335,60 +335,60 @@ impl Exchange {
         if content.len() > Self::MAX_CONTENT {
             return Err(ExchangeError::TooLarge(content.len()));
         }
-        let Some(neighbour) = self.neighbours.get_mut(&from) else {
+        let Some(neighbor) = self.neighbors.get_mut(&from) else {
             if self.early.len() < Self::MAX_NEIGHBOURS {
                 self.early.insert(from);
             }
             return Err(ExchangeError::Stranger);
         };
         match wire::decode(content)? {
-            Told::Again => {
-                neighbour.telling = Telling::nothing();
-                if let Some(under_way) = &mut neighbour.under_way {
-                    *under_way = Telling::nothing();
+            ExchangeMessage::Again => {
+                neighbor.state = SyncState::nothing();
+                if let Some(under_way) = &mut neighbor.under_way {
+                    *under_way = SyncState::nothing();
                 }
                 // Limits the rate of answers to a neighbor that keeps asking.
-                let told = neighbour.told.map_or(now, |told| told + Self::FIRST_PAUSE);
-                neighbour.due = told.max(now);
+                let told = neighbor.told.map_or(now, |told| told + Self::FIRST_PAUSE);
+                neighbor.due = told.max(now);
                 Ok(())
             }
-            Told::Goodbye => {
-                neighbour.held = None;
-                neighbour.staged = None;
+            ExchangeMessage::Goodbye => {
+                neighbor.stored = None;
+                neighbor.staged = None;
                 self.directory.forget(from);
                 Ok(())
             }
-            Told::Full(full) => {
-                neighbour.told_all(now, full, &self.directory)?;
+            ExchangeMessage::Full(full) => {
+                neighbor.handle_full(now, full, &self.directory)?;
                 self.end_replaced();
                 Ok(())
             }
-            Told::Changes(changes) => neighbour.told_changes(now, changes, &self.directory),
+            ExchangeMessage::Changes(changes) => neighbor.handle_changes(now, changes, &self.directory),
         }
     }
 
     /// Handles the result of the letter in flight to this neighbor.
     pub fn handle_sent(&mut self, now: Instant, to: Incarnation, arrived: bool) {
-        let Some(neighbour) = self.neighbours.get_mut(&to) else {
+        let Some(neighbor) = self.neighbors.get_mut(&to) else {
             return;
         };
-        match neighbour.under_way.take() {
-            Some(telling) if arrived => {
-                neighbour.failures = 0;
-                neighbour.telling = telling;
-                neighbour.due = match neighbour.telling {
-                    Telling::Some { .. } => now,
-                    Telling::All { version } if version < self.own.version => now + Self::GATHERING,
-                    Telling::All { .. } => now + Self::ALIVE,
+        match neighbor.under_way.take() {
+            Some(state) if arrived => {
+                neighbor.failures = 0;
+                neighbor.state = state;
+                neighbor.due = match neighbor.state {
+                    SyncState::Some { .. } => now,
+                    SyncState::All { version } if version < self.own.version => now + Self::GATHERING,
+                    SyncState::All { .. } => now + Self::ALIVE,
                 };
             }
             _ if arrived => {}
             _ => {
                 // It may have arrived nevertheless, so the state of the neighbor is unknown.
-                neighbour.telling = Telling::nothing();
-                let doubled = Self::FIRST_PAUSE * 2_u32.saturating_pow(neighbour.failures.min(8));
-                neighbour.failures += 1;
-                neighbour.due = now + doubled.min(Self::LONGEST_PAUSE);
+                neighbor.state = SyncState::nothing();
+                let doubled = Self::FIRST_PAUSE * 2_u32.saturating_pow(neighbor.failures.min(8));
+                neighbor.failures += 1;
+                neighbor.due = now + doubled.min(Self::LONGEST_PAUSE);
             }
         }
     }
@@ -396,8 +396,8 @@ impl Exchange {
     /// Removes neighbors that have been disconnected for too long, with all their entries.
     pub fn handle_timeout(&mut self, now: Instant) {
         let directory = &self.directory;
-        self.neighbours.retain(|incarnation, neighbour| {
-            let gone = neighbour
+        self.neighbors.retain(|incarnation, neighbor| {
+            let gone = neighbor
                 .gone
                 .is_some_and(|since| now >= since + Self::MEMORY);
             if gone {
@@ -412,12 +412,12 @@ impl Exchange {
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
         let times = self
-            .neighbours
+            .neighbors
             .values()
-            .map(|neighbour| match neighbour.gone {
+            .map(|neighbor| match neighbor.gone {
                 Some(since) => Some(since + Self::MEMORY),
-                None if neighbour.under_way.is_some() => None,
-                None => Some(neighbour.next_letter()),
+                None if neighbor.under_way.is_some() => None,
+                None => Some(neighbor.next_letter()),
             });
         times.flatten().min()
     }
@@ -426,32 +426,32 @@ impl Exchange {
     /// with [`handle_sent`](Self::handle_sent).
     pub fn poll_letter(&mut self, now: Instant) -> Option<(Incarnation, Vec<u8>)> {
         let mut ready = self
-            .neighbours
+            .neighbors
             .iter_mut()
-            .filter(|(_, neighbour)| neighbour.gone.is_none() && neighbour.under_way.is_none());
-        let (incarnation, neighbour) =
-            ready.find(|(_, neighbour)| neighbour.next_letter() <= now)?;
-        if neighbour.ask.is_some_and(|at| at <= now) {
-            neighbour.ask = None;
-            neighbour.asked = Some(now);
-            neighbour.under_way = Some(neighbour.telling.clone());
-            return Some((*incarnation, wire::encode(&Told::Again)));
+            .filter(|(_, neighbor)| neighbor.gone.is_none() && neighbor.under_way.is_none());
+        let (incarnation, neighbor) =
+            ready.find(|(_, neighbor)| neighbor.next_letter() <= now)?;
+        if neighbor.ask.is_some_and(|at| at <= now) {
+            neighbor.ask = None;
+            neighbor.asked = Some(now);
+            neighbor.under_way = Some(neighbor.state.clone());
+            return Some((*incarnation, wire::encode(&ExchangeMessage::Again)));
         }
-        let (told, telling) = self.own.next(&neighbour.telling);
-        if matches!(&told, Told::Full(full) if full.first) {
-            neighbour.told = Some(now);
+        let (told, state) = self.own.next(&neighbor.state);
+        if matches!(&told, ExchangeMessage::Full(full) if full.first) {
+            neighbor.told = Some(now);
         }
-        neighbour.under_way = Some(telling);
+        neighbor.under_way = Some(state);
         Some((*incarnation, wire::encode(&told)))
     }
 
     /// Returns the final letters of this gateway: their receivers and their common content.
     #[must_use]
     pub fn goodbye(&self) -> (Vec<Incarnation>, Vec<u8>) {
-        let present = self.neighbours.iter();
-        let present = present.filter(|(_, neighbour)| neighbour.gone.is_none());
+        let present = self.neighbors.iter();
+        let present = present.filter(|(_, neighbor)| neighbor.gone.is_none());
         let present = present.map(|(incarnation, _)| *incarnation).collect();
-        (present, wire::encode(&Told::Goodbye))
+        (present, wire::encode(&ExchangeMessage::Goodbye))
     }
 
     fn jitter(&mut self) -> Duration {
@@ -465,7 +465,7 @@ impl Exchange {
     }
 }
 
-impl Own {
+impl LocalAgents {
     /// Replaces the agents; returns whether anything changed.
     fn replace(&mut self, agents: Agents) -> bool {
         let before = std::mem::replace(&mut self.agents, agents);
@@ -481,9 +481,9 @@ impl Own {
         let (coalitions, agents): (Vec<_>, Vec<_>) = left.chain(other).partition(is_coalition);
         let any = !coalitions.is_empty() || !agents.is_empty();
         self.version += (coalitions.len() + agents.len()) as u64;
-        let logged = |name: &Arc<str>, together| Logged {
+        let logged = |name: &Arc<str>, with_previous| Logged {
             name: Arc::clone(name),
-            together,
+            with_previous,
         };
         let agents = agents.into_iter().map(|name| logged(name, false));
         let coalitions = coalitions.into_iter().enumerate();
@@ -495,16 +495,16 @@ impl Own {
     }
 
     /// Returns the next message for a neighbor in this state, and its state after receipt.
-    fn next(&self, knows: &Telling) -> (Told, Telling) {
+    fn next(&self, knows: &SyncState) -> (ExchangeMessage, SyncState) {
         match knows {
-            Telling::All { version } => {
+            SyncState::All { version } => {
                 let behind = self.version - version;
                 match usize::try_from(behind) {
                     Ok(behind) if behind <= self.log.len() => self.changes(*version, behind),
                     _ => self.part(None, self.version),
                 }
             }
-            Telling::Some { upto, version } => {
+            SyncState::Some { upto, version } => {
                 // Start again if more has changed since the first part than the log holds.
                 let behind = usize::try_from(self.version - version).unwrap_or(usize::MAX);
                 match upto {
@@ -517,7 +517,7 @@ impl Own {
 
     /// Builds the part of all entries after that name. Changes since the first part are sent after
     /// the last part.
-    fn part(&self, upto: Option<&Arc<str>>, version: u64) -> (Told, Telling) {
+    fn part(&self, upto: Option<&Arc<str>>, version: u64) -> (ExchangeMessage, SyncState) {
         let from = upto.map_or(Bound::Unbounded, |name| Bound::Excluded(Arc::clone(name)));
         let rest = self
             .agents
@@ -528,12 +528,12 @@ impl Own {
             let behind = (Bound::Excluded(Arc::clone(&entry.name)), Bound::Unbounded);
             self.agents.range(behind).next().is_none()
         });
-        let telling = match batch.last() {
-            Some(entry) if !last => Telling::Some {
+        let state = match batch.last() {
+            Some(entry) if !last => SyncState::Some {
                 upto: Some(Arc::clone(&entry.name)),
                 version,
             },
-            _ => Telling::All { version },
+            _ => SyncState::All { version },
         };
         let full = Full {
             version,
@@ -541,17 +541,17 @@ impl Own {
             last,
             agents: batch.into_iter().map(wire::Agent::of).collect(),
         };
-        (Told::Full(full), telling)
+        (ExchangeMessage::Full(full), state)
     }
 
-    fn changes(&self, version: u64, behind: usize) -> (Told, Telling) {
+    fn changes(&self, version: u64, behind: usize) -> (ExchangeMessage, SyncState) {
         let start = self.log.len().saturating_sub(behind);
         let mut names = BTreeSet::new();
         let (mut bytes, mut taken) = (0, 0);
-        for Logged { name, together } in self.log.range(start..) {
+        for Logged { name, with_previous } in self.log.range(start..) {
             let full = names.len() >= Exchange::BATCH || bytes > Exchange::BATCH_BYTES;
             // Coalitions that changed together stay in one letter, as long as they fit.
-            if full && !(*together && bytes <= Exchange::MAX_CONTENT / 2) {
+            if full && !(*with_previous && bytes <= Exchange::MAX_CONTENT / 2) {
                 break;
             }
             if names.insert(Arc::clone(name)) {
@@ -577,7 +577,7 @@ impl Own {
                 .map(ToString::to_string)
                 .collect(),
         };
-        (Told::Changes(changes), Telling::All { version: to })
+        (ExchangeMessage::Changes(changes), SyncState::All { version: to })
     }
 }
 
@@ -600,7 +600,7 @@ fn weight(entry: &Entry) -> usize {
     entry.name.len() + entry.agent_type.len() + entry.description.len() + members + 100
 }
 
-impl Telling {
+impl SyncState {
     fn nothing() -> Self {
         Self::Some {
             upto: None,
@@ -609,18 +609,18 @@ impl Telling {
     }
 }
 
-impl Neighbour {
+impl Neighbor {
     fn new(mts: Mts, locations: Vec<Location>, due: Instant) -> Self {
         Self {
             mts,
             locations,
             mandate: Mandate::Unproved,
             gone: None,
-            telling: Telling::nothing(),
+            state: SyncState::nothing(),
             under_way: None,
             due,
             failures: 0,
-            held: None,
+            stored: None,
             staged: None,
             ask: None,
             asked: None,
@@ -644,14 +644,14 @@ impl Neighbour {
 
     /// Schedules a request for all entries, because a received letter does not fit the stored
     /// state.
-    fn ask_again(&mut self, now: Instant) {
+    fn request_all(&mut self, now: Instant) {
         let earliest = self
             .asked
             .map_or(now, |asked| asked + Exchange::FIRST_PAUSE);
         self.ask = Some(earliest.max(now));
     }
 
-    fn told_all(
+    fn handle_full(
         &mut self,
         now: Instant,
         full: Full,
@@ -664,7 +664,7 @@ impl Neighbour {
             },
             Some(staged) if staged.version == full.version => staged,
             _ => {
-                self.ask_again(now);
+                self.request_all(now);
                 return Ok(());
             }
         };
@@ -680,7 +680,7 @@ impl Neighbour {
         }
         if full.last {
             directory.replace(self.mts.incarnation, staged.entries)?;
-            self.held = Some(full.version);
+            self.stored = Some(full.version);
             self.ask = None;
         } else {
             self.staged = Some(staged);
@@ -688,20 +688,20 @@ impl Neighbour {
         Ok(())
     }
 
-    fn told_changes(
+    fn handle_changes(
         &mut self,
         now: Instant,
         changes: Changes,
         directory: &ExchangeDirectory,
     ) -> Result<(), ExchangeError> {
-        if self.held != Some(changes.from) {
-            self.ask_again(now);
+        if self.stored != Some(changes.from) {
+            self.request_all(now);
             return Ok(());
         }
         let agents = changes.agents.into_iter();
         let joined = agents.filter_map(|agent| self.entry(agent)).collect();
         directory.change(self.mts.incarnation, joined, changes.left)?;
-        self.held = Some(changes.to);
+        self.stored = Some(changes.to);
         Ok(())
     }
 

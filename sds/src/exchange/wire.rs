@@ -32,7 +32,7 @@ struct Envelope<T> {
 /// One letter.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub(super) enum Told {
+pub(super) enum ExchangeMessage {
     /// Requests all entries again.
     Again,
     /// The gateway is closing.
@@ -92,14 +92,14 @@ impl Agent {
     }
 }
 
-pub(super) fn encode(tell: &Told) -> Vec<u8> {
+pub(super) fn encode(tell: &ExchangeMessage) -> Vec<u8> {
     let version = VERSION;
     // Serialization of text, numbers and lists cannot fail.
     serde_json::to_vec(&Envelope { version, tell }).unwrap_or_default()
 }
 
-pub(super) fn decode(content: &[u8]) -> Result<Told, serde_json::Error> {
-    let envelope: Envelope<Told> = serde_json::from_slice(content)?;
+pub(super) fn decode(content: &[u8]) -> Result<ExchangeMessage, serde_json::Error> {
+    let envelope: Envelope<ExchangeMessage> = serde_json::from_slice(content)?;
     match envelope.version {
         VERSION => Ok(envelope.tell),
         other => Err(serde_json::Error::custom(format!(

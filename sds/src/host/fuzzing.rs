@@ -1,7 +1,7 @@
 //! Entries files for the fuzz targets.
 
 use super::file;
-use super::place::Name;
+use super::host_dir::Name;
 use crate::{Entry, Mts, Reach, Source};
 
 /// Reads an entries file, writes it, asserts that reading it again gives the same, and returns it.

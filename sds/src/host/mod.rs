@@ -14,7 +14,7 @@
 mod file;
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing;
-mod place;
+mod host_dir;
 mod shared;
 mod socket;
 mod watcher;
@@ -29,7 +29,7 @@ use fipa_transport::{Forked, Incarnation, OwnerProcess};
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
-use self::place::{Id, Place};
+use self::host_dir::{Id, HostDir};
 use self::shared::Shared;
 use self::watcher::Watcher;
 use crate::{
@@ -70,10 +70,10 @@ impl HostDirectory {
         let runtime = tokio::runtime::Handle::try_current().map_err(|_| HostError::NoRuntime)?;
         // Not the service's incarnation, because a process may open the directory more than once.
         let id = Id(Incarnation::random().as_u64());
-        let place = Place::join(&config.dir, id)?;
-        let shared = Arc::new(Shared::new(place, config.mts.clone()));
+        let host_dir = HostDir::join(&config.dir, id)?;
+        let shared = Arc::new(Shared::new(host_dir, config.mts.clone()));
         // Starts to watch before reading, so that no change is missed in between.
-        let watcher = Watcher::new(&shared.place());
+        let watcher = Watcher::new(&shared.host_dir());
         if let Err(error) = shared.refresh().and_then(|()| shared.find_sockets()) {
             // The first error is the one to return.
             let _ = shared.close();
@@ -150,7 +150,7 @@ impl HostDirectory {
     /// Fails when the directory was closed, or the system refuses the socket.
     pub fn listen(&self) -> Result<OwnedFd, HostError> {
         self.owner.check()?;
-        self.shared.place().lock()?.listen()
+        self.shared.host_dir().lock()?.listen()
     }
 
     /// Returns the list of other processes that accept connections, and its changes.
@@ -165,7 +165,7 @@ impl HostDirectory {
     /// Fails when that process has ended, when too many of its connections are not accepted yet
     /// ([`io::ErrorKind::WouldBlock`]), or when the socket is not of this user.
     pub fn connect(&self, socket: SocketId) -> Result<OwnedFd, HostError> {
-        self.shared.place().connect(socket.0)
+        self.shared.host_dir().connect(socket.0)
     }
 
     /// Waits until another program may have removed the directory; [`rejoin`](Self::rejoin) checks
@@ -178,7 +178,7 @@ impl HostDirectory {
     /// removed the directory, or files in it.
     ///
     /// # Errors
-    /// When the directory cannot be examined.
+    /// Fails when the directory cannot be examined.
     pub fn is_there(&self) -> Result<bool, HostError> {
         self.shared.is_there()
     }
@@ -198,7 +198,7 @@ impl HostDirectory {
         }
         task.abort();
         let _context = self.runtime.enter();
-        let watcher = Watcher::new(&self.shared.place());
+        let watcher = Watcher::new(&self.shared.host_dir());
         // Reads the changes that other processes made before the watcher started.
         let read = self
             .shared
@@ -322,9 +322,9 @@ pub enum HostError {
     /// A system call failed.
     #[error("cannot {what} {}: {source}", path.display())]
     Io {
-        /// What was tried.
+        /// The operation, as a verb.
         what: &'static str,
-        /// On which file.
+        /// The path of the operation.
         path: PathBuf,
         /// Error of the system.
         source: io::Error,

@@ -10,24 +10,24 @@ use rustix::net::{
 };
 
 use super::HostError;
-use super::place::{Guard, Id, Name, Place};
+use super::host_dir::{Guard, Id, Name, HostDir};
 
 /// Maximum number of connections that wait to be accepted.
 const BACKLOG: i32 = 1024;
 
 impl Guard<'_> {
     pub(super) fn listen(&self) -> Result<OwnedFd, HostError> {
-        let place = self.place;
-        let temporary = Name::Temporary(place.id());
-        place.remove(temporary)?;
+        let host_dir = self.host_dir;
+        let temporary = Name::Temporary(host_dir.id());
+        host_dir.remove(temporary)?;
         let socket = new_socket()
             .and_then(|socket| {
                 // The full path may exceed the length limit of a socket's path.
-                let path = place.pinned_path().join(temporary.to_string());
+                let path = host_dir.pinned_path().join(temporary.to_string());
                 bind(&socket, &SocketAddrUnix::new(&path)?)?;
                 let private = Mode::RUSR | Mode::WUSR;
                 rustix::fs::chmodat(
-                    place.dir(),
+                    host_dir.dir(),
                     temporary.to_string(),
                     private,
                     AtFlags::empty(),
@@ -35,14 +35,14 @@ impl Guard<'_> {
                 listen(&socket, BACKLOG)?;
                 Ok(socket)
             })
-            .map_err(|error| place.io("listen at", temporary)(error.into()))?;
+            .map_err(|error| host_dir.io("listen at", temporary)(error.into()))?;
         // Appears under its name only now that it accepts connections.
-        place.rename(temporary, Name::Socket(place.id()))?;
+        host_dir.rename(temporary, Name::Socket(host_dir.id()))?;
         Ok(socket)
     }
 }
 
-impl Place {
+impl HostDir {
     pub(super) fn connect(&self, id: Id) -> Result<OwnedFd, HostError> {
         use std::os::fd::AsRawFd as _;
         let name = Name::Socket(id);

@@ -78,7 +78,7 @@ impl Digest {
 
 /// The content of a beacon.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) struct Announced {
+pub(super) struct BeaconContent {
     /// All agents of the gateway.
     pub(super) all: Digest,
     /// The coalitions, which change [atomically](super::coalition_sync).
@@ -87,7 +87,7 @@ pub(super) struct Announced {
 
 /// Digest of the stored records of one gateway, and the time of its last change.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Held {
+pub(super) struct StoredDigest {
     pub(super) digest: Digest,
     pub(super) changed: Instant,
 }
@@ -106,11 +106,11 @@ pub(super) enum Repair {
 /// Beacons of other gateways.
 #[derive(Debug, Default)]
 pub(super) struct Beacons {
-    heard: HashMap<Incarnation, Heard>,
+    gateways: HashMap<Incarnation, BeaconState>,
 }
 
 #[derive(Debug)]
-struct Heard {
+struct BeaconState {
     digest: Digest,
     last: Instant,
     /// Number of consecutive mismatches that led to a query.
@@ -127,37 +127,37 @@ impl Beacons {
         now: Instant,
         gateway: Incarnation,
         digest: Digest,
-        held: Option<Held>,
+        stored: Option<StoredDigest>,
     ) -> Option<Repair> {
-        if self.heard.len() >= MAX_GATEWAYS && !self.heard.contains_key(&gateway) {
+        if self.gateways.len() >= MAX_GATEWAYS && !self.gateways.contains_key(&gateway) {
             return None;
         }
-        let heard = self.heard.entry(gateway).or_insert_with(|| Heard {
+        let state = self.gateways.entry(gateway).or_insert_with(|| BeaconState {
             digest,
             last: now,
             repairs: 0,
             due: now + QUIET,
         });
-        if heard.digest != digest {
+        if state.digest != digest {
             // The gateway is still announcing its latest change.
-            heard.due = heard.due.max(now + QUIET);
+            state.due = state.due.max(now + QUIET);
         }
-        heard.digest = digest;
-        heard.last = now;
-        let is = held.map(|held| held.digest).unwrap_or_default();
-        if is == digest {
-            heard.repairs = 0;
+        state.digest = digest;
+        state.last = now;
+        let current = stored.map(|stored| stored.digest).unwrap_or_default();
+        if current == digest {
+            state.repairs = 0;
             return None;
         }
-        if heard.due > now || held.is_some_and(|held| held.changed + QUIET > now) {
+        if state.due > now || stored.is_some_and(|stored| stored.changed + QUIET > now) {
             return None;
         }
-        let nothing_missing = is.agents >= digest.agents;
-        let pause = FIRST_PAUSE * 2_u32.saturating_pow((heard.repairs / 2).min(8));
-        heard.due = now + pause.min(LONGEST_PAUSE);
-        heard.repairs += 1;
+        let nothing_missing = current.agents >= digest.agents;
+        let pause = FIRST_PAUSE * 2_u32.saturating_pow((state.repairs / 2).min(8));
+        state.due = now + pause.min(LONGEST_PAUSE);
+        state.repairs += 1;
         // Alternates, starting with the likelier cause, because both may apply.
-        Some(match (nothing_missing, heard.repairs % 2) {
+        Some(match (nothing_missing, state.repairs % 2) {
             (true, 1) | (false, 0) => Repair::Surplus(gateway),
             _ => Repair::Missing,
         })
@@ -166,8 +166,8 @@ impl Beacons {
     /// Returns the gateways whose beacons have stopped, each once.
     pub(super) fn silent(&mut self, now: Instant) -> Vec<Repair> {
         let mut silent = Vec::new();
-        self.heard.retain(|gateway, heard| {
-            let stays = now < heard.last + SILENCE;
+        self.gateways.retain(|gateway, state| {
+            let stays = now < state.last + SILENCE;
             if !stays {
                 silent.push(Repair::Silent(*gateway));
             }
@@ -178,11 +178,11 @@ impl Beacons {
 }
 
 /// Builds the packet with the beacon of a gateway.
-pub(super) fn packet(gateway: Incarnation, announced: Announced) -> Option<Vec<u8>> {
+pub(super) fn packet(gateway: Incarnation, announced: BeaconContent) -> Option<Vec<u8>> {
     let label = gateway.to_string();
     let mut labels = vec![Label::new(label.as_bytes()).ok()?];
     labels.extend(TYPE_LABELS.map(|label| Label::new_unchecked(label.as_bytes())));
-    let Announced { all, coalitions } = announced;
+    let BeaconContent { all, coalitions } = announced;
     let strings = [
         format!("agents={}", all.agents),
         format!("digest={:016x}", all.digest),
@@ -210,7 +210,7 @@ pub(super) fn packet(gateway: Incarnation, announced: Announced) -> Option<Vec<u
 }
 
 /// Parses a beacon; `None` if the packet is not one.
-pub(super) fn read(packet: &[u8]) -> Option<(Incarnation, Announced)> {
+pub(super) fn read(packet: &[u8]) -> Option<(Incarnation, BeaconContent)> {
     // Most packets are not beacons; this search rejects them without parsing.
     memchr::memmem::find(packet, TYPE_LABELS[0].as_bytes())?;
     let packet = parse_answer(packet)?;
@@ -238,7 +238,7 @@ pub(super) fn read(packet: &[u8]) -> Option<(Incarnation, Announced)> {
         })
     };
     let (coalitions, of_coalitions) = text("coalitions")?.split_once(':')?;
-    let announced = Announced {
+    let announced = BeaconContent {
         all: digest(text("agents")?, text("digest")?)?,
         coalitions: digest(coalitions, of_coalitions)?,
     };
@@ -277,7 +277,7 @@ mod tests {
     #[test]
     fn beacons_survive_a_round_trip() {
         for numbers in [&[][..], &[7], &[1, 2, 3]] {
-            let announced = Announced {
+            let announced = BeaconContent {
                 all: digest(numbers),
                 coalitions: digest(&numbers[numbers.len() / 2..]),
             };
@@ -289,7 +289,7 @@ mod tests {
         assert_eq!(read(&question_for_all(&[])[0]), None);
         // The PTR record is needed because the mDNS library would otherwise keep the beacon
         // forever.
-        let written = packet(gateway(0xab), Announced::default()).unwrap();
+        let written = packet(gateway(0xab), BeaconContent::default()).unwrap();
         let answers = parse_answer(&written).unwrap().answers;
         let (of, introduced) = match &answers[..] {
             [of, pointer] => (of.name.clone(), pointer),
@@ -319,28 +319,28 @@ mod tests {
         assert!((4..=6).contains(&asked.len()), "{asked:?}");
         // The stored records first match, and then include a surplus.
         let now = start + Duration::from_secs(100);
-        let held = |numbers: &[u64]| {
-            Some(Held {
+        let stored = |numbers: &[u64]| {
+            Some(StoredDigest {
                 digest: digest(numbers),
                 changed: start,
             })
         };
-        let mut hear = |millis, beacon: &[u64], held| {
+        let mut handle = |millis, beacon: &[u64], stored| {
             let now = now + Duration::from_millis(millis);
-            beacons.handle(now, gateway(1), digest(beacon), held)
+            beacons.handle(now, gateway(1), digest(beacon), stored)
         };
-        assert_eq!(hear(0, &[1, 2], held(&[1, 2])), None);
+        assert_eq!(handle(0, &[1, 2], stored(&[1, 2])), None);
         // A change counts only after the quiet time.
-        assert_eq!(hear(0, &[1], held(&[1, 2])), None);
+        assert_eq!(handle(0, &[1], stored(&[1, 2])), None);
         assert_eq!(
-            hear(2000, &[1], held(&[1, 2])),
+            handle(2000, &[1], stored(&[1, 2])),
             Some(Repair::Surplus(gateway(1)))
         );
-        let changing = Some(Held {
+        let changing = Some(StoredDigest {
             digest: digest(&[1, 2]),
             changed: now + Duration::from_secs(9),
         });
-        assert_eq!(hear(9500, &[1], changing), None);
+        assert_eq!(handle(9500, &[1], changing), None);
     }
 
     #[test]
@@ -354,13 +354,13 @@ mod tests {
         for number in 0..MAX_GATEWAYS as u64 + 10 {
             beacons.handle(now, gateway(number + 1), digest(&[]), None);
         }
-        assert_eq!(beacons.heard.len(), MAX_GATEWAYS);
+        assert_eq!(beacons.gateways.len(), MAX_GATEWAYS);
     }
 
     proptest! {
         #[test]
         fn a_corrupted_beacon_does_not_panic(at in 0_usize..140, byte: u8) {
-            let mut written = packet(gateway(1), Announced::default()).unwrap();
+            let mut written = packet(gateway(1), BeaconContent::default()).unwrap();
             if let Some(broken) = written.get_mut(at) {
                 *broken = byte;
             }

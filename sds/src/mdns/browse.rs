@@ -15,7 +15,7 @@
 //!
 //! This module has no I/O and no clock: packets and the time go in, packets and changes come out.
 
-mod everything;
+mod full_query;
 #[cfg(test)]
 mod tests;
 
@@ -28,7 +28,7 @@ use fipa_transport::Incarnation;
 use simple_dns::rdata::RData;
 use simple_dns::{CLASS, Name, Packet, PacketFlag, QTYPE, TYPE};
 
-use self::everything::Everything;
+use self::full_query::FullQuery;
 use super::beacon::Digest;
 use super::packet::{self, KNOWN};
 use super::record::Properties;
@@ -72,7 +72,7 @@ const RENEWED_JITTER: f64 = 0.12;
 /// A record that is due within this fraction (1/24) of its TTL is queried for together with others.
 const ALONG: u32 = 24;
 /// Upper bound of a TTL.
-const MAX_LIFE: Duration = Duration::from_secs(4500);
+const MAX_LIFETIME: Duration = Duration::from_secs(4500);
 /// Minimum time between two scans of all records: a constant, and an amount per record.
 const GRAIN: Duration = Duration::from_millis(20);
 const GRAIN_EACH: Duration = Duration::from_micros(10);
@@ -95,7 +95,7 @@ pub(super) struct Browser {
     shares: HashMap<IpAddr, Share>,
     /// Time at which the beacon of a gateway last matched its stored records.
     confirmed: HashMap<Incarnation, Instant>,
-    everything: Everything,
+    full_query: FullQuery,
     /// Jitter of the next renewals, from 0 to 1.
     share: f64,
     /// Time of the last scan of all records, and of the next.
@@ -120,10 +120,10 @@ struct Record {
     /// The gateway that announces it, if it is not a legacy peer's record.
     gateway: Incarnation,
     /// TTL of its SRV record, and the host in it.
-    place: Option<Life>,
+    place: Option<Lifetime>,
     host: String,
     /// TTL of its TXT record, its digest and its length in bytes.
-    text: Option<Life>,
+    text: Option<Lifetime>,
     digest: Digest,
     len: usize,
     /// Properties that have not been reported yet.
@@ -145,8 +145,8 @@ struct Questions {
 
 /// Lifetime of a DNS record.
 #[derive(Debug, Clone, Copy)]
-struct Life {
-    heard: Instant,
+struct Lifetime {
+    received: Instant,
     ttl: Duration,
     /// Number of renewal queries since then.
     asked: usize,
@@ -161,7 +161,7 @@ enum Introduced {
 
 /// Content of a packet.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub(super) struct Heard {
+pub(super) struct ParsedPacket {
     /// Full names and properties of records that are new or have changed.
     pub(super) found: Vec<(Arc<str>, Properties)>,
     /// Number of records that were refused for lack of space.
@@ -187,7 +187,7 @@ impl Browser {
             bytes: 0,
             shares: HashMap::new(),
             confirmed: HashMap::new(),
-            everything: Everything::new(now, chance),
+            full_query: FullQuery::new(now, chance),
             share: 0.0,
             looked: None,
             next: None,
@@ -196,7 +196,7 @@ impl Browser {
 
     /// Restarts the queries for all records, because a new interface has not been queried yet.
     pub(super) fn start_again(&mut self, now: Instant, chance: f64) {
-        self.everything = Everything::new(now, chance);
+        self.full_query = FullQuery::new(now, chance);
     }
 
     /// Handles a packet from this address. `chance`, from 0 to 1, scales the jitter.
@@ -206,15 +206,15 @@ impl Browser {
         from: IpAddr,
         packet: &[u8],
         chance: f64,
-    ) -> Heard {
-        let mut heard = Heard::default();
+    ) -> ParsedPacket {
+        let mut received = ParsedPacket::default();
         let ours = packet::may_name_our_type(packet);
         let Some(packet) = ours.then(|| packet::parse(packet)).flatten() else {
-            return heard;
+            return received;
         };
         if !packet.has_flags(PacketFlag::RESPONSE) {
             self.handle_question(now, &packet);
-            return heard;
+            return received;
         }
         let all = packet.answers.iter().chain(&packet.additional_records);
         let all = all.filter(|record| record.class == CLASS::IN);
@@ -224,7 +224,7 @@ impl Browser {
             if let Some(label) = introduced(&record.name, &record.rdata) {
                 match self.introduce(now, from, label, chance) {
                     Introduced::New => new.push(label),
-                    Introduced::Refused => heard.refused += 1,
+                    Introduced::Refused => received.refused += 1,
                     Introduced::Already => {}
                 }
             }
@@ -234,31 +234,31 @@ impl Browser {
             let Some(known) = label.and_then(|label| self.records.get_mut(label)) else {
                 continue;
             };
-            let life = Life::new(now, record.ttl);
+            let lifetime = Lifetime::new(now, record.ttl);
             match &record.rdata {
                 RData::SRV(srv) => {
                     known.host = srv.target.to_string();
-                    known.place = Some(life);
+                    known.place = Some(lifetime);
                 }
                 RData::TXT(txt) => {
-                    let said = packet::properties(txt);
-                    let digest = Digest::of(&said);
+                    let properties = packet::properties(txt);
+                    let digest = Digest::of(&properties);
                     if known.text.is_none() || known.digest != digest {
-                        let len = len_of(&said);
+                        let len = len_of(&properties);
                         let others = self.bytes - known.len;
                         let share = self.shares.entry(known.from).or_default();
                         let others_of_share = share.bytes - known.len;
                         if others + len > MdnsDirectory::MAX_BYTES
                             || others_of_share + len > MAX_SHARE_BYTES
                         {
-                            heard.refused += 1;
+                            received.refused += 1;
                             continue;
                         }
                         (self.bytes, share.bytes) = (others + len, others_of_share + len);
                         (known.digest, known.len) = (digest, len);
-                        known.news = Some(said);
+                        known.news = Some(properties);
                     }
-                    known.text = Some(life);
+                    known.text = Some(lifetime);
                 }
                 _ => continue,
             }
@@ -272,7 +272,7 @@ impl Browser {
             known.known = true;
             known.is_there();
             if let Some(news) = known.news.take() {
-                heard.found.push((Arc::clone(&known.fullname), news));
+                received.found.push((Arc::clone(&known.fullname), news));
             }
             if let Some(due) = known.due(self.share, self.own) {
                 self.wake(due);
@@ -284,7 +284,7 @@ impl Browser {
             let are_too_many = self.unknown > MAX_UNKNOWN || share.unknown > MAX_SHARE_UNKNOWN;
             if are_too_many && self.records.get(label).is_some_and(|it| !it.known) {
                 self.remove(label);
-                heard.refused += 1;
+                received.refused += 1;
             }
         }
         for record in &goodbyes {
@@ -292,7 +292,7 @@ impl Browser {
                 self.handle_goodbye(now, label, &goodbyes);
             }
         }
-        heard
+        received
     }
 
     /// Handles the introduction of a record.
@@ -381,7 +381,7 @@ impl Browser {
         let all_known = known_answers
             .all(|answer| introduced(&answer.name, &answer.rdata).is_some_and(is_known));
         if for_all && !more_to_come && all_known {
-            self.everything.asked_by_others(now, self.records.len());
+            self.full_query.asked_by_others(now, self.records.len());
         }
     }
 
@@ -424,10 +424,10 @@ impl Browser {
 
     /// Queries for all unknown records at once, unless such a query was sent just now.
     pub(super) fn ask_for_missing(&mut self, now: Instant) -> Vec<Vec<u8>> {
-        if !self.everything.may_be_asked(now) {
+        if !self.full_query.may_be_asked(now) {
             return Vec::new();
         }
-        self.everything.last = Some(now);
+        self.full_query.last = Some(now);
         self.question_for_all()
     }
 
@@ -449,16 +449,16 @@ impl Browser {
     /// scales the jitter.
     pub(super) fn handle_timeout(&mut self, now: Instant, chance: f64) -> Due {
         let mut due = Due::default();
-        if self.everything.next <= now {
+        if self.full_query.next <= now {
             due.packets = self.question_for_all();
-            self.everything.asked(now, self.records.len(), chance);
+            self.full_query.asked(now, self.records.len(), chance);
         }
         if self.next.is_none_or(|next| now < next) {
             return due;
         }
         self.looked = Some(now);
         self.next = None;
-        self.confirmed.retain(|_, at| now < *at + MAX_LIFE);
+        self.confirmed.retain(|_, at| now < *at + MAX_LIFETIME);
         let (mut all, mut places, mut texts) = (Vec::new(), Vec::new(), Vec::new());
         let mut next: Option<Instant> = None;
         self.records.retain(|label, record| {
@@ -478,12 +478,12 @@ impl Browser {
                 all.push(label.clone());
             }
             if record.is_renewed(self.own) {
-                for (life, labels) in [
+                for (lifetime, labels) in [
                     (&mut record.place, &mut places),
                     (&mut record.text, &mut texts),
                 ] {
-                    if let Some(life) = life
-                        && life.renew(now, self.share)
+                    if let Some(lifetime) = lifetime
+                        && lifetime.renew(now, self.share)
                     {
                         labels.push(label.clone());
                     }
@@ -529,8 +529,8 @@ impl Browser {
 
     /// Time of the next action.
     pub(super) fn poll_timeout(&self) -> Instant {
-        let next = self.next.unwrap_or(self.everything.next);
-        next.min(self.everything.next)
+        let next = self.next.unwrap_or(self.full_query.next);
+        next.min(self.full_query.next)
     }
 
     fn wake(&mut self, at: Instant) {
@@ -544,9 +544,9 @@ impl Browser {
 impl Record {
     /// The beacon of its gateway matched at that time.
     fn confirm(&mut self, at: Instant) {
-        for life in [&mut self.place, &mut self.text].into_iter().flatten() {
-            if at > life.heard {
-                (life.heard, life.asked) = (at, 0);
+        for lifetime in [&mut self.place, &mut self.text].into_iter().flatten() {
+            if at > lifetime.received {
+                (lifetime.received, lifetime.asked) = (at, 0);
             }
         }
     }
@@ -580,16 +580,16 @@ impl Record {
 
     /// Time at which the record expires without further packets.
     fn end(&self) -> Option<Instant> {
-        let lives = [self.place, self.text].into_iter().flatten();
-        lives.map(Life::end).chain(self.ends).min()
+        let lifetimes = [self.place, self.text].into_iter().flatten();
+        lifetimes.map(Lifetime::end).chain(self.ends).min()
     }
 
     /// Time of the next action for this record.
     fn due(&self, share: f64, own: Incarnation) -> Option<Instant> {
-        let lives = [self.place, self.text].into_iter().flatten();
-        let renewed = lives
+        let lifetimes = [self.place, self.text].into_iter().flatten();
+        let renewed = lifetimes
             .filter(|_| self.is_renewed(own))
-            .map(|life| life.due(share));
+            .map(|lifetime| lifetime.due(share));
         let asked = self.questions.as_ref().map(|it| it.due);
         renewed.chain(asked).chain(self.end()).min()
     }
@@ -605,18 +605,18 @@ impl Questions {
     }
 }
 
-impl Life {
-    fn new(heard: Instant, ttl: u32) -> Self {
-        let ttl = Duration::from_secs(ttl.into()).min(MAX_LIFE);
+impl Lifetime {
+    fn new(received: Instant, ttl: u32) -> Self {
+        let ttl = Duration::from_secs(ttl.into()).min(MAX_LIFETIME);
         Self {
-            heard,
+            received,
             ttl,
             asked: 0,
         }
     }
 
     fn end(self) -> Instant {
-        self.heard + self.ttl
+        self.received + self.ttl
     }
 
     /// Time of the next renewal query, or of expiry.
@@ -627,7 +627,7 @@ impl Life {
             0.0
         };
         let part = RENEWED.get(self.asked).map_or(1.0, |part| part + jitter);
-        self.heard + self.ttl.mul_f64(part)
+        self.received + self.ttl.mul_f64(part)
     }
 
     /// Whether to query now, either because it is due or together with others.
@@ -666,8 +666,8 @@ pub(super) fn label_of(fullname: &str) -> &str {
         .unwrap_or(fullname)
 }
 
-fn len_of(said: &Properties) -> usize {
-    said.iter()
+fn len_of(properties: &Properties) -> usize {
+    properties.iter()
         .map(|(key, value)| key.len() + value.len() + 2)
         .sum()
 }

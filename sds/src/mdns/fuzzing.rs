@@ -10,18 +10,18 @@ use fipa_transport::Incarnation;
 
 use super::beacon::{self, Beacons};
 use super::browse::{Browser, label_of};
-use super::held::Holdings;
-use super::together::Together;
+use super::peer_records::PeerRecords;
+use super::coalition_sync::CoalitionSync;
 use super::{packet, record};
 use crate::{Entry, Reach, Source};
 
 /// A host that receives multicast DNS, without its sockets.
 #[derive(Debug)]
-pub struct Ear {
+pub struct Listener {
     browser: Browser,
     beacons: Beacons,
-    held: Holdings,
-    together: Together,
+    peer_records: PeerRecords,
+    coalition_sync: CoalitionSync,
     /// Full names that were found and not removed.
     found: BTreeSet<String>,
 }
@@ -36,37 +36,37 @@ pub fn announced(entry: &Entry) -> Vec<Vec<u8>> {
         .collect()
 }
 
-impl Ear {
+impl Listener {
     /// Creates a host whose own gateway has incarnation 1.
     #[must_use]
     pub fn new(now: Instant) -> Self {
         Self {
             browser: Browser::new(now, Incarnation::from_u64(1), 0.5),
             beacons: Beacons::default(),
-            held: Holdings::default(),
-            together: Together::default(),
+            peer_records: PeerRecords::default(),
+            coalition_sync: CoalitionSync::default(),
             found: BTreeSet::new(),
         }
     }
 
     /// Handles a packet from this address.
     pub fn arrive(&mut self, now: Instant, from: IpAddr, bytes: &[u8]) {
-        if let Some((gateway, said)) = beacon::read(bytes) {
-            let _ = self.together.said(now, gateway, said.coalitions);
-            let held = self.held.of(gateway);
-            let _ = self.beacons.handle(now, gateway, said.all, held);
+        if let Some((gateway, content)) = beacon::read(bytes) {
+            let _ = self.coalition_sync.handle_beacon(now, gateway, content.coalitions);
+            let stored = self.peer_records.of(gateway);
+            let _ = self.beacons.handle(now, gateway, content.all, stored);
             self.browser.confirm(now, gateway);
         }
-        let heard = self.browser.handle_packet(now, from, bytes, 0.5);
+        let received = self.browser.handle_packet(now, from, bytes, 0.5);
         self.browser.check();
         let at = SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000);
-        for (fullname, properties) in heard.found {
+        for (fullname, properties) in received.found {
             self.found.insert(fullname.to_string());
             let entry = match record::decode(label_of(&fullname), &properties, at) {
                 Ok(entry) => entry,
                 Err(error) => {
-                    self.held.put(now, &fullname, None);
-                    let _ = self.together.put(now, &fullname, None);
+                    self.peer_records.put(now, &fullname, None);
+                    let _ = self.coalition_sync.put(now, &fullname, None);
                     drop(error.to_string());
                     continue;
                 }
@@ -77,8 +77,8 @@ impl Ear {
                 survives(&entry, at);
             }
             self.browser.belongs(&fullname, entry.mts.incarnation);
-            self.held.put(now, &fullname, Some(&entry));
-            let _ = self.together.put(now, &fullname, Some(Arc::new(entry)));
+            self.peer_records.put(now, &fullname, Some(&entry));
+            let _ = self.coalition_sync.put(now, &fullname, Some(Arc::new(entry)));
         }
     }
 
@@ -98,10 +98,10 @@ impl Ear {
             for fullname in due.gone {
                 let was_found = self.found.remove(&*fullname);
                 assert!(was_found, "{fullname} was removed but never found");
-                self.held.put(*now, &fullname, None);
-                let _ = self.together.put(*now, &fullname, None);
+                self.peer_records.put(*now, &fullname, None);
+                let _ = self.coalition_sync.put(*now, &fullname, None);
             }
-            let _ = self.together.handle_timeout(*now);
+            let _ = self.coalition_sync.handle_timeout(*now);
             let silent = self.beacons.silent(*now);
             assert!(silent.len() <= 1024);
         }

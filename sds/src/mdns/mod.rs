@@ -10,20 +10,20 @@
 //! of a record has no meaning between gateways: a label in use by another name is replaced by a
 //! different one.
 
-mod anew;
+mod restart;
 mod beacon;
 mod browse;
-mod ear;
+mod listener;
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing;
-mod held;
+mod peer_records;
 mod pace;
 mod packet;
 mod probe;
 mod record;
 mod sockets;
 mod task;
-mod together;
+mod coalition_sync;
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -36,10 +36,10 @@ use parking_lot::Mutex;
 use tokio::sync::{Notify, broadcast};
 
 use self::beacon::Digest;
-use self::held::Holdings;
+use self::peer_records::PeerRecords;
 use self::pace::Pace;
 pub use self::probe::{Multicast, probe};
-use self::together::{Together, Updates};
+use self::coalition_sync::{CoalitionSync, Updates};
 use crate::table::Table;
 use crate::{
     DeregisterError, Directory, Entry, Mts, RegisterError, Registration, Role, Source, Subscriber,
@@ -124,7 +124,7 @@ impl MdnsDirectory {
     /// The library keeps records of packets that introduce no service forever. The cache is checked
     /// every two seconds; beyond this limit the library is restarted, and this gateway's agents are
     /// announced again without a goodbye.
-    pub const MAX_CACHED: u64 = anew::MAX_CACHED;
+    pub const MAX_CACHED: u64 = restart::MAX_CACHED;
 
     /// Opens the directory; a task of the current tokio runtime keeps the view up to date. Failing
     /// multicast is not an error but part of the [status](Self::status).
@@ -145,8 +145,8 @@ impl MdnsDirectory {
             daemon: Mutex::new(daemon),
             config,
             table: Table::new(),
-            held: Mutex::default(),
-            together: Mutex::default(),
+            peer_records: Mutex::default(),
+            coalition_sync: Mutex::default(),
             coalitions_changed: AtomicBool::new(false),
             interfaces_changed: AtomicBool::new(false),
             own: Mutex::default(),
@@ -189,7 +189,7 @@ impl MdnsDirectory {
         };
         match entry.mts.incarnation {
             Incarnation::UNKNOWN => {
-                self.shared.held.lock().verify(&fullname);
+                self.shared.peer_records.lock().verify(&fullname);
                 self.shared.postponed.notify_one();
             }
             gateway => self.verify_gateway(gateway),
@@ -199,7 +199,7 @@ impl MdnsDirectory {
     /// Queries the network for this gateway; see [`verify`](Self::verify). A repeated call within a
     /// few seconds does nothing.
     pub fn verify_gateway(&self, gateway: Incarnation) {
-        let doubted = self.shared.held.lock().doubt(Instant::now(), gateway);
+        let doubted = self.shared.peer_records.lock().doubt(Instant::now(), gateway);
         if doubted {
             self.shared.postponed.notify_one();
         }
@@ -208,7 +208,7 @@ impl MdnsDirectory {
     /// Removes all entries of this gateway at once, because it ended without a goodbye and another
     /// one took its place.
     pub fn gateway_has_ended(&self, gateway: Incarnation) {
-        self.shared.held.lock().end(gateway);
+        self.shared.peer_records.lock().end(gateway);
         self.shared.postponed.notify_one();
     }
 
@@ -232,7 +232,7 @@ impl MdnsDirectory {
         }
         self.task.abort();
         // The last beacon reports that the coalitions are gone; other gateways wait for that.
-        let (config, nothing) = (&self.shared.config, beacon::Announced::default());
+        let (config, nothing) = (&self.shared.config, beacon::BeaconContent::default());
         if let Some(beacon) = beacon::packet(config.mts.incarnation, nothing)
             && let Err(error) = sockets::send_once(config, &beacon)
         {
@@ -301,14 +301,14 @@ struct Shared {
     /// Entries of other gateways, by the full name of their record with its original spelling.
     table: Table<Arc<str>>,
     /// The same records, by the gateways that announce them.
-    held: Mutex<Holdings>,
+    peer_records: Mutex<PeerRecords>,
     /// Records that are not in the table yet.
-    together: Mutex<Together>,
+    coalition_sync: Mutex<CoalitionSync>,
     /// Whether to send a beacon at once because coalitions changed.
     coalitions_changed: AtomicBool,
     /// Whether to check the interfaces at once.
     interfaces_changed: AtomicBool,
-    own: Mutex<Own>,
+    own: Mutex<OwnAgents>,
     withdrawals: broadcast::Sender<Withdrawal>,
     status: Mutex<MdnsStatus>,
     /// Wakes the task for work that is due later or now.
@@ -325,9 +325,9 @@ impl std::fmt::Debug for Shared {
 }
 
 #[derive(Debug, Default)]
-struct Own {
+struct OwnAgents {
     closed: bool,
-    agents: HashMap<Arc<str>, Announced>,
+    agents: HashMap<Arc<str>, Announcement>,
     pace: Pace,
     /// Full names for which the library has just sent a goodbye, and the end of their rest. The
     /// library sends a goodbye twice, and would take its second one for a conflicting claim to the
@@ -337,7 +337,7 @@ struct Own {
     spoilt: HashSet<Arc<str>>,
     /// The announcements at the time the library was stopped, until the next one starts. Later changes
     /// are not announced meanwhile, so a beacon with them would cause unanswered queries.
-    meanwhile: Option<beacon::Announced>,
+    while_stopped: Option<beacon::BeaconContent>,
     /// Names of records in which only the locations changed. They are announced at once, because
     /// the library needs about two seconds.
     moved: Vec<Arc<str>>,
@@ -346,9 +346,9 @@ struct Own {
 /// Maximum number of records that are announced at once; the library announces the others.
 const MAX_MOVED: usize = 256;
 
-impl Own {
-    fn announced(&self) -> beacon::Announced {
-        let mut announced = beacon::Announced::default();
+impl OwnAgents {
+    fn announced(&self) -> beacon::BeaconContent {
+        let mut announced = beacon::BeaconContent::default();
         for one in self.agents.values() {
             if let Some((_, told)) = one.told {
                 announced.all.add(told);
@@ -362,7 +362,7 @@ impl Own {
 }
 
 #[derive(Debug)]
-struct Announced {
+struct Announcement {
     entry: Arc<Entry>,
     /// The full name of its record, in lower case.
     fullname: Arc<str>,
@@ -378,7 +378,7 @@ struct Announced {
     told: Option<(Instant, Digest)>,
 }
 
-impl Announced {
+impl Announcement {
     fn host_name(&self) -> String {
         format!("fipa-{}.local.", self.host)
     }
@@ -395,8 +395,8 @@ const SETTLING: Duration = Duration::from_secs(3);
 const MOVING: Duration = Duration::from_secs(1);
 
 /// Intervals in seconds at which the library polls the interfaces: normally, and while they change.
-const LOOKS: u32 = mdns_sd::IP_CHECK_INTERVAL_IN_SECS_DEFAULT;
-const LOOKS_SOON: u32 = 1;
+const NORMAL_POLL: u32 = mdns_sd::IP_CHECK_INTERVAL_IN_SECS_DEFAULT;
+const FAST_POLL: u32 = 1;
 
 /// Time for which a full name rests after a goodbye.
 const REST: Duration = Duration::from_secs(1);
@@ -405,7 +405,7 @@ const REST: Duration = Duration::from_secs(1);
 const MAX_SPOILT: usize = 1024;
 
 impl Shared {
-    fn register(&self, own: &mut Own, entry: Entry) -> Result<Arc<Entry>, RegisterError> {
+    fn register(&self, own: &mut OwnAgents, entry: Entry) -> Result<Arc<Entry>, RegisterError> {
         if own.closed {
             return Err(RegisterError::Closed);
         }
@@ -435,7 +435,7 @@ impl Shared {
     /// or when the label has rested and the pace allows it.
     fn announce(
         &self,
-        own: &mut Own,
+        own: &mut OwnAgents,
         entry: &Arc<Entry>,
         mut attempt: u32,
     ) -> Result<(), mdns_sd::Error> {
@@ -454,7 +454,7 @@ impl Shared {
         let now = Instant::now();
         let turn = match before {
             // An announced record is changed only after it has settled.
-            Some(Announced {
+            Some(Announcement {
                 entry: before,
                 told: Some((when, _)),
                 ..
@@ -472,7 +472,7 @@ impl Shared {
             Some(waiting) => waiting.due,
             None => own.pace.turn(now, fastrand::f64()),
         };
-        let mut announced = Announced {
+        let mut announced = Announcement {
             entry: Arc::clone(entry),
             digest: Digest::of(&record::encode(entry)),
             host: before.map_or_else(Incarnation::random, |announced| announced.host),
@@ -492,7 +492,7 @@ impl Shared {
         Ok(())
     }
 
-    fn tell_daemon(&self, announced: &Announced) -> Result<(), mdns_sd::Error> {
+    fn tell_daemon(&self, announced: &Announcement) -> Result<(), mdns_sd::Error> {
         let label = record::label(&announced.entry.name, announced.attempt);
         let host = announced.host_name();
         let properties = record::encode(&announced.entry);
@@ -511,8 +511,8 @@ impl Shared {
         let packets = moved.iter().filter_map(|name| {
             let announced = own.agents.get(name)?;
             let label = record::label(name, announced.attempt);
-            let says = record::encode(&announced.entry);
-            packet::announcement(&label, &announced.host_name(), &says)
+            let properties = record::encode(&announced.entry);
+            packet::announcement(&label, &announced.host_name(), &properties)
         });
         packets.collect()
     }
@@ -536,7 +536,7 @@ impl Shared {
     }
 
     /// Withdraws the record with a goodbye.
-    fn take_back(&self, own: &mut Own, name: &str) -> Result<(), mdns_sd::Error> {
+    fn take_back(&self, own: &mut OwnAgents, name: &str) -> Result<(), mdns_sd::Error> {
         let Some(announced) = own.agents.get(name) else {
             return Ok(());
         };
@@ -555,7 +555,7 @@ impl Shared {
 
     fn deregister(
         &self,
-        own: &mut Own,
+        own: &mut OwnAgents,
         name: &str,
         incarnation: Incarnation,
     ) -> Result<(), DeregisterError> {
@@ -571,7 +571,7 @@ impl Shared {
     }
 
     /// Sets the interval at which the library polls the interfaces; it applies after the next poll.
-    fn daemon_looks(&self, seconds: u32) {
+    fn set_poll_interval(&self, seconds: u32) {
         if let Err(error) = self.ask(|daemon| daemon.set_ip_check_interval(seconds)) {
             self.failed(format!("cannot set the interval for polling the interfaces: {error}"));
         }
@@ -620,7 +620,7 @@ impl Shared {
         };
         let mut own = self.own.lock();
         *self.daemon.lock() = None;
-        own.meanwhile = Some(own.announced());
+        own.while_stopped = Some(own.announced());
         Ok(ended)
     }
 
@@ -642,7 +642,7 @@ impl Shared {
         };
         self.choose(&daemon);
         *self.daemon.lock() = Some(daemon);
-        own.meanwhile = None;
+        own.while_stopped = None;
         let now = Instant::now();
         let agents = own.agents.values_mut();
         let mut before: Vec<_> = agents.filter(|one| one.told.is_some()).collect();
@@ -665,15 +665,15 @@ impl Shared {
     /// Stores the current state of a record, or its removal.
     fn put(&self, fullname: &Arc<str>, entry: Option<Arc<Entry>>) {
         let now = Instant::now();
-        self.held.lock().put(now, fullname, entry.as_deref());
-        self.show(|together| together.put(now, fullname, entry));
+        self.peer_records.lock().put(now, fullname, entry.as_deref());
+        self.show(|coalition_sync| coalition_sync.put(now, fullname, entry));
     }
 
     /// Applies the updates that are visible now, atomically.
-    fn show(&self, what: impl FnOnce(&mut Together) -> Updates) {
-        // Held until the table is updated, so that updates stay in order.
-        let mut together = self.together.lock();
-        let updates = what(&mut together);
+    fn show(&self, what: impl FnOnce(&mut CoalitionSync) -> Updates) {
+        // StoredDigest until the table is updated, so that updates stay in order.
+        let mut coalition_sync = self.coalition_sync.lock();
+        let updates = what(&mut coalition_sync);
         if !updates.is_empty() {
             self.table.replace(updates);
         }
@@ -681,9 +681,9 @@ impl Shared {
 
     /// The announcements of this gateway. Includes coalitions that will be announced soon, because
     /// other gateways must wait for them.
-    fn announced(&self) -> beacon::Announced {
+    fn announced(&self) -> beacon::BeaconContent {
         let own = self.own.lock();
-        own.meanwhile.unwrap_or_else(|| own.announced())
+        own.while_stopped.unwrap_or_else(|| own.announced())
     }
 
     /// Sends a beacon at once if the entry is a coalition.

@@ -380,7 +380,7 @@ mod tests {
         decode(label, properties, UNIX_EPOCH)
     }
 
-    fn said(pairs: &[(&str, &[u8])]) -> Properties {
+    fn strings(pairs: &[(&str, &[u8])]) -> Properties {
         let pairs = pairs.iter();
         pairs
             .map(|(key, value)| ((*key).to_owned(), value.to_vec()))
@@ -445,7 +445,7 @@ mod tests {
 
     #[test]
     fn records_of_legacy_peers_are_decoded() {
-        let properties = said(&[
+        let properties = strings(&[
             ("timestamp", b"20261120-11:00:00:123456"),
             (
                 "LOCATOR",
@@ -470,15 +470,15 @@ mod tests {
         assert!(!entry.incarnation.is_known());
 
         let now = UNIX_EPOCH + Duration::from_secs(5);
-        let bare = decode("bare", &said(&[]), now).unwrap();
+        let bare = decode("bare", &strings(&[]), now).unwrap();
         assert_eq!(bare.registered, now);
-        assert!(decode("", &said(&[]), now).is_err());
+        assert!(decode("", &strings(&[]), now).is_err());
     }
 
     #[test]
     fn an_agent_with_udt_only_keeps_its_location() {
         let locator = format!("udt://10.0.0.2:1 {SIGNATURE};http://10.0.0.2:2 {SIGNATURE};");
-        let entry = read("cpp", &said(&[("LOCATOR", locator.as_bytes())])).unwrap();
+        let entry = read("cpp", &strings(&[("LOCATOR", locator.as_bytes())])).unwrap();
         assert_eq!(
             entry.locations,
             ["udt://10.0.0.2:1;fipa-services".parse().unwrap()]
@@ -497,7 +497,7 @@ mod tests {
         let parts = locator.as_bytes().chunks(200 - "LOCATOR=".len());
         let mut properties: Vec<(&str, &[u8])> = parts.map(|part| ("LOCATOR", part)).collect();
         properties.insert(1, ("TYPE", b"arm"));
-        let entry = read("arm", &said(&properties)).unwrap();
+        let entry = read("arm", &strings(&properties)).unwrap();
         assert_eq!(entry.agent_type, "arm");
         let addresses = entry.locations.iter().map(|one| one.address().to_owned());
         let addresses: Vec<String> = addresses.collect();

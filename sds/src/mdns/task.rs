@@ -6,9 +6,9 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_transport::Incarnation;
 use mdns_sd::{DaemonEvent, DaemonStatus, Error, Metrics, Receiver, ServiceDaemon};
 
-use super::anew::{self, Pauses};
-use super::browse::{Heard, label_of};
-use super::ear::Ear;
+use super::restart::{self, Pauses};
+use super::browse::{ParsedPacket, label_of};
+use super::listener::Listener;
 use super::record::{self, Properties};
 use super::{MAX_SPOILT, Shared, Withdrawal};
 use crate::Entry;
@@ -18,26 +18,26 @@ const RETRY: Duration = Duration::from_millis(50);
 
 /// Keeps the view up to date and this gateway's names unambiguous, until it is aborted.
 pub(super) async fn run(shared: Arc<Shared>) {
-    let mut ear = Ear::new(&shared);
+    let mut listener = Listener::new(&shared);
     let mut pauses = Pauses::new(Instant::now());
     while let Some(monitor) = monitor(&shared) {
-        let why = listen(&shared, Some(&monitor), &mut ear).await;
+        let why = listen(&shared, Some(&monitor), &mut listener).await;
         // Later events of this library are ignored.
         drop(monitor);
         let pause = pauses.ended(Instant::now());
         shared.status.lock().restarts += 1;
         shared.failed(format!("{why}: restarting it in {pause:?}"));
         tokio::select! {
-            () = start_anew(&shared, pause) => {}
+            () = restart_daemon(&shared, pause) => {}
             // Receiving and beacons continue without the library.
-            _ = listen(&shared, None, &mut ear) => {}
+            _ = listen(&shared, None, &mut listener) => {}
         }
         pauses.started(Instant::now());
     }
 }
 
 /// Stops the library, and starts it again after the pause.
-async fn start_anew(shared: &Shared, pause: Duration) {
+async fn restart_daemon(shared: &Shared, pause: Duration) {
     let ended = loop {
         match shared.end_daemon() {
             // Its command queue is full.
@@ -72,29 +72,29 @@ fn monitor(shared: &Shared) -> Option<Receiver<DaemonEvent>> {
 }
 
 /// Processes events until the library, if there is one, must be restarted; returns the reason.
-async fn listen(shared: &Shared, monitor: Option<&Receiver<DaemonEvent>>, ear: &mut Ear) -> String {
-    let mut look = monitor.map(|_| Instant::now() + anew::INTERVAL);
+async fn listen(shared: &Shared, monitor: Option<&Receiver<DaemonEvent>>, listener: &mut Listener) -> String {
+    let mut look = monitor.map(|_| Instant::now() + restart::INTERVAL);
     let mut metrics: Option<Receiver<Metrics>> = None;
     loop {
         let now = Instant::now();
-        shared.show(|together| together.handle_timeout(now));
+        shared.show(|coalition_sync| coalition_sync.handle_timeout(now));
         if look.is_some_and(|look| look <= now) {
             look = None;
             // Requests the cache size; a busy library is asked again later.
             let daemon = shared.daemon.lock().clone();
             metrics = daemon.and_then(|daemon| daemon.get_metrics().ok());
             if metrics.is_none() {
-                look = Some(now + anew::INTERVAL);
+                look = Some(now + restart::INTERVAL);
             }
         }
-        let waiting = shared.together.lock().poll_timeout();
+        let waiting = shared.coalition_sync.lock().poll_timeout();
         let announcing = shared.announce_due();
-        let due = [announcing, Some(ear.speak(shared)), waiting, look];
+        let due = [announcing, Some(listener.send_due(shared)), waiting, look];
         let due = due.into_iter().flatten().min();
         tokio::select! {
             () = shared.postponed.notified() => {}
             () = until(due), if due.is_some() => {}
-            heard = ear.listen(shared) => handle(shared, ear, heard),
+            received = listener.listen(shared) => handle(shared, listener, received),
             event = next(monitor) => match event {
                 Some(DaemonEvent::NameChange(change)) => renamed(shared, &change.original),
                 Some(DaemonEvent::Error(error)) => shared.failed(error.to_string()),
@@ -103,8 +103,8 @@ async fn listen(shared: &Shared, monitor: Option<&Receiver<DaemonEvent>>, ear: &
             },
             answer = next(metrics.as_ref()) => {
                 metrics = None;
-                look = Some(Instant::now() + anew::INTERVAL);
-                if let Some(kept) = answer.as_ref().and_then(anew::is_too_much) {
+                look = Some(Instant::now() + restart::INTERVAL);
+                if let Some(kept) = answer.as_ref().and_then(restart::is_too_much) {
                     return format!(
                         "the mDNS library cached {kept}, because a host floods the network; new \
                          registrations are announced with a delay; find the host that sends so \
@@ -132,15 +132,15 @@ async fn until(due: Option<Instant>) {
     }
 }
 
-fn handle(shared: &Shared, ear: &mut Ear, heard: Heard) {
-    for (fullname, properties) in heard.found {
+fn handle(shared: &Shared, listener: &mut Listener, received: ParsedPacket) {
+    for (fullname, properties) in received.found {
         if let Some(gateway) = found(shared, &fullname, &properties) {
-            ear.browser.belongs(&fullname, gateway);
+            listener.browser.belongs(&fullname, gateway);
         }
     }
-    if heard.refused > 0 {
+    if received.refused > 0 {
         let mut status = shared.status.lock();
-        status.refused += heard.refused;
+        status.refused += received.refused;
         status.last_error = Some("refused records of other hosts: too many on the network".to_owned());
     }
 }
@@ -255,8 +255,8 @@ mod tests {
     use std::net::Ipv4Addr;
 
     use super::super::SERVICE_TYPE;
-    use super::super::anew::tests::directory;
-    use super::super::beacon::{Announced, Digest};
+    use super::super::restart::tests::directory;
+    use super::super::beacon::{BeaconContent, Digest};
     use super::super::packet::tests::{Part, answer};
     use super::*;
     use crate::{Directory, Mts, Registration, Source};
@@ -276,23 +276,23 @@ mod tests {
         let strings: Vec<&[u8]> = strings.iter().map(Vec::as_slice).collect();
         let parts = [Part::Ptr, Part::Srv("theirs.local"), Part::Txt(&strings)];
 
-        let (mut ear, now) = (Ear::new(shared), Instant::now());
+        let (mut listener, now) = (Listener::new(shared), Instant::now());
         let at = |seconds| now + Duration::from_secs(seconds);
-        let heard = ear.browser.handle_packet(
+        let received = listener.browser.handle_packet(
             now,
             Ipv4Addr::LOCALHOST.into(),
             &answer("arm", &parts, 120),
             0.0,
         );
-        handle(shared, &mut ear, heard);
+        handle(shared, &mut listener, received);
         assert!(directory.lookup("arm").is_some());
         let mut all = Digest::default();
         all.add(Digest::of(&properties));
         let coalitions = Digest::default();
-        let beacon = Announced { all, coalitions };
-        ear.handle_beacon(at(100), shared, gateway.incarnation, beacon);
-        assert_eq!(ear.browser.handle_timeout(at(150), 0.0).gone.len(), 0);
-        assert_eq!(ear.browser.handle_timeout(at(221), 0.0).gone.len(), 1);
+        let beacon = BeaconContent { all, coalitions };
+        listener.handle_beacon(at(100), shared, gateway.incarnation, beacon);
+        assert_eq!(listener.browser.handle_timeout(at(150), 0.0).gone.len(), 0);
+        assert_eq!(listener.browser.handle_timeout(at(221), 0.0).gone.len(), 1);
     }
 
     #[test]

@@ -29,14 +29,14 @@ fn announced(label: &str, text: &[u8], ttl: u32) -> Vec<u8> {
 fn browser(now: Instant, labels: &[&str]) -> Browser {
     let mut browser = Browser::new(now, OWN, 0.0);
     for label in labels {
-        let heard = browser.handle_packet(now, FROM, &announced(label, b"TYPE=x", 120), 0.0);
-        assert_eq!(names(&heard), [*label]);
+        let received = browser.handle_packet(now, FROM, &announced(label, b"TYPE=x", 120), 0.0);
+        assert_eq!(names(&received), [*label]);
     }
     browser
 }
 
-fn names(heard: &Heard) -> Vec<&str> {
-    let found = heard.found.iter();
+fn names(received: &ParsedPacket) -> Vec<&str> {
+    let found = received.found.iter();
     found.map(|(fullname, _)| label_of(fullname)).collect()
 }
 
@@ -77,9 +77,9 @@ fn an_announced_record_is_reported_once_with_all_its_strings() {
         b"=",
     ];
     let parts = [Part::Txt(&strings), Part::Srv(HOST), Part::Ptr];
-    let heard = browser.handle_packet(now, FROM, &answer("Arm.left", &parts, 120), 0.0);
-    let [(fullname, properties)] = &heard.found[..] else {
-        panic!("{heard:?}");
+    let received = browser.handle_packet(now, FROM, &answer("Arm.left", &parts, 120), 0.0);
+    let [(fullname, properties)] = &received.found[..] else {
+        panic!("{received:?}");
     };
     assert_eq!(**fullname, format!("Arm.left.{SERVICE_TYPE}"));
     let expected: [(&str, &[u8]); 4] = [
@@ -92,7 +92,7 @@ fn an_announced_record_is_reported_once_with_all_its_strings() {
     assert_eq!(*properties, expected);
     // An identical record is not reported again; a changed one is.
     let again = browser.handle_packet(now, FROM, &answer("Arm.left", &parts, 120), 0.0);
-    assert_eq!(again, Heard::default());
+    assert_eq!(again, ParsedPacket::default());
     let other = answer("Arm.left", &[Part::Txt(&[b"TYPE=x"])], 120);
     assert_eq!(
         names(&browser.handle_packet(now, FROM, &other, 0.0)),
@@ -102,7 +102,7 @@ fn an_announced_record_is_reported_once_with_all_its_strings() {
     let stranger = answer("leg", &[Part::Srv(HOST), Part::Txt(&strings)], 120);
     assert_eq!(
         browser.handle_packet(now, FROM, &stranger, 0.0),
-        Heard::default()
+        ParsedPacket::default()
     );
     assert_eq!(browser.records.len(), 1);
 }
@@ -118,7 +118,7 @@ fn missing_parts_are_queried_a_few_times() {
     let half = answer("arm", &[Part::Srv(HOST)], 120);
     assert_eq!(
         browser.handle_packet(start, FROM, &half, 0.0),
-        Heard::default()
+        ParsedPacket::default()
     );
     let half = answer("arm", &[Part::Txt(&[b"TYPE=x"])], 120);
     assert_eq!(
@@ -167,10 +167,10 @@ fn renewals_are_batched_and_jittered() {
     let times: std::collections::HashSet<u64> = questions.iter().map(|(at, _)| *at).collect();
     assert_eq!((questions.len(), times.len()), (60, 1), "{questions:?}");
     // Maximum jitter delays the query, but still before other implementations renew.
-    let life = Life::new(start, 120);
-    assert_eq!(life.due(0.0), start + seconds(66.0));
-    assert!(life.due(1.0) > start + seconds(80.0));
-    assert!(life.due(1.0) < start + seconds(120.0 * 0.75));
+    let lifetime = Lifetime::new(start, 120);
+    assert_eq!(lifetime.due(0.0), start + seconds(66.0));
+    assert!(lifetime.due(1.0) > start + seconds(80.0));
+    assert!(lifetime.due(1.0) < start + seconds(120.0 * 0.75));
 }
 
 #[test]
@@ -210,8 +210,8 @@ fn a_goodbye_takes_effect_after_a_second_unless_it_is_revoked() {
     let parts = [Part::Ptr, Part::Srv("other.local"), Part::Txt(&[b"TYPE=y"])];
     browser.handle_packet(start, FROM, &answer("eye", &parts, 0), 0.0);
     let back = start + seconds(0.5);
-    let heard = browser.handle_packet(back, FROM, &announced("leg", b"TYPE=x", 120), 0.0);
-    assert_eq!(heard, Heard::default());
+    let received = browser.handle_packet(back, FROM, &announced("leg", b"TYPE=x", 120), 0.0);
+    assert_eq!(received, ParsedPacket::default());
     let (_, gone) = goes_on(&mut browser, start, 5.0);
     assert_eq!(gone, [10]);
     assert!(browser.records.contains_key("leg") && browser.records.contains_key("eye"));
@@ -337,13 +337,13 @@ fn the_stored_state_is_bounded() {
     let mut browser = Browser::new(now, OWN, 0.0);
     for number in 0..MAX_UNKNOWN + 10 {
         let introduced = answer(&format!("unknown {number}"), &[Part::Ptr], 120);
-        let heard = browser.handle_packet(now, one_of_many(number), &introduced, 1.0);
-        assert_eq!(heard.refused, u64::from(number >= MAX_UNKNOWN));
+        let received = browser.handle_packet(now, one_of_many(number), &introduced, 1.0);
+        assert_eq!(received.refused, u64::from(number >= MAX_UNKNOWN));
     }
     assert_eq!(browser.unknown, MAX_UNKNOWN);
     // Unknown records do not prevent complete ones from being stored.
-    let heard = browser.handle_packet(now, FROM, &announced("arm", b"TYPE=x", 10), 0.0);
-    assert_eq!((names(&heard), heard.refused), (vec!["arm"], 0));
+    let received = browser.handle_packet(now, FROM, &announced("arm", b"TYPE=x", 10), 0.0);
+    assert_eq!((names(&received), received.refused), (vec!["arm"], 0));
     goes_on(&mut browser, now, 20.0);
     assert_eq!((browser.records.len(), browser.unknown), (0, 0));
 
@@ -393,8 +393,8 @@ fn one_source_cannot_fill_the_tables() {
         }
         assert!(refused > 0);
         assert!(browser.records.len() <= MAX_SHARE && browser.bytes <= MAX_SHARE_BYTES);
-        let heard = browser.handle_packet(now, others, &answer("arm", &parts, 120), 0.0);
-        assert_eq!(names(&heard), ["arm"]);
+        let received = browser.handle_packet(now, others, &answer("arm", &parts, 120), 0.0);
+        assert_eq!(names(&received), ["arm"]);
         goes_on(&mut browser, now, 200.0);
         assert!(browser.shares.is_empty());
     }

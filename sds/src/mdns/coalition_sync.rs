@@ -33,7 +33,7 @@ pub(super) type Updates = Vec<(Arc<str>, Option<Arc<Entry>>)>;
 
 /// Coalition records of other gateways that are not visible yet.
 #[derive(Debug, Default)]
-pub(super) struct Together {
+pub(super) struct CoalitionSync {
     gateways: HashMap<Incarnation, Gateway>,
     /// The gateway of each coalition record, until its removal is visible.
     records: HashMap<Arc<str>, Incarnation>,
@@ -44,9 +44,9 @@ pub(super) struct Together {
 #[derive(Debug, Default)]
 struct Gateway {
     /// Coalition digest of its last beacon, and its time.
-    said: Option<(Instant, Digest)>,
+    beacon: Option<(Instant, Digest)>,
     /// Digest of each received record.
-    heard: HashMap<Arc<str>, Digest>,
+    received: HashMap<Arc<str>, Digest>,
     /// Digest of all of them.
     digest: Digest,
     /// Received records that are not visible yet.
@@ -55,7 +55,7 @@ struct Gateway {
     since: Option<Instant>,
 }
 
-impl Together {
+impl CoalitionSync {
     /// Handles a record, or its removal, and returns the updates that become visible.
     pub(super) fn put(
         &mut self,
@@ -68,43 +68,43 @@ impl Together {
             Some(entry) => self.gateway_of(now, entry),
             None => before,
         };
-        let mut shown = Updates::new();
+        let mut visible = Updates::new();
         if let Some(before) = before
             && gateway != Some(before)
         {
             // The record now belongs to another gateway, and must not wait for the previous one.
             self.records.remove(fullname);
             if let Some(other) = self.gateways.get_mut(&before) {
-                other.hear(fullname, None);
+                other.receive(fullname, None);
                 self.waiting -= usize::from(other.waiting.remove(fullname).is_some());
             }
-            shown = self.settle(now, before);
+            visible = self.settle(now, before);
         }
         let Some(gateway) = gateway else {
-            shown.push((Arc::clone(fullname), entry));
-            return shown;
+            visible.push((Arc::clone(fullname), entry));
+            return visible;
         };
         self.records.insert(Arc::clone(fullname), gateway);
         let known = self.gateways.entry(gateway).or_default();
-        known.hear(fullname, entry.as_deref());
+        known.receive(fullname, entry.as_deref());
         let already = known.waiting.insert(Arc::clone(fullname), entry);
         self.waiting += usize::from(already.is_none());
         known.since.get_or_insert(now);
-        shown.extend(match self.waiting > MAX_WAITING {
+        visible.extend(match self.waiting > MAX_WAITING {
             true => self.show(gateway),
             false => self.settle(now, gateway),
         });
-        shown
+        visible
     }
 
     /// Handles the coalition digest of a beacon, and returns the updates that become visible.
-    pub(super) fn said(&mut self, now: Instant, gateway: Incarnation, digest: Digest) -> Updates {
+    pub(super) fn handle_beacon(&mut self, now: Instant, gateway: Incarnation, digest: Digest) -> Updates {
         let unknown = !self.gateways.contains_key(&gateway);
         if unknown && (digest == Digest::default() || !self.has_room(now)) {
             return Updates::new();
         }
         let known = self.gateways.entry(gateway).or_default();
-        known.said = Some((now, digest));
+        known.beacon = Some((now, digest));
         self.settle(now, gateway)
     }
 
@@ -137,8 +137,8 @@ impl Together {
         if self.gateways.len() >= MAX_GATEWAYS {
             // Drops gateways of which only an old beacon is stored.
             self.gateways.retain(|_, known| {
-                let said = known.said.is_some_and(|(when, _)| now < when + SILENCE);
-                said || !known.heard.is_empty() || !known.waiting.is_empty()
+                let beacon = known.beacon.is_some_and(|(when, _)| now < when + SILENCE);
+                beacon || !known.received.is_empty() || !known.waiting.is_empty()
             });
         }
         self.gateways.len() < MAX_GATEWAYS
@@ -148,7 +148,7 @@ impl Together {
         let Some(known) = self.gateways.get(&gateway) else {
             return Updates::new();
         };
-        let complete = known.said.is_some_and(|(_, said)| said == known.digest);
+        let complete = known.beacon.is_some_and(|(_, beacon)| beacon == known.digest);
         if complete || known.due().is_some_and(|due| due <= now) {
             return self.show(gateway);
         }
@@ -161,38 +161,38 @@ impl Together {
             return Updates::new();
         };
         known.since = None;
-        let mut shown: Updates = known.waiting.drain().collect();
-        self.waiting -= shown.len();
+        let mut visible: Updates = known.waiting.drain().collect();
+        self.waiting -= visible.len();
         // Additions come first, so that a record that continues under another label does not
         // disappear in between.
-        shown.sort_by_key(|(_, entry)| entry.is_none());
-        for (fullname, _) in shown.iter().filter(|(_, entry)| entry.is_none()) {
+        visible.sort_by_key(|(_, entry)| entry.is_none());
+        for (fullname, _) in visible.iter().filter(|(_, entry)| entry.is_none()) {
             self.records.remove(fullname);
         }
-        let nothing_said = known.said.is_none_or(|(_, it)| it == Digest::default());
-        if known.heard.is_empty() && nothing_said {
+        let nothing_said = known.beacon.is_none_or(|(_, it)| it == Digest::default());
+        if known.received.is_empty() && nothing_said {
             self.gateways.remove(&gateway);
         }
-        shown
+        visible
     }
 }
 
 impl Gateway {
-    fn hear(&mut self, fullname: &Arc<str>, entry: Option<&Entry>) {
-        if let Some(before) = self.heard.remove(fullname) {
+    fn receive(&mut self, fullname: &Arc<str>, entry: Option<&Entry>) {
+        if let Some(before) = self.received.remove(fullname) {
             self.digest.remove(before);
         }
         if let Some(entry) = entry {
             let digest = Digest::of(&record::encode(entry));
             self.digest.add(digest);
-            self.heard.insert(Arc::clone(fullname), digest);
+            self.received.insert(Arc::clone(fullname), digest);
         }
     }
 
     /// Time at which its waiting records become visible in any case.
     fn due(&self) -> Option<Instant> {
         let patience = self.since? + PATIENCE;
-        let silent = self.said.map(|(when, _)| when + SILENCE);
+        let silent = self.beacon.map(|(when, _)| when + SILENCE);
         Some(silent.map_or(patience, |silent| silent.min(patience)))
     }
 }
@@ -242,9 +242,9 @@ mod tests {
 
     /// The state that a watcher sees.
     #[derive(Default)]
-    struct Shown(State);
+    struct Visible(State);
 
-    impl Shown {
+    impl Visible {
         fn apply(&mut self, updates: Updates) -> bool {
             for (fullname, entry) in &updates {
                 match entry.as_deref() {
@@ -262,87 +262,87 @@ mod tests {
         }
     }
 
-    fn put(together: &mut Together, now: Instant, state: &State, name: &str) -> Updates {
+    fn put(sync: &mut CoalitionSync, now: Instant, state: &State, name: &str) -> Updates {
         let entry = state.get(name).map(|members| entry(1, name, members));
-        together.put(now, &name.into(), entry)
+        sync.put(now, &name.into(), entry)
     }
 
     #[test]
     fn a_merger_becomes_visible_when_it_is_complete() {
-        let (mut together, now, mut shown) =
-            (Together::default(), Instant::now(), Shown::default());
+        let (mut sync, now, mut visible) =
+            (CoalitionSync::default(), Instant::now(), Visible::default());
         let apart = state(&[("one", &["a", "b"]), ("two", &["c"])]);
         let merged = state(&[("one", &["a", "b", "c"])]);
         let gateway = Incarnation::from_u64(1);
         // The initial records also become visible only when they are complete.
-        assert!(put(&mut together, now, &apart, "one").is_empty());
-        assert!(together.said(now, gateway, digest(1, &apart)).is_empty());
-        shown.apply(put(&mut together, now, &apart, "two"));
-        assert_eq!(shown.0, apart);
-        assert_eq!(together.poll_timeout(), None);
+        assert!(put(&mut sync, now, &apart, "one").is_empty());
+        assert!(sync.handle_beacon(now, gateway, digest(1, &apart)).is_empty());
+        visible.apply(put(&mut sync, now, &apart, "two"));
+        assert_eq!(visible.0, apart);
+        assert_eq!(sync.poll_timeout(), None);
 
-        assert!(put(&mut together, now, &merged, "two").is_empty());
-        assert!(put(&mut together, now, &merged, "one").is_empty());
-        shown.apply(together.said(now, gateway, digest(1, &merged)));
-        assert_eq!(shown.0, merged);
+        assert!(put(&mut sync, now, &merged, "two").is_empty());
+        assert!(put(&mut sync, now, &merged, "one").is_empty());
+        visible.apply(sync.handle_beacon(now, gateway, digest(1, &merged)));
+        assert_eq!(visible.0, merged);
         // After the last coalition left, no state remains.
         let none = State::new();
-        assert!(put(&mut together, now, &none, "one").is_empty());
-        shown.apply(together.said(now, gateway, digest(1, &none)));
-        assert_eq!(shown.0, none);
-        assert!(together.gateways.is_empty() && together.records.is_empty());
+        assert!(put(&mut sync, now, &none, "one").is_empty());
+        visible.apply(sync.handle_beacon(now, gateway, digest(1, &none)));
+        assert_eq!(visible.0, none);
+        assert!(sync.gateways.is_empty() && sync.records.is_empty());
     }
 
     #[test]
     fn an_incomplete_update_becomes_visible_after_the_timeout() {
-        let (mut together, now) = (Together::default(), Instant::now());
+        let (mut sync, now) = (CoalitionSync::default(), Instant::now());
         let half = state(&[("one", &["a"]), ("two", &["b"])]);
         let gateway = Incarnation::from_u64(1);
-        together.said(now, gateway, digest(1, &half));
-        assert!(put(&mut together, now, &half, "one").is_empty());
-        assert_eq!(together.poll_timeout(), Some(now + PATIENCE));
-        assert!(together.handle_timeout(now + PATIENCE / 2).is_empty());
-        assert_eq!(together.handle_timeout(now + PATIENCE).len(), 1);
-        assert_eq!(together.poll_timeout(), None);
+        sync.handle_beacon(now, gateway, digest(1, &half));
+        assert!(put(&mut sync, now, &half, "one").is_empty());
+        assert_eq!(sync.poll_timeout(), Some(now + PATIENCE));
+        assert!(sync.handle_timeout(now + PATIENCE / 2).is_empty());
+        assert_eq!(sync.handle_timeout(now + PATIENCE).len(), 1);
+        assert_eq!(sync.poll_timeout(), None);
         // A gateway without beacons is not waited for.
         let later = now + SILENCE;
-        assert_eq!(put(&mut together, later, &half, "two").len(), 1);
+        assert_eq!(put(&mut sync, later, &half, "two").len(), 1);
     }
 
     #[test]
     fn agents_and_records_that_change_their_gateway_do_not_wait() {
-        let (mut together, now) = (Together::default(), Instant::now());
+        let (mut sync, now) = (CoalitionSync::default(), Instant::now());
         let mut agent = Entry::clone(&entry(1, "one", &["a".to_owned()]));
         agent.role = Role::Agent;
         let name: Arc<str> = "one".into();
-        let shown = together.put(now, &name, Some(Arc::new(agent.clone())));
-        assert_eq!(shown.len(), 1);
-        assert!(together.put(now, &name, None).len() == 1);
+        let visible = sync.put(now, &name, Some(Arc::new(agent.clone())));
+        assert_eq!(visible.len(), 1);
+        assert!(sync.put(now, &name, None).len() == 1);
         let coalition = state(&[("one", &["a"])]);
-        assert!(put(&mut together, now, &coalition, "one").is_empty());
-        assert!(together.put(now, &name, None).is_empty(), "waits");
+        assert!(put(&mut sync, now, &coalition, "one").is_empty());
+        assert!(sync.put(now, &name, None).is_empty(), "waits");
         // The label now belongs to another gateway, or to an agent: the waiting removal does not
         // apply to it.
         let other = entry(2, "one", &["b".to_owned()]);
-        assert!(together.put(now, &name, Some(other)).is_empty());
-        assert_eq!(together.put(now, &name, Some(Arc::new(agent))).len(), 1);
-        assert_eq!(together.waiting, 0);
-        assert!(together.handle_timeout(now + PATIENCE).is_empty());
+        assert!(sync.put(now, &name, Some(other)).is_empty());
+        assert_eq!(sync.put(now, &name, Some(Arc::new(agent))).len(), 1);
+        assert_eq!(sync.waiting, 0);
+        assert!(sync.handle_timeout(now + PATIENCE).is_empty());
     }
 
     #[test]
     fn the_number_of_waiting_records_is_bounded() {
-        let (mut together, now) = (Together::default(), Instant::now());
-        let mut shown = 0;
+        let (mut sync, now) = (CoalitionSync::default(), Instant::now());
+        let mut visible = 0;
         for number in 0..10_000_u64 {
             let name: Arc<str> = number.to_string().into();
             let entry = entry(number % 2000 + 1, &name, &["a".to_owned()]);
-            shown += together.put(now, &name, Some(entry)).len();
-            assert!(together.waiting <= MAX_WAITING);
+            visible += sync.put(now, &name, Some(entry)).len();
+            assert!(sync.waiting <= MAX_WAITING);
         }
-        assert!(together.gateways.len() <= MAX_GATEWAYS);
-        shown += together.handle_timeout(now + PATIENCE).len();
-        assert_eq!((shown, together.waiting), (10_000, 0));
+        assert!(sync.gateways.len() <= MAX_GATEWAYS);
+        visible += sync.handle_timeout(now + PATIENCE).len();
+        assert_eq!((visible, sync.waiting), (10_000, 0));
     }
 
     /// Simulates mergers and splits, in bursts, on a network that delays each record independently,
@@ -360,7 +360,7 @@ mod tests {
     fn simulate(seed: u64) {
         let mut random = fastrand::Rng::with_seed(seed);
         let (start, gateway) = (Instant::now(), Incarnation::from_u64(1));
-        let (mut together, mut shown) = (Together::default(), Shown::default());
+        let (mut sync, mut visible) = (CoalitionSync::default(), Visible::default());
         let mut is = state(&[("c0", &["a", "b", "c", "d", "e", "f"])]);
         let mut was = vec![State::new(), is.clone()];
         // Times at which records arrive; the content is that at the time of arrival.
@@ -395,24 +395,24 @@ mod tests {
             let mut updates = Vec::new();
             records.retain(|(due, name)| {
                 if *due <= millis {
-                    updates.push(put(&mut together, now, &is, name));
+                    updates.push(put(&mut sync, now, &is, name));
                 }
                 *due > millis
             });
             while beacons.front().is_some_and(|(due, _)| *due <= millis) {
                 if let Some((_, digest)) = beacons.pop_front() {
-                    updates.push(together.said(now, gateway, digest));
+                    updates.push(sync.handle_beacon(now, gateway, digest));
                 }
             }
-            updates.push(together.handle_timeout(now));
+            updates.push(sync.handle_timeout(now));
             for update in updates {
-                if shown.apply(update) {
-                    assert!(was.contains(&shown.0), "seed {seed}: {:?}", shown.0);
+                if visible.apply(update) {
+                    assert!(was.contains(&visible.0), "seed {seed}: {:?}", visible.0);
                 }
             }
         }
-        assert_eq!(shown.0, is, "seed {seed}");
-        assert_eq!(together.poll_timeout(), None, "seed {seed}");
+        assert_eq!(visible.0, is, "seed {seed}");
+        assert_eq!(sync.poll_timeout(), None, "seed {seed}");
     }
 
     /// Performs a merger or a split, and returns the names of the changed coalitions.

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::Incarnation;
 
-use super::beacon::{Digest, Held};
+use super::beacon::{Digest, StoredDigest};
 use super::record;
 use crate::Entry;
 
@@ -20,7 +20,7 @@ const DOUBT: Duration = Duration::from_secs(6);
 
 /// Records of other hosts by gateway, and the queue of those to verify.
 #[derive(Debug, Default)]
-pub(super) struct Holdings {
+pub(super) struct PeerRecords {
     records: HashMap<Arc<str>, (Incarnation, Digest)>,
     gateways: HashMap<Incarnation, Gateway>,
     queue: VecDeque<Arc<str>>,
@@ -33,7 +33,7 @@ pub(super) struct Holdings {
 
 #[derive(Debug)]
 struct Gateway {
-    held: Held,
+    stored: StoredDigest,
     records: HashSet<Arc<str>>,
     /// Start of the current doubt, and the record that stands for the gateway.
     doubted: Option<(Instant, Arc<str>)>,
@@ -41,14 +41,14 @@ struct Gateway {
     verified: HashSet<Arc<str>>,
 }
 
-impl Holdings {
+impl PeerRecords {
     /// Stores the record with this full name, or removes it if `entry` is `None`.
     pub(super) fn put(&mut self, now: Instant, fullname: &Arc<str>, entry: Option<&Entry>) {
         if let Some((gateway, digest)) = self.records.remove(fullname)
             && let Some(known) = self.gateways.get_mut(&gateway)
         {
-            known.held.digest.remove(digest);
-            known.held.changed = now;
+            known.stored.digest.remove(digest);
+            known.stored.changed = now;
             known.records.remove(fullname);
             let end = known
                 .doubted
@@ -74,7 +74,7 @@ impl Holdings {
         let digest = Digest::of(&record::encode(entry));
         let gateway = entry.mts.incarnation;
         let known = self.gateways.entry(gateway).or_insert_with(|| Gateway {
-            held: Held {
+            stored: StoredDigest {
                 digest: Digest::default(),
                 changed: now,
             },
@@ -82,15 +82,15 @@ impl Holdings {
             doubted: None,
             verified: HashSet::new(),
         });
-        known.held.digest.add(digest);
-        known.held.changed = now;
+        known.stored.digest.add(digest);
+        known.stored.changed = now;
         known.records.insert(Arc::clone(fullname));
         self.records.insert(Arc::clone(fullname), (gateway, digest));
     }
 
     /// Digest of the stored records of this gateway.
-    pub(super) fn of(&self, gateway: Incarnation) -> Option<Held> {
-        self.gateways.get(&gateway).map(|known| known.held)
+    pub(super) fn of(&self, gateway: Incarnation) -> Option<StoredDigest> {
+        self.gateways.get(&gateway).map(|known| known.stored)
     }
 
     /// Doubts the gateway: queues up to `BATCH` of its records for verification first. If it has
@@ -190,7 +190,7 @@ mod tests {
         }
     }
 
-    fn put(holdings: &mut Holdings, now: Instant, number: u64, gateway: u64, there: bool) {
+    fn put(holdings: &mut PeerRecords, now: Instant, number: u64, gateway: u64, there: bool) {
         let entry = entry(number, gateway);
         let entry = there.then_some(&entry);
         holdings.put(now, &number.to_string().into(), entry);
@@ -198,7 +198,7 @@ mod tests {
 
     #[test]
     fn the_digest_of_a_gateway_follows_its_records() {
-        let mut holdings = Holdings::default();
+        let mut holdings = PeerRecords::default();
         let now = Instant::now();
         for number in 1..=3 {
             put(&mut holdings, now, number, 7, true);
@@ -211,8 +211,8 @@ mod tests {
         put(&mut holdings, now, 2, 7, false);
         // An identical update changes nothing.
         put(&mut holdings, now, 3, 7, true);
-        let held = holdings.of(Incarnation::from_u64(7)).unwrap();
-        assert_eq!(held.digest, expected);
+        let stored = holdings.of(Incarnation::from_u64(7)).unwrap();
+        assert_eq!(stored.digest, expected);
         for number in [1, 3, 9] {
             put(&mut holdings, now, number, 7, false);
         }
@@ -224,7 +224,7 @@ mod tests {
 
     #[test]
     fn the_end_of_a_doubted_record_verifies_all_records_of_its_gateway() {
-        let mut holdings = Holdings::default();
+        let mut holdings = PeerRecords::default();
         let (now, gateway) = (Instant::now(), Incarnation::from_u64(7));
         for number in 0..60 {
             put(&mut holdings, now, number, 7, true);

@@ -16,13 +16,13 @@ const PAUSE_EACH: Duration = Duration::from_millis(500);
 
 /// Times of the queries for all records.
 #[derive(Debug)]
-pub(super) struct Everything {
+pub(super) struct FullQuery {
     pub(super) last: Option<Instant>,
     pub(super) next: Instant,
     pause: Duration,
 }
 
-impl Everything {
+impl FullQuery {
     /// Schedules the first query at once, except for a jitter that separates hosts that start
     /// together; `chance`, from 0 to 1, scales it.
     pub(super) fn new(now: Instant, chance: f64) -> Self {

@@ -69,7 +69,7 @@ impl std::fmt::Display for Name {
 
 /// The directory after this process has joined.
 #[derive(Debug)]
-pub(super) struct Place {
+pub(super) struct HostDir {
     path: PathBuf,
     dir: OwnedFd,
     domain: File,
@@ -104,14 +104,14 @@ const LAST_PAUSE: Duration = Duration::from_millis(8);
 /// must read that one's changes, which takes longer than a registration.
 const TURN: Duration = Duration::from_millis(20);
 
-impl Place {
+impl HostDir {
     /// Opens the directory, creates it if necessary, checks it, and joins as the process with this
     /// ID.
     pub(super) fn join(path: &Path, id: Id) -> Result<Self, HostError> {
         // With a trailing slash, the kernel would follow a symbolic link.
         let path: PathBuf = path.components().collect();
         let dir = open_private(&path)?;
-        let mut place = Self {
+        let mut host_dir = Self {
             domain: open_domain(&dir, &path)?,
             path,
             dir,
@@ -120,14 +120,14 @@ impl Place {
             process: Mutex::new(None),
         };
         let deadline = Instant::now() + LONGEST;
-        while !place.try_join()? {
+        while !host_dir.try_join()? {
             // The last process left in between and removed the lock file.
-            place.domain = open_domain(&place.dir, &place.path)?;
+            host_dir.domain = open_domain(&host_dir.dir, &host_dir.path)?;
             if Instant::now() > deadline {
-                return Err(HostError::Busy { path: place.path });
+                return Err(HostError::Busy { path: host_dir.path });
             }
         }
-        Ok(place)
+        Ok(host_dir)
     }
 
     fn try_join(&self) -> Result<bool, HostError> {
@@ -224,7 +224,7 @@ impl Place {
             return Ok(None);
         };
         Ok(self.try_domain()?.then(|| Guard {
-            place: self,
+            host_dir: self,
             _threads: threads,
         }))
     }
@@ -243,7 +243,7 @@ impl Place {
         let in_turn = threads.is_some_and(|began| began.elapsed() < TURN);
         if in_turn && self.try_domain()? {
             return Ok(Guard {
-                place: self,
+                host_dir: self,
                 _threads: threads,
             });
         }
@@ -259,7 +259,7 @@ impl Place {
             if (turn.is_some() || waited > SKIPPED) && self.try_domain()? {
                 *threads = Some(Instant::now());
                 return Ok(Guard {
-                    place: self,
+                    host_dir: self,
                     _threads: threads,
                 });
             }
@@ -315,7 +315,7 @@ impl Place {
     }
 
     /// Whether the process is running, that is, holds its lock file.
-    pub(super) fn lives(&self, id: Id) -> Result<bool, HostError> {
+    pub(super) fn is_running(&self, id: Id) -> Result<bool, HostError> {
         let name = Name::Process(id);
         // Opened for reading only: closing a writable descriptor would look like the end of that
         // process.
@@ -435,26 +435,26 @@ pub(super) const MAX_ENTRIES_FILE: usize = 32 * 1024 * 1024;
 const PRIVATE: Mode = Mode::RUSR.union(Mode::WUSR);
 
 /// The turn to wait for the lock of the domain; dropping it releases the turn.
-struct Turn<'a>(&'a Place);
+struct Turn<'a>(&'a HostDir);
 
 impl Drop for Turn<'_> {
     fn drop(&mut self) {
         if let Err(error) = rustix::fs::flock(&self.0.dir, FlockOperation::Unlock) {
-            tracing::error!(%error, path = %self.0.path.display(), "cannot pass the turn on");
+            tracing::error!(%error, path = %self.0.path.display(), "cannot unlock the turn lock");
         }
     }
 }
 
 /// The locked domain.
 pub(super) struct Guard<'a> {
-    pub(super) place: &'a Place,
+    pub(super) host_dir: &'a HostDir,
     _threads: MutexGuard<'a, Option<Instant>>,
 }
 
 impl Drop for Guard<'_> {
     fn drop(&mut self) {
-        if let Err(error) = self.place.domain.unlock() {
-            tracing::error!(%error, path = %self.place.path.display(), "cannot unlock the directory");
+        if let Err(error) = self.host_dir.domain.unlock() {
+            tracing::error!(%error, path = %self.host_dir.path.display(), "cannot unlock the directory");
         }
     }
 }
@@ -462,11 +462,11 @@ impl Drop for Guard<'_> {
 impl Guard<'_> {
     /// Whether the locked file is still the one that a joining process locks.
     fn is_current(&self) -> Result<bool, HostError> {
-        let place = self.place;
-        let io = |error: Errno| place.io("examine", Name::Domain)(error.into());
-        let held = rustix::fs::fstat(&place.domain).map_err(io)?;
+        let host_dir = self.host_dir;
+        let io = |error: Errno| host_dir.io("examine", Name::Domain)(error.into());
+        let held = rustix::fs::fstat(&host_dir.domain).map_err(io)?;
         let name = Name::Domain.to_string();
-        match rustix::fs::statat(&place.dir, name, AtFlags::SYMLINK_NOFOLLOW) {
+        match rustix::fs::statat(&host_dir.dir, name, AtFlags::SYMLINK_NOFOLLOW) {
             Ok(found) => Ok((held.st_dev, held.st_ino) == (found.st_dev, found.st_ino)),
             Err(Errno::NOENT) => Ok(false),
             Err(error) => Err(io(error)),
@@ -475,11 +475,11 @@ impl Guard<'_> {
 
     /// Replaces this process's entries file and increments the generation, which it returns.
     pub(super) fn write_entries(&self, bytes: &[u8]) -> Result<u64, HostError> {
-        let place = self.place;
-        let generation = place.generation()?.wrapping_add(1);
-        let temporary = Name::Temporary(place.id);
-        place.remove(temporary)?;
-        let mut file = place.create(temporary)?;
+        let host_dir = self.host_dir;
+        let generation = host_dir.generation()?.wrapping_add(1);
+        let temporary = Name::Temporary(host_dir.id);
+        host_dir.remove(temporary)?;
+        let mut file = host_dir.create(temporary)?;
         let written = file.write_all(bytes).and_then(|()| {
             // The modification time is the version: clocks are too coarse and inodes are reused, so
             // neither distinguishes two files of one process.
@@ -498,17 +498,17 @@ impl Guard<'_> {
             rustix::fs::futimens(&file, &times).map_err(io::Error::from)
         });
         let renamed = written
-            .map_err(place.io("write", temporary))
-            .and_then(|()| place.rename(temporary, Name::Entries(place.id)));
+            .map_err(host_dir.io("write", temporary))
+            .and_then(|()| host_dir.rename(temporary, Name::Entries(host_dir.id)));
         if let Err(error) = renamed {
             // The first error is returned; the next sweep removes the temporary file.
-            let _ = place.remove(temporary);
+            let _ = host_dir.remove(temporary);
             return Err(error);
         }
-        place
+        host_dir
             .domain
             .write_all_at(&generation.to_le_bytes(), 0)
-            .map_err(place.io("write", Name::Domain))?;
+            .map_err(host_dir.io("write", Name::Domain))?;
         Ok(generation)
     }
 
@@ -516,43 +516,43 @@ impl Guard<'_> {
     /// one after it has joined.
     pub(super) fn sweep(&self) -> Result<usize, HostError> {
         let mut living = std::collections::HashMap::new();
-        for name in self.place.names()? {
+        for name in self.host_dir.names()? {
             let id = match name {
                 Name::Domain => continue,
                 // Written under this lock only, so no process is about to rename it.
                 Name::Temporary(_) => {
-                    self.place.remove(name)?;
+                    self.host_dir.remove(name)?;
                     continue;
                 }
                 Name::Process(id) | Name::Entries(id) | Name::Socket(id) => id,
             };
             let lives = match living.get(&id) {
                 Some(lives) => *lives,
-                None => self.place.lives(id)?,
+                None => self.host_dir.is_running(id)?,
             };
             living.insert(id, lives);
             if !lives {
-                self.place.remove(name)?;
+                self.host_dir.remove(name)?;
             }
         }
         Ok(living.values().filter(|lives| **lives).count())
     }
 
     /// Removes the files of a dead process.
-    pub(super) fn bury(&self, id: Id) -> Result<(), HostError> {
-        self.place.remove(Name::Entries(id))?;
-        self.place.remove(Name::Socket(id))?;
-        self.place.remove(Name::Temporary(id))?;
-        self.place.remove(Name::Process(id))
+    pub(super) fn remove_files(&self, id: Id) -> Result<(), HostError> {
+        self.host_dir.remove(Name::Entries(id))?;
+        self.host_dir.remove(Name::Socket(id))?;
+        self.host_dir.remove(Name::Temporary(id))?;
+        self.host_dir.remove(Name::Process(id))
     }
 
     /// Leaves the directory, and leaves it empty if this is the last process.
     pub(super) fn leave(self) -> Result<(), HostError> {
-        self.bury(self.place.id)?;
+        self.remove_files(self.host_dir.id)?;
         // Last, because the lock shows that this process is running.
-        drop(self.place.process.lock().take());
+        drop(self.host_dir.process.lock().take());
         if self.sweep()? == 0 && self.is_current()? {
-            self.place.remove(Name::Domain)?;
+            self.host_dir.remove(Name::Domain)?;
         }
         Ok(())
     }

@@ -8,7 +8,7 @@ use fipa_transport::Incarnation;
 
 use super::Shared;
 use super::beacon::{self, Beacons, Digest, Repair};
-use super::browse::{Browser, Heard};
+use super::browse::{Browser, ParsedPacket};
 use super::sockets::Sockets;
 
 /// Maximum jitter of the beacon interval, so that gateways do not send simultaneously.
@@ -16,7 +16,7 @@ const JITTER: Duration = Duration::from_millis(500);
 /// Minimum time between two beacons, however fast coalitions change.
 const BREATH: Duration = Duration::from_millis(200);
 
-pub(super) struct Ear {
+pub(super) struct Listener {
     sockets: Sockets,
     pub(super) browser: Browser,
     beacons: Beacons,
@@ -24,10 +24,10 @@ pub(super) struct Ear {
     /// Earliest time of the next urgent beacon.
     next_urgent: Instant,
     /// Until this time the mDNS library polls the interfaces at a shorter interval.
-    looks_soon: Option<Instant>,
+    fast_poll_until: Option<Instant>,
 }
 
-impl Ear {
+impl Listener {
     pub(super) fn new(shared: &Shared) -> Self {
         let now = Instant::now();
         Self {
@@ -36,12 +36,12 @@ impl Ear {
             beacons: Beacons::default(),
             next_beacon: now,
             next_urgent: now,
-            looks_soon: None,
+            fast_poll_until: None,
         }
     }
 
     /// Sends everything that is due, and returns the time of the next call.
-    pub(super) fn speak(&mut self, shared: &Shared) -> Instant {
+    pub(super) fn send_due(&mut self, shared: &Shared) -> Instant {
         let now = Instant::now();
         if shared.coalitions_changed.swap(false, Ordering::Relaxed) {
             // Other gateways delay coalition changes until they receive the beacon.
@@ -49,12 +49,12 @@ impl Ear {
         }
         if shared.interfaces_changed.swap(false, Ordering::Relaxed) {
             self.next_beacon = now;
-            self.looks_soon = Some(now + beacon::INTERVAL);
-            shared.daemon_looks(super::LOOKS_SOON);
+            self.fast_poll_until = Some(now + beacon::INTERVAL);
+            shared.set_poll_interval(super::FAST_POLL);
         }
-        if self.looks_soon.is_some_and(|until| until <= now) {
-            self.looks_soon = None;
-            shared.daemon_looks(super::LOOKS);
+        if self.fast_poll_until.is_some_and(|until| until <= now) {
+            self.fast_poll_until = None;
+            shared.set_poll_interval(super::NORMAL_POLL);
         }
         if now >= self.next_beacon {
             self.next_beacon = now + beacon::INTERVAL + JITTER.mul_f64(fastrand::f64());
@@ -81,8 +81,8 @@ impl Ear {
         }
         self.send(shared.moved());
         let (ended, doubtful) = {
-            let mut held = shared.held.lock();
-            (held.take_ended(), held.due(now))
+            let mut stored = shared.peer_records.lock();
+            (stored.take_ended(), stored.due(now))
         };
         self.browser.end(now, &ended);
         self.browser.doubt(now, &doubtful);
@@ -91,8 +91,8 @@ impl Ear {
         for fullname in due.gone {
             shared.put(&fullname, None);
         }
-        let later = shared.held.lock().poll_timeout(now);
-        let due = [Some(self.browser.poll_timeout()), later, self.looks_soon];
+        let later = shared.peer_records.lock().poll_timeout(now);
+        let due = [Some(self.browser.poll_timeout()), later, self.fast_poll_until];
         let due = due.into_iter().flatten().min();
         due.map_or(self.next_beacon, |due| due.min(self.next_beacon))
     }
@@ -104,20 +104,20 @@ impl Ear {
     }
 
     /// Receives one packet and processes it.
-    pub(super) async fn listen(&mut self, shared: &Shared) -> Heard {
+    pub(super) async fn listen(&mut self, shared: &Shared) -> ParsedPacket {
         let (packet, from) = self.sockets.receive().await;
         let now = Instant::now();
         let is_question = packet.get(2).is_some_and(|flags| flags & 0x80 == 0);
         if is_question && from.port() != shared.config.port {
             // A query from another port gets a unicast answer (RFC 6762 clause 6.7), which does not
             // arrive here.
-            return Heard::default();
+            return ParsedPacket::default();
         }
-        if let Some((gateway, said)) = beacon::read(packet) {
+        if let Some((gateway, content)) = beacon::read(packet) {
             if gateway != shared.config.mts.incarnation {
-                self.handle_beacon(now, shared, gateway, said);
+                self.handle_beacon(now, shared, gateway, content);
             }
-            return Heard::default();
+            return ParsedPacket::default();
         }
         self.browser
             .handle_packet(now, from.ip(), packet, fastrand::f64())
@@ -128,17 +128,17 @@ impl Ear {
         now: Instant,
         shared: &Shared,
         gateway: Incarnation,
-        said: beacon::Announced,
+        content: beacon::BeaconContent,
     ) {
-        shared.show(|together| together.said(now, gateway, said.coalitions));
-        let held = shared.held.lock().of(gateway);
-        if let Some(held) = held
-            && held.digest == said.all
-            && held.digest != Digest::default()
+        shared.show(|coalition_sync| coalition_sync.handle_beacon(now, gateway, content.coalitions));
+        let stored = shared.peer_records.lock().of(gateway);
+        if let Some(stored) = stored
+            && stored.digest == content.all
+            && stored.digest != Digest::default()
         {
             self.browser.confirm(now, gateway);
         }
-        if let Some(repair) = self.beacons.handle(now, gateway, said.all, held) {
+        if let Some(repair) = self.beacons.handle(now, gateway, content.all, stored) {
             self.repair(shared, repair);
         }
     }
@@ -150,9 +150,9 @@ impl Ear {
                 let question = self.browser.ask_for_missing(Instant::now());
                 self.send(question);
             }
-            Repair::Surplus(gateway) => shared.held.lock().verify_all(gateway),
+            Repair::Surplus(gateway) => shared.peer_records.lock().verify_all(gateway),
             Repair::Silent(gateway) => {
-                shared.held.lock().doubt(Instant::now(), gateway);
+                shared.peer_records.lock().doubt(Instant::now(), gateway);
             }
         }
     }
