@@ -1,4 +1,4 @@
-//! Failure messages: which senders are told of which failures, and how often.
+//! Failure messages: their receivers and their rate.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -15,13 +15,13 @@ use super::{Core, News, Now, own_lane, work};
 use crate::failure::Failure;
 use crate::stamp;
 
-/// How long a failure message to an old peer's agent may take.
+/// Deadline of a failure message to a legacy peer's agent.
 const FAILURE_DEADLINE: Duration = Duration::from_secs(5);
 
 impl Core {
-    /// An agent of this process has taken a letter whose message cannot be decoded. The sender is told
-    /// if it is an agent of this process, or one that the directory has under the name that the
-    /// envelope gives. Nothing else proves a name in an envelope.
+    /// Handles a letter that an agent of this process took and whose message cannot be decoded. The
+    /// sender gets a failure message if it is an agent of this process, or one that the directory
+    /// has under the name in the envelope. Nothing else proves a name in an envelope.
     pub fn handle_undecodable(
         &mut self,
         now: Now,
@@ -55,7 +55,7 @@ impl Core {
         self.tell_failures(now);
     }
 
-    /// Tells senders of what failed, in the form of FIPA `failure` messages.
+    /// Sends the pending FIPA `failure` messages.
     pub(super) fn tell_failures(&mut self, now: Now) {
         while let Some(undelivered) = self.desk.undelivered.pop_front() {
             let Undelivered {
@@ -70,13 +70,13 @@ impl Core {
             let from = match sender {
                 Author::Ours(_) => None,
                 Author::Remote { from } => {
-                    // Before the message is decoded, by the name that the envelope gives.
+                    // Before the message is decoded, by the name in the envelope.
                     let named = stamp::sender(&letter).unwrap_or_default();
                     let address = from.map(|from| from.address);
                     if !self.failure_limit.allows(now.instant, address, &named) {
                         continue;
                     }
-                    // The message is decoded as often only as its bytes came.
+                    // Messages are decoded only in proportion to the received bytes.
                     if !self
                         .failure_limit
                         .may_pay(now.instant, address, letter.len())
@@ -86,7 +86,7 @@ impl Core {
                     from
                 }
             };
-            // The message is decoded, and written anew.
+            // The message is decoded, and a new one encoded.
             work::steps(letter.len() / 512);
             let Some(report) = Failure::of(&letter, &receiver, reason, &detail) else {
                 continue;
@@ -100,7 +100,7 @@ impl Core {
                 let letter = match report.written_for(name, Dialect::Standard, now.utc) {
                     Ok(letter) => letter,
                     Err(error) => {
-                        tracing::warn!(%error, %receiver, "a failure message could not be written");
+                        tracing::warn!(%error, %receiver, "cannot encode a failure message");
                         continue;
                     }
                 };
@@ -120,14 +120,14 @@ impl Core {
                 }
                 continue;
             }
-            // Its sender is known by name, or a legacy peer's letter gives its address.
+            // The directory has the sender, or a legacy peer's letter states its address.
             let known = self.desk.directory.lookup(report.sender.name());
             let said = match known {
                 Some(_) => None,
                 None => from.and_then(|from| said_of_itself(&report, from)),
             };
             let Some(entry) = known.or_else(|| said.clone()) else {
-                tracing::info!(to = %report.sender, %reason, "nobody to send a failure message to");
+                tracing::info!(to = %report.sender, %reason, "cannot send a failure message: its receiver is not known");
                 continue;
             };
             if entry.role == Role::Gateway {
@@ -136,7 +136,7 @@ impl Core {
             let letter = match report.written_for(name, dialect_of(&entry), now.utc) {
                 Ok(letter) => letter,
                 Err(error) => {
-                    tracing::warn!(%error, receiver = %report.receiver, "a failure message could not be written");
+                    tracing::warn!(%error, receiver = %report.receiver, "cannot encode a failure message");
                     continue;
                 }
             };
@@ -180,8 +180,8 @@ pub(super) fn cannot_be_decoded(why: &dyn std::fmt::Display) -> String {
     format!("the message cannot be decoded: {why}")
 }
 
-/// The locations that an agent of a legacy peer gives as its own: of its addresses, the numeric ones
-/// of the host that its letter came from. Any others could be claimed to have this service send to
+/// The locations that an agent of a legacy peer states as its own: of its addresses, the numeric
+/// ones of the host that its letter came from. Others could be claimed to make this service send to
 /// a third party.
 pub(super) fn locations_given<'a>(
     addresses: impl IntoIterator<Item = &'a str>,
@@ -198,7 +198,7 @@ pub(super) fn locations_given<'a>(
     locations.take(Entry::MAX_LOCATIONS).collect()
 }
 
-/// An agent that the directory does not know, with the locations that it gives as its own.
+/// An agent that is not in the directory, with the locations that it states as its own.
 fn said_of_itself(report: &Failure<'_>, from: LegacySource) -> Option<Arc<Entry>> {
     let agent = &report.sender;
     let addresses = agent.addresses().iter().map(|address| &**address);
@@ -223,7 +223,7 @@ fn said_of_itself(report: &Failure<'_>, from: LegacySource) -> Option<Arc<Entry>
     entry.check().is_ok().then(|| Arc::new(entry))
 }
 
-/// What an agent understands, by what is understood where it can be reached.
+/// The dialect of an agent, by the signature of its first location.
 fn dialect_of(entry: &Entry) -> Dialect {
     match entry.locations.first().map(Location::signature) {
         Some(Signature::FipaServices) => Dialect::FipaServices,

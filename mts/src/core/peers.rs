@@ -1,12 +1,12 @@
-//! Static peers: message transport services that the configuration names, and that this one keeps
-//! in touch with before any letter needs it.
+//! Static peers: message transport services in the configuration, with which this service keeps in
+//! touch before any letter needs them.
 //!
-//! Being in touch means that a parcel without consequences (a credit that no lane waits for) was
-//! answered a moment ago. Asking opens the connection, keeps it from being closed as idle, and
-//! notices when it leads nowhere any more; the transport tells which service is at its other end.
+//! Being in touch means that a parcel without effect (a credit that no lane waits for) was recently
+//! answered. The check opens the connection, keeps it from being closed as idle, and detects when
+//! it is dead; the transport learns which service is at the other end.
 //!
-//! All locations of a peer are asked at the same time until one answers, so that addresses at which
-//! no host is (a peer may be listed with several, and have one of them) delay nothing.
+//! All locations of a peer are checked concurrently until one answers, so that addresses without a
+//! host (a peer may be listed with several, and have only one of them) cause no delay.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -17,12 +17,12 @@ use fipa_transport::{
 
 use super::desk::{Desk, Purpose, note_parcel};
 
-/// A message transport service that the configuration names.
+/// A message transport service in the configuration.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Peer {
-    /// What it is called here.
+    /// Its name in the configuration.
     pub name: Arc<str>,
-    /// Where it may be found. Who is there is not known before it was asked.
+    /// Its possible locations. The service there is unknown until it answers.
     pub locations: Vec<Location>,
 }
 
@@ -31,22 +31,22 @@ pub struct Peer {
 pub struct PeerState {
     /// The peer.
     pub peer: Peer,
-    /// Where it answered last, if it still does.
+    /// The location that answered last, if it still does.
     pub answers: Option<Location>,
-    /// Why it did not answer, for each location since it last did.
+    /// The error of each location since a location last answered.
     pub failures: Vec<(Location, WayError)>,
-    /// How often in a row it could not be found at any of its locations.
+    /// Number of consecutive rounds in which no location answered.
     pub rounds: u32,
-    /// How long until it is asked again; none while an answer is awaited.
+    /// Time until the next check; `None` while an answer is awaited.
     pub asked_again_in: Option<Duration>,
 }
 
-/// How often a peer that answers is asked.
+/// Interval of checks of a peer that answers.
 const KEEP: Duration = Duration::from_secs(5);
-/// Pauses before a location is asked again that did not answer.
+/// Backoff before a location that did not answer is checked again.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
-/// Pause before asking again when a connection with the peer has ended.
+/// Pause before a check after a connection with the peer has ended.
 const PARTED_PAUSE: Duration = Duration::from_millis(200);
 
 /// The static peers of a service.
@@ -54,7 +54,7 @@ const PARTED_PAUSE: Duration = Duration::from_millis(200);
 pub(super) struct Peers {
     all: Vec<Watched>,
     next: u64,
-    /// The earliest of their times.
+    /// The earliest time of all peers.
     due: Option<Instant>,
 }
 
@@ -64,7 +64,7 @@ struct Watched {
     peer: Peer,
     /// Its locations in the order of the configuration's transports.
     ways: Vec<Way>,
-    /// Where the peer answers. No other location is asked meanwhile.
+    /// The location that answers. No other location is checked meanwhile.
     answers: Option<Location>,
 }
 
@@ -73,9 +73,9 @@ struct Watched {
 struct Way {
     location: Location,
     state: State,
-    /// Failures in a row.
+    /// Number of consecutive failures.
     failures: u32,
-    /// Why it did not answer, since the peer last did at any of its locations.
+    /// Its latest error since a location of the peer last answered.
     error: Option<WayError>,
     last_asked: Option<Instant>,
 }
@@ -87,7 +87,7 @@ enum State {
 }
 
 impl Peers {
-    /// Keeps in touch with these from now on. Those that were there before stay as they are.
+    /// Replaces the list of peers. Peers on both lists keep their state.
     pub(super) fn set(&mut self, now: Instant, peers: Vec<Peer>, desk: &mut Desk) {
         let mut before = std::mem::take(&mut self.all);
         for peer in peers {
@@ -108,7 +108,7 @@ impl Peers {
         self.ask_those_due(now, desk);
     }
 
-    /// The order of transports has changed.
+    /// Applies a new order of transports.
     pub(super) fn reorder(&mut self, now: Instant, desk: &mut Desk) {
         for watched in &mut self.all {
             watched.order(now, desk);
@@ -116,7 +116,7 @@ impl Peers {
         self.ask_those_due(now, desk);
     }
 
-    /// A connection that had been opened for this location has ended.
+    /// Handles the end of a connection that was opened for this location.
     pub(super) fn parted(&mut self, now: Instant, location: &Location) {
         let ways = self.all.iter_mut().flat_map(|watched| &mut watched.ways);
         for way in ways.filter(|way| way.location == *location) {
@@ -126,7 +126,7 @@ impl Peers {
         self.look_ahead();
     }
 
-    /// The network of this host has changed: peers that did not answer are asked at once.
+    /// Checks all peers at once, because this host's network has changed.
     pub(super) fn ask_again(&mut self, now: Instant, desk: &mut Desk) {
         let ways = self.all.iter_mut().flat_map(|watched| &mut watched.ways);
         for way in ways {
@@ -136,7 +136,7 @@ impl Peers {
         self.ask_those_due(now, desk);
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
+    /// Time of the next call of [`handle_timeout`](Self::handle_timeout).
     pub(super) fn due(&self) -> Option<Instant> {
         self.due
     }
@@ -161,7 +161,7 @@ impl Peers {
         self.ask_those_due(now, desk);
     }
 
-    /// The conclusion of asking one of them.
+    /// Handles the conclusion of a check.
     pub(super) fn concluded(
         &mut self,
         now: Instant,
@@ -180,7 +180,7 @@ impl Peers {
             Conclusion::NotSent(error) | Conclusion::Unconfirmed(error) => {
                 watched.failed(now, index, error);
             }
-            // Any answer shows that the peer is there.
+            // Any answer shows that the peer is reachable.
             _ => watched.answered(now, index),
         }
         self.ask_those_due(now, desk);
@@ -212,13 +212,13 @@ impl Watched {
         }
     }
 
-    /// Brings the ways into the order of transports, which may have changed.
+    /// Sorts the locations by the order of transports, which may have changed.
     fn order(&mut self, now: Instant, desk: &mut Desk) {
         let mut before = std::mem::take(&mut self.ways);
         let order = desk.config.order.iter();
         let listed = order.flat_map(|kind| {
             let all = self.peer.locations.iter();
-            // Legacy peers understand nothing but letters.
+            // Legacy peers accept only letters.
             all.filter(move |location| {
                 location.kind() == *kind && location.signature() == Signature::Frames
             })
@@ -236,7 +236,7 @@ impl Watched {
         }
     }
 
-    /// Whether this way is asked now and then: all are until one answers.
+    /// Whether this location is checked: all are until one answers.
     fn is_of_use(&self, way: &Way) -> bool {
         self.answers.as_ref().is_none_or(|at| *at == way.location)
     }
@@ -264,7 +264,7 @@ impl Watched {
             return;
         };
         if self.answers.is_none() {
-            tracing::info!(peer = %self.peer.name, at = %way.location, "in touch");
+            tracing::info!(peer = %self.peer.name, at = %way.location, "the static peer answers");
         }
         way.state = State::AskAt(now + KEEP);
         self.answers = Some(way.location.clone());
@@ -280,7 +280,7 @@ impl Watched {
         };
         let parted = self.answers.take_if(|at| *at == way.location).is_some();
         if parted || way.failures == 0 && self.answers.is_none() {
-            tracing::info!(peer = %self.peer.name, at = %way.location, %error, "not in touch");
+            tracing::info!(peer = %self.peer.name, at = %way.location, %error, "the static peer does not answer");
         }
         let pause = FIRST_PAUSE.saturating_mul(1 << way.failures.min(10));
         way.state = State::AskAt(now + pause.min(LONGEST_PAUSE));
@@ -321,7 +321,7 @@ impl Way {
         }
     }
 
-    /// Is asked at this time at the latest, unless an answer is awaited.
+    /// Schedules a check for this time at the latest, unless an answer is awaited.
     fn ask_by(&mut self, time: Instant) {
         if let State::AskAt(at) = &mut self.state {
             *at = time.min(*at);
@@ -340,7 +340,7 @@ impl Way {
         self.last_asked = Some(now);
         self.state = State::Asked {
             attempt,
-            // Opening a connection may take longer than an answer on one that is there.
+            // Opening a connection may take longer than an answer on an open one.
             until: now + desk.config.attempt_timeout * 3,
         };
     }

@@ -1,6 +1,5 @@
-//! Routes and ways as people look at them: which way a letter to somebody would go now, and why;
-//! what has happened on each way so far. And as those do who loan memory for a letter before there
-//! is one.
+//! Reports of routes: the locations to which a letter would go now, and counters of each location
+//! since the start. The allocation of memory for a letter in advance also uses them.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -15,19 +14,18 @@ use super::desk::{self, Desk};
 use super::{Core, Now};
 use crate::{Map, stamp};
 
-/// How letters to one agent would go now.
+/// The route that letters to one agent would take now.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Route {
     /// The agent's name.
     pub receiver: String,
-    /// This life of it.
+    /// Its incarnation.
     pub incarnation: Incarnation,
-    /// The gateway that letters go to, when the agent is on another host.
+    /// The gateway to which letters go, when the agent is on another host.
     pub gateway: Option<Incarnation>,
-    /// The pattern of `[routes]` that decides, or none for the order of `mts.transports`.
+    /// The pattern of `[routes]` that applies, or `None` for the order of `mts.transports`.
     pub exception: Option<String>,
-    /// Its locations, in the order in which they would be tried. Those that would not be come
-    /// last.
+    /// Its locations, in the order in which they would be tried. Unused ones come last.
     pub ways: Vec<Way>,
 }
 
@@ -40,20 +38,20 @@ pub struct Way {
     pub standing: Standing,
 }
 
-/// Whether letters would go to a location.
+/// State of a location for letters.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "standing", rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum Standing {
-    /// It works as far as is known.
+    /// Not known to fail.
     Ready,
-    /// It failed, and is tried after all that work, until this time has passed.
+    /// It failed, and is tried after all working ones until this time has passed.
     Failing {
-        /// How long it is put back still.
+        /// Remaining time of its backoff.
         milliseconds: u64,
-        /// How often in a row it failed.
+        /// Number of consecutive failures.
         failures: u32,
-        /// Why it failed last.
+        /// The latest error.
         error: String,
     },
     /// Its transport is not in the order for this receiver.
@@ -62,33 +60,34 @@ pub enum Standing {
     Unsupported,
 }
 
-/// What has happened on one way since the service started, or since the way was last forgotten:
-/// the least used are, when there are more than 4096.
+/// Counters of one location since the service started, or since the location was last dropped.
+/// Beyond 4096 locations, those without letters in flight are dropped.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WayState {
-    /// Where to.
+    /// The location.
     pub location: Location,
-    /// How it stands now.
+    /// Its current state.
     #[serde(flatten)]
     pub standing: Standing,
-    /// Letters that were sent there and have no answer yet.
+    /// Number of letters that were sent there and have no answer yet.
     pub in_flight: u64,
-    /// Attempts to send a letter there.
+    /// Number of attempts to send a letter there.
     pub tried: u64,
-    /// Letters that the other side took, into a queue or into custody, or that were handed to a
-    /// peer that cannot confirm.
+    /// Number of letters that the other side took, into a queue or into custody, or that were
+    /// handed to a peer that cannot confirm.
     pub taken: u64,
-    /// Letters that the other side did not take: its queue was full, or it had a reason of its own.
+    /// Number of letters that the other side did not take, because its queue was full or for
+    /// another reason.
     pub turned_back: u64,
-    /// Attempts that failed: nobody reached, or nothing heard.
+    /// Number of failed attempts: no connection, or no answer.
     pub failed: u64,
-    /// Why the last of these failed.
+    /// Error of the last of these.
     pub last_error: Option<String>,
-    /// How many seconds ago that was.
+    /// Seconds since that error.
     pub last_error_seconds: Option<u64>,
 }
 
-/// What happens on one way, counted.
+/// Counters of one location.
 #[derive(Debug, Default)]
 pub(crate) struct Tally {
     pub(super) tried: AtomicU64,
@@ -99,11 +98,11 @@ pub(crate) struct Tally {
     last_error: Mutex<Option<(String, Instant)>>,
 }
 
-/// The tallies of all ways.
+/// Counters of all locations.
 #[derive(Debug, Default)]
 pub(super) struct Tallies(Map<Location, Arc<Tally>>);
 
-/// Ways that are counted, at most.
+/// Maximum number of locations with counters.
 const MAX_TALLIES: usize = 4096;
 
 impl Tally {
@@ -123,7 +122,7 @@ impl Tally {
 }
 
 impl Tallies {
-    /// The tally of this way. Beyond the bound those nothing is under way on are forgotten.
+    /// Counters of this location. Beyond the limit, those without letters in flight are dropped.
     pub(super) fn of(&mut self, location: &Location) -> Arc<Tally> {
         if let Some(tally) = self.0.get(location) {
             return Arc::clone(tally);
@@ -140,7 +139,7 @@ impl Tallies {
 }
 
 impl Desk {
-    /// How letters to this agent would go now.
+    /// The route that letters to this agent would take now.
     pub(super) fn route(&self, now: Instant, entry: &Entry) -> Route {
         let (exception, order) = self.config.route_for(&entry.name);
         let mut ways = Vec::new();
@@ -187,7 +186,7 @@ impl Desk {
         }
     }
 
-    /// What has happened on each way, by location.
+    /// The counters of each location, sorted by location.
     pub(super) fn way_states(&self, now: Instant) -> Vec<WayState> {
         let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         let tallies = self.tallies.0.iter();
@@ -218,19 +217,20 @@ fn seconds(duration: Duration) -> u64 {
 }
 
 impl Core {
-    /// How letters from here to the agent of this entry would go now.
+    /// Returns the route that letters from here to the agent of this entry would take now.
     #[must_use]
     pub fn route(&self, now: Now, entry: &Entry) -> Route {
         self.desk.route(now.instant, entry)
     }
 
-    /// What has happened on each way so far, in the order of their locations.
+    /// Returns the counters of each location, sorted by location.
     #[must_use]
     pub fn ways(&self, now: Now) -> Vec<WayState> {
         self.desk.way_states(now.instant)
     }
 
-    /// The first way that a letter from here to this receiver would take now; none to several.
+    /// Returns the first location to which a letter from here to this receiver would go now; `None`
+    /// for several receivers.
     #[must_use]
     pub fn first_way(&self, now: Now, receiver: &str) -> Option<Location> {
         let entry = self.desk.directory.lookup(receiver)?;
@@ -240,9 +240,9 @@ impl Core {
         self.desk.choose(now.instant, &entry, &[])
     }
 
-    /// The first way that a letter of others, for this life of an agent with this name, would take
-    /// from here now, if this service passes it on within its host; and the bytes that its stamp
-    /// takes.
+    /// Returns the first location to which this service would forward a letter for this
+    /// registration and name now, and the length of its stamp in bytes. `None` unless the receiver
+    /// is another process of this host.
     #[must_use]
     pub fn first_way_onwards(
         &self,
@@ -260,8 +260,8 @@ impl Core {
         Some((way?, stamp::room(&config.name)))
     }
 
-    /// The kind of transport by which a letter to these receivers would go first to two of them at
-    /// least, now; of several kinds, the one that most of them would be reached by.
+    /// Returns the kind of transport that would come first for most of these receivers now, if that
+    /// applies to at least two of them.
     #[must_use]
     pub fn kind_for_many<'a>(
         &self,

@@ -1,5 +1,4 @@
-//! What a lane does with answers, with the end of attempts, with reports of custodians, and with
-//! changes of the directory.
+//! Handling of answers, ends of attempts, reports of custodians, and changes of the directory.
 
 use std::time::{Duration, Instant};
 
@@ -17,7 +16,7 @@ use super::delivery::State;
 use super::{BUSY_PAUSE, CONGESTED_PAUSE, CONGESTED_TRIES, ENDED_PATIENCE, Lane, MOVING_PATIENCE};
 
 impl Lane {
-    /// What became of an attempt.
+    /// Handles the conclusion of an attempt.
     pub(crate) fn concluded(
         &mut self,
         now: Instant,
@@ -40,7 +39,7 @@ impl Lane {
         self.back();
         self.heard(now);
         self.letters[index].progress.state = State::Waiting;
-        // The clock decides about the letter again, also when its deadline has passed meanwhile.
+        // The timer visits the letter again, also if its deadline passed in the meantime.
         self.due_at(self.letters[index].deadline);
         match conclusion {
             Conclusion::Answered(answer) => {
@@ -67,7 +66,7 @@ impl Lane {
             }
             Conclusion::NotSent(error) => self.came_back(now, index, &location, error, desk),
             Conclusion::Unconfirmed(error) if location.signature() != Signature::Frames => {
-                // A legacy peer takes a copy for another letter.
+                // A legacy peer would take a copy for a new letter.
                 self.letters[index].failed_at(&location, error);
                 self.fail(now, index, FailureReason::Unconfirmed, desk);
             }
@@ -111,7 +110,7 @@ impl Lane {
                     since: now,
                 };
                 self.ask_custodian_at(now + ASK_CUSTODIAN_AFTER);
-                // A letter before it may have failed since this copy left.
+                // A letter before it may have failed since this copy was dispatched.
                 if !self.is_custody() {
                     self.tell_predecessor(index, desk);
                 }
@@ -158,8 +157,8 @@ impl Lane {
         }
     }
 
-    /// The letter came back because an earlier one is missing at the other side, where `last` was
-    /// taken, if that is known. The way is not at fault.
+    /// Handles a letter that came back because an earlier one is missing at the other side. `last`
+    /// is the last letter taken there, or 0 if unknown. The route has not failed.
     fn came_early(
         &mut self,
         now: Instant,
@@ -186,7 +185,7 @@ impl Lane {
         }
     }
 
-    /// A service says that this registration of the receiver has left its host a moment ago.
+    /// Handles an answer that this registration of the receiver recently left its host.
     fn receiver_moved(&mut self, now: Instant, index: usize, desk: &mut Desk) {
         self.recovering = true;
         let delivery = &self.letters[index];
@@ -206,14 +205,14 @@ impl Lane {
         self.receiver_left(now, index, desk);
     }
 
-    /// Whether the registration that the letter is for, of which others say that it is not there,
-    /// is not in the directory either: it may have ended a moment ago.
+    /// Whether the letter's registration, which another service reports as unknown, is not in the
+    /// directory either: it may have just ended.
     fn is_registered_no_more(&self, index: usize, desk: &Desk) -> bool {
         desk.directory.refresh();
         self.entry(self.letters[index].registration, desk).is_none()
     }
 
-    /// The other side said finally that it does not take the letter.
+    /// Handles the final refusal of a letter by the other side.
     fn refused(
         &mut self,
         now: Instant,
@@ -227,7 +226,7 @@ impl Lane {
         self.fail(now, index, reason, desk);
     }
 
-    /// An attempt did not reach the other side, or may not have.
+    /// Handles an attempt that did not reach the other side, or may not have.
     pub(super) fn came_back(
         &mut self,
         now: Instant,
@@ -241,7 +240,7 @@ impl Lane {
             tally.fail(now, &error);
         }
         if error.fault == WayFault::Congested && self.congested < CONGESTED_TRIES {
-            // What is under way, in this lane or in another, makes room.
+            // The end of another attempt, in this lane or another, makes room.
             self.congested += 1;
             self.letters[index]
                 .progress
@@ -258,7 +257,8 @@ impl Lane {
         self.letters[index].failed_at(location, error);
     }
 
-    /// The custody of a letter has ended, as this service reports of the hand-over `transfer`.
+    /// Handles this service's report that the custody of a letter, from the hand-over `transfer`,
+    /// has ended.
     pub(crate) fn reported(
         &mut self,
         now: Instant,
@@ -283,7 +283,7 @@ impl Lane {
                 uncertain: *uncertain,
             },
             Report::Moved => Told::NotDelivered { uncertain: false },
-            // What a later version knows says nothing to this one.
+            // An unknown report of a later version carries no information.
             _ => Told::NotDelivered { uncertain: true },
         };
         let handed = delivery.was_handed_to(from);
@@ -299,7 +299,7 @@ impl Lane {
         }
         let taken_by = match current {
             Some((_, kind)) => Some(kind),
-            // An attempt that nothing was heard of delivered it, the last one most likely.
+            // An attempt without an answer delivered it, most likely the last one.
             None => delivery.progress.attempts.last().map(|it| it.via),
         };
         self.end_hand_over(index, transfer, desk);
@@ -318,7 +318,8 @@ impl Lane {
         self.pump(now, desk);
     }
 
-    /// The letter is here again: an attempt that a report overtook has ended.
+    /// Takes a letter back after a report, which may have arrived before the conclusion of the
+    /// attempt.
     fn end_hand_over(&mut self, index: usize, transfer: u64, desk: &mut Desk) {
         let state = &mut self.letters[index].progress.state;
         let before = std::mem::replace(state, State::Waiting);
@@ -327,7 +328,7 @@ impl Lane {
         } = before
         {
             desk.drop_attempt(location.kind(), attempt);
-            // If the report is of an earlier hand-over, this way has not shown that it works.
+            // A report of an earlier hand-over does not show that this route works.
             if attempt.0 == transfer {
                 desk.way_worked(&location);
                 if let Some(tally) = self.tally() {
@@ -346,7 +347,7 @@ impl Lane {
         outcome: Outcome,
         desk: &mut Desk,
     ) {
-        // The sender is told the way between the hosts, which only this side may have seen.
+        // The sender is told the transport between the hosts, which only this side may know.
         let way = |theirs| match taken_by {
             None => theirs,
             Some(ours) if ours.is_host_local() => theirs,
@@ -382,14 +383,15 @@ impl Lane {
         self.settle(now, index, Settlement::Outcome(outcome), desk);
     }
 
-    /// The directory has changed: services that have letters in custody may be gone.
+    /// Handles a change of the directory: services with letters in custody may be gone.
     pub(crate) fn directory_changed(&mut self, now: Instant, desk: &mut Desk) {
         self.check_next_hops(now, desk);
         self.notice_end(now, desk);
         self.pump(now, desk);
     }
 
-    /// Looks for letters that services have which lead to their receiver no more.
+    /// Checks for letters that were handed to services through which their receiver cannot be
+    /// reached any more.
     pub(super) fn check_next_hops(&mut self, now: Instant, desk: &mut Desk) {
         let mut entry: Option<(Incarnation, Option<std::sync::Arc<Entry>>)> = None;
         for index in 0..self.letters.len() {
@@ -403,15 +405,16 @@ impl Lane {
                     known
                 }
             };
-            // When the receiver itself is gone, its custodian says so, or the clock does.
+            // If the receiver itself is gone, its custodian reports that, or a timeout ends the
+            // letter.
             if let Some(entry) = known {
                 self.check_next_hop(now, index, &entry, desk);
             }
         }
     }
 
-    /// Notices that the registration which the first letters are for has left the directory:
-    /// letters for its successor do not wait for long.
+    /// Detects that the registration of the first letters has left the directory; letters for its
+    /// successor then wait only for a limited time.
     fn notice_end(&mut self, now: Instant, desk: &Desk) {
         if self.is_custody() {
             return;
@@ -430,16 +433,15 @@ impl Lane {
         }
     }
 
-    /// Something was heard of the letters: those for a registration that has ended are waited for
-    /// anew.
+    /// Restarts the wait for letters of an ended registration after an event of one of them.
     fn heard(&mut self, now: Instant) {
         if let Some((_, heard)) = &mut self.ended {
             *heard = now;
         }
     }
 
-    /// The receiver cannot be reached through the service any more that the letter was handed to: no
-    /// answer or report of that service is waited for.
+    /// Checks whether the receiver can still be reached through the service that the letter was
+    /// handed to; if not, ends the wait for that service's answer or report.
     fn check_next_hop(&mut self, now: Instant, index: usize, entry: &Entry, desk: &mut Desk) {
         let delivery = &mut self.letters[index];
         let Some((_, location)) = delivery.progress.state.handed_over() else {
@@ -458,7 +460,7 @@ impl Lane {
                 ..
             } => {
                 if !std::mem::replace(abandoned, true) {
-                    let text = "another service is there now";
+                    let text = "the service at this location was replaced";
                     let error = WayError::new(WayFault::Broken, text);
                     desk.abandon(location.kind(), *attempt, error);
                 }
@@ -472,7 +474,7 @@ impl Lane {
     }
 }
 
-/// The end of a custody that handed the letter back.
+/// The end of a custody that returned the letter.
 fn end_of(uncertain: bool) -> End {
     match uncertain {
         true => End::Unknown,

@@ -1,4 +1,4 @@
-//! What a lane does because time has passed.
+//! Timeouts of a lane.
 
 use std::time::Instant;
 
@@ -10,8 +10,8 @@ use super::delivery::{Holding, State};
 use super::{ENDED_PATIENCE, Lane};
 
 impl Lane {
-    /// What is due by the clock: deadlines, attempts without an answer, custody to be told, letters
-    /// to be handed back.
+    /// Handles everything that is due: deadlines, attempts without an answer, custody reports, and
+    /// letters to return.
     pub(super) fn expire(&mut self, now: Instant, desk: &mut Desk) {
         if self.due.is_none_or(|due| due > now) {
             return;
@@ -20,7 +20,7 @@ impl Lane {
         let ended = self
             .ended
             .filter(|(_, heard)| now >= *heard + ENDED_PATIENCE);
-        // For what is due, and for what will be.
+        // Once for due timers, and once for the next ones.
         work::steps(2 * self.letters.len());
         let mut index = 0;
         while let Some(delivery) = self.letters.get_mut(index) {
@@ -77,7 +77,7 @@ impl Lane {
     fn next_due(&self, now: Instant) -> Option<Instant> {
         let letters = self.letters.iter().flat_map(|delivery| {
             let progress = &delivery.progress;
-            // The end of an abandoned attempt is on its way, and decides about the letter.
+            // The conclusion of an abandoned attempt follows at once, and decides about the letter.
             let (deadline, times_out) = match &progress.state {
                 State::UnderWay {
                     abandoned: true, ..

@@ -1,8 +1,9 @@
-//! What custodians do about predecessors: a letter waits for one that is in the lane, and is handed
-//! back when one does not arrive. Copies of held letters, and notes about predecessors, come here.
+//! Predecessors at custodians: a letter waits for a predecessor that is in the lane, and is
+//! returned when a predecessor does not arrive. This module also handles copies of held letters,
+//! and notes about predecessors.
 //!
-//! And what the service before a custodian does: it asks now and then whether the custodian has the
-//! letter. Whatever became of its report, a custodian without the letter has lost it.
+//! It also has the previous hop's checks: that service periodically asks a custodian whether it has
+//! the letter. A custodian without the letter has lost it, whatever became of its report.
 
 use std::time::{Duration, Instant};
 
@@ -14,24 +15,24 @@ use super::super::work;
 use super::Lane;
 use super::delivery::{Holding, State};
 
-/// How long a predecessor that is not here may take to arrive, at least and at most: two round trips to
-/// the service that handed the letter over. Where they take longer than this service has seen, a letter
-/// travels twice, and nothing is lost.
+/// Minimum and maximum time for a missing predecessor to arrive: two round trips to the service
+/// that handed the letter over. If the predecessor takes longer, the letter travels twice, and
+/// nothing is lost.
 const LEAST_PATIENCE: Duration = Duration::from_millis(50);
 const MOST_PATIENCE: Duration = Duration::from_secs(1);
-/// Time in custody after which the custodian is asked whether it has the letter, and the pause until it is
-/// asked again.
+/// Time in custody after which the custodian is asked whether it has the letter, and the pause
+/// until it is asked again.
 pub(super) const ASK_CUSTODIAN_AFTER: Duration = Duration::from_secs(1);
 const ASK_CUSTODIAN_AGAIN: Duration = Duration::from_secs(2);
-/// The same when the custodian did not have another letter of this lane.
+/// The pause when the custodian did not have another letter of this lane.
 const ASK_CUSTODIAN_ON: Duration = Duration::from_millis(10);
-/// Letters of one lane that are asked about at once.
+/// Maximum number of letters of one lane that are asked about at once.
 const ASKED_AT_ONCE: usize = 16;
-/// Letters that left a lane are remembered, at most this many.
+/// Maximum number of remembered letters that left a lane.
 const MAX_LEFT: usize = 64;
 
 impl Lane {
-    /// A copy of a letter that may be here already. Returns what it came with when it is not.
+    /// Handles a copy of a letter that may be in the lane already; returns `upstream` if it is not.
     pub(crate) fn adopt(
         &mut self,
         now: Instant,
@@ -50,8 +51,9 @@ impl Lane {
         Ok(())
     }
 
-    /// A note says which predecessor this letter has now, and asks whether the letter of this hand-over
-    /// is here. Believed from the service that handed it over. Returns whether it is here.
+    /// Handles a note with the current predecessor of this letter, which also asks whether the
+    /// letter of this hand-over is here. Accepted only from the service that handed it over.
+    /// Returns whether the letter is here.
     pub(crate) fn predecessor_told(
         &mut self,
         now: Instant,
@@ -68,14 +70,14 @@ impl Lane {
         index.is_some()
     }
 
-    /// How long the predecessor of the letter at `index` may take to arrive.
+    /// Maximum time for the predecessor of the letter at `index` to arrive.
     pub(super) fn predecessor_patience(&self, index: usize, desk: &Desk) -> Duration {
         let upstreams = self.letters[index].upstreams();
         let slowest = upstreams.filter_map(|it| desk.round_trip(it)).max();
         (slowest.unwrap_or_default() * 2).clamp(LEAST_PATIENCE, MOST_PATIENCE)
     }
 
-    /// Custodians are asked at this time at the latest.
+    /// Schedules the question to custodians for this time at the latest.
     pub(super) fn ask_custodian_at(&mut self, at: Instant) {
         if self.ask_custodian.is_none_or(|due| at < due) {
             self.ask_custodian = Some(at);
@@ -83,9 +85,8 @@ impl Lane {
         }
     }
 
-    /// Asks the custodians of the letters that have been longest in custody whether they have them, and
-    /// tells them the present predecessors by the way. What the directory says of them is looked at
-    /// again, too.
+    /// Asks the custodians of the letters that are longest in custody whether they have them, and
+    /// sends them the current predecessors with that. Checks the directory's data about them, too.
     pub(super) fn ask_custodians(&mut self, now: Instant, desk: &mut Desk) {
         if self.ask_custodian.is_none_or(|due| due > now) {
             return;
@@ -129,7 +130,7 @@ impl Lane {
         }
     }
 
-    /// The custodian that was asked about this hand-over of a letter does not have it.
+    /// Handles the answer of a custodian that it does not have the letter of this hand-over.
     pub(crate) fn custodian_denied(
         &mut self,
         now: Instant,
@@ -151,7 +152,7 @@ impl Lane {
         }
     }
 
-    /// The service that has the letter in custody is lost, or has lost it.
+    /// Handles the loss of the custodian, or of the letter at the custodian.
     pub(super) fn custodian_lost(
         &mut self,
         now: Instant,
@@ -205,13 +206,13 @@ impl Lane {
         };
         match self.letters[predecessor].progress.state.handed_over() {
             None => true,
-            // What leaves on the same way arrives behind it, unless it came back from there already.
+            // A letter on the same route arrives behind it, unless it already came back from there.
             Some((attempt, _)) => delivery.progress.hold == Some(Holding::ForPredecessor(attempt)),
         }
     }
 
-    /// The letter came back because its predecessor was not taken, or was handed back by the next
-    /// custodian for that reason.
+    /// Holds a letter that came back because its predecessor was not taken, or that the next
+    /// custodian returned for that reason.
     pub(super) fn hold(&mut self, now: Instant, index: usize, patience: Duration, desk: &mut Desk) {
         let delivery = &self.letters[index];
         let after = delivery.after;
@@ -237,13 +238,13 @@ impl Lane {
         }
     }
 
-    /// Hands a letter back to the services that handed it over.
+    /// Returns a letter to the services that handed it over.
     pub(super) fn return_letter(&mut self, now: Instant, index: usize, desk: &mut Desk) {
         let uncertain = self.letters[index].progress.uncertain;
         self.settle(now, index, Settlement::Returned { uncertain }, desk);
     }
 
-    /// A letter came: those that wait for it to arrive wait for it in the lane now.
+    /// Lets letters that wait for the arrival of this one wait for it in the lane.
     pub(super) fn predecessor_came(&mut self, sequence: u64) {
         if !self.holds {
             return;
@@ -258,7 +259,7 @@ impl Lane {
         }
     }
 
-    /// A letter left the lane without being delivered.
+    /// Records a letter that left the lane without being delivered.
     pub(super) fn predecessor_failed(&mut self, now: Instant, sequence: u64) {
         if self.left.len() >= MAX_LEFT {
             self.left.pop_front();

@@ -1,16 +1,16 @@
-//! A lane: letters that have no outcome yet, in order, and where each of them stands.
+//! A lane: open letters in order, and the state of each.
 //!
 //! The sender's process has one lane for each pair of a sender and the *name* of a receiver, so
 //! that letters for a new registration wait for those of the old one. A custodian has one lane for
-//! each stream. [`rules`] has what the two must do and why; this is how they do it.
+//! each stream. The module [`rules`] states the rules; the lane applies them.
 //!
-//! Letters are dispatched in order and only along one way at a time. When one comes back, the
-//! lane waits until everything under way has been heard of, and goes on from the earliest letter
-//! that waits.
+//! Letters are dispatched in order and only on one route at a time. When a letter comes back, the
+//! lane waits until all letters in transit have ended, and continues with the earliest waiting
+//! letter.
 //!
-//! Here is what moves letters on; [`answers`] is what comes back, [`clock`] what time does,
-//! [`custody`] what custodians do about predecessors, [`delivery`] a single letter, [`tried`] what
-//! letters tell that were never dispatched.
+//! This module dispatches letters; [`answers`] handles answers and reports, [`clock`] timeouts,
+//! [`custody`] predecessors at custodians, [`delivery`] the state of one letter, [`tried`] the
+//! attempts that are reported for letters that were never dispatched.
 //!
 //! [`rules`]: super::rules
 
@@ -37,39 +37,40 @@ use super::routes::Tally;
 use super::rules;
 use super::work;
 
-/// Pauses between rounds over all ways, and before a letter that was handed back goes out again.
+/// Pauses between rounds over all routes, and before a returned letter is dispatched again.
 const FIRST_PAUSE: Duration = Duration::from_millis(10);
 const LONGEST_PAUSE: Duration = Duration::from_millis(500);
-/// Pause towards a busy receiver when no credit comes.
+/// Pause for a busy receiver without a credit.
 const BUSY_PAUSE: Duration = Duration::from_millis(100);
-/// Pause of a lane that waits for room on its way, and how many in a row count as a failure of
-/// the way.
+/// Pause of a lane that waits for room on its route, and the number of consecutive pauses that
+/// count as a failure of the route.
 const CONGESTED_PAUSE: Duration = Duration::from_millis(20);
 const CONGESTED_TRIES: u32 = 25;
-/// A large letter may take longer: this many bytes a second are expected at least.
+/// Minimum expected throughput, which extends the timeout of large letters.
 const SLOWEST_BYTES_PER_SECOND: u64 = 1 << 20;
-/// What is taken off the remaining time at every hop, so that services further down the way give
-/// up first and can still say why.
+/// Subtracted from the remaining time at every hop, so that services further down the route time
+/// out first and can still report the reason.
 const HOP_MARGIN: Duration = Duration::from_millis(100);
-/// How long a letter waits for the new registration of a receiver that has moved.
+/// Time for which a letter waits for the new registration of a receiver that has moved.
 const MOVING_PATIENCE: Duration = Duration::from_secs(2);
-/// How long letters that were handed over for a registration that has ended are waited for.
+/// Time for which letters that were handed over for an ended registration are waited for.
 const ENDED_PATIENCE: Duration = Duration::from_secs(2);
-/// How long a letter that is too large for the kinds that its receiver shows waits for another kind.
+/// Time for which a letter that is too large for the receiver's current kinds of transport waits
+/// for another kind.
 const KIND_PATIENCE: Duration = Duration::from_secs(2);
 
 /// The number of a lane within its core.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(crate) struct LaneId(pub(crate) u64);
 
-/// What a lane is for.
+/// The letters of a lane.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(crate) enum LaneKey {
-    /// Letters that this process sends: from this agent or service, to all registrations of this
+    /// Letters that this process sends, from this agent or service to all registrations of this
     /// name.
     Name(Incarnation, Arc<str>),
-    /// Letters that this process sends to this registration of a service, whose name others may
-    /// have too.
+    /// Letters that this process sends to this registration of a service, whose name other services
+    /// may have.
     Service(Stream),
     /// Letters of others in custody.
     Custody(Stream),
@@ -81,46 +82,45 @@ pub(crate) struct Lane {
     key: LaneKey,
     sender: Incarnation,
     receiver: Arc<str>,
-    /// Where the receiver says that it can be reached, if the directory does not know it.
+    /// The location that the receiver stated itself, if it is not in the directory.
     said: Option<Arc<Entry>>,
     letters: VecDeque<Delivery>,
     bytes: usize,
     under_way: usize,
-    /// The way that letters under way go.
+    /// The route of the letters in transit.
     way: Option<Location>,
-    /// Where it is counted what happens on that way, also when it was the last one.
+    /// Counters of the current or last route.
     tally: Option<(Location, Arc<Tally>)>,
-    /// The last error of each route that has failed since the lane was empty, and has not worked since.
-    /// Letters that never had an attempt of their own tell them.
+    /// The latest error of each route that failed since the lane was empty and has not worked
+    /// since. Reported for letters without an attempt of their own.
     failed: Vec<Attempt>,
-    /// Something came back: nothing is dispatched until all that is under way has been heard of.
+    /// Whether a letter came back: nothing is dispatched until all letters in transit have ended.
     recovering: bool,
     paused_until: Option<Instant>,
-    /// The pause is for a lower letter, and ends with it.
+    /// Whether the pause is for a lower letter, with whose end it ends.
     paused_for_lower: bool,
     pauses: u32,
-    /// The receiver's queue was full when it was last heard of.
+    /// Whether the receiver's queue was full at its last answer.
     busy: bool,
-    /// When it was last full.
+    /// Time at which it was last full.
     was_busy: Option<Instant>,
-    /// A registration that has moved, and until when its successor is waited for.
+    /// A registration that has moved, and the end of the wait for its successor.
     moving: Option<(Incarnation, Instant)>,
-    /// A registration that has left the directory, and when something was last heard about
-    /// letters for it.
+    /// A registration that left the directory, and the time of the last event of letters for it.
     ended: Option<(Incarnation, Instant)>,
-    /// When custodians are asked whether they have letters of this lane.
+    /// Time at which custodians are asked whether they have letters of this lane.
     ask_custodian: Option<Instant>,
     /// Whether a letter may wait for its predecessor to arrive.
     holds: bool,
     /// Letters that left this lane without being delivered, and when.
     left: VecDeque<(u64, Instant)>,
-    /// When something is due by the clock at the earliest.
+    /// Earliest time at which a timer of this lane is due.
     due: Option<Instant>,
-    /// When the core's timer will look at this lane next.
+    /// Time at which the core's timer visits this lane next.
     pub(crate) scheduled: Option<Instant>,
-    /// How often in a row the way had no room.
+    /// Number of consecutive attempts that found no room on the route.
     congested: u32,
-    /// When something last happened here.
+    /// Time of the last activity.
     pub(crate) active: Instant,
     /// The service that was told that the lane is full, and waits for a credit.
     waiting: Option<Location>,
@@ -176,12 +176,12 @@ impl Lane {
         self.letters.is_empty()
     }
 
-    /// Nothing more to do.
+    /// Whether nothing is left to do.
     pub(crate) fn is_idle(&self) -> bool {
         self.letters.is_empty() && self.waiting.is_none()
     }
 
-    /// Whether what becomes of letters that are still to come depends on this lane.
+    /// Whether later letters depend on the state of this lane.
     pub(crate) fn remembers(&self) -> bool {
         !self.left.is_empty()
     }
@@ -197,7 +197,7 @@ impl Lane {
         }
     }
 
-    /// The way that a letter is going at the moment.
+    /// The current route of a letter in transit.
     pub(crate) fn way_of(&self, sequence: u64) -> Option<&Location> {
         match &self.letters[self.index(sequence)?].progress.state {
             State::UnderWay { location, .. } => Some(location),
@@ -205,15 +205,15 @@ impl Lane {
         }
     }
 
-    /// Whether there is room for another letter of this process, of this many bytes.
+    /// Whether there is room for another letter of this process with this many bytes.
     pub(crate) fn has_room(&self, len: usize, desk: &Desk) -> bool {
         let config = &desk.config;
         let fits = self.bytes.saturating_add(len) <= config.lane_bytes;
         self.letters.len() < config.lane && (fits || self.letters.is_empty())
     }
 
-    /// Whether a custodian takes this letter. A letter below one that waits for it is taken beyond
-    /// the bounds, up to twice as far.
+    /// Whether a custodian takes this letter. A letter below a waiting one is taken beyond the
+    /// limits, up to twice as much.
     pub(crate) fn admits(&self, sequence: u64, len: usize, desk: &Desk) -> bool {
         let config = &desk.config;
         let held = desk.held.saturating_add(len);
@@ -238,7 +238,7 @@ impl Lane {
         entry.is_some_and(|entry| entry.locations.iter().any(is_meant))
     }
 
-    /// When the lane must be looked at again at the latest.
+    /// Latest time of the next visit.
     pub(crate) fn due(&self) -> Option<Instant> {
         self.due
     }
@@ -249,8 +249,8 @@ impl Lane {
         }
     }
 
-    /// Where this registration of the receiver can be reached: as the directory has it, or as it
-    /// said itself when the directory does not know it. None when it has moved.
+    /// The entry of this registration of the receiver: from the directory, or as the receiver
+    /// stated it. `None` when it has moved.
     fn entry(&self, registration: Incarnation, desk: &Desk) -> Option<Arc<Entry>> {
         if self.moving.is_some_and(|(moved, _)| moved == registration) {
             return None;
@@ -259,12 +259,12 @@ impl Lane {
         known.or_else(|| self.said.clone())
     }
 
-    /// The receiver is not in the directory, but has said where it can be reached.
+    /// Sets the entry that a receiver outside the directory stated.
     pub(crate) fn said(&mut self, entry: Arc<Entry>) {
         self.said = Some(entry);
     }
 
-    /// Puts a letter in, at its place in the order.
+    /// Inserts a letter at its position in the order.
     pub(crate) fn push(&mut self, delivery: Delivery, desk: &mut Desk) {
         let len = delivery.letter.len();
         desk.held += len;
@@ -285,7 +285,7 @@ impl Lane {
         self.waiting = Some(back);
     }
 
-    /// Dispatches what can be dispatched.
+    /// Dispatches all letters that can be dispatched.
     pub(crate) fn pump(&mut self, now: Instant, desk: &mut Desk) {
         self.active = now;
         self.expire(now, desk);
@@ -306,7 +306,8 @@ impl Lane {
         while index < self.letters.len() && self.under_way < desk.config.window {
             work::steps(1);
             let registration = self.letters[index].registration;
-            // All between have the same, or the loop would not have come here.
+            // All letters in between have the same registration, or the loop would have ended
+            // earlier.
             if !rules::may_dispatch(self.first_registration(), registration) {
                 break;
             }
@@ -331,7 +332,8 @@ impl Lane {
                     self.dispatch(now, index, way, desk);
                     index += 1;
                 }
-                // Another way than the letters before it: not before they have arrived.
+                // A different route than that of earlier letters must wait until those have
+                // arrived.
                 Some(_) => break,
                 None if self.under_way > 0 => break,
                 None => {
@@ -391,19 +393,19 @@ impl Lane {
         self.way = Some(way);
     }
 
-    /// The predecessor that the letter at `index` is dispatched with: at a custodian the one it
-    /// came with, at the sender's process the nearest open one before it.
+    /// The predecessor with which the letter at `index` is dispatched: at a custodian the one it
+    /// came with, at the sender's process the nearest open letter before it.
     fn after(&self, index: usize) -> u64 {
         let delivery = &self.letters[index];
         if self.is_custody() {
             return delivery.after;
         }
-        // Of all registrations: a letter that waits for a new one must not be passed over, either.
+        // Of all registrations: a letter that waits for a new one must not be passed over either.
         let open = self.letters.iter().take(index);
         rules::predecessor(open.map(|other| other.sequence), delivery.sequence)
     }
 
-    /// The tally of the way that letters take now: looked up when the way changes, not for each.
+    /// The counters of the current route, looked up only when the route changes.
     fn tally_of(&mut self, way: &Location, desk: &mut Desk) -> Option<&Tally> {
         if self
             .tally
@@ -419,7 +421,7 @@ impl Lane {
         self.tally.as_ref().map(|(_, tally)| &**tally)
     }
 
-    /// A letter is not under way any more.
+    /// Records that a letter is no longer in transit.
     fn back(&mut self) {
         self.under_way -= 1;
         if let Some(tally) = self.tally() {
@@ -427,7 +429,7 @@ impl Lane {
         }
     }
 
-    /// Every way was tried. Says whether the letter was settled.
+    /// Handles a letter for which every route was tried. Returns whether it was settled.
     fn end_of_round(&mut self, now: Instant, index: usize, entry: &Entry, desk: &mut Desk) -> bool {
         let delivery = &mut self.letters[index];
         if delivery.progress.tried.is_empty() {
@@ -487,8 +489,8 @@ impl Lane {
         self.due_at(until);
     }
 
-    /// The registration that the letter is for has ended. Says whether the lane may go on with the
-    /// letter at this index: another one, or the same for the new registration.
+    /// Handles the end of the registration that the letter is for. Returns whether the lane may
+    /// continue with the letter at this index: another one, or the same for the new registration.
     fn receiver_left(&mut self, now: Instant, index: usize, desk: &mut Desk) -> bool {
         let delivery = &self.letters[index];
         let registration = delivery.registration;
@@ -525,15 +527,15 @@ impl Lane {
         }
     }
 
-    /// There is room again, at the receiver or on the way to it.
+    /// Continues after room was made, at the receiver or on the route to it.
     pub(crate) fn resume(&mut self, now: Instant, desk: &mut Desk) {
         self.paused_until = None;
         self.pauses = 0;
         self.pump(now, desk);
     }
 
-    /// Gives up everything, when the sending agent goes away or the service ends. What is under
-    /// way has its outcome when its transport has concluded it, which is at once.
+    /// Abandons all letters, when the sending agent goes away or the service ends. A letter in
+    /// transit gets its outcome from the conclusion of its transport, which follows at once.
     pub(crate) fn give_up(&mut self, now: Instant, desk: &mut Desk) {
         self.recovering = true;
         work::steps(self.letters.len());
@@ -567,7 +569,7 @@ impl Lane {
         }
     }
 
-    /// Gives a letter up. If an attempt may have delivered it, its sender is told so.
+    /// Ends a letter as failed, or as unconfirmed if an attempt may have delivered it.
     fn fail(&mut self, now: Instant, index: usize, reason: FailureReason, desk: &mut Desk) {
         let delivery = &mut self.letters[index];
         let reason = match delivery.progress.uncertain {
@@ -594,7 +596,7 @@ impl Lane {
         self.settle(now, index, Settlement::Outcome(outcome), desk);
     }
 
-    /// Takes a letter out of the lane, and tells those it came from.
+    /// Removes a letter from the lane, and reports its end to its origin.
     fn settle(&mut self, now: Instant, index: usize, settlement: Settlement, desk: &mut Desk) {
         let Some(delivery) = self.letters.remove(index) else {
             return;
@@ -627,8 +629,8 @@ impl Lane {
         desk.settle(delivery, stream, Arc::clone(&self.receiver), settlement);
     }
 
-    /// The letter before the one at `index` has failed at its sender's process: the service that
-    /// holds this one is told the predecessor that it has now.
+    /// Sends the custodian of the letter at `index` its new predecessor, after the letter before it
+    /// failed at the sender's process.
     fn tell_predecessor(&mut self, index: usize, desk: &mut Desk) {
         let Some(delivery) = self.letters.get(index) else {
             return;
@@ -654,7 +656,7 @@ impl Lane {
             && self.bytes <= config.lane_bytes / 2
             && let Some(back) = self.waiting.take()
         {
-            // Only custodians tell that they are full.
+            // Only custodians answer that they are full.
             if let LaneKey::Custody(stream) = &self.key {
                 desk.credit(*stream, Arc::clone(&self.receiver), back);
             }
