@@ -78,15 +78,15 @@ impl<'a> Failure<'a> {
             .receiver(self.sender.clone())
             .ontology("fipa-agent-management");
         failure = match dialect {
-            Dialect::FipaServices => match self.told_by_path(mts) {
+            Dialect::FipaServices => match self.path_content(mts) {
                 Ok(content) => failure.content(content),
                 // The string encoding cannot represent some names.
                 Err(error) => {
                     tracing::debug!(%error, receiver = self.receiver, "writing the failure message in FIPA SL");
-                    failure.language("fipa-sl").content(self.told_in_sl())
+                    failure.language("fipa-sl").content(self.sl_content())
                 }
             },
-            _ => failure.language("fipa-sl").content(self.told_in_sl()),
+            _ => failure.language("fipa-sl").content(self.sl_content()),
         };
         if let Some(message) = &self.message {
             if let Some(protocol) = message.protocol() {
@@ -102,7 +102,7 @@ impl<'a> Failure<'a> {
         Ok(letter_for(&failure.build()?, utc)?)
     }
 
-    fn told_in_sl(&self) -> String {
+    fn sl_content(&self) -> String {
         let text = self.text();
         format!(
             "((action (agent-identifier :name {}) (ACLMessage)) \
@@ -121,10 +121,10 @@ impl<'a> Failure<'a> {
         }
     }
 
-    fn told_by_path(&self, mts: &str) -> Result<Vec<u8>, Box<dyn Error>> {
+    fn path_content(&self, mts: &str) -> Result<Vec<u8>, Box<dyn Error>> {
         let mut path = self.path.clone();
         path.push(mts.to_owned());
-        let told = Message::builder(Performative::Inform)
+        let report = Message::builder(Performative::Inform)
             .sender(self.sender.clone())
             .receiver(AgentId::new(self.receiver)?)
             .language("internal-error")
@@ -134,8 +134,8 @@ impl<'a> Failure<'a> {
                 path.join(",")
             ))
             .build()?;
-        let told = told.encode(Representation::String, Dialect::FipaServices)?;
-        Ok(told.to_vec())
+        let report = report.encode(Representation::String, Dialect::FipaServices)?;
+        Ok(report.to_vec())
     }
 }
 

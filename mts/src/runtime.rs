@@ -25,7 +25,7 @@ use tokio::runtime::Handle;
 use tokio::sync::{Notify, watch};
 use tokio::task::JoinHandle;
 
-use self::receiving::Receiving;
+use self::receiving::TransportSink;
 use crate::Gate;
 use crate::Map;
 use crate::core::{
@@ -81,7 +81,7 @@ pub trait Tap: Send + Sync {
 /// Cheap to clone; all clones are the same service. It runs until [`close`](Self::close).
 #[derive(Clone)]
 pub struct Mts {
-    shared: Arc<Running>,
+    shared: Arc<ServiceHandle>,
 }
 
 /// The service as its users hold it. Dropping the last of them closes the transports.
@@ -89,9 +89,9 @@ pub struct Mts {
 /// Sinks and tasks hold the inner value, but only during a call. One of them may drop it last,
 /// within a call by a transport; that transport is closed by then, because `close` waits for such
 /// calls.
-struct Running(Arc<Shared>);
+struct ServiceHandle(Arc<Shared>);
 
-impl std::ops::Deref for Running {
+impl std::ops::Deref for ServiceHandle {
     type Target = Shared;
 
     fn deref(&self) -> &Shared {
@@ -99,7 +99,7 @@ impl std::ops::Deref for Running {
     }
 }
 
-impl Drop for Running {
+impl Drop for ServiceHandle {
     fn drop(&mut self) {
         // In a forked child, closing would end the parent's connections.
         if self.owner.is_this() {
@@ -130,13 +130,13 @@ struct State {
     /// Time at which the timer wakes up.
     armed: Option<Instant>,
     sends: Map<SendId, Arc<Slot>>,
-    agents: Map<Incarnation, Arc<Door>>,
+    agents: Map<Incarnation, Arc<AgentWaiter>>,
 }
 
 /// Wakes the tasks that receive for an agent. Written under the lock of the state, and read without
 /// it by polling tasks.
 #[derive(Default)]
-struct Door {
+struct AgentWaiter {
     /// Whether the agent's queue has a letter.
     ready: AtomicBool,
     /// Whether no more letters will arrive.
@@ -146,7 +146,7 @@ struct Door {
     over: Notify,
 }
 
-impl Door {
+impl AgentWaiter {
     fn close(&self) {
         self.gone.store(true, Ordering::Release);
         self.over.notify_waiters();
@@ -159,21 +159,21 @@ impl Door {
 /// Collects the outcomes of one letter.
 #[derive(Default)]
 struct Slot {
-    outcomes: Mutex<Gathered>,
+    outcomes: Mutex<Outcomes>,
     complete: Notify,
 }
 
 #[derive(Default)]
-struct Gathered {
+struct Outcomes {
     expected: usize,
     known: Vec<(Arc<str>, Outcome)>,
 }
 
 impl Slot {
     fn taken_if_complete(&self) -> Option<Vec<(Arc<str>, Outcome)>> {
-        let mut gathered = self.outcomes.lock();
-        let complete = gathered.known.len() >= gathered.expected;
-        complete.then(|| std::mem::take(&mut gathered.known))
+        let mut outcomes = self.outcomes.lock();
+        let complete = outcomes.known.len() >= outcomes.expected;
+        complete.then(|| std::mem::take(&mut outcomes.known))
     }
 }
 
@@ -226,7 +226,7 @@ impl Mts {
         });
         let mut failed = Vec::new();
         for transport in &transports {
-            let sink = Arc::new(Receiving {
+            let sink = Arc::new(TransportSink {
                 shared: Arc::downgrade(&shared),
                 kind: transport.kind(),
                 answers_at_once: transport.answers_at_once(),
@@ -247,7 +247,7 @@ impl Mts {
         shared.tasks.lock().extend(tasks);
         Started {
             mts: Self {
-                shared: Arc::new(Running(shared)),
+                shared: Arc::new(ServiceHandle(shared)),
             },
             locations,
             failed,
@@ -272,11 +272,11 @@ impl Mts {
     /// Starts to accept letters for this agent. It must be in the directory, or be added soon.
     pub fn register(&self, name: Arc<str>, incarnation: Incarnation) {
         let mut state = self.shared.state.lock();
-        let door = Arc::new(Door::default());
+        let waiter = Arc::new(AgentWaiter::default());
         if self.shared.closed.load(Ordering::Acquire) {
-            door.close();
+            waiter.close();
         }
-        state.agents.insert(incarnation, door);
+        state.agents.insert(incarnation, waiter);
         state.core.register(name, incarnation);
     }
 
@@ -285,8 +285,8 @@ impl Mts {
         let mut state = self.shared.state.lock();
         let unread = std::iter::from_fn(|| state.core.take(incarnation)).collect();
         state.core.deregister(Now::read(), incarnation);
-        if let Some(door) = state.agents.remove(&incarnation) {
-            door.close();
+        if let Some(waiter) = state.agents.remove(&incarnation) {
+            waiter.close();
         }
         self.shared.carry_out(state);
         unread
@@ -384,17 +384,17 @@ impl Mts {
     /// Waits for the next letter for this agent; `None` when the agent was deregistered or the
     /// service closed.
     pub async fn receive(&self, agent: Incarnation) -> Option<Received> {
-        let door = Arc::clone(self.shared.state.lock().agents.get(&agent)?);
+        let waiter = Arc::clone(self.shared.state.lock().agents.get(&agent)?);
         self.shared
-            .wait(&door.notify, || {
-                if door.ready.load(Ordering::Acquire)
+            .wait(&waiter.notify, || {
+                if waiter.ready.load(Ordering::Acquire)
                     && let Some(received) = self.try_receive(agent)
                 {
                     return Some(Some(received));
                 }
-                door.gone.load(Ordering::Acquire).then(|| {
+                waiter.gone.load(Ordering::Acquire).then(|| {
                     // Other tasks may be about to wait too, and each notification wakes one.
-                    door.notify.notify_one();
+                    waiter.notify.notify_one();
                     None
                 })
             })
@@ -404,12 +404,12 @@ impl Mts {
     /// Waits until no more letters can arrive for this agent, because it was deregistered or the
     /// service closed.
     pub async fn gone(&self, agent: Incarnation) {
-        let Some(door) = self.shared.state.lock().agents.get(&agent).map(Arc::clone) else {
+        let Some(waiter) = self.shared.state.lock().agents.get(&agent).map(Arc::clone) else {
             return;
         };
         // Created before the check, so that a later notification is not missed.
-        let over = door.over.notified();
-        if !door.gone.load(Ordering::Acquire) {
+        let over = waiter.over.notified();
+        if !waiter.gone.load(Ordering::Acquire) {
             over.await;
         }
     }
@@ -419,11 +419,11 @@ impl Mts {
         let mut state = self.shared.state.lock();
         let received = state.core.take(agent);
         let more = state.core.waiting(agent) > 0;
-        if let Some(door) = state.agents.get(&agent) {
-            door.ready.store(more, Ordering::Release);
+        if let Some(waiter) = state.agents.get(&agent) {
+            waiter.ready.store(more, Ordering::Release);
             if more {
                 // Another task may be waiting for the same agent's letters.
-                door.notify.notify_one();
+                waiter.notify.notify_one();
             }
         }
         let received = received?;
@@ -469,8 +469,8 @@ impl Mts {
         }
         let mut state = self.shared.state.lock();
         state.core.give_up(Now::read());
-        for door in state.agents.values() {
-            door.close();
+        for waiter in state.agents.values() {
+            waiter.close();
         }
         self.shared.carry_out(state);
         for transport in &self.shared.transports {
@@ -580,9 +580,9 @@ impl Shared {
                     }
                 }
                 Action::Deliverable { agent } => {
-                    if let Some(door) = state.agents.get(&agent) {
-                        door.ready.store(true, Ordering::Release);
-                        door.notify.notify_one();
+                    if let Some(waiter) = state.agents.get(&agent) {
+                        waiter.ready.store(true, Ordering::Release);
+                        waiter.notify.notify_one();
                     }
                 }
             }
@@ -632,14 +632,14 @@ impl State {
             return;
         };
         let complete = {
-            let mut gathered = slot.outcomes.lock();
+            let mut outcomes = slot.outcomes.lock();
             if outcome.attempts().is_empty() {
                 tracing::trace!(%receiver, %outcome, "letter");
             } else {
                 tracing::info!(%receiver, %outcome, "letter");
             }
-            gathered.known.push((receiver, outcome));
-            gathered.known.len() >= gathered.expected
+            outcomes.known.push((receiver, outcome));
+            outcomes.known.len() >= outcomes.expected
         };
         if complete {
             slot.complete.notify_one();
@@ -656,7 +656,7 @@ fn no_such_transport(kind: Kind) -> WayError {
 /// A future with the outcomes of one letter.
 #[must_use = "await it to get the outcomes of the letter"]
 pub struct Sending {
-    shared: Arc<Running>,
+    shared: Arc<ServiceHandle>,
     slot: Arc<Slot>,
 }
 

@@ -8,7 +8,7 @@ use fipa_acl::Dialect;
 use fipa_sds::{Entry, Mts, Reach, Role, Source};
 use fipa_transport::{FailureReason, Incarnation, LegacySource, Location, Signature, Stream};
 
-use super::desk::{Action, Author, Origin, Undelivered, life_of};
+use super::attempts::{Action, FailureTarget, Origin, Undelivered, registration_of};
 use super::inbox::Received;
 use super::lane::Delivery;
 use super::{Core, News, Now, own_lane, work};
@@ -29,35 +29,35 @@ impl Core {
         received: &Received,
         why: String,
     ) {
-        let life = received.sender;
-        if received.via.is_none() || !life.is_known() {
+        let registration = received.sender;
+        if received.via.is_none() || !registration.is_known() {
             return;
         }
-        let sender = if self.agents.contains_key(&life) {
-            Author::Ours(life)
+        let sender = if self.agents.contains_key(&registration) {
+            FailureTarget::Ours(registration)
         } else {
             let named = stamp::sender(&received.letter);
-            let known = self.desk.directory.known_incarnation(life);
+            let known = self.table.directory.known_incarnation(registration);
             match known {
                 Some(entry) if named.as_deref() == Some(&*entry.name) => {
-                    Author::Remote { from: None }
+                    FailureTarget::Remote { from: None }
                 }
                 _ => return,
             }
         };
-        self.desk.undelivered.push_back(Undelivered {
+        self.table.undelivered.push_back(Undelivered {
             sender,
             receiver: Arc::clone(receiver),
             letter: received.letter.clone(),
             reason: FailureReason::Refused,
             detail: cannot_be_decoded(&why),
         });
-        self.tell_failures(now);
+        self.send_failures(now);
     }
 
     /// Sends the pending FIPA `failure` messages.
-    pub(super) fn tell_failures(&mut self, now: Now) {
-        while let Some(undelivered) = self.desk.undelivered.pop_front() {
+    pub(super) fn send_failures(&mut self, now: Now) {
+        while let Some(undelivered) = self.table.undelivered.pop_front() {
             let Undelivered {
                 sender,
                 receiver,
@@ -65,11 +65,11 @@ impl Core {
                 reason,
                 detail,
             } = undelivered;
-            let name = Arc::clone(&self.desk.config.name);
+            let name = Arc::clone(&self.table.config.name);
             let name = &*name;
             let from = match sender {
-                Author::Ours(_) => None,
-                Author::Remote { from } => {
+                FailureTarget::Ours(_) => None,
+                FailureTarget::Remote { from } => {
                     // Before the message is decoded, by the name in the envelope.
                     let named = stamp::sender(&letter).unwrap_or_default();
                     let address = from.map(|from| from.address);
@@ -79,7 +79,7 @@ impl Core {
                     // Messages are decoded only in proportion to the received bytes.
                     if !self
                         .failure_limit
-                        .may_pay(now.instant, address, letter.len())
+                        .covers(now.instant, address, letter.len())
                     {
                         continue;
                     }
@@ -91,9 +91,9 @@ impl Core {
             let Some(report) = Failure::of(&letter, &receiver, reason, &detail) else {
                 continue;
             };
-            let own = self.desk.config.incarnation;
+            let own = self.table.config.incarnation;
             let sequence = self.sequence_of(own);
-            if let Author::Ours(agent) = sender {
+            if let FailureTarget::Ours(agent) = sender {
                 let Some(inbox) = self.agents.get_mut(&agent) else {
                     continue;
                 };
@@ -110,23 +110,23 @@ impl Core {
                         receiver: agent,
                     };
                     let name = Arc::clone(&inbox.name);
-                    self.desk.notice(stream, sequence, &name, || News::Taken {
+                    self.table.notice(stream, sequence, &name, || News::Taken {
                         via: None,
                         letter,
                     });
-                    self.desk.actions.push_back(Action::Deliverable { agent });
+                    self.table.actions.push_back(Action::Deliverable { agent });
                 } else {
                     self.failure_limit.leave_out(now.instant);
                 }
                 continue;
             }
             // The directory has the sender, or a legacy peer's letter states its address.
-            let known = self.desk.directory.lookup(report.sender.name());
-            let said = match known {
+            let known = self.table.directory.lookup(report.sender.name());
+            let stated = match known {
                 Some(_) => None,
-                None => from.and_then(|from| said_of_itself(&report, from)),
+                None => from.and_then(|from| stated_entry(&report, from)),
             };
-            let Some(entry) = known.or_else(|| said.clone()) else {
+            let Some(entry) = known.or_else(|| stated.clone()) else {
                 tracing::info!(to = %report.sender, %reason, "cannot send a failure message: its receiver is not known");
                 continue;
             };
@@ -140,16 +140,15 @@ impl Core {
                     continue;
                 }
             };
-            if !self.failure_limit.has_paid(
-                now.instant,
-                from.map(|from| from.address),
-                letter.len(),
-            ) {
+            if !self
+                .failure_limit
+                .debit(now.instant, from.map(|from| from.address), letter.len())
+            {
                 continue;
             }
             let stream = Stream {
-                sender: self.desk.config.incarnation,
-                receiver: life_of(&entry),
+                sender: self.table.config.incarnation,
+                receiver: registration_of(&entry),
             };
             let id = self.lane(now, own_lane(stream.sender, &entry), &entry.name);
             if !self.has_room_for_stranger(id, letter.len()) {
@@ -158,17 +157,17 @@ impl Core {
             }
             let deadline = now.instant + FAILURE_DEADLINE;
             let letter_of = (stream.receiver, sequence);
-            let origin = Origin::Nobody;
+            let origin = Origin::FailureMessage;
             let delivery = Delivery::new(now.instant, origin, letter, letter_of, deadline);
-            self.desk
+            self.table
                 .notice(stream, sequence, &entry.name, || News::Sent {
                     send: None,
                     letter: delivery.letter.clone(),
                 });
-            if said.is_some()
+            if stated.is_some()
                 && let Some(lane) = self.lanes.get_mut(&id)
             {
-                lane.said(Arc::clone(&entry));
+                lane.set_stated(Arc::clone(&entry));
             }
             self.put(now, id, delivery);
         }
@@ -199,7 +198,7 @@ pub(super) fn locations_given<'a>(
 }
 
 /// An agent that is not in the directory, with the locations that it states as its own.
-fn said_of_itself(report: &Failure<'_>, from: LegacySource) -> Option<Arc<Entry>> {
+fn stated_entry(report: &Failure<'_>, from: LegacySource) -> Option<Arc<Entry>> {
     let agent = &report.sender;
     let addresses = agent.addresses().iter().map(|address| &**address);
     let locations = locations_given(addresses, from);

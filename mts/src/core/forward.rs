@@ -11,7 +11,7 @@ use fipa_transport::{
     Signature, Stream, Ticket, Verdict,
 };
 
-use super::desk::{Action, Author, Origin, Undelivered, Upstream};
+use super::attempts::{Action, FailureTarget, Origin, Undelivered, Upstream};
 use super::failures::{cannot_be_decoded, locations_given};
 use super::inbox::link_of;
 use super::lane::{Delivery, Lane, LaneId, LaneKey};
@@ -162,11 +162,11 @@ impl Core {
         };
         if let Some(id) = self.lane_ids.get(&key).copied() {
             let mut kept = Some(upstream);
-            self.with_lane(now, id, |lane, desk| {
+            self.with_lane(now, id, |lane, table| {
                 let letter = (parcel.sequence, parcel.after);
                 kept = kept
                     .take()
-                    .and_then(|it| lane.adopt(now.instant, letter, it, desk).err());
+                    .and_then(|it| lane.adopt(now.instant, letter, it, table).err());
             });
             upstream = match kept {
                 Some(upstream) => upstream,
@@ -178,7 +178,7 @@ impl Core {
         }
         let id = self.lane(now, key, &entry.name);
         if let Some(lane) = self.lanes.get_mut(&id)
-            && !lane.admits(parcel.sequence, stamped.len(), &self.desk)
+            && !lane.admits(parcel.sequence, stamped.len(), &self.table)
         {
             lane.wait_for_credit(from.location);
             return Verdict::Now(Answer::Busy);
@@ -187,9 +187,9 @@ impl Core {
             return Verdict::Now(Answer::failed(FailureReason::Refused, why));
         }
         if from.is_remote() {
-            self.hear(stream.sender, &stamped, &from);
+            self.report_contact(stream.sender, &stamped, &from);
         }
-        self.desk
+        self.table
             .notice(stream, parcel.sequence, &entry.name, || News::Passed {
                 via,
                 remote: from.is_remote(),
@@ -232,7 +232,7 @@ impl Core {
         if receiver.source != Source::Mdns || !receiver.locations.iter().any(is_legacy) {
             return None;
         }
-        let sender = self.desk.directory.known_incarnation(sender)?;
+        let sender = self.table.directory.known_incarnation(sender)?;
         // A registration in the future means that the clock was set back.
         let ago = now.utc.duration_since(sender.registered);
         let wait = FOUND_AFTER.checked_sub(ago.unwrap_or_default())?;
@@ -258,16 +258,16 @@ impl Core {
         letter: Letter,
         from: &Hop,
     ) -> Result<(Arc<Entry>, Letter), Answer> {
-        let config = &self.desk.config;
+        let config = &self.table.config;
         let unknown = |why: &str| Answer::failed(FailureReason::NoSuchAgent, why);
         let refused = |why: String| Answer::failed(FailureReason::Refused, why);
         if !config.forwards {
             return Err(unknown("the agent is not in this process any more"));
         }
         let registration = parcel.stream.receiver;
-        let Some(entry) = self.desk.receiver(registration, &parcel.receiver) else {
+        let Some(entry) = self.table.receiver(registration, &parcel.receiver) else {
             return Err(
-                match self.desk.departed.contains(now.instant, registration) {
+                match self.table.departed.contains(now.instant, registration) {
                     true => Answer::Moved,
                     false => unknown("the agent is not known to the gateway"),
                 },
@@ -296,8 +296,8 @@ impl Core {
 
     /// Reports the sender of this stamped letter as a contact if it is unknown, so that it can be
     /// answered.
-    fn hear(&mut self, agent: Incarnation, letter: &Letter, from: &Hop) {
-        let directory = &self.desk.directory;
+    fn report_contact(&mut self, agent: Incarnation, letter: &Letter, from: &Hop) {
+        let directory = &self.table.directory;
         if !agent.is_known() || directory.known_incarnation(agent).is_some() {
             return;
         }
@@ -309,7 +309,7 @@ impl Core {
             && directory.known(&name).is_none()
         {
             let location = from.location.clone();
-            self.desk.actions.push_back(Action::Heard {
+            self.table.actions.push_back(Action::Heard {
                 name,
                 agent,
                 location,
@@ -319,11 +319,16 @@ impl Core {
 
     /// Reports an agent of a legacy peer as a contact, at the location that it states as its own.
     /// Only for an agent that is unknown, or known as a contact that sends from the same host.
-    fn hear_unframed(&mut self, now: Now, (name, location): (String, Location), from: IpAddr) {
-        if !self.desk.config.forwards {
+    fn report_legacy_contact(
+        &mut self,
+        now: Now,
+        (name, location): (String, Location),
+        from: IpAddr,
+    ) {
+        if !self.table.config.forwards {
             return;
         }
-        if let Some(known) = self.desk.directory.known(&name) {
+        if let Some(known) = self.table.directory.known(&name) {
             let at = known.locations.first();
             let address = at.and_then(|at| at.address().parse::<SocketAddr>().ok());
             let same = address.is_some_and(|address| address.ip().to_canonical() == from);
@@ -338,7 +343,7 @@ impl Core {
             tracing::debug!(%from, "rate limit of new agents of legacy peers exceeded; this one cannot be answered");
             return;
         }
-        self.desk.actions.push_back(Action::Heard {
+        self.table.actions.push_back(Action::Heard {
             name,
             agent: Incarnation::UNKNOWN,
             location,
@@ -348,13 +353,13 @@ impl Core {
     /// Whether this lane has room for another letter.
     pub(super) fn has_room(&self, lane: LaneId, len: usize) -> bool {
         let lane = self.lanes.get(&lane);
-        lane.is_some_and(|lane| lane.has_room(len, &self.desk))
+        lane.is_some_and(|lane| lane.has_room(len, &self.table))
     }
 
     /// Whether this lane has room for a letter whose sender cannot be held back.
     pub(super) fn has_room_for_stranger(&self, lane: LaneId, len: usize) -> bool {
-        let bytes = self.desk.held.saturating_add(len);
-        bytes <= self.desk.config.custody_bytes && self.has_room(lane, len)
+        let bytes = self.table.held.saturating_add(len);
+        bytes <= self.table.config.custody_bytes && self.has_room(lane, len)
     }
 
     /// Handles a legacy peer's letter for the agents of this host in its envelope. If its message
@@ -370,17 +375,17 @@ impl Core {
             fault,
         } = unframed;
         self.failure_limit
-            .came(now.instant, from.address, letter.len());
+            .credit(now.instant, from.address, letter.len());
         if let Some(fault) = fault {
             tracing::info!(from = %from.address, "refused a letter of a legacy peer: {fault}");
             for (receiver, _) in receivers {
                 let why = (FailureReason::Refused, fault.clone());
                 self.unframed_failed(&receiver, &letter, (via, from), why);
             }
-            self.tell_failures(now);
+            self.send_failures(now);
             return;
         }
-        let stream_sender = self.desk.config.incarnation;
+        let stream_sender = self.table.config.incarnation;
         let unproved = Link {
             via,
             service: Incarnation::UNKNOWN,
@@ -416,7 +421,7 @@ impl Core {
                     continue;
                 }
                 if let Some(located) = located.take() {
-                    self.hear_unframed(now, located, from.address);
+                    self.report_legacy_contact(now, located, from.address);
                 }
                 let stream = Stream {
                     sender: stream_sender,
@@ -426,16 +431,16 @@ impl Core {
                 if let Some(inbox) = self.agents.get_mut(&entry.incarnation)
                     && inbox.push_unframed(letter.clone(), via)
                 {
-                    self.desk
+                    self.table
                         .notice(stream, sequence, &entry.name, || News::Taken {
                             via: Some(via),
                             letter: letter.clone(),
                         });
                     let agent = entry.incarnation;
-                    self.desk.actions.push_back(Action::Deliverable { agent });
+                    self.table.actions.push_back(Action::Deliverable { agent });
                     continue;
                 }
-                self.desk
+                self.table
                     .notice(stream, sequence, &entry.name, || News::Passed {
                         via,
                         remote: true,
@@ -443,14 +448,14 @@ impl Core {
                     });
                 let lane = self.lane(now, own_lane(stream_sender, entry), &entry.name);
                 if !self.has_room_for_stranger(lane, letter.len()) {
-                    self.desk.undelivered.push_back(Undelivered {
-                        sender: Author::Remote { from: Some(from) },
+                    self.table.undelivered.push_back(Undelivered {
+                        sender: FailureTarget::Remote { from: Some(from) },
                         receiver: Arc::clone(&entry.name),
                         letter: letter.clone(),
                         reason: FailureReason::QueueFull,
                         detail: String::new(),
                     });
-                    self.desk
+                    self.table
                         .notice(stream, sequence, &entry.name, || News::Settled {
                             outcome: failed(FailureReason::QueueFull),
                             sender: true,
@@ -458,14 +463,14 @@ impl Core {
                     continue;
                 }
                 let until = now.instant + deadline.min(MAX_DEADLINE);
-                let origin = Origin::OldPeer { from };
+                let origin = Origin::LegacyPeer { from };
                 let letter_of = (stream.receiver, sequence);
                 let letter = letter.clone();
                 let delivery = Delivery::new(now.instant, origin, letter, letter_of, until);
                 self.put(now, lane, delivery);
             }
         }
-        self.tell_failures(now);
+        self.send_failures(now);
     }
 
     /// Reports that a legacy peer's letter cannot be delivered to this receiver.
@@ -476,25 +481,25 @@ impl Core {
         (via, from): (Kind, LegacySource),
         (reason, detail): (FailureReason, String),
     ) {
-        let own = self.desk.config.incarnation;
+        let own = self.table.config.incarnation;
         let stream = Stream {
             sender: own,
             receiver: Incarnation::UNKNOWN,
         };
         let sequence = self.sequence_of(own);
-        self.desk
+        self.table
             .notice(stream, sequence, receiver, || News::Passed {
                 via,
                 remote: true,
                 letter: letter.clone(),
             });
-        self.desk
+        self.table
             .notice(stream, sequence, receiver, || News::Settled {
                 outcome: failed(reason),
                 sender: true,
             });
-        self.desk.undelivered.push_back(Undelivered {
-            sender: Author::Remote { from: Some(from) },
+        self.table.undelivered.push_back(Undelivered {
+            sender: FailureTarget::Remote { from: Some(from) },
             receiver: Arc::clone(receiver),
             letter: letter.clone(),
             reason,

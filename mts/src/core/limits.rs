@@ -20,13 +20,13 @@ const IN_ALL: f64 = 400.0;
 /// Time after which a token bucket is full again, so that it can be dropped.
 const MEMORY: Duration = Duration::from_secs(1);
 /// Maximum number of addresses with a byte credit.
-const MAX_PAID: usize = 4096;
+const MAX_CREDITS: usize = 4096;
 /// Time for which a credit is kept when another address needs the space. Longer than the deadline
 /// of most letters.
-const PAID_MEMORY: Duration = Duration::from_secs(60);
+const CREDIT_MEMORY: Duration = Duration::from_secs(60);
 /// Minimum credit of a letter, in bytes. A failure message about a letter of 119 bytes has 300 to
 /// 700, and the headers of the letter's own connection have 270.
-const MIN_PAID: u64 = 1024;
+const MIN_CREDIT: u64 = 1024;
 /// Maximum credit of an address, in bytes.
 const MAX_CREDIT: u64 = 1 << 20;
 /// Interval of the log line about omitted failure messages.
@@ -105,7 +105,7 @@ impl SenderLimit {
 
 /// Bytes received from one address, minus those of the failure messages about them.
 #[derive(Debug, Clone, Copy)]
-struct Paid {
+struct ByteCredit {
     bytes: u64,
     last: Instant,
 }
@@ -116,7 +116,7 @@ pub(super) struct FailureLimit {
     limit: SenderLimit,
     /// Credit of legacy peers' addresses: failure messages about letters from one address never
     /// have more bytes than these letters are credited for.
-    paid: Map<IpAddr, Paid>,
+    credits: Map<IpAddr, ByteCredit>,
     left_out: u64,
     /// Time of the next log line about omitted messages.
     log_at: Option<Instant>,
@@ -126,7 +126,7 @@ impl Default for FailureLimit {
     fn default() -> Self {
         Self {
             limit: SenderLimit::new(PER_SENDER, PER_ADDRESS, IN_ALL),
-            paid: Map::default(),
+            credits: Map::default(),
             left_out: 0,
             log_at: None,
         }
@@ -143,33 +143,37 @@ impl FailureLimit {
         allowed
     }
 
-    /// Credits the bytes of a letter from a legacy peer at this address, at least [`MIN_PAID`].
-    pub(super) fn came(&mut self, now: Instant, from: IpAddr, bytes: usize) {
-        let (from, bytes) = (host(from), (bytes as u64).max(MIN_PAID));
-        if self.paid.len() >= MAX_PAID && !self.paid.contains_key(&from) {
-            let is_recent = |it: &Paid| now.saturating_duration_since(it.last) < PAID_MEMORY;
-            self.paid.retain(|_, paid| is_recent(paid));
-            if self.paid.len() >= MAX_PAID {
+    /// Credits the bytes of a letter from a legacy peer at this address, at least [`MIN_CREDIT`].
+    pub(super) fn credit(&mut self, now: Instant, from: IpAddr, bytes: usize) {
+        let (from, bytes) = (host(from), (bytes as u64).max(MIN_CREDIT));
+        if self.credits.len() >= MAX_CREDITS && !self.credits.contains_key(&from) {
+            let is_recent =
+                |it: &ByteCredit| now.saturating_duration_since(it.last) < CREDIT_MEMORY;
+            self.credits.retain(|_, credits| is_recent(credits));
+            if self.credits.len() >= MAX_CREDITS {
                 // Failure messages to it are omitted.
                 return;
             }
         }
-        let none = Paid {
+        let none = ByteCredit {
             bytes: 0,
             last: now,
         };
-        let paid = self.paid.entry(from).or_insert(none);
-        paid.bytes = paid.bytes.saturating_add(bytes).min(MAX_CREDIT);
-        paid.last = now;
+        let credits = self.credits.entry(from).or_insert(none);
+        credits.bytes = credits.bytes.saturating_add(bytes).min(MAX_CREDIT);
+        credits.last = now;
     }
 
     /// Whether the credit of this address covers the bytes of the failed letter; otherwise counts
     /// the message as omitted.
-    pub(super) fn may_pay(&mut self, now: Instant, from: Option<IpAddr>, bytes: usize) -> bool {
+    pub(super) fn covers(&mut self, now: Instant, from: Option<IpAddr>, bytes: usize) -> bool {
         let Some(from) = from else { return true };
-        let paid = self.paid.get(&host(from)).map_or(0, |paid| paid.bytes);
+        let credits = self
+            .credits
+            .get(&host(from))
+            .map_or(0, |credits| credits.bytes);
         // Larger letters than the maximum credit need only that.
-        let may = paid >= (bytes as u64).min(MAX_CREDIT);
+        let may = credits >= (bytes as u64).min(MAX_CREDIT);
         if !may {
             self.leave_out(now);
         }
@@ -179,15 +183,15 @@ impl FailureLimit {
     /// Subtracts the bytes of a failure message from the credit of this address, if it covers them;
     /// otherwise counts the message as omitted. Without an address there is no limit: the sender is
     /// an agent of another gateway.
-    pub(super) fn has_paid(&mut self, now: Instant, from: Option<IpAddr>, bytes: usize) -> bool {
+    pub(super) fn debit(&mut self, now: Instant, from: Option<IpAddr>, bytes: usize) -> bool {
         let Some(from) = from else { return true };
-        let paid = self.paid.get_mut(&host(from));
-        let left = paid
+        let credits = self.credits.get_mut(&host(from));
+        let left = credits
             .as_ref()
             .and_then(|it| it.bytes.checked_sub(bytes as u64));
-        match (paid, left) {
-            (Some(paid), Some(left)) => {
-                paid.bytes = left;
+        match (credits, left) {
+            (Some(credits), Some(left)) => {
+                credits.bytes = left;
                 true
             }
             _ => {
@@ -297,21 +301,21 @@ mod tests {
     fn an_address_gets_no_more_bytes_than_came_from_it() {
         let (mut limit, now) = (FailureLimit::default(), Instant::now());
         let [one, other] = [1, 2].map(|last| address(last).unwrap());
-        limit.came(now, one, 1500);
-        assert!(limit.has_paid(now, Some(one), 1000));
-        assert!(!limit.has_paid(now, Some(one), 600));
-        assert!(!limit.has_paid(now, Some(other), 1));
+        limit.credit(now, one, 1500);
+        assert!(limit.debit(now, Some(one), 1000));
+        assert!(!limit.debit(now, Some(one), 600));
+        assert!(!limit.debit(now, Some(other), 1));
         assert_eq!(limit.left_out, 2);
-        limit.came(now, one, 200);
-        assert!(limit.has_paid(now, Some(one), 600), "200 count as 1024");
-        assert!(limit.has_paid(now, None, 600), "another gateway's agent");
-        for number in 0..2 * MAX_PAID as u32 {
-            limit.came(now, Ipv4Addr::from(number).into(), 1);
+        limit.credit(now, one, 200);
+        assert!(limit.debit(now, Some(one), 600), "200 count as 1024");
+        assert!(limit.debit(now, None, 600), "another gateway's agent");
+        for number in 0..2 * MAX_CREDITS as u32 {
+            limit.credit(now, Ipv4Addr::from(number).into(), 1);
         }
-        assert_eq!(limit.paid.len(), MAX_PAID);
-        limit.came(now + PAID_MEMORY, other, 9);
-        assert_eq!(limit.paid.len(), 1);
-        assert!(limit.has_paid(now + PAID_MEMORY, Some(other), 9));
+        assert_eq!(limit.credits.len(), MAX_CREDITS);
+        limit.credit(now + CREDIT_MEMORY, other, 9);
+        assert_eq!(limit.credits.len(), 1);
+        assert!(limit.debit(now + CREDIT_MEMORY, Some(other), 9));
     }
 
     #[test]

@@ -21,9 +21,9 @@
 //! receiver) and its sequence number. Every copy names its predecessor, the letter that must be
 //! taken before it, so that a failed letter leaves no gap to wait for.
 
+mod attempts;
 mod config;
 mod departed;
-mod desk;
 mod failures;
 mod forward;
 mod inbox;
@@ -50,9 +50,9 @@ use fipa_transport::{
     Kind, Location, Outcome, Parcel, Report, Stream, Verdict, WayError, WayFault,
 };
 
+pub use attempts::Action;
+use attempts::{AttemptTable, FailureTarget, Note, Origin, Purpose, Undelivered};
 pub use config::{CoreConfig, MAX_DEADLINE};
-pub use desk::Action;
-use desk::{Author, Desk, Note, Origin, Purpose, Undelivered};
 pub use forward::Unframed;
 use inbox::Inbox;
 pub use inbox::Received;
@@ -110,7 +110,7 @@ const IDLE_TIME: Duration = Duration::from_secs(60);
 
 /// The delivery core. See the module documentation.
 pub struct Core {
-    desk: Desk,
+    table: AttemptTable,
     lanes: Map<LaneId, Lane>,
     lane_ids: Map<LaneKey, LaneId>,
     agents: Map<Incarnation, Inbox>,
@@ -175,7 +175,7 @@ impl Core {
     #[must_use]
     pub fn new(config: CoreConfig, directory: Arc<dyn Directory>) -> Self {
         Self {
-            desk: Desk::new(config, directory),
+            table: AttemptTable::new(config, directory),
             lanes: Map::default(),
             lane_ids: Map::default(),
             agents: Map::default(),
@@ -207,12 +207,12 @@ impl Core {
     /// Returns the configuration.
     #[must_use]
     pub fn config(&self) -> &CoreConfig {
-        &self.desk.config
+        &self.table.config
     }
 
     /// Registers an agent of this process: letters for it are accepted from now on.
     pub fn register(&mut self, name: Arc<str>, incarnation: Incarnation) {
-        let inbox = Inbox::new(name, &self.desk.config);
+        let inbox = Inbox::new(name, &self.table.config);
         self.agents.insert(incarnation, inbox);
     }
 
@@ -222,17 +222,17 @@ impl Core {
         if let Some(mut inbox) = self.agents.remove(&incarnation) {
             let receiver = Arc::clone(&inbox.name);
             for (stream, back) in inbox.all_waiting() {
-                self.desk.credit(stream, Arc::clone(&receiver), back);
+                self.table.credit(stream, Arc::clone(&receiver), back);
             }
         }
         for id in self.lanes_in_order() {
             if let Some(lane) = self.lanes.get_mut(&id)
                 && lane.sender() == incarnation
             {
-                lane.give_up(now.instant, &mut self.desk);
+                lane.give_up(now.instant, &mut self.table);
             }
         }
-        self.desk.undelivered.clear();
+        self.table.undelivered.clear();
         self.forget_lanes(|lane| lane.is_idle() && lane.sender() == incarnation);
     }
 
@@ -253,11 +253,11 @@ impl Core {
                 let reason = FailureReason::Closed;
                 self.undeliverable(send, sender, receiver, letter.clone(), reason);
             }
-            self.desk.undelivered.clear();
+            self.table.undelivered.clear();
             return (send, receivers.len());
         }
         let deadline = now.instant + deadline.min(MAX_DEADLINE);
-        let directory = Arc::clone(&self.desk.directory);
+        let directory = Arc::clone(&self.table.directory);
         let sender_name = self
             .agents
             .get(&sender)
@@ -271,7 +271,7 @@ impl Core {
                 // The common case, without the data structures that several receivers need.
                 Ok(Resolution::Exact(entry)) if only_one && entry.incarnation.is_known() => {
                     self.send_one(now, (send, sender), &entry, letter, deadline);
-                    self.tell_failures(now);
+                    self.send_failures(now);
                     return (send, 1);
                 }
                 Ok(Resolution::Exact(entry)) => vec![entry],
@@ -295,16 +295,16 @@ impl Core {
                 self.undeliverable(send, sender, receiver, letter.clone(), reason);
             }
             for entry in entries {
-                let life = desk::life_of(&entry);
-                if reached.contains(&life) {
+                let registration = attempts::registration_of(&entry);
+                if reached.contains(&registration) {
                     continue;
                 }
-                reached.push(life);
+                reached.push(registration);
                 count += 1;
                 self.send_one(now, (send, sender), &entry, letter.clone(), deadline);
             }
         }
-        self.tell_failures(now);
+        self.send_failures(now);
         (send, count)
     }
 
@@ -316,7 +316,7 @@ impl Core {
         let deadline = now.instant + submission.deadline.min(MAX_DEADLINE);
         let sending = (send, submission.sender);
         self.send_one(now, sending, entry, submission.letter, deadline);
-        self.tell_failures(now);
+        self.send_failures(now);
         send
     }
 
@@ -330,7 +330,7 @@ impl Core {
     ) {
         let stream = Stream {
             sender,
-            receiver: desk::life_of(entry),
+            receiver: attempts::registration_of(entry),
         };
         let name = Arc::clone(&entry.name);
         if self.closed {
@@ -341,7 +341,7 @@ impl Core {
             return self.undeliverable(send, sender, name, letter, FailureReason::QueueFull);
         }
         let sequence = self.sequence_of(sender);
-        self.desk.notice(stream, sequence, &name, || News::Sent {
+        self.table.notice(stream, sequence, &name, || News::Sent {
             send: Some(send),
             letter: letter.clone(),
         });
@@ -377,24 +377,24 @@ impl Core {
             sender,
             receiver: Incarnation::UNKNOWN,
         };
-        self.desk
+        self.table
             .notice(stream, sequence, &receiver, || News::Sent {
                 send: Some(send),
                 letter: letter.clone(),
             });
-        self.desk
+        self.table
             .notice(stream, sequence, &receiver, || News::Settled {
                 outcome: outcome.clone(),
                 sender: true,
             });
-        self.desk.undelivered.push_back(Undelivered {
-            sender: Author::Ours(sender),
+        self.table.undelivered.push_back(Undelivered {
+            sender: FailureTarget::Ours(sender),
             receiver: Arc::clone(&receiver),
             letter,
             reason,
             detail: String::new(),
         });
-        self.desk.actions.push_back(Action::Outcome {
+        self.table.actions.push_back(Action::Outcome {
             send,
             receiver,
             outcome,
@@ -403,9 +403,9 @@ impl Core {
 
     /// Puts a letter into its lane and dispatches what can be dispatched.
     fn put(&mut self, now: Now, lane: LaneId, delivery: Delivery) {
-        self.with_lane(now, lane, |lane, desk| {
-            lane.push(delivery, desk);
-            lane.pump(now.instant, desk);
+        self.with_lane(now, lane, |lane, table| {
+            lane.push(delivery, table);
+            lane.pump(now.instant, table);
         });
     }
 
@@ -441,23 +441,23 @@ impl Core {
     }
 
     /// Runs `work` on a lane, then schedules its timer and repeated notes.
-    fn with_lane(&mut self, now: Now, id: LaneId, work: impl FnOnce(&mut Lane, &mut Desk)) {
+    fn with_lane(&mut self, now: Now, id: LaneId, work: impl FnOnce(&mut Lane, &mut AttemptTable)) {
         let Some(lane) = self.lanes.get_mut(&id) else {
             return;
         };
-        work(lane, &mut self.desk);
+        work(lane, &mut self.table);
         if let Some(due) = lane.due()
             && lane.scheduled.is_none_or(|scheduled| due < scheduled)
         {
             lane.scheduled = Some(due);
             self.timers.push(Reverse((due, id)));
         }
-        while let Some(attempt) = self.desk.repeated.pop_front() {
-            if let Some(Purpose::Note(note)) = self.desk.attempts.get_mut(&attempt) {
+        while let Some(attempt) = self.table.repeated.pop_front() {
+            if let Some(Purpose::Note(note)) = self.table.attempts.get_mut(&attempt) {
                 note.sent = Some(now.instant);
             }
             if self.notes.len() < MAX_LATE_NOTES {
-                let due = now.instant + self.desk.config.attempt_timeout;
+                let due = now.instant + self.table.config.attempt_timeout;
                 self.notes
                     .push(Reverse(LateNote(due, Late::Check(attempt))));
             }
@@ -467,13 +467,13 @@ impl Core {
     /// Returns the directory in which receivers are looked up.
     #[must_use]
     pub fn directory(&self) -> &Arc<dyn Directory> {
-        &self.desk.directory
+        &self.table.directory
     }
 
     /// Turns watching on or off: while it is on, an [`Action::Notice`] reports every event of a
     /// letter before the action that follows from it.
     pub fn watch(&mut self, watched: bool) {
-        self.desk.watched = watched;
+        self.table.watched = watched;
     }
 
     /// Takes the next letter from an agent's queue.
@@ -482,7 +482,7 @@ impl Core {
         let received = inbox.take()?;
         let receiver = Arc::clone(&inbox.name);
         for (stream, back) in inbox.credits() {
-            self.desk.credit(stream, Arc::clone(&receiver), back);
+            self.table.credit(stream, Arc::clone(&receiver), back);
         }
         Some(received)
     }
@@ -513,7 +513,7 @@ impl Core {
         match std::mem::replace(&mut parcel.body, Body::Credit) {
             Body::Letter(letter) => {
                 let sender = parcel.stream.sender;
-                let directory = &*self.desk.directory;
+                let directory = &*self.table.directory;
                 if let Err(impostor) = self.principals.check_sender(sender, &from, directory) {
                     if impostor == Impostor::Stranger {
                         return Verdict::Now(Answer::Busy);
@@ -525,7 +525,7 @@ impl Core {
                     let detail = "the letter's sequence is not above its predecessor's";
                     return Verdict::Now(Answer::failed(FailureReason::Refused, detail));
                 }
-                let watched = self.desk.watched;
+                let watched = self.table.watched;
                 if let Some(inbox) = self.agents.get_mut(&parcel.stream.receiver) {
                     let seen = watched.then(|| letter.clone());
                     let gate = self.gate.as_deref();
@@ -537,20 +537,20 @@ impl Core {
                             let Parcel {
                                 stream, sequence, ..
                             } = parcel;
-                            self.desk
+                            self.table
                                 .notice(stream, sequence, &parcel.receiver, || News::Taken {
                                     via,
                                     letter,
                                 });
                         }
                         let agent = parcel.stream.receiver;
-                        self.desk.actions.push_back(Action::Deliverable { agent });
+                        self.table.actions.push_back(Action::Deliverable { agent });
                     }
                     return Verdict::Now(answer);
                 }
                 let unanswered = (!answers_at_once).then_some((via, ticket));
                 let verdict = self.forward(now, via, &parcel, letter, from, unanswered);
-                self.tell_failures(now);
+                self.send_failures(now);
                 verdict
             }
             Body::Report(report) => {
@@ -559,9 +559,9 @@ impl Core {
             }
             Body::Credit => {
                 if let Some(lane) = self.lane_of(parcel.stream, &parcel.receiver) {
-                    self.with_lane(now, lane, |lane, desk| lane.resume(now.instant, desk));
+                    self.with_lane(now, lane, |lane, table| lane.resume(now.instant, table));
                 }
-                self.tell_failures(now);
+                self.send_failures(now);
                 Verdict::Now(Answer::Accepted)
             }
             Body::Predecessor => {
@@ -569,11 +569,11 @@ impl Core {
                 if let Some(lane) = self.lane_ids.get(&LaneKey::Custody(parcel.stream)) {
                     let letter = (parcel.sequence, parcel.after, parcel.transfer);
                     let from = from.location.incarnation();
-                    self.with_lane(now, *lane, |lane, desk| {
-                        is_here = lane.predecessor_told(now.instant, from, letter, desk);
+                    self.with_lane(now, *lane, |lane, table| {
+                        is_here = lane.predecessor_told(now.instant, from, letter, table);
                     });
                 }
-                self.tell_failures(now);
+                self.send_failures(now);
                 Verdict::Now(match is_here {
                     true => Answer::Accepted,
                     false => Answer::Returned { uncertain: true },
@@ -591,42 +591,42 @@ impl Core {
                 ..
             } = *parcel;
             let letter = (stream.receiver, sequence, transfer);
-            self.with_lane(now, lane, |lane, desk| {
-                lane.reported(now.instant, from, letter, report, desk);
+            self.with_lane(now, lane, |lane, table| {
+                lane.reported(now.instant, from, letter, report, table);
             });
         }
-        self.tell_failures(now);
+        self.send_failures(now);
     }
 
     /// Handles the end of an attempt, or its immediate refusal by the transport.
     pub fn handle_conclusion(&mut self, now: Now, attempt: AttemptId, conclusion: Conclusion) {
-        match self.desk.attempts.remove(&attempt) {
+        match self.table.attempts.remove(&attempt) {
             Some(Purpose::Letter { lane: id, sequence }) => {
-                let mut way = None;
+                let mut route = None;
                 // An attempt that failed for lack of room has freed none; waking a waiting lane
                 // here would make it retry and fail, until the route counts as broken.
                 let made_room = !matches!(
                     &conclusion,
                     Conclusion::NotSent(error) if error.fault == WayFault::Congested
                 );
-                self.with_lane(now, id, |lane, desk| {
-                    way = lane.way_of(sequence).filter(|_| made_room).cloned();
-                    lane.concluded(now.instant, sequence, attempt, conclusion, desk);
+                self.with_lane(now, id, |lane, table| {
+                    route = lane.route_of(sequence).filter(|_| made_room).cloned();
+                    lane.concluded(now.instant, sequence, attempt, conclusion, table);
                 });
                 // The attempt that ended has made room.
-                if let Some(id) = way.and_then(|way| self.desk.room_for(&way)) {
-                    self.with_lane(now, id, |lane, desk| lane.resume(now.instant, desk));
+                if let Some(id) = route.and_then(|route| self.table.room_for(&route)) {
+                    self.with_lane(now, id, |lane, table| lane.resume(now.instant, table));
                 }
             }
             Some(Purpose::Note(note)) => self.note_concluded(now, *note, conclusion),
-            Some(Purpose::Touch { peer }) => {
+            Some(Purpose::PeerCheck { peer }) => {
                 let asked = (peer, attempt);
                 self.peers
-                    .concluded(now.instant, asked, conclusion, &mut self.desk);
+                    .concluded(now.instant, asked, conclusion, &mut self.table);
             }
             None => {}
         }
-        self.tell_failures(now);
+        self.send_failures(now);
     }
 
     fn note_concluded(&mut self, now: Now, note: Note, conclusion: Conclusion) {
@@ -637,7 +637,7 @@ impl Core {
         );
         if arrived && let Some(sent) = note.sent {
             let took = now.instant.saturating_duration_since(sent);
-            self.desk.acknowledged(note.location.incarnation(), took);
+            self.table.acknowledged(note.location.incarnation(), took);
         }
         if note.parcel.body == Body::Predecessor && is_denied(&conclusion) {
             let Parcel {
@@ -648,8 +648,8 @@ impl Core {
             } = note.parcel;
             if let Some(lane) = self.lane_of(stream, &note.parcel.receiver) {
                 let letter = (stream.receiver, sequence, transfer);
-                self.with_lane(now, lane, |lane, desk| {
-                    lane.custodian_denied(now.instant, letter, desk);
+                self.with_lane(now, lane, |lane, table| {
+                    lane.custodian_denied(now.instant, letter, table);
                 });
             }
             return;
@@ -666,12 +666,12 @@ impl Core {
 
     fn handle_late_note(&mut self, now: Now, late: Late) {
         match late {
-            Late::Again(note) => self.desk.note(*note),
+            Late::Again(note) => self.table.note(*note),
             Late::Check(attempt) => {
-                if let Some(Purpose::Note(note)) = self.desk.attempts.remove(&attempt) {
+                if let Some(Purpose::Note(note)) = self.table.attempts.remove(&attempt) {
                     let kind = note.location.kind();
                     let error = WayError::new(WayFault::TimedOut, "");
-                    self.desk.abandon(kind, attempt, error.clone());
+                    self.table.abandon(kind, attempt, error.clone());
                     self.note_concluded(now, *note, Conclusion::Unconfirmed(error));
                 }
             }
@@ -681,21 +681,21 @@ impl Core {
     /// Handles a change of the directory.
     pub fn handle_directory_change(&mut self, now: Now) {
         for lane in self.lanes_in_order() {
-            self.with_lane(now, lane, |lane, desk| {
+            self.with_lane(now, lane, |lane, table| {
                 if !lane.is_empty() {
-                    lane.directory_changed(now.instant, desk);
+                    lane.directory_changed(now.instant, table);
                 }
             });
         }
-        self.tell_failures(now);
+        self.send_failures(now);
     }
 
     /// Handles an entry that left the directory or was replaced by another of the same name. Must
     /// be called before [`handle_directory_change`](Self::handle_directory_change). For 30 s a
     /// gateway answers letters for an agent that left its host with [`Answer::Moved`].
     pub fn handle_departure(&mut self, now: Now, entry: &Entry) {
-        if self.desk.config.forwards {
-            self.desk.departed.left(now.instant, entry);
+        if self.table.config.forwards {
+            self.table.departed.left(now.instant, entry);
             self.principals.left(entry);
         }
     }
@@ -718,7 +718,7 @@ impl Core {
             }
         }
         for id in lanes {
-            self.with_lane(now, id, |lane, desk| lane.pump(now.instant, desk));
+            self.with_lane(now, id, |lane, table| lane.pump(now.instant, table));
         }
         let mut notes = Vec::new();
         while self
@@ -731,18 +731,18 @@ impl Core {
         for Reverse(LateNote(_, late)) in notes {
             self.handle_late_note(now, late);
         }
-        self.peers.handle_timeout(now.instant, &mut self.desk);
+        self.peers.handle_timeout(now.instant, &mut self.table);
         self.failure_limit.handle_timeout(now.instant);
-        self.tell_failures(now);
+        self.send_failures(now);
         self.forget_idle_lanes(now);
     }
 
     /// Replaces the orders of transports, also for waiting letters. Attempts in progress are not
     /// affected.
     pub fn reorder(&mut self, now: Now, order: Vec<Kind>, routes: Vec<(Pattern, Vec<Kind>)>) {
-        self.desk.config.order = order;
-        self.desk.config.routes = routes;
-        self.peers.reorder(now.instant, &mut self.desk);
+        self.table.config.order = order;
+        self.table.config.routes = routes;
+        self.peers.reorder(now.instant, &mut self.table);
         self.handle_directory_change(now);
     }
 
@@ -754,7 +754,7 @@ impl Core {
 
     /// Sets the services to keep in touch with.
     pub fn keep_in_touch(&mut self, now: Now, peers: Vec<Peer>) {
-        self.peers.set(now.instant, peers, &mut self.desk);
+        self.peers.set(now.instant, peers, &mut self.table);
     }
 
     /// Returns the state of contact with each of these services.
@@ -786,18 +786,18 @@ impl Core {
     /// dispatches the letters that wait because of them.
     pub fn handle_reachable(&mut self, now: Now, service: Option<Incarnation>) {
         let is_meant = |location: &Location| service.is_none_or(|it| it == location.incarnation());
-        self.desk.forget_failures(is_meant);
+        self.table.forget_failures(is_meant);
         if service.is_none() {
-            self.peers.ask_again(now.instant, &mut self.desk);
+            self.peers.ask_again(now.instant, &mut self.table);
         }
         for lane in self.lanes_in_order() {
-            self.with_lane(now, lane, |lane, desk| {
-                if lane.is_paused_towards(desk, is_meant) {
-                    lane.resume(now.instant, desk);
+            self.with_lane(now, lane, |lane, table| {
+                if lane.is_paused_towards(table, is_meant) {
+                    lane.resume(now.instant, table);
                 }
             });
         }
-        self.tell_failures(now);
+        self.send_failures(now);
     }
 
     /// Opens connections to these locations, to announce the current locations of this service to
@@ -808,9 +808,9 @@ impl Core {
                 sender: Incarnation::UNKNOWN,
                 receiver: Incarnation::UNKNOWN,
             };
-            self.desk.note(Note {
+            self.table.note(Note {
                 location,
-                parcel: desk::note_parcel(nobodys, name, 0, Body::Credit),
+                parcel: attempts::note_parcel(no_stream, name, 0, Body::Credit),
                 tries: 0,
                 sent: None,
                 until: None,
@@ -852,7 +852,7 @@ impl Core {
 
     /// Returns the next action to perform.
     pub fn poll_action(&mut self) -> Option<Action> {
-        self.desk.actions.pop_front()
+        self.table.actions.pop_front()
     }
 
     /// Whether any letter that was sent or taken into custody here has no outcome yet.
@@ -867,10 +867,10 @@ impl Core {
         self.closed = true;
         for id in self.lanes_in_order() {
             if let Some(lane) = self.lanes.get_mut(&id) {
-                lane.give_up(now.instant, &mut self.desk);
+                lane.give_up(now.instant, &mut self.table);
             }
         }
-        self.desk.undelivered.clear();
+        self.table.undelivered.clear();
     }
 }
 
@@ -890,7 +890,7 @@ fn own_lane(sender: Incarnation, entry: &Entry) -> LaneKey {
         // Several services may have the same name.
         _ => LaneKey::Service(Stream {
             sender,
-            receiver: desk::life_of(entry),
+            receiver: attempts::registration_of(entry),
         }),
     }
 }

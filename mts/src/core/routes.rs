@@ -10,7 +10,7 @@ use fipa_transport::{Incarnation, Kind, Location};
 use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
 
-use super::desk::{self, Desk};
+use super::attempts::{self, AttemptTable};
 use super::{Core, Now};
 use crate::{Map, stamp};
 
@@ -34,7 +34,7 @@ pub struct Route {
 pub struct Way {
     /// The location.
     pub location: Location,
-    /// Whether letters would go there.
+    /// State of the location.
     pub standing: Standing,
 }
 
@@ -138,7 +138,7 @@ impl Tallies {
     }
 }
 
-impl Desk {
+impl AttemptTable {
     /// The route that letters to this agent would take now.
     pub(super) fn route(&self, now: Instant, entry: &Entry) -> Route {
         let (exception, order) = self.config.route_for(&entry.name);
@@ -220,24 +220,24 @@ impl Core {
     /// Returns the route that letters from here to the agent of this entry would take now.
     #[must_use]
     pub fn route(&self, now: Now, entry: &Entry) -> Route {
-        self.desk.route(now.instant, entry)
+        self.table.route(now.instant, entry)
     }
 
     /// Returns the counters of each location, sorted by location.
     #[must_use]
     pub fn ways(&self, now: Now) -> Vec<WayState> {
-        self.desk.way_states(now.instant)
+        self.table.way_states(now.instant)
     }
 
     /// Returns the first location to which a letter from here to this receiver would go now; `None`
     /// for several receivers.
     #[must_use]
     pub fn first_way(&self, now: Now, receiver: &str) -> Option<Location> {
-        let entry = self.desk.directory.lookup(receiver)?;
+        let entry = self.table.directory.lookup(receiver)?;
         if matches!(entry.role, Role::Coalition(_)) {
             return None;
         }
-        self.desk.choose(now.instant, &entry, &[])
+        self.table.choose(now.instant, &entry, &[])
     }
 
     /// Returns the first location to which this service would forward a letter for this
@@ -247,16 +247,16 @@ impl Core {
     pub fn first_way_onwards(
         &self,
         now: Now,
-        life: Incarnation,
+        registration: Incarnation,
         receiver: &str,
     ) -> Option<(Location, usize)> {
-        let config = &self.desk.config;
-        if !config.forwards || self.agents.contains_key(&life) {
+        let config = &self.table.config;
+        if !config.forwards || self.agents.contains_key(&registration) {
             return None;
         }
-        let entry = self.desk.receiver(life, receiver)?;
+        let entry = self.table.receiver(registration, receiver)?;
         let here = entry.role == Role::Agent && entry.reach == Reach::Local;
-        let way = here.then(|| self.desk.choose(now.instant, &entry, &[]))?;
+        let way = here.then(|| self.table.choose(now.instant, &entry, &[]))?;
         Some((way?, stamp::room(&config.name)))
     }
 
@@ -269,7 +269,7 @@ impl Core {
         sender: Incarnation,
         receivers: impl IntoIterator<Item = &'a str>,
     ) -> Option<Kind> {
-        let directory = &*self.desk.directory;
+        let directory = &*self.table.directory;
         let own = self.agents.get(&sender).map(|inbox| &*inbox.name);
         let mut reached = Map::default();
         for receiver in receivers {
@@ -280,8 +280,8 @@ impl Core {
                 Ok(Resolution::None) | Err(_) => Vec::new(),
             };
             for entry in entries {
-                if let Some(way) = self.desk.choose(now.instant, &entry, &[]) {
-                    reached.insert(desk::life_of(&entry), way.kind());
+                if let Some(way) = self.table.choose(now.instant, &entry, &[]) {
+                    reached.insert(attempts::registration_of(&entry), way.kind());
                 }
             }
         }

@@ -66,7 +66,7 @@ pub fn may_move(uncertain: bool) -> bool {
 
 /// The end of a custody according to a report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Told {
+pub enum CustodyReport {
     /// The receiver has it.
     Delivered,
     /// It failed, or was returned; it may have been taken nevertheless if `uncertain`.
@@ -91,13 +91,13 @@ pub enum Belief {
 /// the letter, if one is in progress or in custody. `handed` is whether the letter was ever handed
 /// to the reporting service.
 #[must_use]
-pub fn believe(handed: bool, told: Told, transfer: u64, current: Option<u64>) -> Belief {
+pub fn believe(handed: bool, told: CustodyReport, transfer: u64, current: Option<u64>) -> Belief {
     match told {
         _ if !handed => Belief::Ignored,
-        Told::Delivered => Belief::Believed,
-        Told::NotDelivered { .. } if current == Some(transfer) => Belief::Believed,
-        Told::NotDelivered { uncertain: true } => Belief::OnlyUncertain,
-        Told::NotDelivered { uncertain: false } => Belief::Ignored,
+        CustodyReport::Delivered => Belief::Believed,
+        CustodyReport::NotDelivered { .. } if current == Some(transfer) => Belief::Believed,
+        CustodyReport::NotDelivered { uncertain: true } => Belief::OnlyUncertain,
+        CustodyReport::NotDelivered { uncertain: false } => Belief::Ignored,
     }
 }
 
@@ -117,7 +117,7 @@ pub fn admits_when_full(highest_held: Option<u64>, sequence: u64) -> bool {
 
 /// Decision of a custodian about a letter that came back as out of order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Hold {
+pub enum HoldDecision {
     /// The letter waits for its predecessor, which is in the lane.
     ForPredecessor,
     /// The letter waits this long for its predecessor to arrive.
@@ -130,19 +130,19 @@ pub enum Hold {
 /// predecessor left the lane or, if it was never in it, since the letter arrived; `patience` is the
 /// maximum time for a predecessor to arrive.
 #[must_use]
-pub fn hold(predecessor_is_here: bool, missing_for: Duration, patience: Duration) -> Hold {
+pub fn hold(predecessor_is_here: bool, missing_for: Duration, patience: Duration) -> HoldDecision {
     if predecessor_is_here {
-        Hold::ForPredecessor
+        HoldDecision::ForPredecessor
     } else if missing_for < patience {
-        Hold::For(patience - missing_for)
+        HoldDecision::For(patience - missing_for)
     } else {
-        Hold::Return
+        HoldDecision::Return
     }
 }
 
 /// The end of an attempt, or of a custody, of a letter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum End {
+pub enum AttemptEnd {
     /// The letter was certainly not delivered: not sent, busy, out of order, no such agent, moved,
     /// refused, or returned as certain.
     NotTaken,
@@ -155,8 +155,8 @@ pub enum End {
 /// Whether a letter may have been delivered, after another attempt or custody ended. An uncertain
 /// letter stays uncertain.
 #[must_use]
-pub fn stays_uncertain(uncertain: bool, end: End) -> bool {
-    uncertain || end != End::NotTaken
+pub fn stays_uncertain(uncertain: bool, end: AttemptEnd) -> bool {
+    uncertain || end != AttemptEnd::NotTaken
 }
 
 /// Whether a custodian dispatches a letter again that came back as out of order: its predecessor
@@ -191,14 +191,20 @@ mod tests {
 
     #[test]
     fn reports_count_for_the_hand_over_that_they_name() {
-        let failed = |uncertain| Told::NotDelivered { uncertain };
+        let failed = |uncertain| CustodyReport::NotDelivered { uncertain };
         // The letter was never handed to this service.
-        for told in [Told::Delivered, failed(true), failed(false)] {
+        for told in [CustodyReport::Delivered, failed(true), failed(false)] {
             assert_eq!(believe(false, told, 3, Some(3)), Belief::Ignored);
         }
         // "Delivered" counts for any hand-over.
-        assert_eq!(believe(true, Told::Delivered, 1, Some(3)), Belief::Believed);
-        assert_eq!(believe(true, Told::Delivered, 1, None), Belief::Believed);
+        assert_eq!(
+            believe(true, CustodyReport::Delivered, 1, Some(3)),
+            Belief::Believed
+        );
+        assert_eq!(
+            believe(true, CustodyReport::Delivered, 1, None),
+            Belief::Believed
+        );
         // Other reports count for the latest hand-over only.
         assert_eq!(believe(true, failed(false), 3, Some(3)), Belief::Believed);
         assert_eq!(believe(true, failed(false), 1, Some(3)), Belief::Ignored);

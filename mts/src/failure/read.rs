@@ -54,14 +54,15 @@ fn of_sl(text: &str) -> Option<DeliveryFailure> {
 
 /// A nested `inform` to the receiver in the language `internal-error`.
 fn of_fipa_services(content: Payload) -> Option<DeliveryFailure> {
-    let told = Message::decode(&content).ok()?;
-    if *told.performative() != Performative::Inform || told.language() != Some("internal-error") {
+    let report = Message::decode(&content).ok()?;
+    if *report.performative() != Performative::Inform || report.language() != Some("internal-error")
+    {
         return None;
     }
-    let text = String::from_utf8_lossy(told.content()?).into_owned();
+    let text = String::from_utf8_lossy(report.content()?).into_owned();
     let first = text.lines().next().unwrap_or_default();
     Some(DeliveryFailure {
-        receiver: told.receivers().first().map(|to| to.name().to_owned()),
+        receiver: report.receivers().first().map(|to| to.name().to_owned()),
         reason: one_line(first.strip_prefix("description: ").unwrap_or(first)),
     })
 }
@@ -136,7 +137,7 @@ mod tests {
     const FIPA_SERVICES: &[u8] = include_bytes!("../../../acl/tests/vectors/failure_letter.bin");
     const JADE: &[u8] = include_bytes!("../../../acl/tests/vectors/jade_failure.str");
 
-    fn told(receiver: &str, reason: &str) -> DeliveryFailure {
+    fn report(receiver: &str, reason: &str) -> DeliveryFailure {
         DeliveryFailure {
             receiver: Some(receiver.to_owned()),
             reason: reason.to_owned(),
@@ -149,7 +150,7 @@ mod tests {
         let message = Message::decode(letter.payload()).unwrap();
         assert_eq!(
             DeliveryFailure::read(&message),
-            Some(told("nobo", "message delivery failed"))
+            Some(report("nobo", "message delivery failed"))
         );
     }
 
@@ -159,7 +160,7 @@ mod tests {
         let reason = "Agent not found: getContainerID() failed to find agent nobody@jadetest";
         assert_eq!(
             DeliveryFailure::read(&message),
-            Some(told("nobody@jadetest", reason))
+            Some(report("nobody@jadetest", reason))
         );
     }
 
@@ -182,7 +183,7 @@ mod tests {
         ] {
             let letter = failure.written_for("mts", dialect, SystemTime::UNIX_EPOCH);
             let message = Message::decode(letter.unwrap().payload()).unwrap();
-            assert_eq!(DeliveryFailure::read(&message), Some(told("arm", reason)));
+            assert_eq!(DeliveryFailure::read(&message), Some(report("arm", reason)));
         }
     }
 
@@ -213,7 +214,7 @@ mod tests {
         let failure = message(Performative::Failure, open);
         assert_eq!(
             DeliveryFailure::read(&failure),
-            Some(told("arm", r"a\u{1b}b"))
+            Some(report("arm", r"a\u{1b}b"))
         );
     }
 }

@@ -22,9 +22,9 @@ impl Mts {
         len: usize,
         tail_room: usize,
     ) -> Box<dyn LoanedContent> {
-        let loaned = match self.way_to_one(receivers) {
-            Some(way) => self.shared.loan_from(way.kind(), |transport| {
-                transport.loan(&way, head_room, len, tail_room)
+        let loaned = match self.route_to_one(receivers) {
+            Some(route) => self.shared.loan_from(route.kind(), |transport| {
+                transport.loan(&route, head_room, len, tail_room)
             }),
             None => self.loan_for_many(sender, receivers.iter().copied(), len),
         };
@@ -32,7 +32,7 @@ impl Mts {
     }
 
     /// Returns the first route of a letter to the only receiver.
-    fn way_to_one(&self, receivers: &[&str]) -> Option<Location> {
+    fn route_to_one(&self, receivers: &[&str]) -> Option<Location> {
         let [receiver] = receivers else {
             return None;
         };
@@ -85,13 +85,15 @@ impl Shared {
             len,
             tail,
         } = *arriving;
-        let (way, stamp) = {
+        let (route, stamp) = {
             let state = self.state.lock();
-            let life = stream.receiver;
-            state.core.first_way_onwards(Now::read(), life, receiver)?
+            let registration = stream.receiver;
+            state
+                .core
+                .first_way_onwards(Now::read(), registration, receiver)?
         };
-        self.loan_from(way.kind(), |transport| {
-            transport.loan(&way, front.saturating_add(stamp), len, tail)
+        self.loan_from(route.kind(), |transport| {
+            transport.loan(&route, front.saturating_add(stamp), len, tail)
         })
     }
 

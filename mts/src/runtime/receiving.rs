@@ -13,13 +13,13 @@ use super::Shared;
 use crate::core::{Now, Unframed};
 
 /// The sink of one transport.
-pub(super) struct Receiving {
+pub(super) struct TransportSink {
     pub(super) shared: Weak<Shared>,
     pub(super) kind: Kind,
     pub(super) answers_at_once: bool,
 }
 
-impl Sink for Receiving {
+impl Sink for TransportSink {
     fn arrived(&self, arrival: Arrival) -> Verdict {
         let Some(shared) = self.shared.upgrade() else {
             return closing();

@@ -23,7 +23,7 @@ const PATIENCE: Duration = Duration::from_millis(250);
 /// Maximum number of letters that are held back; beyond it the earliest is reported as it is.
 const MAX_WAITING: usize = 65_536;
 /// Maximum number of reported letters that are remembered, so that none is reported twice.
-const MAX_TOLD: usize = 65_536;
+const MAX_REPORTED: usize = 65_536;
 /// Maximum number of outcomes of unknown letters that are remembered.
 const MAX_EARLY: usize = 4096;
 /// Maximum number of processes that are remembered.
@@ -127,16 +127,16 @@ pub enum Event {
 /// the letter follows its receiver to another incarnation.
 type Key = (Incarnation, u64);
 /// Time of sending, and order of arrival among letters of the same time.
-type Place = (SystemTime, u64);
+type SendPosition = (SystemTime, u64);
 
 /// Joins records to events; see the module documentation.
 #[derive(Debug, Default)]
 pub struct Joiner {
-    letters: HashMap<Key, Known>,
+    letters: HashMap<Key, KnownLetter>,
     /// Letters that are held back, in order.
-    waiting: BTreeMap<Place, Key>,
+    waiting: BTreeMap<SendPosition, Key>,
     /// Letters that were reported, in order.
-    told: VecDeque<Key>,
+    reported: VecDeque<Key>,
     early: HashMap<Key, (Outcome, bool)>,
     processes: HashMap<Source, Process>,
     events: VecDeque<Event>,
@@ -145,11 +145,11 @@ pub struct Joiner {
 }
 
 #[derive(Debug)]
-struct Known {
-    place: Place,
+struct KnownLetter {
+    place: SendPosition,
     since: Instant,
     passage: Passage,
-    told: bool,
+    reported: bool,
     /// Whether the sender's record has arrived, which sets the time.
     sent: bool,
 }
@@ -253,11 +253,13 @@ impl Joiner {
         };
         let before = known.passage.fate.clone();
         // A process that has just started may not have the request for content yet.
-        if known.passage.content.is_empty() && !known.told {
+        if known.passage.content.is_empty() && !known.reported {
             known.passage.content = content;
         }
         known.see(seen, gateway);
-        if matches!(seen, Seen::Sent(_)) && !std::mem::replace(&mut known.sent, true) && !known.told
+        if matches!(seen, Seen::Sent(_))
+            && !std::mem::replace(&mut known.sent, true)
+            && !known.reported
         {
             let place = (at, known.place.1);
             self.waiting
@@ -265,7 +267,7 @@ impl Joiner {
             known.passage.at = at;
             self.waiting.insert(place, key);
         }
-        if known.told && known.passage.fate != before {
+        if known.reported && known.passage.fate != before {
             let later = Event::Later(Arc::new(known.passage.clone()));
             self.events.push_back(later);
         }
@@ -302,11 +304,11 @@ impl Joiner {
         if let Some((outcome, sender)) = self.early.remove(&key) {
             passage.settle(outcome, sender);
         }
-        let known = Known {
+        let known = KnownLetter {
             place,
             since: now,
             passage,
-            told: false,
+            reported: false,
             sent: false,
         };
         self.letters.insert(key, known);
@@ -332,7 +334,7 @@ impl Joiner {
             }
             (before, after) => before != after,
         };
-        if known.told && news {
+        if known.reported && news {
             let later = Event::Later(Arc::new(known.passage.clone()));
             self.events.push_back(later);
         }
@@ -342,7 +344,7 @@ impl Joiner {
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
         let (_, key) = self.waiting.first_key_value()?;
-        self.letters.get(key).map(Known::due)
+        self.letters.get(key).map(KnownLetter::due)
     }
 
     /// Returns the next event. Pass all available records before calling it.
@@ -360,7 +362,7 @@ impl Joiner {
             return None;
         }
         self.waiting.remove(&place);
-        self.tell(key)
+        self.report(key)
     }
 
     /// Returns the next event without holding back letters, at the end of the watch.
@@ -369,20 +371,20 @@ impl Joiner {
             return Some(event);
         }
         let (_, key) = self.waiting.pop_first()?;
-        self.tell(key)
+        self.report(key)
     }
 
-    fn tell(&mut self, key: Key) -> Option<Event> {
-        if self.told.len() >= MAX_TOLD
-            && let Some(oldest) = self.told.pop_front()
+    fn report(&mut self, key: Key) -> Option<Event> {
+        if self.reported.len() >= MAX_REPORTED
+            && let Some(oldest) = self.reported.pop_front()
         {
             self.letters.remove(&oldest);
         }
-        self.told.push_back(key);
+        self.reported.push_back(key);
         let known = self.letters.get_mut(&key)?;
         self.number += 1;
         known.passage.number = self.number;
-        known.told = true;
+        known.reported = true;
         let passage = Arc::new(known.passage.clone());
         // The content has been reported and is not kept.
         known.passage.content = Bytes::new();
@@ -390,7 +392,7 @@ impl Joiner {
     }
 }
 
-impl Known {
+impl KnownLetter {
     fn see(&mut self, seen: Seen, gateway: Option<Arc<str>>) {
         let passage = &mut self.passage;
         match seen {

@@ -35,7 +35,7 @@ const MAGIC: [u8; 4] = *b"fipw";
 /// Version of the whole format: a watcher accepts only its own.
 const VERSION: u8 = 1;
 
-const WISH: u8 = 0;
+const REQUEST: u8 = 0;
 const HELLO: u8 = 1;
 const SENT: u8 = 2;
 const TAKEN: u8 = 3;
@@ -43,7 +43,7 @@ const PASSED: u8 = 4;
 const SETTLED: u8 = 5;
 const LOST: u8 = 6;
 
-const NO_WAY: u8 = u8::MAX;
+const NO_TRANSPORT: u8 = u8::MAX;
 
 /// The reporting process is a gateway.
 const GATEWAY: u8 = 1;
@@ -215,7 +215,7 @@ impl Header {
             magic: MAGIC,
             version: VERSION,
             kind,
-            via: NO_WAY,
+            via: NO_TRANSPORT,
             at: U64::new(u64::try_from(since.as_nanos()).unwrap_or(u64::MAX)),
             ..Self::new_zeroed()
         }
@@ -263,7 +263,7 @@ pub fn lost(at: SystemTime) -> Vec<u8> {
 
 /// Builds the record of a notice, for a watcher with this request.
 #[must_use]
-pub fn of(notice: &Notice, wish: Wish, at: SystemTime) -> Vec<u8> {
+pub fn of(notice: &Notice, request: Wish, at: SystemTime) -> Vec<u8> {
     let kind = match &notice.news {
         News::Sent { .. } => SENT,
         News::Taken { .. } => TAKEN,
@@ -280,7 +280,7 @@ pub fn of(notice: &Notice, wish: Wish, at: SystemTime) -> Vec<u8> {
             letter
         }
         News::Taken { via, letter } => {
-            header.via = via.map_or(NO_WAY, wire::kind_code);
+            header.via = via.map_or(NO_TRANSPORT, wire::kind_code);
             letter
         }
         News::Passed {
@@ -304,7 +304,7 @@ pub fn of(notice: &Notice, wish: Wish, at: SystemTime) -> Vec<u8> {
             return written(header, [name, b"", b"", b"", &written_outcome]);
         }
     };
-    written_letter(header, &notice.receiver, letter, wish)
+    written_letter(header, &notice.receiver, letter, request)
 }
 
 fn without_attempts(outcome: &Outcome) -> Option<Outcome> {
@@ -326,7 +326,7 @@ fn without_attempts(outcome: &Outcome) -> Option<Outcome> {
     })
 }
 
-fn written_letter(mut header: Header, receiver: &str, letter: &Letter, wish: Wish) -> Vec<u8> {
+fn written_letter(mut header: Header, receiver: &str, letter: &Letter, request: Wish) -> Vec<u8> {
     header.size = U64::new(letter.len() as u64);
     let envelope = letter.envelope();
     let envelope: &[u8] = if envelope.len() <= MAX_PART {
@@ -345,7 +345,7 @@ fn written_letter(mut header: Header, receiver: &str, letter: &Letter, wish: Wis
         header.content_len = U64::new(content.len() as u64);
     }
     let content = content.unwrap_or_default();
-    let given = usize::try_from(wish.content).unwrap_or(MAX_CONTENT);
+    let given = usize::try_from(request.content).unwrap_or(MAX_CONTENT);
     let given = content.len().min(given).min(MAX_CONTENT);
     let (given, _) = content.split_at(given);
     let message = message.unwrap_or_default();
@@ -448,7 +448,7 @@ impl Header {
         let via = || wire::kind_of_code(self.via).ok_or(RecordError::Part("transport"));
         Ok(match self.kind {
             SENT => Seen::Sent(Some(self.send.get()).filter(|send| *send != 0)),
-            TAKEN if self.via == NO_WAY => Seen::Taken(None),
+            TAKEN if self.via == NO_TRANSPORT => Seen::Taken(None),
             TAKEN => Seen::Taken(Some(via()?)),
             _ if self.flags & REMOTE != 0 => Seen::Passed(via()?, Origin::Elsewhere),
             _ => Seen::Passed(via()?, Origin::Here),
@@ -502,7 +502,7 @@ impl Wish {
     pub fn to_bytes(self) -> [u8; Self::LEN] {
         let mut bytes = [0; Self::LEN];
         let (head, content) = bytes.split_at_mut(6);
-        head.copy_from_slice(&[&MAGIC[..], &[VERSION, WISH]].concat());
+        head.copy_from_slice(&[&MAGIC[..], &[VERSION, REQUEST]].concat());
         content.copy_from_slice(&self.content.to_le_bytes());
         bytes
     }
@@ -511,7 +511,7 @@ impl Wish {
     #[must_use]
     pub fn parse(bytes: &[u8]) -> Option<Self> {
         let (head, content) = bytes.split_at_checked(6)?;
-        let understood = head.strip_prefix(&MAGIC)? == [VERSION, WISH];
+        let understood = head.strip_prefix(&MAGIC)? == [VERSION, REQUEST];
         let content = u32::from_le_bytes(content.try_into().ok()?);
         understood.then_some(Self { content })
     }

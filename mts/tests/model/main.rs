@@ -19,7 +19,7 @@
 //! FIPA_MODEL_WALKS=1000000 cargo test --release -p fipa-mts --test model walks -- --nocapture
 //! ```
 
-#![expect(clippy::print_stdout, reason = "a long run tells how far it went")]
+#![expect(clippy::print_stdout, reason = "a long run prints its progress")]
 
 mod custodian;
 mod graph;

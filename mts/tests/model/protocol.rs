@@ -1,7 +1,7 @@
 //! The steps of the model: every step that a service or the network can take, each decided by
 //! the functions of [`fipa_mts::core::rules`].
 
-use fipa_mts::core::rules::End;
+use fipa_mts::core::rules::AttemptEnd;
 use stateright::{Model, Property};
 
 use crate::state::{
@@ -444,14 +444,14 @@ impl Model for Protocol {
                 Self::reply(state, message, What::Refused);
             }
             Action::TimeOut { at, key } | Action::GiveUp { at, key } => {
-                self.give_up(state, at, key, End::Unknown);
+                self.give_up(state, at, key, AttemptEnd::Unknown);
             }
             Action::NotSent(message) => {
                 Self::remove(state, message);
-                self.give_up(state, message.from, message.key, End::NotTaken);
+                self.give_up(state, message.from, message.key, AttemptEnd::NotTaken);
             }
             Action::NoticeDeath { at, key } => {
-                self.give_up(state, at, key, End::CustodianLost);
+                self.give_up(state, at, key, AttemptEnd::CustodianLost);
             }
             Action::LosePatience { custodian, key } => self.hold(state, custodian, key),
             Action::Expire { sequence } => {

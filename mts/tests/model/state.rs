@@ -17,7 +17,7 @@ pub(crate) const SENDER: Service = Service { node: 0, life: 0 };
 pub(crate) const RECEIVER: Service = Service { node: 3, life: 0 };
 /// Nodes of the two custodians.
 pub(crate) const CUSTODIANS: [u8; 2] = [1, 2];
-/// Lives of one custodian: it dies at most once.
+/// Incarnations of one custodian: it dies at most once.
 pub(crate) const LIVES: u8 = 2;
 
 impl Service {
@@ -26,7 +26,7 @@ impl Service {
         CUSTODIANS.iter().position(|node| *node == self.node)
     }
 
-    /// Services in all their lives.
+    /// Services in all their incarnations.
     pub(crate) const COUNT: usize = 4 * LIVES as usize;
 
     /// A number below [`Service::COUNT`].
@@ -39,7 +39,7 @@ impl Service {
         1 << self.index()
     }
 
-    /// Index in [`Held::upstream`]: the sender, or the first custodian in one of its lives.
+    /// Index in [`Held::upstream`]: the sender, or the first custodian in one of its incarnations.
     pub(crate) fn slot(self) -> usize {
         match self.node {
             0 => 0,

@@ -28,7 +28,7 @@ use fipa_acl::escape;
 use fipa_transport::{Incarnation, Location, Mandate};
 
 pub use directory::ExchangeDirectory;
-use wire::{Changes, Full, ExchangeMessage};
+use wire::{Changes, ExchangeMessage, Full};
 
 use crate::entry::time_of_millis;
 use crate::{Entry, Mts, Reach, Role, Source};
@@ -363,7 +363,9 @@ impl Exchange {
                 self.end_replaced();
                 Ok(())
             }
-            ExchangeMessage::Changes(changes) => neighbor.handle_changes(now, changes, &self.directory),
+            ExchangeMessage::Changes(changes) => {
+                neighbor.handle_changes(now, changes, &self.directory)
+            }
         }
     }
 
@@ -378,7 +380,9 @@ impl Exchange {
                 neighbor.state = state;
                 neighbor.due = match neighbor.state {
                     SyncState::Some { .. } => now,
-                    SyncState::All { version } if version < self.own.version => now + Self::GATHERING,
+                    SyncState::All { version } if version < self.own.version => {
+                        now + Self::GATHERING
+                    }
                     SyncState::All { .. } => now + Self::ALIVE,
                 };
             }
@@ -411,14 +415,11 @@ impl Exchange {
     /// Time of the next action.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
-        let times = self
-            .neighbors
-            .values()
-            .map(|neighbor| match neighbor.gone {
-                Some(since) => Some(since + Self::MEMORY),
-                None if neighbor.under_way.is_some() => None,
-                None => Some(neighbor.next_letter()),
-            });
+        let times = self.neighbors.values().map(|neighbor| match neighbor.gone {
+            Some(since) => Some(since + Self::MEMORY),
+            None if neighbor.under_way.is_some() => None,
+            None => Some(neighbor.next_letter()),
+        });
         times.flatten().min()
     }
 
@@ -429,8 +430,7 @@ impl Exchange {
             .neighbors
             .iter_mut()
             .filter(|(_, neighbor)| neighbor.gone.is_none() && neighbor.under_way.is_none());
-        let (incarnation, neighbor) =
-            ready.find(|(_, neighbor)| neighbor.next_letter() <= now)?;
+        let (incarnation, neighbor) = ready.find(|(_, neighbor)| neighbor.next_letter() <= now)?;
         if neighbor.ask.is_some_and(|at| at <= now) {
             neighbor.ask = None;
             neighbor.asked = Some(now);
@@ -548,7 +548,11 @@ impl LocalAgents {
         let start = self.log.len().saturating_sub(behind);
         let mut names = BTreeSet::new();
         let (mut bytes, mut taken) = (0, 0);
-        for Logged { name, with_previous } in self.log.range(start..) {
+        for Logged {
+            name,
+            with_previous,
+        } in self.log.range(start..)
+        {
             let full = names.len() >= Exchange::BATCH || bytes > Exchange::BATCH_BYTES;
             // Coalitions that changed together stay in one letter, as long as they fit.
             if full && !(*with_previous && bytes <= Exchange::MAX_CONTENT / 2) {
@@ -577,7 +581,10 @@ impl LocalAgents {
                 .map(ToString::to_string)
                 .collect(),
         };
-        (ExchangeMessage::Changes(changes), SyncState::All { version: to })
+        (
+            ExchangeMessage::Changes(changes),
+            SyncState::All { version: to },
+        )
     }
 }
 

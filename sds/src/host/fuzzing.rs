@@ -16,7 +16,9 @@ pub fn read_and_written(bytes: &[u8]) -> Result<Vec<u8>, String> {
     assert!(entries.len() <= file::MAX_ENTRIES);
     for (name, entry) in &entries {
         assert_eq!(*name, entry.name);
-        entry.check().expect("an accepted file is within the limits");
+        entry
+            .check()
+            .expect("an accepted file is within the limits");
     }
     let mut own: Option<Mts> = None;
     for entry in entries.values() {

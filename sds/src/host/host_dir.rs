@@ -124,7 +124,9 @@ impl HostDir {
             // The last process left in between and removed the lock file.
             host_dir.domain = open_domain(&host_dir.dir, &host_dir.path)?;
             if Instant::now() > deadline {
-                return Err(HostError::Busy { path: host_dir.path });
+                return Err(HostError::Busy {
+                    path: host_dir.path,
+                });
             }
         }
         Ok(host_dir)
@@ -579,7 +581,9 @@ fn open_private(path: &Path) -> Result<OwnedFd, HostError> {
     let dir = match rustix::fs::open(path, flags, Mode::empty()) {
         Ok(dir) => dir,
         Err(Errno::LOOP | Errno::NOTDIR) => {
-            return Err(refused("it is a symbolic link or a file, not a directory".into()));
+            return Err(refused(
+                "it is a symbolic link or a file, not a directory".into(),
+            ));
         }
         Err(error) => return Err(io("open")(error.into())),
     };

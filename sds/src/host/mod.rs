@@ -29,7 +29,7 @@ use fipa_transport::{Forked, Incarnation, OwnerProcess};
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
-use self::host_dir::{Id, HostDir};
+use self::host_dir::{HostDir, Id};
 use self::shared::Shared;
 use self::watcher::Watcher;
 use crate::{

@@ -11,7 +11,7 @@ use tokio::sync::{Notify, watch};
 use super::HostError;
 use super::SocketId;
 use super::file::{self, Entries, FileError};
-use super::host_dir::{Guard, Id, MAX_ENTRIES_FILE, Name, HostDir, Version};
+use super::host_dir::{Guard, HostDir, Id, MAX_ENTRIES_FILE, Name, Version};
 use crate::table::Table;
 use crate::{DeregisterError, Entry, Mts, Reach, RegisterError};
 
@@ -424,7 +424,10 @@ impl Shared {
 
     /// Changes this process's entries under the lock of the domain, or without it if the directory
     /// was removed.
-    fn change<T>(&self, change: impl FnOnce(Result<Guard<'_>, HostError>, &mut OwnEntries) -> T) -> T {
+    fn change<T>(
+        &self,
+        change: impl FnOnce(Result<Guard<'_>, HostError>, &mut OwnEntries) -> T,
+    ) -> T {
         loop {
             let host_dir = self.host_dir();
             let guard = host_dir.lock();

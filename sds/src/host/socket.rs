@@ -10,7 +10,7 @@ use rustix::net::{
 };
 
 use super::HostError;
-use super::host_dir::{Guard, Id, Name, HostDir};
+use super::host_dir::{Guard, HostDir, Id, Name};
 
 /// Maximum number of connections that wait to be accepted.
 const BACKLOG: i32 = 1024;

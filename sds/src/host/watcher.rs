@@ -19,7 +19,7 @@ use inotify::{EventMask, EventStream, Inotify, WatchMask};
 use tokio::time::Instant;
 
 use super::HostError;
-use super::host_dir::{Id, Name, HostDir};
+use super::host_dir::{HostDir, Id, Name};
 use super::shared::Shared;
 
 pub(super) struct Watcher {
@@ -258,7 +258,11 @@ async fn sleep_until(time: Option<Instant>) {
     }
 }
 
-fn handle(shared: &Shared, changes: DirChanges, ending: &mut EndingProcesses) -> Result<(), HostError> {
+fn handle(
+    shared: &Shared,
+    changes: DirChanges,
+    ending: &mut EndingProcesses,
+) -> Result<(), HostError> {
     // Files that disappear together with the directory do not mean that their processes ended.
     if (changes.lost || ending.rescan || !changes.ended.is_empty()) && !shared.is_there()? {
         return Err(HostError::Removed {

@@ -667,7 +667,8 @@ pub(super) fn label_of(fullname: &str) -> &str {
 }
 
 fn len_of(properties: &Properties) -> usize {
-    properties.iter()
+    properties
+        .iter()
         .map(|(key, value)| key.len() + value.len() + 2)
         .sum()
 }

@@ -98,7 +98,12 @@ impl CoalitionSync {
     }
 
     /// Handles the coalition digest of a beacon, and returns the updates that become visible.
-    pub(super) fn handle_beacon(&mut self, now: Instant, gateway: Incarnation, digest: Digest) -> Updates {
+    pub(super) fn handle_beacon(
+        &mut self,
+        now: Instant,
+        gateway: Incarnation,
+        digest: Digest,
+    ) -> Updates {
         let unknown = !self.gateways.contains_key(&gateway);
         if unknown && (digest == Digest::default() || !self.has_room(now)) {
             return Updates::new();
@@ -148,7 +153,9 @@ impl CoalitionSync {
         let Some(known) = self.gateways.get(&gateway) else {
             return Updates::new();
         };
-        let complete = known.beacon.is_some_and(|(_, beacon)| beacon == known.digest);
+        let complete = known
+            .beacon
+            .is_some_and(|(_, beacon)| beacon == known.digest);
         if complete || known.due().is_some_and(|due| due <= now) {
             return self.show(gateway);
         }
@@ -276,7 +283,10 @@ mod tests {
         let gateway = Incarnation::from_u64(1);
         // The initial records also become visible only when they are complete.
         assert!(put(&mut sync, now, &apart, "one").is_empty());
-        assert!(sync.handle_beacon(now, gateway, digest(1, &apart)).is_empty());
+        assert!(
+            sync.handle_beacon(now, gateway, digest(1, &apart))
+                .is_empty()
+        );
         visible.apply(put(&mut sync, now, &apart, "two"));
         assert_eq!(visible.0, apart);
         assert_eq!(sync.poll_timeout(), None);

@@ -10,8 +10,8 @@ use fipa_transport::Incarnation;
 
 use super::beacon::{self, Beacons};
 use super::browse::{Browser, label_of};
-use super::peer_records::PeerRecords;
 use super::coalition_sync::CoalitionSync;
+use super::peer_records::PeerRecords;
 use super::{packet, record};
 use crate::{Entry, Reach, Source};
 
@@ -52,7 +52,9 @@ impl Listener {
     /// Handles a packet from this address.
     pub fn arrive(&mut self, now: Instant, from: IpAddr, bytes: &[u8]) {
         if let Some((gateway, content)) = beacon::read(bytes) {
-            let _ = self.coalition_sync.handle_beacon(now, gateway, content.coalitions);
+            let _ = self
+                .coalition_sync
+                .handle_beacon(now, gateway, content.coalitions);
             let stored = self.peer_records.of(gateway);
             let _ = self.beacons.handle(now, gateway, content.all, stored);
             self.browser.confirm(now, gateway);
@@ -78,7 +80,9 @@ impl Listener {
             }
             self.browser.belongs(&fullname, entry.mts.incarnation);
             self.peer_records.put(now, &fullname, Some(&entry));
-            let _ = self.coalition_sync.put(now, &fullname, Some(Arc::new(entry)));
+            let _ = self
+                .coalition_sync
+                .put(now, &fullname, Some(Arc::new(entry)));
         }
     }
 

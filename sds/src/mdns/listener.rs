@@ -92,7 +92,11 @@ impl Listener {
             shared.put(&fullname, None);
         }
         let later = shared.peer_records.lock().poll_timeout(now);
-        let due = [Some(self.browser.poll_timeout()), later, self.fast_poll_until];
+        let due = [
+            Some(self.browser.poll_timeout()),
+            later,
+            self.fast_poll_until,
+        ];
         let due = due.into_iter().flatten().min();
         due.map_or(self.next_beacon, |due| due.min(self.next_beacon))
     }
@@ -130,7 +134,8 @@ impl Listener {
         gateway: Incarnation,
         content: beacon::BeaconContent,
     ) {
-        shared.show(|coalition_sync| coalition_sync.handle_beacon(now, gateway, content.coalitions));
+        shared
+            .show(|coalition_sync| coalition_sync.handle_beacon(now, gateway, content.coalitions));
         let stored = shared.peer_records.lock().of(gateway);
         if let Some(stored) = stored
             && stored.digest == content.all
@@ -144,7 +149,10 @@ impl Listener {
     }
 
     fn repair(&mut self, shared: &Shared, repair: Repair) {
-        tracing::debug!(?repair, "stored records of another gateway differ from its beacon");
+        tracing::debug!(
+            ?repair,
+            "stored records of another gateway differ from its beacon"
+        );
         match repair {
             Repair::Missing => {
                 let question = self.browser.ask_for_missing(Instant::now());

@@ -10,20 +10,20 @@
 //! of a record has no meaning between gateways: a label in use by another name is replaced by a
 //! different one.
 
-mod restart;
 mod beacon;
 mod browse;
-mod listener;
+mod coalition_sync;
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing;
-mod peer_records;
+mod listener;
 mod pace;
 mod packet;
+mod peer_records;
 mod probe;
 mod record;
+mod restart;
 mod sockets;
 mod task;
-mod coalition_sync;
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -36,10 +36,10 @@ use parking_lot::Mutex;
 use tokio::sync::{Notify, broadcast};
 
 use self::beacon::Digest;
-use self::peer_records::PeerRecords;
-use self::pace::Pace;
-pub use self::probe::{Multicast, probe};
 use self::coalition_sync::{CoalitionSync, Updates};
+use self::pace::Pace;
+use self::peer_records::PeerRecords;
+pub use self::probe::{Multicast, probe};
 use crate::table::Table;
 use crate::{
     DeregisterError, Directory, Entry, Mts, RegisterError, Registration, Role, Source, Subscriber,
@@ -199,7 +199,11 @@ impl MdnsDirectory {
     /// Queries the network for this gateway; see [`verify`](Self::verify). A repeated call within a
     /// few seconds does nothing.
     pub fn verify_gateway(&self, gateway: Incarnation) {
-        let doubted = self.shared.peer_records.lock().doubt(Instant::now(), gateway);
+        let doubted = self
+            .shared
+            .peer_records
+            .lock()
+            .doubt(Instant::now(), gateway);
         if doubted {
             self.shared.postponed.notify_one();
         }
@@ -242,7 +246,9 @@ impl MdnsDirectory {
             return;
         };
         if ended.recv_timeout(Duration::from_secs(5)).is_err() {
-            tracing::error!("timed out after 5 s waiting for the mDNS library to send its goodbyes; other hosts keep the records until they expire");
+            tracing::error!(
+                "timed out after 5 s waiting for the mDNS library to send its goodbyes; other hosts keep the records until they expire"
+            );
         }
     }
 }
@@ -573,7 +579,9 @@ impl Shared {
     /// Sets the interval at which the library polls the interfaces; it applies after the next poll.
     fn set_poll_interval(&self, seconds: u32) {
         if let Err(error) = self.ask(|daemon| daemon.set_ip_check_interval(seconds)) {
-            self.failed(format!("cannot set the interval for polling the interfaces: {error}"));
+            self.failed(format!(
+                "cannot set the interval for polling the interfaces: {error}"
+            ));
         }
     }
 
@@ -665,7 +673,9 @@ impl Shared {
     /// Stores the current state of a record, or its removal.
     fn put(&self, fullname: &Arc<str>, entry: Option<Arc<Entry>>) {
         let now = Instant::now();
-        self.peer_records.lock().put(now, fullname, entry.as_deref());
+        self.peer_records
+            .lock()
+            .put(now, fullname, entry.as_deref());
         self.show(|coalition_sync| coalition_sync.put(now, fullname, entry));
     }
 

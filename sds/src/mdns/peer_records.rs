@@ -238,7 +238,11 @@ mod tests {
             panic!("no record was queried");
         };
         put(&mut holdings, now, others[0].parse().unwrap(), 7, false);
-        assert_eq!(holdings.poll_timeout(now), None, "only one record was removed");
+        assert_eq!(
+            holdings.poll_timeout(now),
+            None,
+            "only one record was removed"
+        );
         put(&mut holdings, now, doubted.parse().unwrap(), 7, false);
         let mut asked = Vec::new();
         let mut now = now;
@@ -248,7 +252,11 @@ mod tests {
             assert!(batch.len() <= BATCH);
             asked.extend(batch);
         }
-        assert_eq!(asked.len(), 60 - BATCH, "the records that were not queried yet");
+        assert_eq!(
+            asked.len(),
+            60 - BATCH,
+            "the records that were not queried yet"
+        );
         // After the doubt, the end of a record affects no others.
         assert!(holdings.doubt(now, gateway));
         let doubted = holdings.due(now + PAUSE);

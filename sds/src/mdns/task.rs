@@ -6,10 +6,10 @@ use std::time::{Duration, Instant, SystemTime};
 use fipa_transport::Incarnation;
 use mdns_sd::{DaemonEvent, DaemonStatus, Error, Metrics, Receiver, ServiceDaemon};
 
-use super::restart::{self, Pauses};
 use super::browse::{ParsedPacket, label_of};
 use super::listener::Listener;
 use super::record::{self, Properties};
+use super::restart::{self, Pauses};
 use super::{MAX_SPOILT, Shared, Withdrawal};
 use crate::Entry;
 
@@ -65,14 +65,20 @@ fn monitor(shared: &Shared) -> Option<Receiver<DaemonEvent>> {
     match shared.ask(ServiceDaemon::monitor) {
         Ok(receiver) => receiver,
         Err(error) => {
-            shared.failed(format!("cannot receive events of the mDNS library: {error}"));
+            shared.failed(format!(
+                "cannot receive events of the mDNS library: {error}"
+            ));
             None
         }
     }
 }
 
 /// Processes events until the library, if there is one, must be restarted; returns the reason.
-async fn listen(shared: &Shared, monitor: Option<&Receiver<DaemonEvent>>, listener: &mut Listener) -> String {
+async fn listen(
+    shared: &Shared,
+    monitor: Option<&Receiver<DaemonEvent>>,
+    listener: &mut Listener,
+) -> String {
     let mut look = monitor.map(|_| Instant::now() + restart::INTERVAL);
     let mut metrics: Option<Receiver<Metrics>> = None;
     loop {
@@ -141,7 +147,8 @@ fn handle(shared: &Shared, listener: &mut Listener, received: ParsedPacket) {
     if received.refused > 0 {
         let mut status = shared.status.lock();
         status.refused += received.refused;
-        status.last_error = Some("refused records of other hosts: too many on the network".to_owned());
+        status.last_error =
+            Some("refused records of other hosts: too many on the network".to_owned());
     }
 }
 
@@ -255,9 +262,9 @@ mod tests {
     use std::net::Ipv4Addr;
 
     use super::super::SERVICE_TYPE;
-    use super::super::restart::tests::directory;
     use super::super::beacon::{BeaconContent, Digest};
     use super::super::packet::tests::{Part, answer};
+    use super::super::restart::tests::directory;
     use super::*;
     use crate::{Directory, Mts, Registration, Source};
 

@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use fipa_transport::{FailureReason, WayError, WayFault};
 
-use super::super::desk::Desk;
+use super::super::attempts::AttemptTable;
 use super::super::work;
 use super::delivery::{Holding, State};
 use super::{ENDED_PATIENCE, Lane};
@@ -12,11 +12,11 @@ use super::{ENDED_PATIENCE, Lane};
 impl Lane {
     /// Handles everything that is due: deadlines, attempts without an answer, custody reports, and
     /// letters to return.
-    pub(super) fn expire(&mut self, now: Instant, desk: &mut Desk) {
+    pub(super) fn expire(&mut self, now: Instant, table: &mut AttemptTable) {
         if self.due.is_none_or(|due| due > now) {
             return;
         }
-        self.ask_custodians(now, desk);
+        self.ask_custodians(now, table);
         let ended = self
             .ended
             .filter(|(_, heard)| now >= *heard + ENDED_PATIENCE);
@@ -27,7 +27,7 @@ impl Lane {
             let expired = delivery.deadline <= now;
             let abandoned = ended.is_some_and(|(gone, _)| gone == delivery.registration);
             if delivery.custody_due.is_some_and(|due| due <= now) {
-                delivery.custody_taken(desk);
+                delivery.custody_taken(table);
             }
             match &mut delivery.progress.state {
                 State::UnderWay {
@@ -44,26 +44,26 @@ impl Lane {
                             }
                             false => WayError::new(WayFault::TimedOut, ""),
                         };
-                        desk.abandon(location.kind(), *attempt, error);
+                        table.abandon(location.kind(), *attempt, error);
                     }
                 }
                 State::Custody { location, .. } if expired || abandoned => {
                     let location = location.clone();
                     let text = "the gateway that has the letter in custody has not reported";
                     delivery.failed_at(&location, WayError::new(WayFault::TimedOut, text));
-                    self.fail(now, index, FailureReason::Unconfirmed, desk);
+                    self.fail(now, index, FailureReason::Unconfirmed, table);
                     continue;
                 }
                 State::Waiting if expired => {
                     let reason = self.reason_while_waiting(index);
-                    self.fail(now, index, reason, desk);
+                    self.fail(now, index, reason, table);
                     continue;
                 }
                 State::Waiting => {
                     if let Some(Holding::Until(until)) = delivery.progress.hold
                         && until <= now
                     {
-                        self.return_letter(now, index, desk);
+                        self.return_letter(now, index, table);
                         continue;
                     }
                 }

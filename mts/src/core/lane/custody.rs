@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 
 use fipa_transport::{Incarnation, WayError, WayFault};
 
-use super::super::desk::{Desk, Settlement, Upstream};
-use super::super::rules::{self, End, Hold};
+use super::super::attempts::{AttemptTable, Settlement, Upstream};
+use super::super::rules::{self, AttemptEnd, HoldDecision};
 use super::super::work;
 use super::Lane;
 use super::delivery::{Holding, State};
@@ -38,16 +38,16 @@ impl Lane {
         now: Instant,
         (sequence, after): (u64, u64),
         upstream: Upstream,
-        desk: &mut Desk,
+        table: &mut AttemptTable,
     ) -> Result<(), Upstream> {
         let Some(index) = self.index(sequence) else {
             return Err(upstream);
         };
         let delivery = &mut self.letters[index];
-        delivery.custody_taken(desk);
+        delivery.custody_taken(table);
         delivery.add_upstream(upstream);
-        self.lower_predecessor(index, after, desk);
-        self.pump(now, desk);
+        self.lower_predecessor(index, after, table);
+        self.pump(now, table);
         Ok(())
     }
 
@@ -59,21 +59,21 @@ impl Lane {
         now: Instant,
         from: Incarnation,
         (sequence, after, transfer): (u64, u64, u64),
-        desk: &mut Desk,
+        table: &mut AttemptTable,
     ) -> bool {
         let index = self.index(sequence);
         let index = index.filter(|index| self.letters[*index].came_from(from, transfer));
         if let Some(index) = index {
-            self.lower_predecessor(index, after, desk);
-            self.pump(now, desk);
+            self.lower_predecessor(index, after, table);
+            self.pump(now, table);
         }
         index.is_some()
     }
 
     /// Maximum time for the predecessor of the letter at `index` to arrive.
-    pub(super) fn predecessor_patience(&self, index: usize, desk: &Desk) -> Duration {
+    pub(super) fn predecessor_patience(&self, index: usize, table: &AttemptTable) -> Duration {
         let upstreams = self.letters[index].upstreams();
-        let slowest = upstreams.filter_map(|it| desk.round_trip(it)).max();
+        let slowest = upstreams.filter_map(|it| table.round_trip(it)).max();
         (slowest.unwrap_or_default() * 2).clamp(LEAST_PATIENCE, MOST_PATIENCE)
     }
 
@@ -87,7 +87,7 @@ impl Lane {
 
     /// Asks the custodians of the letters that are longest in custody whether they have them, and
     /// sends them the current predecessors with that. Checks the directory's data about them, too.
-    pub(super) fn ask_custodians(&mut self, now: Instant, desk: &mut Desk) {
+    pub(super) fn ask_custodians(&mut self, now: Instant, table: &mut AttemptTable) {
         if self.ask_custodian.is_none_or(|due| due > now) {
             return;
         }
@@ -117,13 +117,13 @@ impl Lane {
             let stream = self.stream_of(delivery);
             let after = self.after(index);
             let letter = (delivery.sequence, after, attempt.0);
-            desk.predecessor(stream, self.receiver.clone(), letter, location);
+            table.predecessor(stream, self.receiver.clone(), letter, location);
             let delivery = &mut self.letters[index];
             delivery.after = delivery.after.min(after);
         }
         if asked > 0 {
             next = Some(now + ASK_CUSTODIAN_AGAIN);
-            self.check_next_hops(now, desk);
+            self.check_next_hops(now, table);
         }
         if let Some(next) = next {
             self.ask_custodian_at(next);
@@ -135,7 +135,7 @@ impl Lane {
         &mut self,
         now: Instant,
         (registration, sequence, transfer): (Incarnation, u64, u64),
-        desk: &mut Desk,
+        table: &mut AttemptTable,
     ) {
         let Some(index) = self.index(sequence) else {
             return;
@@ -145,10 +145,10 @@ impl Lane {
             && matches!(delivery.progress.state, State::Custody { attempt, .. } if attempt.0 == transfer);
         if is_meant {
             let text = "the gateway that had the letter in custody does not have it";
-            self.custodian_lost(now, index, text, desk);
+            self.custodian_lost(now, index, text, table);
             // It may have lost others, too.
             self.ask_custodian_at(now + ASK_CUSTODIAN_ON);
-            self.pump(now, desk);
+            self.pump(now, table);
         }
     }
 
@@ -158,18 +158,18 @@ impl Lane {
         now: Instant,
         index: usize,
         text: &'static str,
-        desk: &mut Desk,
+        table: &mut AttemptTable,
     ) {
         let delivery = &mut self.letters[index];
         let before = std::mem::replace(&mut delivery.progress.state, State::Waiting);
         if let State::Custody { location, .. } = before {
-            delivery.ended(End::CustodianLost);
+            delivery.ended(AttemptEnd::CustodianLost);
             let error = WayError::new(WayFault::Broken, text);
-            self.came_back(now, index, &location, error, desk);
+            self.came_back(now, index, &location, error, table);
         }
     }
 
-    fn lower_predecessor(&mut self, index: usize, after: u64, desk: &mut Desk) {
+    fn lower_predecessor(&mut self, index: usize, after: u64, table: &mut AttemptTable) {
         let stream = self.stream_of(&self.letters[index]);
         let delivery = &mut self.letters[index];
         let lower = rules::lower(delivery.after, after);
@@ -187,7 +187,7 @@ impl Lane {
                 let transfer = delivery.progress.state.handed_over();
                 let transfer = transfer.map_or(0, |(attempt, _)| attempt.0);
                 let receiver = self.receiver.clone();
-                desk.predecessor(stream, receiver, (sequence, lower, transfer), location);
+                table.predecessor(stream, receiver, (sequence, lower, transfer), location);
             }
         }
     }
@@ -213,7 +213,13 @@ impl Lane {
 
     /// Holds a letter that came back because its predecessor was not taken, or that the next
     /// custodian returned for that reason.
-    pub(super) fn hold(&mut self, now: Instant, index: usize, patience: Duration, desk: &mut Desk) {
+    pub(super) fn hold(
+        &mut self,
+        now: Instant,
+        index: usize,
+        patience: Duration,
+        table: &mut AttemptTable,
+    ) {
         let delivery = &self.letters[index];
         let after = delivery.after;
         work::steps(self.left.len());
@@ -222,26 +228,26 @@ impl Lane {
         let missing_for = now.saturating_duration_since(since);
         let here = self.index(after).is_some();
         match rules::hold(here, missing_for, patience) {
-            Hold::ForPredecessor => {
+            HoldDecision::ForPredecessor => {
                 let predecessor = self.index(after).map(|at| &self.letters[at]);
                 let attempt = predecessor.and_then(|it| it.progress.state.handed_over());
                 let hold = attempt.map(|(attempt, _)| Holding::ForPredecessor(attempt));
                 self.letters[index].progress.hold = hold;
             }
-            Hold::For(rest) => {
+            HoldDecision::For(rest) => {
                 let until = now + rest;
                 self.holds = true;
                 self.letters[index].progress.hold = Some(Holding::Until(until));
                 self.due_at(until);
             }
-            Hold::Return => self.return_letter(now, index, desk),
+            HoldDecision::Return => self.return_letter(now, index, table),
         }
     }
 
     /// Returns a letter to the services that handed it over.
-    pub(super) fn return_letter(&mut self, now: Instant, index: usize, desk: &mut Desk) {
+    pub(super) fn return_letter(&mut self, now: Instant, index: usize, table: &mut AttemptTable) {
         let uncertain = self.letters[index].progress.uncertain;
-        self.settle(now, index, Settlement::Returned { uncertain }, desk);
+        self.settle(now, index, Settlement::Returned { uncertain }, table);
     }
 
     /// Lets letters that wait for the arrival of this one wait for it in the lane.

@@ -8,8 +8,8 @@ use fipa_transport::{
 };
 use smallvec::SmallVec;
 
-use super::super::desk::{Action, Desk, Origin, Upstream};
-use super::super::rules::{self, End};
+use super::super::attempts::{Action, AttemptTable, Origin, Upstream};
+use super::super::rules::{self, AttemptEnd};
 
 /// Maximum number of failed attempts in one letter's outcome.
 const MAX_ATTEMPTS: usize = 16;
@@ -142,7 +142,7 @@ impl Delivery {
     }
 
     /// Records the end of an attempt or a custody.
-    pub(super) fn ended(&mut self, end: End) {
+    pub(super) fn ended(&mut self, end: AttemptEnd) {
         self.progress.uncertain = rules::stays_uncertain(self.progress.uncertain, end);
     }
 
@@ -214,11 +214,11 @@ impl Delivery {
     }
 
     /// Answers the services that wait for an answer that the letter is in custody.
-    pub(super) fn custody_taken(&mut self, desk: &mut Desk) {
+    pub(super) fn custody_taken(&mut self, table: &mut AttemptTable) {
         if let Origin::Forwarded { upstreams } = &mut self.origin {
             for upstream in upstreams {
                 if let Some((kind, ticket)) = upstream.unanswered.take() {
-                    desk.actions.push_back(Action::Answer {
+                    table.actions.push_back(Action::Answer {
                         kind,
                         ticket,
                         answer: Answer::Custody,

@@ -32,7 +32,9 @@ use fipa_transport::{
 
 pub(crate) use self::delivery::Delivery;
 use self::delivery::State;
-use super::desk::{Author, Desk, Origin, Purpose, Settlement, Undelivered, life_of};
+use super::attempts::{
+    AttemptTable, FailureTarget, Origin, Purpose, Settlement, Undelivered, registration_of,
+};
 use super::routes::Tally;
 use super::rules;
 use super::work;
@@ -83,12 +85,12 @@ pub(crate) struct Lane {
     sender: Incarnation,
     receiver: Arc<str>,
     /// The location that the receiver stated itself, if it is not in the directory.
-    said: Option<Arc<Entry>>,
+    stated: Option<Arc<Entry>>,
     letters: VecDeque<Delivery>,
     bytes: usize,
     under_way: usize,
     /// The route of the letters in transit.
-    way: Option<Location>,
+    route: Option<Location>,
     /// Counters of the current or last route.
     tally: Option<(Location, Arc<Tally>)>,
     /// The latest error of each route that failed since the lane was empty and has not worked
@@ -137,11 +139,11 @@ impl Lane {
             key,
             sender,
             receiver,
-            said: None,
+            stated: None,
             letters: VecDeque::new(),
             bytes: 0,
             under_way: 0,
-            way: None,
+            route: None,
             tally: None,
             failed: Vec::new(),
             recovering: false,
@@ -198,7 +200,7 @@ impl Lane {
     }
 
     /// The current route of a letter in transit.
-    pub(crate) fn way_of(&self, sequence: u64) -> Option<&Location> {
+    pub(crate) fn route_of(&self, sequence: u64) -> Option<&Location> {
         match &self.letters[self.index(sequence)?].progress.state {
             State::UnderWay { location, .. } => Some(location),
             _ => None,
@@ -206,18 +208,18 @@ impl Lane {
     }
 
     /// Whether there is room for another letter of this process with this many bytes.
-    pub(crate) fn has_room(&self, len: usize, desk: &Desk) -> bool {
-        let config = &desk.config;
+    pub(crate) fn has_room(&self, len: usize, table: &AttemptTable) -> bool {
+        let config = &table.config;
         let fits = self.bytes.saturating_add(len) <= config.lane_bytes;
         self.letters.len() < config.lane && (fits || self.letters.is_empty())
     }
 
     /// Whether a custodian takes this letter. A letter below a waiting one is taken beyond the
     /// limits, up to twice as much.
-    pub(crate) fn admits(&self, sequence: u64, len: usize, desk: &Desk) -> bool {
-        let config = &desk.config;
-        let held = desk.held.saturating_add(len);
-        if self.has_room(len, desk) && (held <= config.custody_bytes || desk.held == 0) {
+    pub(crate) fn admits(&self, sequence: u64, len: usize, table: &AttemptTable) -> bool {
+        let config = &table.config;
+        let held = table.held.saturating_add(len);
+        if self.has_room(len, table) && (held <= config.custody_bytes || table.held == 0) {
             return true;
         }
         let highest = self.letters.back().map(|delivery| delivery.sequence);
@@ -230,11 +232,11 @@ impl Lane {
     /// Whether letters wait for a pause to end, and the receiver has such a location.
     pub(crate) fn is_paused_towards(
         &self,
-        desk: &Desk,
+        table: &AttemptTable,
         is_meant: impl Fn(&Location) -> bool,
     ) -> bool {
         let first = self.letters.front().filter(|_| self.paused_until.is_some());
-        let entry = first.and_then(|first| self.entry(first.registration, desk));
+        let entry = first.and_then(|first| self.entry(first.registration, table));
         entry.is_some_and(|entry| entry.locations.iter().any(is_meant))
     }
 
@@ -251,23 +253,23 @@ impl Lane {
 
     /// The entry of this registration of the receiver: from the directory, or as the receiver
     /// stated it. `None` when it has moved.
-    fn entry(&self, registration: Incarnation, desk: &Desk) -> Option<Arc<Entry>> {
+    fn entry(&self, registration: Incarnation, table: &AttemptTable) -> Option<Arc<Entry>> {
         if self.moving.is_some_and(|(moved, _)| moved == registration) {
             return None;
         }
-        let known = desk.receiver(registration, &self.receiver);
-        known.or_else(|| self.said.clone())
+        let known = table.receiver(registration, &self.receiver);
+        known.or_else(|| self.stated.clone())
     }
 
     /// Sets the entry that a receiver outside the directory stated.
-    pub(crate) fn said(&mut self, entry: Arc<Entry>) {
-        self.said = Some(entry);
+    pub(crate) fn set_stated(&mut self, entry: Arc<Entry>) {
+        self.stated = Some(entry);
     }
 
     /// Inserts a letter at its position in the order.
-    pub(crate) fn push(&mut self, delivery: Delivery, desk: &mut Desk) {
+    pub(crate) fn push(&mut self, delivery: Delivery, table: &mut AttemptTable) {
         let len = delivery.letter.len();
-        desk.held += len;
+        table.held += len;
         self.bytes += len;
         self.due_at(delivery.deadline);
         if let Some(due) = delivery.custody_due {
@@ -286,24 +288,24 @@ impl Lane {
     }
 
     /// Dispatches all letters that can be dispatched.
-    pub(crate) fn pump(&mut self, now: Instant, desk: &mut Desk) {
+    pub(crate) fn pump(&mut self, now: Instant, table: &mut AttemptTable) {
         self.active = now;
-        self.expire(now, desk);
+        self.expire(now, table);
         if self.recovering && self.under_way == 0 {
             self.recovering = false;
-            self.way = None;
+            self.route = None;
         }
         if !self.recovering && self.paused_until.is_none_or(|until| until <= now) {
             self.paused_until = None;
             self.paused_for_lower = false;
-            self.dispatch_waiting(now, desk);
+            self.dispatch_waiting(now, table);
         }
-        self.give_credit(desk);
+        self.give_credit(table);
     }
 
-    fn dispatch_waiting(&mut self, now: Instant, desk: &mut Desk) {
+    fn dispatch_waiting(&mut self, now: Instant, table: &mut AttemptTable) {
         let mut index = 0;
-        while index < self.letters.len() && self.under_way < desk.config.window {
+        while index < self.letters.len() && self.under_way < table.config.window {
             work::steps(1);
             let registration = self.letters[index].registration;
             // All letters in between have the same registration, or the loop would have ended
@@ -321,15 +323,15 @@ impl Lane {
                 self.due_at(until);
                 break;
             }
-            let Some(entry) = self.entry(registration, desk) else {
-                if self.receiver_left(now, index, desk) {
+            let Some(entry) = self.entry(registration, table) else {
+                if self.receiver_left(now, index, table) {
                     continue;
                 }
                 break;
             };
-            match desk.choose(now, &entry, &self.letters[index].progress.tried) {
-                Some(way) if self.under_way == 0 || self.way.as_ref() == Some(&way) => {
-                    self.dispatch(now, index, way, desk);
+            match table.choose(now, &entry, &self.letters[index].progress.tried) {
+                Some(route) if self.under_way == 0 || self.route.as_ref() == Some(&route) => {
+                    self.dispatch(now, index, route, table);
                     index += 1;
                 }
                 // A different route than that of earlier letters must wait until those have
@@ -337,7 +339,7 @@ impl Lane {
                 Some(_) => break,
                 None if self.under_way > 0 => break,
                 None => {
-                    if !self.end_of_round(now, index, &entry, desk) {
+                    if !self.end_of_round(now, index, &entry, table) {
                         break;
                     }
                 }
@@ -352,12 +354,12 @@ impl Lane {
             .into_iter()
     }
 
-    fn dispatch(&mut self, now: Instant, index: usize, way: Location, desk: &mut Desk) {
+    fn dispatch(&mut self, now: Instant, index: usize, route: Location, table: &mut AttemptTable) {
         let after = self.after(index);
-        if let Some(tally) = self.tally_of(&way, desk) {
+        if let Some(tally) = self.tally_of(&route, table) {
             Tally::add(&tally.tried);
         }
-        let attempt = desk.next_attempt();
+        let attempt = table.next_attempt();
         let stream = self.stream_of(&self.letters[index]);
         let delivery = &mut self.letters[index];
         delivery.after = after;
@@ -373,24 +375,24 @@ impl Lane {
         };
         let size = delivery.letter.len() as u64;
         let allowance = Duration::from_millis(size.saturating_mul(1000) / SLOWEST_BYTES_PER_SECOND);
-        let times_out = now + desk.config.attempt_timeout + allowance;
+        let times_out = now + table.config.attempt_timeout + allowance;
         let purpose = Purpose::Letter {
             lane: self.id,
             sequence: delivery.sequence,
         };
-        desk.dispatch(attempt, purpose, way.clone(), parcel);
-        delivery.handed_to(&way);
-        delivery.progress.tried.push(way.clone());
+        table.dispatch(attempt, purpose, route.clone(), parcel);
+        delivery.handed_to(&route);
+        delivery.progress.tried.push(route.clone());
         delivery.progress.hold = None;
         delivery.progress.state = State::UnderWay {
             attempt,
-            location: way.clone(),
+            location: route.clone(),
             times_out,
             abandoned: false,
         };
         self.due_at(times_out);
         self.under_way += 1;
-        self.way = Some(way);
+        self.route = Some(route);
     }
 
     /// The predecessor with which the letter at `index` is dispatched: at a custodian the one it
@@ -406,13 +408,13 @@ impl Lane {
     }
 
     /// The counters of the current route, looked up only when the route changes.
-    fn tally_of(&mut self, way: &Location, desk: &mut Desk) -> Option<&Tally> {
+    fn tally_of(&mut self, route: &Location, table: &mut AttemptTable) -> Option<&Tally> {
         if self
             .tally
             .as_ref()
-            .is_none_or(|(counted, _)| counted != way)
+            .is_none_or(|(counted, _)| counted != route)
         {
-            self.tally = Some((way.clone(), desk.tallies.of(way)));
+            self.tally = Some((route.clone(), table.tallies.of(route)));
         }
         self.tally()
     }
@@ -430,7 +432,13 @@ impl Lane {
     }
 
     /// Handles a letter for which every route was tried. Returns whether it was settled.
-    fn end_of_round(&mut self, now: Instant, index: usize, entry: &Entry, desk: &mut Desk) -> bool {
+    fn end_of_round(
+        &mut self,
+        now: Instant,
+        index: usize,
+        entry: &Entry,
+        table: &mut AttemptTable,
+    ) -> bool {
         let delivery = &mut self.letters[index];
         if delivery.progress.tried.is_empty() {
             let reason = match entry.is_unsupported() {
@@ -443,12 +451,12 @@ impl Lane {
                 }
                 false => FailureReason::Unreachable,
             };
-            self.fail(now, index, reason, desk);
+            self.fail(now, index, reason, table);
             return true;
         }
         delivery.progress.tried.clear();
-        if let Some(reason) = self.never_fits(now, index, desk) {
-            self.fail(now, index, reason, desk);
+        if let Some(reason) = self.never_fits(now, index, table) {
+            self.fail(now, index, reason, table);
             return true;
         }
         self.pause(now);
@@ -457,16 +465,21 @@ impl Lane {
 
     /// The reason why no repetition can succeed, after all routes of the receiver were tried.
     ///
-    /// A letter that is too large for all of them waits for a while for a kind that the directory does
-    /// not show at present and that may return. Later letters wait behind it. Kinds within a host are
-    /// left out, because they do not lead to other hosts. A letter that a legacy peer's dialect cannot
-    /// express waits for nothing.
-    fn never_fits(&mut self, now: Instant, index: usize, desk: &Desk) -> Option<FailureReason> {
+    /// A letter that is too large for all of them waits for a while for a kind of transport that the
+    /// directory does not show at present and that may return; later letters wait behind it. Kinds
+    /// within a host are excluded, because they do not lead to other hosts. A letter that a legacy
+    /// peer's dialect cannot express does not wait.
+    fn never_fits(
+        &mut self,
+        now: Instant,
+        index: usize,
+        table: &AttemptTable,
+    ) -> Option<FailureReason> {
         let delivery = &mut self.letters[index];
         let reason = delivery.unfit()?;
         let since = *delivery.progress.unfit_since.get_or_insert(now);
         let attempts = &delivery.progress.attempts;
-        let mut order = desk.config.order_for(&self.receiver).iter();
+        let mut order = table.config.order_for(&self.receiver).iter();
         let waits = reason == FailureReason::TooLarge
             && now < since + KIND_PATIENCE
             && !order.all(|kind| {
@@ -491,23 +504,23 @@ impl Lane {
 
     /// Handles the end of the registration that the letter is for. Returns whether the lane may
     /// continue with the letter at this index: another one, or the same for the new registration.
-    fn receiver_left(&mut self, now: Instant, index: usize, desk: &mut Desk) -> bool {
+    fn receiver_left(&mut self, now: Instant, index: usize, table: &mut AttemptTable) -> bool {
         let delivery = &self.letters[index];
         let registration = delivery.registration;
         if !rules::may_move(delivery.progress.uncertain) {
-            self.fail(now, index, FailureReason::Unconfirmed, desk);
+            self.fail(now, index, FailureReason::Unconfirmed, table);
             return true;
         }
         if self.is_custody() {
             // Only the sender's process moves letters to another registration.
-            match desk.departed.contains(now, registration) {
-                true => self.settle(now, index, Settlement::Moved, desk),
-                false => self.fail(now, index, FailureReason::NoSuchAgent, desk),
+            match table.departed.contains(now, registration) {
+                true => self.settle(now, index, Settlement::Moved, table),
+                false => self.fail(now, index, FailureReason::NoSuchAgent, table),
             }
             return true;
         }
-        let successor = desk.directory.lookup(&self.receiver);
-        let successor = successor.map(|entry| life_of(&entry));
+        let successor = table.directory.lookup(&self.receiver);
+        let successor = successor.map(|entry| registration_of(&entry));
         if let Some(successor) = successor.filter(|successor| *successor != registration) {
             let delivery = &mut self.letters[index];
             delivery.registration = successor;
@@ -521,22 +534,22 @@ impl Lane {
                 false
             }
             _ => {
-                self.fail(now, index, FailureReason::NoSuchAgent, desk);
+                self.fail(now, index, FailureReason::NoSuchAgent, table);
                 true
             }
         }
     }
 
     /// Continues after room was made, at the receiver or on the route to it.
-    pub(crate) fn resume(&mut self, now: Instant, desk: &mut Desk) {
+    pub(crate) fn resume(&mut self, now: Instant, table: &mut AttemptTable) {
         self.paused_until = None;
         self.pauses = 0;
-        self.pump(now, desk);
+        self.pump(now, table);
     }
 
     /// Abandons all letters, when the sending agent goes away or the service ends. A letter in
     /// transit gets its outcome from the conclusion of its transport, which follows at once.
-    pub(crate) fn give_up(&mut self, now: Instant, desk: &mut Desk) {
+    pub(crate) fn give_up(&mut self, now: Instant, table: &mut AttemptTable) {
         self.recovering = true;
         work::steps(self.letters.len());
         let mut index = 0;
@@ -551,26 +564,32 @@ impl Lane {
                 } => {
                     if !std::mem::replace(abandoned, true) {
                         let error = WayError::new(WayFault::Closed, "the sender went away");
-                        desk.abandon(location.kind(), *attempt, error);
+                        table.abandon(location.kind(), *attempt, error);
                     }
                     index += 1;
                 }
                 State::Custody { .. } => {
-                    self.fail(now, index, FailureReason::Unconfirmed, desk);
+                    self.fail(now, index, FailureReason::Unconfirmed, table);
                 }
                 State::Waiting => {
                     let reason = match delivery.reason_at_deadline(false) {
                         FailureReason::TimedOut => FailureReason::Closed,
                         reason => reason,
                     };
-                    self.fail(now, index, reason, desk);
+                    self.fail(now, index, reason, table);
                 }
             }
         }
     }
 
     /// Ends a letter as failed, or as unconfirmed if an attempt may have delivered it.
-    fn fail(&mut self, now: Instant, index: usize, reason: FailureReason, desk: &mut Desk) {
+    fn fail(
+        &mut self,
+        now: Instant,
+        index: usize,
+        reason: FailureReason,
+        table: &mut AttemptTable,
+    ) {
         let delivery = &mut self.letters[index];
         let reason = match delivery.progress.uncertain {
             true => FailureReason::Unconfirmed,
@@ -578,13 +597,13 @@ impl Lane {
         };
         let attempts = std::mem::take(&mut delivery.progress.attempts);
         let sender = match delivery.origin {
-            Origin::Local { .. } => Some(Author::Ours(self.sender)),
-            Origin::OldPeer { from } => Some(Author::Remote { from: Some(from) }),
-            Origin::Forwarded { .. } | Origin::Nobody => None,
+            Origin::Local { .. } => Some(FailureTarget::Ours(self.sender)),
+            Origin::LegacyPeer { from } => Some(FailureTarget::Remote { from: Some(from) }),
+            Origin::Forwarded { .. } | Origin::FailureMessage => None,
         };
         if let Some(sender) = sender {
             let detail = attempts.last().map(ToString::to_string).unwrap_or_default();
-            desk.undelivered.push_back(Undelivered {
+            table.undelivered.push_back(Undelivered {
                 sender,
                 receiver: Arc::clone(&self.receiver),
                 letter: delivery.letter.clone(),
@@ -593,19 +612,25 @@ impl Lane {
             });
         }
         let outcome = Outcome::Failed { reason, attempts };
-        self.settle(now, index, Settlement::Outcome(outcome), desk);
+        self.settle(now, index, Settlement::Outcome(outcome), table);
     }
 
     /// Removes a letter from the lane, and reports its end to its origin.
-    fn settle(&mut self, now: Instant, index: usize, settlement: Settlement, desk: &mut Desk) {
+    fn settle(
+        &mut self,
+        now: Instant,
+        index: usize,
+        settlement: Settlement,
+        table: &mut AttemptTable,
+    ) {
         let Some(delivery) = self.letters.remove(index) else {
             return;
         };
         let len = delivery.letter.len();
-        desk.held -= len;
+        table.held -= len;
         self.bytes -= len;
         if self.letters.is_empty() {
-            self.way = None;
+            self.route = None;
             self.busy = false;
             self.ended = None;
             self.moving = None;
@@ -623,15 +648,15 @@ impl Lane {
         match self.is_custody() {
             _ if delivered => {}
             true => self.predecessor_failed(now, delivery.sequence),
-            false => self.tell_predecessor(index, desk),
+            false => self.tell_predecessor(index, table),
         }
         let stream = self.stream_of(&delivery);
-        desk.settle(delivery, stream, Arc::clone(&self.receiver), settlement);
+        table.settle(delivery, stream, Arc::clone(&self.receiver), settlement);
     }
 
     /// Sends the custodian of the letter at `index` its new predecessor, after the letter before it
     /// failed at the sender's process.
-    fn tell_predecessor(&mut self, index: usize, desk: &mut Desk) {
+    fn tell_predecessor(&mut self, index: usize, table: &mut AttemptTable) {
         let Some(delivery) = self.letters.get(index) else {
             return;
         };
@@ -645,20 +670,20 @@ impl Lane {
         if after < delivery.after {
             let stream = self.stream_of(delivery);
             let letter = (delivery.sequence, after, attempt.0);
-            desk.predecessor(stream, Arc::clone(&self.receiver), letter, location.clone());
+            table.predecessor(stream, Arc::clone(&self.receiver), letter, location.clone());
             self.letters[index].after = after;
         }
     }
 
-    fn give_credit(&mut self, desk: &mut Desk) {
-        let config = &desk.config;
+    fn give_credit(&mut self, table: &mut AttemptTable) {
+        let config = &table.config;
         if self.letters.len() * 2 <= config.lane
             && self.bytes <= config.lane_bytes / 2
             && let Some(back) = self.waiting.take()
         {
             // Only custodians answer that they are full.
             if let LaneKey::Custody(stream) = &self.key {
-                desk.credit(*stream, Arc::clone(&self.receiver), back);
+                table.credit(*stream, Arc::clone(&self.receiver), back);
             }
         }
     }

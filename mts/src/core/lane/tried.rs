@@ -50,7 +50,7 @@ impl Lane {
 
     /// The route on which letters have no answer yet.
     fn waits_behind(&self) -> Option<Attempt> {
-        let location = self.way.as_ref().filter(|_| self.under_way > 0)?;
+        let location = self.route.as_ref().filter(|_| self.under_way > 0)?;
         let detail = format!("letters before it have no answer ({})", self.under_way);
         Some(Attempt {
             via: location.kind(),

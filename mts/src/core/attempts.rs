@@ -63,11 +63,11 @@ pub enum Action {
     /// be sent to this location, from which its letter came or which a legacy peer states as its
     /// own. Precedes the forwarding of the letter.
     Heard {
-        /// The name it writes under.
+        /// Its name in the letter.
         name: String,
-        /// This life of it; unknown for an agent of a legacy peer.
+        /// Its incarnation; unknown for an agent of a legacy peer.
         agent: Incarnation,
-        /// Where its message transport service can be reached.
+        /// Location of its message transport service.
         location: Location,
     },
     /// An attempt at this location, of a known incarnation, failed: the service may have ended
@@ -95,19 +95,19 @@ pub(crate) enum Origin {
     /// The source at a legacy peer, which gets a failure message.
     Forwarded { upstreams: SmallVec<[Upstream; 1]> },
     /// A failure message; its outcome is not reported.
-    OldPeer { from: LegacySource },
+    LegacyPeer { from: LegacySource },
     /// Nobody is told: it is a failure message.
-    Nobody,
+    FailureMessage,
 }
 
 /// A service that handed over a copy of a letter.
 #[derive(Debug)]
 pub(crate) struct Upstream {
-    /// Where reports to it go.
+    /// Location for reports to it.
     pub(crate) back: Location,
-    /// Its latest hand-over of the letter, which a report names.
+    /// The attempt number of its latest hand-over of the letter, which a report names.
     pub(crate) transfer: u64,
-    /// The arrival that still has no answer.
+    /// Its arrival that has no answer yet.
     pub(crate) unanswered: Option<(Kind, Ticket)>,
 }
 
@@ -124,7 +124,7 @@ pub(crate) enum Settlement {
 
 /// Receiver of a failure message.
 #[derive(Debug)]
-pub(crate) enum Author {
+pub(crate) enum FailureTarget {
     /// This agent of this process.
     Ours(Incarnation),
     /// An agent of another service. `from` is the source of a legacy peer's letter.
@@ -134,7 +134,7 @@ pub(crate) enum Author {
 /// A failed delivery that a failure message reports.
 #[derive(Debug)]
 pub(crate) struct Undelivered {
-    pub(crate) sender: Author,
+    pub(crate) sender: FailureTarget,
     pub(crate) receiver: Arc<str>,
     pub(crate) letter: Letter,
     pub(crate) reason: FailureReason,
@@ -149,7 +149,7 @@ pub(crate) enum Purpose {
     /// A report, a credit or a predecessor.
     Note(Box<Note>),
     /// Check of contact with a static peer.
-    Touch { peer: u64 },
+    PeerCheck { peer: u64 },
 }
 
 /// A message about a letter: a report, a credit or a predecessor.
@@ -165,7 +165,7 @@ pub(crate) struct Note {
 }
 
 /// State that all lanes share.
-pub(crate) struct Desk {
+pub(crate) struct AttemptTable {
     pub(crate) config: CoreConfig,
     pub(crate) directory: Arc<dyn Directory>,
     pub(crate) actions: VecDeque<Action>,
@@ -199,7 +199,7 @@ const FIRST_PENALTY: Duration = Duration::from_millis(100);
 /// Maximum number of failed routes that are remembered.
 const MAX_HEALTH: usize = 4096;
 
-impl Desk {
+impl AttemptTable {
     pub(crate) fn new(config: CoreConfig, directory: Arc<dyn Directory>) -> Self {
         Self {
             config,
@@ -372,18 +372,18 @@ impl Desk {
                 });
             }
             (Origin::Forwarded { upstreams }, settlement) => {
-                let (brief, report) = tidings(settlement);
+                let (brief, report) = answer_and_report(settlement);
                 for upstream in upstreams {
                     let letter = (stream, sequence);
-                    self.tell(upstream, letter, &receiver, (&brief, &report), deadline);
+                    self.report_to(upstream, letter, &receiver, (&brief, &report), deadline);
                 }
             }
             // Only custodians return letters; a failed failure message is not reported.
-            (Origin::Local { .. } | Origin::OldPeer { .. } | Origin::Nobody, _) => {}
+            (Origin::Local { .. } | Origin::LegacyPeer { .. } | Origin::FailureMessage, _) => {}
         }
     }
 
-    fn tell(
+    fn report_to(
         &mut self,
         upstream: Upstream,
         (stream, sequence): (Stream, u64),
@@ -422,9 +422,9 @@ impl Desk {
     }
 
     /// Resolves the receiver of a stream, if it is still in the directory.
-    pub(crate) fn receiver(&self, life: Incarnation, name: &str) -> Option<Arc<Entry>> {
-        self.directory.by_incarnation(life).or_else(|| {
-            let nameless = life == life_by_name(name);
+    pub(crate) fn receiver(&self, registration: Incarnation, name: &str) -> Option<Arc<Entry>> {
+        self.directory.by_incarnation(registration).or_else(|| {
+            let nameless = registration == registration_by_name(name);
             let entry = nameless.then(|| self.directory.lookup(name)).flatten();
             entry.filter(|entry| !entry.incarnation.is_known())
         })
@@ -506,7 +506,7 @@ impl Desk {
         self.round_trips.get(&service).copied()
     }
 
-    pub(crate) fn way_worked(&mut self, location: &Location) {
+    pub(crate) fn route_worked(&mut self, location: &Location) {
         if !self.health.is_empty() {
             self.health.remove(location);
         }
@@ -517,7 +517,7 @@ impl Desk {
         self.health.retain(|location, _| !which(location));
     }
 
-    pub(crate) fn way_failed(&mut self, now: Instant, location: &Location, fault: WayFault) {
+    pub(crate) fn route_failed(&mut self, now: Instant, location: &Location, fault: WayFault) {
         if self.config.forwards && location.incarnation().is_known() {
             self.actions.push_back(Action::Doubtful {
                 location: location.clone(),
@@ -542,16 +542,16 @@ impl Desk {
 
 /// The registration that letters to this agent are for. A legacy peer's agent has no incarnation;
 /// one that is derived from its name stands for all its registrations.
-pub(crate) fn life_of(entry: &Entry) -> Incarnation {
+pub(crate) fn registration_of(entry: &Entry) -> Incarnation {
     if entry.incarnation.is_known() {
         entry.incarnation
     } else {
-        life_by_name(&entry.name)
+        registration_by_name(&entry.name)
     }
 }
 
 /// The 64-bit FNV-1a hash: equal in every process, so that reports match their letters.
-fn life_by_name(name: &str) -> Incarnation {
+fn registration_by_name(name: &str) -> Incarnation {
     let step = |hash: u64, byte: &u8| (hash ^ u64::from(*byte)).wrapping_mul(0x100_0000_01b3);
     let hash = name.as_bytes().iter().fold(0xcbf2_9ce4_8422_2325, step);
     Incarnation::from_u64(hash.max(1))
@@ -571,7 +571,7 @@ pub(super) fn note_parcel(stream: Stream, receiver: Arc<str>, sequence: u64, bod
 
 /// The answer to services that handed a letter over, if an answer can express the end, and the
 /// report otherwise.
-fn tidings(settlement: Settlement) -> (Option<Answer>, Report) {
+fn answer_and_report(settlement: Settlement) -> (Option<Answer>, Report) {
     match settlement {
         Settlement::Outcome(outcome) => {
             let brief = match &outcome {
