@@ -200,7 +200,9 @@ impl World {
         outcome: Outcome,
     ) -> Result<(), Breach> {
         let Some(&number) = self.sends.get(&sent) else {
-            return Err(format!("an outcome of a letter that was not sent: {outcome}"));
+            return Err(format!(
+                "an outcome of a letter that was not sent: {outcome}"
+            ));
         };
         self.trace(|| format!("letter {number} to {receiver}: {outcome}"));
         self.check_outcome(number, &receiver, &outcome);
