@@ -12,7 +12,6 @@
 //! * agents of fipa_services: an `inform` in the string encoding, from the sender to the intended
 //!   receiver, in the language `internal-error`, with the list of the services that the letter
 //!   passed.
-//!   receiver, in the language `internal-error`, that tells the services which the letter passed.
 
 mod read;
 

@@ -649,7 +649,7 @@ fn letters_to_an_unreachable_legacy_peer_fail_like_others() {
         },
     );
     let (attempt, _, _) = dispatched(&mut core).unwrap();
-    let error = WayError::new(WayFault::Unreachable, "nobody listens");
+    let error = WayError::new(WayFault::Unreachable, "connection refused");
     core.handle_conclusion(start, attempt, Conclusion::NotSent(error));
     let over = Now {
         instant: start.instant + Duration::from_secs(1),

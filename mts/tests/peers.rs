@@ -49,7 +49,7 @@ impl Bench {
     }
 
     fn fails(&mut self, attempt: AttemptId) {
-        let error = WayError::new(WayFault::Unreachable, "nobody");
+        let error = WayError::new(WayFault::Unreachable, "no host");
         let conclusion = Conclusion::NotSent(error);
         self.core.handle_conclusion(self.now, attempt, conclusion);
     }

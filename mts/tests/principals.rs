@@ -36,7 +36,7 @@ fn at(service: Incarnation, address: &str) -> Location {
     location.with_incarnation(service)
 }
 
-/// A link with one of the two peers, which names this service.
+/// A link with one of the two peers that claims this service.
 fn link(service: Incarnation, holder: Incarnation) -> Hop {
     let number = u8::try_from(holder.as_u64()).unwrap();
     Hop {

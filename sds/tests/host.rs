@@ -433,7 +433,7 @@ async fn many_processes_register_at_once_and_all_succeed() {
 async fn a_process_that_is_stopped_in_its_turn_does_not_block_others() {
     let (_parent, dir) = place();
     let directory = open(&dir);
-    // Holds the locks of a process that is stopped; the new process has had no turn yet.
+    // Holds the turn lock, as a stopped process would; the new process has had no turn yet.
     let stopped = std::fs::File::open(&dir).unwrap();
     stopped.lock().unwrap();
     let newcomer = open(&dir);

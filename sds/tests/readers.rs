@@ -198,8 +198,8 @@ fn merged_views_of_them_conform() {
     let (_, _, told) = exchange();
     let (now, heard) = contacts();
     let heard = Arc::new(heard);
-    let nobody = StaticDirectory::new::<&str>([]).unwrap();
-    let view = MergedDirectory::new(vec![Arc::new(nobody), told, heard.clone()]);
+    let empty = StaticDirectory::new::<&str>([]).unwrap();
+    let view = MergedDirectory::new(vec![Arc::new(empty), told, heard.clone()]);
     // Exchanged entries are kept for longer than contacts; each states its source.
     conforms(&view, Source::Exchange);
     let only_heard = MergedDirectory::new(vec![heard.clone()]);

@@ -96,7 +96,7 @@ pub(crate) enum Origin {
     Forwarded { upstreams: SmallVec<[Upstream; 1]> },
     /// A failure message; its outcome is not reported.
     LegacyPeer { from: LegacySource },
-    /// Nobody is told: it is a failure message.
+    /// A failure message; its outcome is not reported.
     FailureMessage,
 }
 

@@ -294,7 +294,7 @@ impl World {
         let told = self.failures_told;
         if self.forecast.is_calm() && !self.forecast.liars && failed != told {
             self.breach(Invariant::Calm, || {
-                format!("{failed} failures, {told} told")
+                format!("{failed} failures, {told} reported")
             });
         }
         let mut living = self.processes.iter().filter(|process| process.alive);

@@ -2,7 +2,6 @@
 //!
 //! This module simulates the interface between core and transports: dispatch, abandon, answer and
 //! arrival.
-//! answer and arrival.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};

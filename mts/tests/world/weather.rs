@@ -111,7 +111,7 @@ pub(crate) struct Weather {
     pub denials: u32,
     /// Letters per second that a gateway accepts from one host; 0 for no limit.
     pub rate: f64,
-    /// Upper bound of the number of letters in such a burst.
+    /// Letters that an agent sends at a time are fewer than this.
     pub burst: u32,
     /// Number of times that an agent sends a few letters.
     pub bursts: u32,

@@ -15,7 +15,6 @@
 //! then for surplus ones. It also queries for a gateway whose beacons stop for some seconds. A
 //! beacon never adds an entry: it triggers queries, or, when it matches the stored records, makes
 //! queries for their renewal unnecessary.
-//! it says, spares them asking whether that is still so.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};

@@ -145,7 +145,10 @@ async fn names_survive_whatever_they_contain(writer: &dyn Directory, reader: &dy
         let (name, incarnation) = (&registration.name, registration.incarnation);
         writer.deregister(name, incarnation).unwrap();
     }
-    eventually("nobody left", || reader.entries().is_empty().then_some(())).await;
+    eventually("all entries left", || {
+        reader.entries().is_empty().then_some(())
+    })
+    .await;
 }
 
 async fn a_name_has_one_owner(writer: &dyn Directory, reader: &dyn Directory) {
