@@ -68,7 +68,7 @@ pub(crate) fn put(
 }
 
 /// Maximum length in bytes of the stamp of a service with this name.
-pub(crate) fn room(name: &str) -> usize {
+pub(crate) fn max_len(name: &str) -> usize {
     // The other parts are markers, lengths, date and incarnation.
     name.len().saturating_add(64)
 }
@@ -106,7 +106,7 @@ mod tests {
                 let incarnation = Incarnation::from_u64(u64::MAX);
                 let stamped = put(Letter::default(), name, incarnation, utc).unwrap();
                 assert!(
-                    stamped.len() <= room(name),
+                    stamped.len() <= max_len(name),
                     "{} {}",
                     stamped.len(),
                     name.len()

@@ -158,8 +158,8 @@ fn each_failed_receiver_is_reported_once_and_failed_failure_messages_never() {
     let message = |performative| {
         Message::builder(performative)
             .sender(AgentId::new("old").unwrap())
-            .receiver(AgentId::new("nobody").unwrap())
-            .receiver(AgentId::new("nobody-else").unwrap())
+            .receiver(AgentId::new("absent").unwrap())
+            .receiver(AgentId::new("absent-else").unwrap())
             .content("x".repeat(600))
             .build()
             .unwrap()
@@ -177,7 +177,7 @@ fn each_failed_receiver_is_reported_once_and_failed_failure_messages_never() {
         let content = message_of(&parcel).content().unwrap().clone();
         told.push(nested(&content).receivers()[0].name().to_owned());
     }
-    assert_eq!(told, ["nobody", "nobody-else"]);
+    assert_eq!(told, ["absent", "absent-else"]);
     core.handle_unframed(
         now(),
         deadline,
@@ -502,7 +502,7 @@ fn a_sender_whose_letters_all_fail_does_not_use_up_the_limit_of_another() {
         let sender = AgentId::new(name).unwrap().with_address(&at).unwrap();
         let message = Message::builder(Performative::Inform)
             .sender(sender)
-            .receiver(AgentId::new("nobody").unwrap())
+            .receiver(AgentId::new("absent").unwrap())
             .build()
             .unwrap();
         letter_for(&message, now().utc).unwrap()
@@ -542,14 +542,14 @@ fn told_of(core: &mut Core, receivers: &[String]) -> Vec<String> {
 #[test]
 fn a_letter_to_too_many_receivers_or_patterns_is_refused_as_a_whole() {
     let names =
-        |count: usize| -> Vec<String> { (0..count).map(|it| format!("nobody-{it}")).collect() };
+        |count: usize| -> Vec<String> { (0..count).map(|it| format!("absent-{it}")).collect() };
     let patterns =
-        |count: usize| -> Vec<String> { (0..count).map(|it| format!("nobody{{{it}}}")).collect() };
+        |count: usize| -> Vec<String> { (0..count).map(|it| format!("absent{{{it}}}")).collect() };
     for refused in [names(65), names(20_000), patterns(2), patterns(1_000)] {
         let mut core = core(true, &[("old", OLD_PEER)]);
         assert_eq!(told_of(&mut core, &refused), [refused[0].clone()]);
     }
-    let long = format!("nobody-{}.*", "x".repeat(120));
+    let long = format!("absent-{}.*", "x".repeat(120));
     let mut one = core(true, &[("old", OLD_PEER)]);
     assert_eq!(told_of(&mut one, std::slice::from_ref(&long)), [long]);
 

@@ -146,22 +146,22 @@ pub(crate) fn agents_of(
     coalition: &Entry,
     sender: &str,
 ) -> (Vec<Arc<Entry>>, Vec<Arc<str>>) {
-    let mut gathered = Gathered {
+    let mut resolved = ResolvedMembers {
         seen: HashSet::from([Arc::clone(&coalition.name)]),
-        ..Gathered::default()
+        ..ResolvedMembers::default()
     };
-    gathered.add(directory, coalition, sender, 1);
-    (gathered.agents, gathered.missing)
+    resolved.add(directory, coalition, sender, 1);
+    (resolved.agents, resolved.missing)
 }
 
 #[derive(Default)]
-struct Gathered {
+struct ResolvedMembers {
     seen: HashSet<Arc<str>>,
     agents: Vec<Arc<Entry>>,
     missing: Vec<Arc<str>>,
 }
 
-impl Gathered {
+impl ResolvedMembers {
     fn add(&mut self, directory: &dyn Directory, coalition: &Entry, sender: &str, depth: usize) {
         let Role::Coalition(members) = &coalition.role else {
             return;

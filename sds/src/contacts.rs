@@ -110,7 +110,7 @@ mod tests {
         "tcp://192.0.2.1:7788#00000000000000aa".parse().unwrap()
     }
 
-    fn life(number: u64) -> Incarnation {
+    fn incarnation(number: u64) -> Incarnation {
         Incarnation::from_u64(number)
     }
 
@@ -118,14 +118,23 @@ mod tests {
     fn a_sender_is_a_contact_until_it_expires() {
         let contacts = ContactDirectory::new();
         let start = Instant::now();
-        assert_eq!(contacts.heard(start, "arm", life(1), location()), Ok(true));
-        assert_eq!(contacts.heard(start, "arm", life(1), location()), Ok(false));
+        assert_eq!(
+            contacts.heard(start, "arm", incarnation(1), location()),
+            Ok(true)
+        );
+        assert_eq!(
+            contacts.heard(start, "arm", incarnation(1), location()),
+            Ok(false)
+        );
         let entry = contacts.lookup("arm").unwrap();
         assert_eq!(entry.locations, [location()]);
-        assert_eq!(contacts.by_incarnation(life(1)).unwrap(), entry);
+        assert_eq!(contacts.by_incarnation(incarnation(1)).unwrap(), entry);
         // Another incarnation of the same name replaces it.
-        assert_eq!(contacts.heard(start, "arm", life(2), location()), Ok(true));
-        assert!(contacts.by_incarnation(life(1)).is_none());
+        assert_eq!(
+            contacts.heard(start, "arm", incarnation(2), location()),
+            Ok(true)
+        );
+        assert!(contacts.by_incarnation(incarnation(1)).is_none());
         contacts.forget(start, |_| false);
         assert!(contacts.lookup("arm").is_some());
         contacts.forget(start + ContactDirectory::MEMORY, |_| false);
@@ -136,8 +145,12 @@ mod tests {
     fn a_contact_that_another_back_end_knows_is_dropped() {
         let contacts = ContactDirectory::new();
         let now = Instant::now();
-        contacts.heard(now, "arm", life(1), location()).unwrap();
-        contacts.heard(now, "leg", life(2), location()).unwrap();
+        contacts
+            .heard(now, "arm", incarnation(1), location())
+            .unwrap();
+        contacts
+            .heard(now, "leg", incarnation(2), location())
+            .unwrap();
         contacts.forget(now, |entry| &*entry.name == "arm");
         assert!(contacts.lookup("arm").is_none());
         assert!(contacts.lookup("leg").is_some());
@@ -150,12 +163,16 @@ mod tests {
         for number in 0..ContactDirectory::MAX_CONTACTS as u64 + 10 {
             let name = format!("agent {number}");
             contacts
-                .heard(now, &name, life(number + 1), location())
+                .heard(now, &name, incarnation(number + 1), location())
                 .unwrap();
         }
         assert_eq!(contacts.entries().len(), ContactDirectory::MAX_CONTACTS);
         assert!(contacts.lookup("agent 0").is_none());
-        assert!(contacts.heard(now, "", life(1), location()).is_err());
-        assert!(contacts.heard(now, "a\nb", life(1), location()).is_err());
+        assert!(contacts.heard(now, "", incarnation(1), location()).is_err());
+        assert!(
+            contacts
+                .heard(now, "a\nb", incarnation(1), location())
+                .is_err()
+        );
     }
 }

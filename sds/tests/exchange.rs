@@ -551,7 +551,7 @@ fn invalid_agents_are_left_out() {
     let mut exchange = with_neighbour();
     let agents = r#"[{"name":"","id":"0000000000000001","registered":1},
         {"name":"a\nb","id":"0000000000000001","registered":1},
-        {"name":"nobody","id":"0000000000000000","registered":1},
+        {"name":"absent","id":"0000000000000000","registered":1},
         {"name":"good","id":"0000000000000001","registered":99999999999999999,"more":[]}]"#;
     let full = format!(
         r#"{{"version":1,"tell":{{"full":{{"version":0,"first":true,"last":true,"agents":{agents}}}}}}}"#

@@ -37,7 +37,7 @@ fn files(dir: &Path) -> Vec<String> {
 }
 
 /// A path that does not exist yet, in a temporary directory.
-fn place() -> (tempfile::TempDir, PathBuf) {
+fn fresh_dir() -> (tempfile::TempDir, PathBuf) {
     let parent = tempfile::tempdir().unwrap();
     let dir = parent.path().join("domain");
     (parent, dir)
@@ -210,7 +210,7 @@ fn child_process() {
 
 #[tokio::test]
 async fn host_conforms() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let (one, two) = (open(&dir), open(&dir));
     conforms(&one, &two).await;
     conforms(&two, &two).await;
@@ -218,7 +218,7 @@ async fn host_conforms() {
 
 #[tokio::test]
 async fn the_directory_is_private_and_empty_after_the_last() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let (one, two) = (open(&dir), open(&dir));
     let mode = std::fs::metadata(&dir).unwrap().permissions().mode();
     assert_eq!(mode & 0o7777, 0o700);
@@ -240,7 +240,7 @@ async fn the_directory_is_private_and_empty_after_the_last() {
 
 #[tokio::test]
 async fn a_name_that_was_just_registered_is_found() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let (one, two) = (open(&dir), open(&dir));
     for round in 0..200 {
         let name = format!("agent_{round}");
@@ -253,7 +253,7 @@ async fn a_name_that_was_just_registered_is_found() {
 #[tokio::test]
 async fn two_processes_cannot_have_one_name() {
     const NAMES: usize = 40;
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let mut processes: Vec<_> = (0..4).map(|_| Process::start(&dir)).collect();
     for number in 0..NAMES {
         for process in &mut processes {
@@ -277,7 +277,7 @@ async fn two_processes_cannot_have_one_name() {
 
 #[tokio::test]
 async fn a_killed_process_loses_its_names_at_once() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let mut victim = Process::start(&dir);
     let mut witness = Process::start(&dir);
     let here = open(&dir);
@@ -318,7 +318,7 @@ async fn a_killed_process_loses_its_names_at_once() {
 
 #[tokio::test]
 async fn a_name_is_free_before_the_death_of_its_process_is_detected() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let here = open(&dir);
     for _ in 0..10 {
         let mut victim = Process::start(&dir);
@@ -334,7 +334,7 @@ async fn a_name_is_free_before_the_death_of_its_process_is_detected() {
 
 #[tokio::test]
 async fn the_end_of_every_process_is_reported() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let here = open(&dir);
     let mut departures = here.departures();
     let told = async |departures: &mut fipa_sds::Departures| {
@@ -356,7 +356,7 @@ async fn the_end_of_every_process_is_reported() {
 
 #[tokio::test]
 async fn without_inotify_the_directory_is_polled() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let Some(mut polling) = Process::start_without_inotify(&dir) else {
         return;
     };
@@ -389,7 +389,7 @@ async fn without_inotify_the_directory_is_polled() {
 
 #[tokio::test]
 async fn the_last_one_cleans_up_after_the_killed() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let mut victims = [Process::start(&dir), Process::start(&dir)];
     for (number, victim) in victims.iter_mut().enumerate() {
         assert_eq!(victim.ask(&format!("register agent_{number}")), "ok");
@@ -409,7 +409,7 @@ const AGENTS: usize = 20;
 #[tokio::test]
 async fn many_processes_register_at_once_and_all_succeed() {
     const PROCESSES: usize = 50;
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let directory = open(&dir);
     let mut processes: Vec<_> = (0..PROCESSES)
         .map(|_| Process::start_unready(&dir))
@@ -431,7 +431,7 @@ async fn many_processes_register_at_once_and_all_succeed() {
 
 #[tokio::test]
 async fn a_process_that_is_stopped_in_its_turn_does_not_block_others() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let directory = open(&dir);
     // Holds the turn lock, as a stopped process would; the new process has had no turn yet.
     let stopped = std::fs::File::open(&dir).unwrap();
@@ -444,7 +444,7 @@ async fn a_process_that_is_stopped_in_its_turn_does_not_block_others() {
 
 #[tokio::test]
 async fn concurrent_joins_and_leaves_leave_no_files() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let mut processes: Vec<_> = (0..3).map(|_| Process::start(&dir)).collect();
     for process in &mut processes {
         assert_eq!(process.ask("close"), "ok");
@@ -491,7 +491,7 @@ async fn a_directory_that_is_not_private_is_refused() {
 
 #[tokio::test]
 async fn planted_files_are_rejected_and_links_not_followed() {
-    let (parent, dir) = place();
+    let (parent, dir) = fresh_dir();
     let here = open(&dir);
     let mut other = Process::start(&dir);
     assert_eq!(other.ask("register arm"), "ok");
@@ -554,7 +554,7 @@ async fn planted_files_are_rejected_and_links_not_followed() {
 
 #[tokio::test]
 async fn a_gateway_publishes_agents_of_other_hosts() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let here = open(&dir);
     let entry = Entry {
         name: "camera".into(),
@@ -617,7 +617,7 @@ async fn a_gateway_publishes_agents_of_other_hosts() {
 #[tokio::test]
 async fn processes_connect_to_the_sockets_they_find() {
     use rustix::net::{RecvFlags, SendFlags, SocketFlags, accept_with, recv, send};
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     // Longer than the path of a socket may be.
     let dir = dir.join("x".repeat(120));
     let (one, mut other) = (open(&dir), Process::start(&dir));
@@ -660,7 +660,7 @@ async fn processes_connect_to_the_sockets_they_find() {
 
 #[tokio::test]
 async fn connections_to_files_that_are_not_sockets_of_this_user_are_refused() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let (one, two) = (open(&dir), open(&dir));
     let mut sockets = one.sockets();
     let _listening = two.listen().unwrap();
@@ -687,7 +687,7 @@ async fn connections_to_files_that_are_not_sockets_of_this_user_are_refused() {
 
 #[tokio::test]
 async fn a_directory_that_was_removed_is_joined_again() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let (one, two) = (open(&dir), open(&dir));
     let arm = registration("arm");
     one.register(arm.clone()).unwrap();
@@ -740,7 +740,7 @@ async fn a_directory_that_was_removed_is_joined_again() {
 
 #[tokio::test]
 async fn a_name_that_was_registered_meanwhile_is_lost() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let here = open(&dir);
     let ours = registration("arm");
     here.register(ours.clone()).unwrap();
@@ -762,7 +762,7 @@ async fn a_name_that_was_registered_meanwhile_is_lost() {
 
 #[tokio::test]
 async fn changes_during_the_removal_of_the_directory_are_written_afterwards() {
-    let (_parent, dir) = place();
+    let (_parent, dir) = fresh_dir();
     let gateway = HostDirectory::open(HostConfig {
         gateway: true,
         ..config(&dir)

@@ -130,7 +130,7 @@ async fn malformed_records_do_not_affect_other_agents() {
     }
     // Beacons of a gateway that claims a million agents, of an unknown gateway, and of the victim
     // itself.
-    for label in ["00000000000000aa", "0000000000000000", "nobody"] {
+    for label in ["00000000000000aa", "0000000000000000", "absent"] {
         let mut packet = Packet::new_reply(0);
         let txt = TXT::new().with_string("agents=1000000").unwrap();
         let txt = txt.with_string("digest=0123456789abcdef").unwrap();

@@ -42,7 +42,7 @@ pub(crate) struct Inbox {
     /// Number of remembered letters of one sender: as many as it can have open.
     recent: usize,
     /// With a keyed hash, because untrusted peers choose these keys, tens of thousands of them.
-    senders: HashMap<Incarnation, Taken>,
+    senders: HashMap<Incarnation, SenderState>,
     /// Streams that were told that the queue is full and wait for a credit, in order.
     waiting: VecDeque<(Stream, Location)>,
     /// Failure messages in the queue, which do not count against its bound.
@@ -53,7 +53,7 @@ pub(crate) struct Inbox {
 
 /// State of one sender: distinguishes a letter that was taken from one that was passed over.
 #[derive(Debug)]
-struct Taken {
+struct SenderState {
     last: u64,
     recent: VecDeque<u64>,
     seen: Instant,
@@ -223,7 +223,7 @@ impl Inbox {
                 ));
             }
         }
-        let taken = self.senders.entry(sender).or_insert_with(|| Taken {
+        let taken = self.senders.entry(sender).or_insert_with(|| SenderState {
             last: 0,
             recent: VecDeque::new(),
             seen: now,
@@ -259,7 +259,7 @@ pub(super) fn link_of(via: Kind, from: &Hop) -> Link {
     }
 }
 
-impl Taken {
+impl SenderState {
     /// Answers a copy of a letter that was taken or passed over before. The last `bound` letters
     /// are remembered.
     fn answer_again(&self, sequence: u64, bound: usize) -> Answer {

@@ -63,7 +63,7 @@ pub use notice::{News, Notice};
 use crate::{Gate, Map};
 use peers::Peers;
 pub use peers::{Peer, PeerState};
-use principals::{Impostor, Principals};
+use principals::{PrincipalError, Principals};
 pub use routes::{Route, Standing, Way, WayState};
 
 /// The current time by two clocks.
@@ -507,18 +507,18 @@ impl Core {
             ticket,
         } = arrival;
         work::steps(1);
-        if let Err(impostor) = self.principals.check_service(&from) {
-            return Verdict::Now(Answer::failed(FailureReason::Refused, impostor.to_string()));
+        if let Err(error) = self.principals.check_service(&from) {
+            return Verdict::Now(Answer::failed(FailureReason::Refused, error.to_string()));
         }
         match std::mem::replace(&mut parcel.body, Body::Credit) {
             Body::Letter(letter) => {
                 let sender = parcel.stream.sender;
                 let directory = &*self.table.directory;
-                if let Err(impostor) = self.principals.check_sender(sender, &from, directory) {
-                    if impostor == Impostor::Stranger {
+                if let Err(error) = self.principals.check_sender(sender, &from, directory) {
+                    if error == PrincipalError::NotIntroduced {
                         return Verdict::Now(Answer::Busy);
                     }
-                    let detail = impostor.to_string();
+                    let detail = error.to_string();
                     return Verdict::Now(Answer::failed(FailureReason::Refused, detail));
                 }
                 if parcel.sequence == 0 || parcel.after >= parcel.sequence {
@@ -570,7 +570,7 @@ impl Core {
                     let letter = (parcel.sequence, parcel.after, parcel.transfer);
                     let from = from.location.incarnation();
                     self.with_lane(now, *lane, |lane, table| {
-                        is_here = lane.predecessor_told(now.instant, from, letter, table);
+                        is_here = lane.handle_predecessor_note(now.instant, from, letter, table);
                     });
                 }
                 self.send_failures(now);
@@ -746,7 +746,7 @@ impl Core {
         self.handle_directory_change(now);
     }
 
-    /// Stops to take letters of others into custody, because the service is about to end. Services
+    /// Stops taking letters of others into custody, because the service is about to end. Services
     /// that hold such a letter keep it, and try another route or gateway.
     pub fn refuse_custody(&mut self) {
         self.ending = true;

@@ -42,14 +42,14 @@ struct Service {
 
 /// Reason for refusing a parcel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub(super) enum Impostor {
+pub(super) enum PrincipalError {
     /// The service of the link belongs to another principal.
     #[error("another service has already proved the incarnation that this link claims")]
     Service,
     /// The gateway of the sender has not introduced itself yet, so it is not known to be this one.
     /// The answer is not final.
     #[error("the gateway of the sender has not introduced itself yet")]
-    Stranger,
+    NotIntroduced,
     /// The sender belongs to another principal.
     #[error("the link does not prove to speak for the sender of this letter")]
     Sender,
@@ -110,14 +110,14 @@ impl Principals {
     }
 
     /// Checks whether the link proves the service that it names; called for every parcel.
-    pub(super) fn check_service(&self, from: &Hop) -> Result<(), Impostor> {
+    pub(super) fn check_service(&self, from: &Hop) -> Result<(), PrincipalError> {
         // Processes of this user are trusted.
         if !from.is_remote() {
             return Ok(());
         }
         let known = self.services.get(&from.location.incarnation());
         match known {
-            Some(known) if known.principal != from.principal => Err(Impostor::Service),
+            Some(known) if known.principal != from.principal => Err(PrincipalError::Service),
             _ => Ok(()),
         }
     }
@@ -129,7 +129,7 @@ impl Principals {
         sender: Incarnation,
         from: &Hop,
         directory: &dyn Directory,
-    ) -> Result<(), Impostor> {
+    ) -> Result<(), PrincipalError> {
         if !from.is_remote() || !sender.is_known() {
             return Ok(());
         }
@@ -139,7 +139,7 @@ impl Principals {
         let is_agent = known.as_ref().is_some_and(|it| it.role == Role::Agent);
         if !is_agent && self.services.contains_key(&sender) && sender != from.location.incarnation()
         {
-            return Err(Impostor::Sender);
+            return Err(PrincipalError::Sender);
         }
         let owner = match known.map(|it| it.reach) {
             Some(Reach::Local) => Some(Principal::Host),
@@ -147,7 +147,9 @@ impl Principals {
                 Some(gateway) => Some(gateway.principal),
                 // The gateway introduces itself before it hands letters over. It may also have a
                 // new incarnation that the directory does not show yet.
-                None if from.principal != Principal::Unproved => return Err(Impostor::Stranger),
+                None if from.principal != Principal::Unproved => {
+                    return Err(PrincipalError::NotIntroduced);
+                }
                 None => None,
             },
             None => None,
@@ -158,7 +160,7 @@ impl Principals {
         };
         match owner == from.principal {
             true => Ok(()),
-            false => Err(Impostor::Sender),
+            false => Err(PrincipalError::Sender),
         }
     }
 
@@ -179,11 +181,11 @@ impl Principals {
         &mut self,
         sender: Incarnation,
         principal: Principal,
-    ) -> Result<Principal, Impostor> {
+    ) -> Result<Principal, PrincipalError> {
         match self.senders.get(&sender) {
             Some(Some(owner)) => Ok(*owner),
             // Its gateway left before it introduced itself.
-            Some(None) if principal != Principal::Unproved => Err(Impostor::Stranger),
+            Some(None) if principal != Principal::Unproved => Err(PrincipalError::NotIntroduced),
             _ => {
                 self.remember(sender, Some(principal));
                 Ok(principal)
@@ -246,7 +248,7 @@ mod tests {
         principals.introduced(&peer("rover", CREX));
         assert_eq!(principals.check_service(&hop(SERVICE, ROVER)), Ok(()));
         let other = principals.check_service(&hop(SERVICE, CREX));
-        assert_eq!(other, Err(Impostor::Service));
+        assert_eq!(other, Err(PrincipalError::Service));
         // The end of the impostor's connection changes nothing.
         principals.parted(&peer("rover", CREX));
         principals.introduced(&peer("rover", CREX));
@@ -260,7 +262,7 @@ mod tests {
         principals.parted(&peer("rover", ROVER));
         principals.introduced(&peer("crex", CREX));
         let other = principals.check_service(&hop(SERVICE, CREX));
-        assert_eq!(other, Err(Impostor::Service));
+        assert_eq!(other, Err(PrincipalError::Service));
         principals.introduced(&peer("rover", CREX));
         assert_eq!(principals.check_service(&hop(SERVICE, CREX)), Ok(()));
     }
@@ -277,7 +279,7 @@ mod tests {
         for sender in 0..2 * MAX_SENDERS as u64 {
             assert_eq!(hear(1000 + sender, CREX), Ok(()));
         }
-        assert_eq!(hear(100, CREX), Err(Impostor::Sender));
+        assert_eq!(hear(100, CREX), Err(PrincipalError::Sender));
         assert!(principals.senders.len() <= MAX_SENDERS + 1);
     }
 

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use fipa_sds::{Entry, Reach, Resolution, Role};
 use fipa_transport::{Incarnation, Kind, Location};
@@ -202,7 +202,7 @@ impl AttemptTable {
                     taken: read(&tally.taken),
                     turned_back: read(&tally.turned_back),
                     failed: read(&tally.failed),
-                    last_error_seconds: last_error.as_ref().map(|(_, at)| seconds(ago(*at))),
+                    last_error_seconds: last_error.as_ref().map(|(_, at)| ago(*at).as_secs()),
                     last_error: last_error.map(|(text, _)| text),
                 }
             })
@@ -210,10 +210,6 @@ impl AttemptTable {
         states.sort_unstable_by(|a, b| a.location.cmp(&b.location));
         states
     }
-}
-
-fn seconds(duration: Duration) -> u64 {
-    duration.as_secs()
 }
 
 impl Core {
@@ -257,7 +253,7 @@ impl Core {
         let entry = self.table.receiver(registration, receiver)?;
         let here = entry.role == Role::Agent && entry.reach == Reach::Local;
         let way = here.then(|| self.table.choose(now.instant, &entry, &[]))?;
-        Some((way?, stamp::room(&config.name)))
+        Some((way?, stamp::max_len(&config.name)))
     }
 
     /// Returns the kind of transport that would come first for most of these receivers now, if that

@@ -109,7 +109,7 @@ pub(crate) struct Protocol {
     pub(crate) moves: bool,
     /// Letters that fit into the lanes of a custodian.
     pub(crate) capacity: usize,
-    /// Letters of the sender that may be under way at once.
+    /// Letters of the sender that may be in transit at once.
     pub(crate) window: usize,
     /// Whether notes of a lower predecessor are sent.
     pub(crate) notes: bool,
@@ -127,7 +127,7 @@ pub(crate) enum Action {
     Pass { custodian: usize, key: Key, to: u8 },
     /// A message arrives.
     Arrive(Message),
-    /// A report or note arrives; a second one is under way.
+    /// A report or note arrives; a second one is in transit.
     ArriveTwice(Message),
     /// A message is lost.
     Lose(Message),
@@ -137,7 +137,7 @@ pub(crate) enum Action {
     TimeOut { at: Service, key: Key },
     /// The transport certifies that the frame of the attempt has not left.
     NotSent(Message),
-    /// The attempt times out; nothing of it is under way any more.
+    /// The attempt times out; nothing of it is in transit any more.
     GiveUp { at: Service, key: Key },
     /// The service notices that the custodian it handed the letter to has died.
     NoticeDeath { at: Service, key: Key },
@@ -147,7 +147,7 @@ pub(crate) enum Action {
     Expire { sequence: u8 },
     /// The letter's deadline ends at a custodian.
     ExpireEarly { custodian: usize, key: Key },
-    /// A custodian dies; its reports that are under way are lost with it or not.
+    /// A custodian dies; its reports that are in transit are lost with it or not.
     Die {
         custodian: usize,
         reports_lost: bool,

@@ -88,7 +88,7 @@ impl fmt::Debug for Key {
 pub(crate) enum Place {
     /// It may be dispatched.
     Ready,
-    /// It was handed over: the attempt is under way, or the letter is in custody there. The model
+    /// It was handed over: the attempt is in progress, or the letter is in custody there. The model
     /// does not tell the two apart, so that each attempt may also be answered late.
     Out {
         to: Service,
@@ -209,7 +209,7 @@ pub(crate) struct State {
     pub(crate) old_gone: bool,
     /// Whether the sender's directory shows the new registration.
     pub(crate) new_known: bool,
-    /// Messages under way, sorted. Any of them may arrive next.
+    /// Messages in transit, sorted. Any of them may arrive next.
     pub(crate) network: Vec<Message>,
     pub(crate) faults_left: u8,
     /// Whether a registration took a letter after a later one, or twice.

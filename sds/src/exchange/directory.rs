@@ -55,7 +55,7 @@ impl ExchangeDirectory {
         self.table.contested(Self::MAX_CONTESTED)
     }
 
-    /// Whether any link with a neighbour is certified.
+    /// Whether any link with a neighbor is certified.
     #[must_use]
     pub fn is_proved(&self) -> bool {
         !self.mandates.load().is_empty()

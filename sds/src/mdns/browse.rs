@@ -31,7 +31,7 @@ use simple_dns::{CLASS, Name, Packet, PacketFlag, QTYPE, TYPE};
 use self::full_query::FullQuery;
 use super::beacon::Digest;
 use super::packet::{self, KNOWN};
-use super::record::Properties;
+use super::record::{self, Properties};
 use super::{MdnsDirectory, SERVICE_TYPE};
 
 /// Maximum number of records that are introduced but not yet known. Each is queried for a few
@@ -244,7 +244,7 @@ impl Browser {
                     let properties = packet::properties(txt);
                     let digest = Digest::of(&properties);
                     if known.text.is_none() || known.digest != digest {
-                        let len = len_of(&properties);
+                        let len = record::len_of(&properties);
                         let others = self.bytes - known.len;
                         let share = self.shares.entry(known.from).or_default();
                         let others_of_share = share.bytes - known.len;
@@ -664,11 +664,4 @@ pub(super) fn label_of(fullname: &str) -> &str {
     label
         .and_then(|label| label.strip_suffix('.'))
         .unwrap_or(fullname)
-}
-
-fn len_of(properties: &Properties) -> usize {
-    properties
-        .iter()
-        .map(|(key, value)| key.len() + value.len() + 2)
-        .sum()
 }

@@ -225,7 +225,7 @@ impl MdnsDirectory {
     }
 
     /// Withdraws all announcements with a goodbye, and stops listening. Blocks until the goodbye is
-    /// sent, at most 5 s. A repeated call does nothing.
+    /// sent, for about 10 s at most. A repeated call does nothing.
     pub fn close(&self) {
         {
             let mut own = self.shared.own.lock();
@@ -422,10 +422,7 @@ impl Shared {
         {
             return Err(RegisterError::AlreadyRegistered { holder });
         }
-        let len: usize = record::encode(&entry)
-            .iter()
-            .map(|(key, value)| key.len() + value.len() + 2)
-            .sum();
+        let len = record::len_of(&record::encode(&entry));
         if len > MAX_TXT {
             let why = format!("the record has {len} bytes; at most {MAX_TXT} are allowed");
             return Err(RegisterError::Full(why));
@@ -490,7 +487,7 @@ impl Shared {
         if announced.due.is_some() {
             self.postponed.notify_one();
         } else {
-            self.tell_daemon(&announced)?;
+            self.register_with_daemon(&announced)?;
             announced.told = Some((now, announced.digest));
         }
         own.agents.insert(entry.name.clone(), announced);
@@ -498,7 +495,7 @@ impl Shared {
         Ok(())
     }
 
-    fn tell_daemon(&self, announced: &Announcement) -> Result<(), mdns_sd::Error> {
+    fn register_with_daemon(&self, announced: &Announcement) -> Result<(), mdns_sd::Error> {
         let label = record::label(&announced.entry.name, announced.attempt);
         let host = announced.host_name();
         let properties = record::encode(&announced.entry);
@@ -532,7 +529,7 @@ impl Shared {
             if announced.due.is_some_and(|due| due <= now) {
                 announced.due = None;
                 announced.told = Some((now, announced.digest));
-                if let Err(error) = self.tell_daemon(announced) {
+                if let Err(error) = self.register_with_daemon(announced) {
                     let name = &announced.entry.name;
                     self.failed(format!("cannot announce {name:?}: {error}"));
                 }
@@ -542,7 +539,7 @@ impl Shared {
     }
 
     /// Withdraws the record with a goodbye.
-    fn take_back(&self, own: &mut OwnAgents, name: &str) -> Result<(), mdns_sd::Error> {
+    fn withdraw(&self, own: &mut OwnAgents, name: &str) -> Result<(), mdns_sd::Error> {
         let Some(announced) = own.agents.get(name) else {
             return Ok(());
         };
@@ -572,7 +569,7 @@ impl Shared {
         if announced.is_none_or(|one| one.entry.incarnation != incarnation) {
             return Err(DeregisterError::NotRegistered(name.into()));
         }
-        self.take_back(own, name)
+        self.withdraw(own, name)
             .map_err(|error| DeregisterError::Failed(Arc::new(error)))
     }
 

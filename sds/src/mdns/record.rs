@@ -119,9 +119,9 @@ pub(super) fn decode(
 ) -> Result<Entry, RecordError> {
     let record = Record(properties);
     let entry = match record.text("fipa-version")? {
-        Some(version) if version == "1" => ours(&record)?,
+        Some(version) if version == "1" => own_entry(&record)?,
         Some(version) => return Err(RecordError::Version(version.chars().take(40).collect())),
-        None => theirs(label, &record, now),
+        None => legacy_entry(label, &record, now),
     };
     entry.check()?;
     Ok(entry)
@@ -199,7 +199,7 @@ impl Record<'_> {
     }
 
     /// A text of a legacy peer, without control characters and truncated to `max` bytes.
-    fn their_text(&self, key: &str, max: usize) -> String {
+    fn legacy_text(&self, key: &str, max: usize) -> String {
         let value = self.joined(key);
         let text = String::from_utf8_lossy(&value);
         let mut text: String = text.chars().filter(|c| !c.is_control()).collect();
@@ -208,7 +208,7 @@ impl Record<'_> {
     }
 }
 
-fn ours(record: &Record<'_>) -> Result<Entry, RecordError> {
+fn own_entry(record: &Record<'_>) -> Result<Entry, RecordError> {
     let key = "fipa-locations";
     let locations = record.text(key)?.ok_or(RecordError::Missing(key))?;
     let mut known = Vec::new();
@@ -258,7 +258,7 @@ fn members(record: &Record<'_>) -> Result<Members, RecordError> {
     Members::new(names.split('\n'), leader).map_err(|_| RecordError::Value(key))
 }
 
-fn theirs(label: &str, record: &Record<'_>, now: SystemTime) -> Entry {
+fn legacy_entry(label: &str, record: &Record<'_>, now: SystemTime) -> Entry {
     let name = label.replace('?', ".");
     let registered = record
         .value("TIMESTAMP")
@@ -268,13 +268,13 @@ fn theirs(label: &str, record: &Record<'_>, now: SystemTime) -> Entry {
     let locator = record.joined("LOCATOR");
     let locator = String::from_utf8_lossy(&locator);
     Entry {
-        agent_type: record.their_text("TYPE", Entry::MAX_TYPE),
+        agent_type: record.legacy_text("TYPE", Entry::MAX_TYPE),
         incarnation: Incarnation::UNKNOWN,
         locations: locations_of_locator(&locator),
         // Legacy records do not name the service; each agent may have its own.
         mts: Mts::new(name.as_str(), Incarnation::UNKNOWN),
         name: name.into(),
-        description: record.their_text("DESCRIPTION", Entry::MAX_DESCRIPTION),
+        description: record.legacy_text("DESCRIPTION", Entry::MAX_DESCRIPTION),
         registered: time_of_millis(registered),
         source: Source::Mdns,
         reach: Reach::Remote {
@@ -349,6 +349,14 @@ fn part_key(key: &str, number: usize) -> String {
         0 => key.to_owned(),
         _ => format!("{key}.{number}"),
     }
+}
+
+/// Length of the strings in a TXT record, in bytes.
+pub(super) fn len_of(properties: &Properties) -> usize {
+    properties
+        .iter()
+        .map(|(key, value)| key.len() + value.len() + 2)
+        .sum()
 }
 
 fn cut(text: &str) -> &str {

@@ -26,7 +26,7 @@ pub(super) async fn run(shared: Arc<Shared>) {
         drop(monitor);
         let pause = pauses.ended(Instant::now());
         shared.status.lock().restarts += 1;
-        shared.failed(format!("{why}: restarting it in {pause:?}"));
+        shared.failed(format!("restarting the mDNS library in {pause:?}: {why}"));
         tokio::select! {
             () = restart_daemon(&shared, pause) => {}
             // Receiving and beacons continue without the library.
@@ -222,7 +222,7 @@ fn renamed(shared: &Shared, original: &str) {
         own.spoilt.clear();
     }
     own.spoilt.insert(original.into());
-    let withdrawn = shared.take_back(&mut own, &entry.name);
+    let withdrawn = shared.withdraw(&mut own, &entry.name);
     let announced = withdrawn.and_then(|()| shared.announce(&mut own, &entry, attempt));
     if let Err(error) = announced {
         let name = &entry.name;
@@ -243,7 +243,7 @@ fn contested(shared: &Shared, theirs: &Arc<Entry>) {
         return;
     }
     let withdrawn = Arc::clone(&ours.entry);
-    if let Err(error) = shared.take_back(&mut own, &withdrawn.name) {
+    if let Err(error) = shared.withdraw(&mut own, &withdrawn.name) {
         let name = &withdrawn.name;
         shared.failed(format!("cannot withdraw {name:?}: {error}"));
     }

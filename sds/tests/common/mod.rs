@@ -162,7 +162,7 @@ async fn a_name_has_one_owner(writer: &dyn Directory, reader: &dyn Directory) {
     }
     for (name, incarnation) in [
         ("camera", Incarnation::random()),
-        ("nobody", first.incarnation),
+        ("absent", first.incarnation),
     ] {
         assert!(matches!(
             writer.deregister(name, incarnation),
@@ -298,7 +298,7 @@ async fn searches_find(writer: &dyn Directory, reader: &dyn Directory) {
         ),
         (
             Query {
-                mts: matcher("nobody.*"),
+                mts: matcher("absent.*"),
                 ..all.clone()
             },
             "",

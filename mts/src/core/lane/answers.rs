@@ -112,7 +112,7 @@ impl Lane {
                 self.ask_custodian_at(now + ASK_CUSTODIAN_AFTER);
                 // A letter before it may have failed since this copy was dispatched.
                 if !self.is_custody() {
-                    self.tell_predecessor(index, table);
+                    self.send_predecessor(index, table);
                 }
             }
             Answer::Busy => {

@@ -54,7 +54,7 @@ impl Lane {
     /// Handles a note with the current predecessor of this letter, which also asks whether the
     /// letter of this hand-over is here. Accepted only from the service that handed it over.
     /// Returns whether the letter is here.
-    pub(crate) fn predecessor_told(
+    pub(crate) fn handle_predecessor_note(
         &mut self,
         now: Instant,
         from: Incarnation,

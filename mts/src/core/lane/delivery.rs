@@ -65,7 +65,7 @@ pub(super) struct Progress {
 pub(super) enum Holding {
     /// The end of this attempt or custody of its predecessor, which is in this lane.
     ForPredecessor(AttemptId),
-    /// The arrival of the predecessor, until this time; then the letter is handed back.
+    /// The arrival of the predecessor, until this time; then the letter is returned.
     Until(Instant),
 }
 

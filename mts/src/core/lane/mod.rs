@@ -648,7 +648,7 @@ impl Lane {
         match self.is_custody() {
             _ if delivered => {}
             true => self.predecessor_failed(now, delivery.sequence),
-            false => self.tell_predecessor(index, table),
+            false => self.send_predecessor(index, table),
         }
         let stream = self.stream_of(&delivery);
         table.settle(delivery, stream, Arc::clone(&self.receiver), settlement);
@@ -656,7 +656,7 @@ impl Lane {
 
     /// Sends the custodian of the letter at `index` its new predecessor, after the letter before it
     /// failed at the sender's process.
-    fn tell_predecessor(&mut self, index: usize, table: &mut AttemptTable) {
+    fn send_predecessor(&mut self, index: usize, table: &mut AttemptTable) {
         let Some(delivery) = self.letters.get(index) else {
             return;
         };

@@ -42,7 +42,7 @@ fn names(received: &ParsedPacket) -> Vec<&str> {
 
 /// Runs the timers until then. Returns the queries, except those for all records, and the removals,
 /// each with its time in tenths of a second.
-fn goes_on(browser: &mut Browser, start: Instant, until: f64) -> (Vec<(u64, String)>, Vec<u64>) {
+fn run_timers(browser: &mut Browser, start: Instant, until: f64) -> (Vec<(u64, String)>, Vec<u64>) {
     let (mut questions, mut gone) = (Vec::new(), Vec::new());
     let mut last = None;
     while let now = browser.poll_timeout()
@@ -113,7 +113,7 @@ fn missing_parts_are_queried_a_few_times() {
     for label in ["arm", "leg"] {
         browser.handle_packet(start, FROM, &answer(label, &[Part::Ptr], 4500), 0.0);
     }
-    let (questions, _) = goes_on(&mut browser, start, 0.5);
+    let (questions, _) = run_timers(&mut browser, start, 0.5);
     assert_eq!(questions.len(), 4, "{questions:?}");
     let half = answer("arm", &[Part::Srv(HOST)], 120);
     assert_eq!(
@@ -125,7 +125,7 @@ fn missing_parts_are_queried_a_few_times() {
         names(&browser.handle_packet(start, FROM, &half, 0.0)),
         ["arm"]
     );
-    let (questions, gone) = goes_on(&mut browser, start, 30.0);
+    let (questions, gone) = run_timers(&mut browser, start, 30.0);
     let times: Vec<u64> = questions.iter().map(|(at, _)| *at).collect();
     assert_eq!(times, [12, 12, 42, 42, 132, 132]);
     assert!(questions.iter().all(|(_, what)| what.starts_with("leg")));
@@ -138,7 +138,7 @@ fn missing_parts_are_queried_a_few_times() {
 fn an_expiring_record_is_queried_and_finally_removed() {
     let start = Instant::now();
     let mut browser = browser(start, &["arm", "leg"]);
-    let (questions, gone) = goes_on(&mut browser, start, 80.0);
+    let (questions, gone) = run_timers(&mut browser, start, 80.0);
     let expected = ["arm SRV", "arm TXT", "leg SRV", "leg TXT"];
     let mut asked: Vec<&str> = questions.iter().map(|(_, what)| what.as_str()).collect();
     asked.sort_unstable();
@@ -147,7 +147,7 @@ fn an_expiring_record_is_queried_and_finally_removed() {
         let now = start + seconds(80.0);
         browser.handle_packet(now, FROM, &answer("arm", &[part], 120), 0.0);
     }
-    let (questions, gone) = goes_on(&mut browser, start, 130.0);
+    let (questions, gone) = run_timers(&mut browser, start, 130.0);
     let of_leg = questions.iter().filter(|(_, what)| what == "leg SRV");
     let times: Vec<u64> = of_leg.map(|(at, _)| *at).collect();
     assert_eq!((times, gone), (vec![960, 1080, 1140], vec![1200]));
@@ -163,7 +163,7 @@ fn renewals_are_batched_and_jittered() {
         let label = format!("agent {number}");
         first.handle_packet(now, FROM, &announced(&label, b"TYPE=x", 120), 0.0);
     }
-    let (questions, _) = goes_on(&mut first, start, 75.0);
+    let (questions, _) = run_timers(&mut first, start, 75.0);
     let times: std::collections::HashSet<u64> = questions.iter().map(|(at, _)| *at).collect();
     assert_eq!((questions.len(), times.len()), (60, 1), "{questions:?}");
     // Maximum jitter delays the query, but still before other implementations renew.
@@ -181,12 +181,12 @@ fn matching_beacons_keep_records_valid() {
     for second in 1..600 {
         let now = start + Duration::from_secs(second);
         browser.confirm(now, OTHER);
-        let (questions, _) = goes_on(&mut browser, start, second as f64 + 1.0);
+        let (questions, _) = run_timers(&mut browser, start, second as f64 + 1.0);
         assert!(questions.iter().all(|(_, what)| what.starts_with("peer")));
     }
     assert_eq!(browser.records.len(), 1, "the peer has no beacons");
     // The beacons stop, and no query is answered.
-    let (questions, gone) = goes_on(&mut browser, start, 800.0);
+    let (questions, gone) = run_timers(&mut browser, start, 800.0);
     assert_eq!((questions[0].0, gone), (5990 + 660, vec![5990 + 1200]));
 }
 
@@ -195,7 +195,7 @@ fn own_records_are_not_queried() {
     let start = Instant::now();
     let mut browser = browser(start, &["own"]);
     browser.belongs(&format!("own.{SERVICE_TYPE}"), OWN);
-    let (questions, gone) = goes_on(&mut browser, start, 200.0);
+    let (questions, gone) = run_timers(&mut browser, start, 200.0);
     assert_eq!((questions, gone), (vec![], vec![1200]));
 }
 
@@ -212,7 +212,7 @@ fn a_goodbye_takes_effect_after_a_second_unless_it_is_revoked() {
     let back = start + seconds(0.5);
     let received = browser.handle_packet(back, FROM, &announced("leg", b"TYPE=x", 120), 0.0);
     assert_eq!(received, ParsedPacket::default());
-    let (_, gone) = goes_on(&mut browser, start, 5.0);
+    let (_, gone) = run_timers(&mut browser, start, 5.0);
     assert_eq!(gone, [10]);
     assert!(browser.records.contains_key("leg") && browser.records.contains_key("eye"));
 }
@@ -223,11 +223,11 @@ fn a_doubted_record_is_confirmed_or_removed() {
     let mut browser = browser(start, &["arm", "leg"]);
     let doubted = ["arm", "leg"].map(|label| format!("{label}.{SERVICE_TYPE}").into());
     browser.doubt(start, &doubted);
-    let (questions, _) = goes_on(&mut browser, start, 0.5);
+    let (questions, _) = run_timers(&mut browser, start, 0.5);
     assert_eq!(questions.len(), 4, "{questions:?}");
     let now = start + seconds(0.5);
     browser.handle_packet(now, FROM, &answer("leg", &[Part::Srv(HOST)], 120), 0.0);
-    let (questions, gone) = goes_on(&mut browser, start, 5.0);
+    let (questions, gone) = run_timers(&mut browser, start, 5.0);
     let mut again = questions.iter().map(|(at, what)| (*at, what.as_str()));
     assert_eq!(again.next(), Some((11, "arm SRV")));
     assert!(again.all(|(_, what)| what.starts_with("arm")));
@@ -236,7 +236,7 @@ fn a_doubted_record_is_confirmed_or_removed() {
     browser.belongs(&doubted[1], OTHER);
     browser.doubt(now, &doubted);
     browser.confirm(now + seconds(0.1), OTHER);
-    let (_, gone) = goes_on(&mut browser, start, 5.0);
+    let (_, gone) = run_timers(&mut browser, start, 5.0);
     assert_eq!(gone, [25]);
 }
 
@@ -344,7 +344,7 @@ fn the_stored_state_is_bounded() {
     // Unknown records do not prevent complete ones from being stored.
     let received = browser.handle_packet(now, FROM, &announced("arm", b"TYPE=x", 10), 0.0);
     assert_eq!((names(&received), received.refused), (vec!["arm"], 0));
-    goes_on(&mut browser, now, 20.0);
+    run_timers(&mut browser, now, 20.0);
     assert_eq!((browser.records.len(), browser.unknown), (0, 0));
 
     let long = [b'x'; 255];
@@ -359,7 +359,7 @@ fn the_stored_state_is_bounded() {
     }
     assert_eq!(browser.records.len(), MdnsDirectory::MAX_RECORDS);
     assert!(browser.unknown >= 5, "some records were refused");
-    goes_on(&mut browser, now, 200.0);
+    run_timers(&mut browser, now, 200.0);
     assert_eq!(
         (browser.records.len(), browser.unknown, browser.bytes),
         (0, 0, 0)
@@ -379,7 +379,7 @@ fn one_source_cannot_fill_the_tables() {
     assert_eq!(browser.unknown, MAX_SHARE_UNKNOWN);
     browser.handle_packet(now, others, &answer("late", &[Part::Ptr], 120), 1.0);
     assert_eq!(browser.unknown, MAX_SHARE_UNKNOWN + 1);
-    goes_on(&mut browser, now, 20.0);
+    run_timers(&mut browser, now, 20.0);
 
     let long = [b'x'; 255];
     let long: Vec<&[u8]> = vec![&long; 33];
@@ -395,7 +395,7 @@ fn one_source_cannot_fill_the_tables() {
         assert!(browser.records.len() <= MAX_SHARE && browser.bytes <= MAX_SHARE_BYTES);
         let received = browser.handle_packet(now, others, &answer("arm", &parts, 120), 0.0);
         assert_eq!(names(&received), ["arm"]);
-        goes_on(&mut browser, now, 200.0);
+        run_timers(&mut browser, now, 200.0);
         assert!(browser.shares.is_empty());
     }
 }
