@@ -20,7 +20,7 @@ const IN_ALL: f64 = 400.0;
 /// Time after which a token bucket is full again, so that it can be dropped.
 const MEMORY: Duration = Duration::from_secs(1);
 /// Maximum number of addresses with a byte credit.
-const MAX_CREDITS: usize = 4096;
+const MAX_CREDIT_ADDRESSES: usize = 4096;
 /// Time for which a credit is kept when another address needs the space. Longer than the deadline
 /// of most letters.
 const CREDIT_MEMORY: Duration = Duration::from_secs(60);
@@ -146,11 +146,11 @@ impl FailureLimit {
     /// Credits the bytes of a letter from a legacy peer at this address, at least [`MIN_CREDIT`].
     pub(super) fn credit(&mut self, now: Instant, from: IpAddr, bytes: usize) {
         let (from, bytes) = (host(from), (bytes as u64).max(MIN_CREDIT));
-        if self.credits.len() >= MAX_CREDITS && !self.credits.contains_key(&from) {
+        if self.credits.len() >= MAX_CREDIT_ADDRESSES && !self.credits.contains_key(&from) {
             let is_recent =
                 |it: &ByteCredit| now.saturating_duration_since(it.last) < CREDIT_MEMORY;
-            self.credits.retain(|_, credits| is_recent(credits));
-            if self.credits.len() >= MAX_CREDITS {
+            self.credits.retain(|_, credit| is_recent(credit));
+            if self.credits.len() >= MAX_CREDIT_ADDRESSES {
                 // Failure messages to it are omitted.
                 return;
             }
@@ -159,21 +159,21 @@ impl FailureLimit {
             bytes: 0,
             last: now,
         };
-        let credits = self.credits.entry(from).or_insert(none);
-        credits.bytes = credits.bytes.saturating_add(bytes).min(MAX_CREDIT);
-        credits.last = now;
+        let credit = self.credits.entry(from).or_insert(none);
+        credit.bytes = credit.bytes.saturating_add(bytes).min(MAX_CREDIT);
+        credit.last = now;
     }
 
     /// Whether the credit of this address covers the bytes of the failed letter; otherwise counts
     /// the message as omitted.
     pub(super) fn covers(&mut self, now: Instant, from: Option<IpAddr>, bytes: usize) -> bool {
         let Some(from) = from else { return true };
-        let credits = self
+        let credit = self
             .credits
             .get(&host(from))
-            .map_or(0, |credits| credits.bytes);
+            .map_or(0, |credit| credit.bytes);
         // Larger letters than the maximum credit need only that.
-        let may = credits >= (bytes as u64).min(MAX_CREDIT);
+        let may = credit >= (bytes as u64).min(MAX_CREDIT);
         if !may {
             self.leave_out(now);
         }
@@ -185,13 +185,13 @@ impl FailureLimit {
     /// an agent of another gateway.
     pub(super) fn debit(&mut self, now: Instant, from: Option<IpAddr>, bytes: usize) -> bool {
         let Some(from) = from else { return true };
-        let credits = self.credits.get_mut(&host(from));
-        let left = credits
+        let credit = self.credits.get_mut(&host(from));
+        let left = credit
             .as_ref()
             .and_then(|it| it.bytes.checked_sub(bytes as u64));
-        match (credits, left) {
-            (Some(credits), Some(left)) => {
-                credits.bytes = left;
+        match (credit, left) {
+            (Some(credit), Some(left)) => {
+                credit.bytes = left;
                 true
             }
             _ => {
@@ -219,9 +219,9 @@ impl FailureLimit {
             let count = std::mem::take(&mut self.left_out);
             tracing::warn!(
                 count,
-                "omitted failure messages: limits are {PER_SENDER} per second to one sender, \
-                 {PER_ADDRESS} to one address or {IN_ALL} in total, and the bytes received from one address; or \
-                 the sender's queue is full"
+                "omitted failure messages beyond a limit: {PER_SENDER} per second to one sender, \
+                 {PER_ADDRESS} to one address, {IN_ALL} in total, the bytes received from one \
+                 address, or a full queue of the sender"
             );
         }
     }
@@ -309,10 +309,10 @@ mod tests {
         limit.credit(now, one, 200);
         assert!(limit.debit(now, Some(one), 600), "200 count as 1024");
         assert!(limit.debit(now, None, 600), "another gateway's agent");
-        for number in 0..2 * MAX_CREDITS as u32 {
+        for number in 0..2 * MAX_CREDIT_ADDRESSES as u32 {
             limit.credit(now, Ipv4Addr::from(number).into(), 1);
         }
-        assert_eq!(limit.credits.len(), MAX_CREDITS);
+        assert_eq!(limit.credits.len(), MAX_CREDIT_ADDRESSES);
         limit.credit(now + CREDIT_MEMORY, other, 9);
         assert_eq!(limit.credits.len(), 1);
         assert!(limit.debit(now + CREDIT_MEMORY, Some(other), 9));

@@ -105,7 +105,7 @@ pub(crate) struct Protocol {
     pub(crate) faults: u8,
     /// Kinds of faults that a run may have.
     pub(crate) kinds: &'static [Fault],
-    /// Whether the receiver is registered anew once.
+    /// Whether the receiver is registered again once.
     pub(crate) moves: bool,
     /// Letters that fit into the lanes of a custodian.
     pub(crate) capacity: usize,
@@ -152,7 +152,7 @@ pub(crate) enum Action {
         custodian: usize,
         reports_lost: bool,
     },
-    /// The receiver is registered anew. The old registration may still take letters.
+    /// The receiver is registered again. The old registration may still take letters.
     Register,
     /// The old registration ends.
     EndOld,

@@ -6,7 +6,7 @@ use std::fmt;
 /// Highest number of letters in a configuration.
 pub(crate) const MAX_LETTERS: usize = 4;
 
-/// A service in one life: a custodian that dies and starts again is another service.
+/// A service with one incarnation: a custodian that dies and restarts is another service.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(crate) struct Service {
     pub(crate) node: u8,
@@ -203,7 +203,7 @@ pub(crate) struct State {
     pub(crate) letters: [Letter; MAX_LETTERS],
     pub(crate) custodians: [Custodian; 2],
     pub(crate) registrations: [Registration; 2],
-    /// Whether the receiver was registered anew.
+    /// Whether the receiver was registered again.
     pub(crate) registered_anew: bool,
     /// Whether the old registration has ended. Until then both take letters.
     pub(crate) old_gone: bool,
