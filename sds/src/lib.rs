@@ -8,7 +8,7 @@
 //!   [`ExchangeDirectory`] and (feature `mdns`) `MdnsDirectory` are its back ends;
 //!   [`MergedDirectory`] merges several directories into one view.
 //! * [`Exchange`] decides which entries gateways send each other about their agents.
-//! * [`Query`] and [`Pattern`] search; [`resolve`] turns the name of a receiver into entries.
+//! * [`Query`] and [`Pattern`] search; [`resolve()`] turns the name of a receiver into entries.
 //! * A coalition is also an entry: its role lists its [`Members`].
 //!
 //! The crate depends on `fipa-transport` for two types: an entry lists
